@@ -45,7 +45,8 @@ help:
 #: make run     simulate a scene and record it into logs/, until Ctrl-C; SCENE=...:
 #:              cusp fast_gyroscope free_top heavy_top looping near_separatrix
 #:              planar_pendulum sleeping spherical_pendulum steady_fast
-#:              steady_slow waking_sleeper wavy  or the path of a parameter file
+#:              steady_slow waking_sleeper wavy  with a moving pivot: braking
+#:              elevator free_fall shuttle  or the path of a parameter file
 run:
 	$(INSTALL) '$(VENV)/.deps-plot' '$(VENV)/.package'
 	@mkdir -p '$(LOGS)'

@@ -37,6 +37,8 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
   sample every 1/`imu.rate`: at other rates a reading has the white noise of the newest sample.
   [sensor.md](sensor.md) has the errors of all sensors.
 - `imu/mag`, `ground_truth/mag`: the magnetic field [T] in `imu.frame_id`.
+- `gnss/fix`, `gnss/velocity`: the pivot as a satellite receiver measures it, and exact in `ground_truth/gnss`.
+  Their stamps are the times of the measurements, `gnss.latency` before they are sent.
 - `ground_truth/imu_bias`: the bias that the readings contain. It depends on time and `seed` alone, and
   changes every millisecond.
 - `ground_truth/imu_timing`: one labelled dimension, {timing}. It has
@@ -60,6 +62,7 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
 | kind | name | type | effect |
 |---|---|---|---|
 | topic | `~/commands` | std_msgs/Float64MultiArray | sets [L3, Lz] in kg m²/s, as an impulsive torque does; the angles and θ' stay |
+| topic | `~/cmd_vel` | geometry_msgs/Twist | drives the pivot: `linear` is its velocity in the world in m/s, `angular` must be 0; of several between two ticks the last one counts |
 | service | `~/set_pause` | std_srvs/SetBool | pauses, resumes; the simulated time stands still meanwhile |
 | service | `~/step` | std_srvs/Trigger | advances by `step.count` × `step.dt`; only while paused |
 | service | `~/reset` | std_srvs/Trigger | starts again with the start state, spin and seed; stamps stay monotonic |

@@ -30,7 +30,8 @@ def markers_of(values=None, commands=(), duration_ns=3 * SECOND):
 
 def decoded(run, t_ns):
     """Return position and orientation of the body, orientation of the axis, points (n, 3)."""
-    position, body, axis, *points = run.stream.template.decode(run.sent[t_ns])
+    position, body, pivot, axis, *points = run.stream.template.decode(run.sent[t_ns])
+    assert not pivot.any()
     return position[0], body[0], axis[0], points[0].reshape(-1, 3) if points else None
 
 
@@ -135,7 +136,7 @@ def test_the_trace_goes_on_through_commands():
         simulation.command(*momenta)
     simulation.advance(3 * SECOND)
     decode = stream(simulation, 'pose').template.decode
-    axes = {t_ns: axis_of(decode(data)[0][0]) for _, t_ns, data in taken}
+    axes = {t_ns: axis_of(decode(data)[1][0]) for _, t_ns, data in taken}
     for t_ns in (750_000_000, 1_250_000_000, 1_500_000_000, 2_200_000_000):
         newest = (t_ns - 1) // 25_000_000
         expected = [axes[max(m, 0) * 25_000_000] for m in range(newest - 39, newest + 1)]
@@ -185,11 +186,11 @@ def test_the_message_is_what_ros_serializes(frame, count, stamp_ns):
     from visualization_msgs.msg import Marker, MarkerArray
 
     size, lines = (0.75, 0.5, 0.125), numbers(12)
-    centre, body, axis, trace = np.split(np.array(numbers(11 + 3 * count)), (3, 7, 11))
+    centre, body, pivot, axis, trace = np.split(np.array(numbers(14 + 3 * count)), (3, 7, 10, 14))
     expected = MarkerArray()
     for name, kind, scale, color, position, orientation, points in (
             ('body', Marker.CYLINDER, size, messages.BODY_COLOR, centre, body, ()),
-            ('axis', Marker.LINE_LIST, (0.0625,), messages.AXIS_COLOR, (), axis, lines),
+            ('axis', Marker.LINE_LIST, (0.0625,), messages.AXIS_COLOR, pivot, axis, lines),
             ('trace', Marker.LINE_STRIP, (0.03125,), messages.TRACE_COLOR, (), (), trace)):
         marker = Marker(ns=name, type=kind, action=Marker.ADD)
         marker.header.frame_id = frame
@@ -203,4 +204,4 @@ def test_the_message_is_what_ros_serializes(frame, count, stamp_ns):
         expected.markers.append(marker)
     del expected.markers[2 + bool(count):]
     assert_same(messages.markers(frame, size, tuple(lines), 0.0625, count).encode_one(
-        stamp_ns, centre, body, axis, *([trace] if count else [])), expected)
+        stamp_ns, centre, body, pivot, axis, *([trace] if count else [])), expected)

@@ -14,12 +14,17 @@ import pytest
 
 rclpy = pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import PoseStamped, QuaternionStamped, Vector3Stamped  # noqa: E402
+from geometry_msgs.msg import (  # noqa: E402
+    PoseStamped,
+    QuaternionStamped,
+    TwistWithCovarianceStamped,
+    Vector3Stamped,
+)
 from helpers.simulations import EPOCH_NS, SECOND, play, simulate  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
-from sensor_msgs.msg import Imu, JointState, MagneticField  # noqa: E402
+from sensor_msgs.msg import Imu, JointState, MagneticField, NavSatFix  # noqa: E402
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String  # noqa: E402
 
 from spinning_top_sim.streams import messages  # noqa: E402
@@ -78,8 +83,9 @@ def assert_same(ours, message):
 def with_header(frame, stamp_ns):
     """Yield template, its fields, and the message that it must give."""
     message, (a, b, c) = PoseStamped(), (numbers(4), numbers(3), numbers(5)[2:])
+    set_axes(message.pose.position, b)
     set_axes(message.pose.orientation, a)
-    yield messages.pose_stamped(frame), (a,), message
+    yield messages.pose_stamped(frame), (b, a), message
     for orientation in (messages.UNKNOWN_ORIENTATION, messages.EXACT, DIAGONAL):
         message = Imu(orientation_covariance=orientation, angular_velocity_covariance=DIAGONAL,
                       linear_acceleration_covariance=messages.EXACT)
@@ -95,10 +101,20 @@ def with_header(frame, stamp_ns):
         message.pose.covariance = message.twist.covariance = messages.diagonal(*6 * (0.0,))
         set_axes(message.pose.pose.orientation, a)
         set_axes(message.twist.twist.angular, b)
-        yield messages.odometry(frame, child), (a, b), message
         set_axes(message.pose.pose.position, c)
         set_axes(message.twist.twist.linear, b[::-1])
-        yield messages.odometry(frame, child, moves=True), (c, a, b[::-1], b), message
+        yield messages.odometry(frame, child), (c, a, b[::-1], b), message
+    message = NavSatFix(latitude=b[0], longitude=b[1], altitude=b[2],
+                        position_covariance=DIAGONAL, position_covariance_type=2)
+    message.status.status, message.status.service = 0, 1
+    yield messages.nav_sat_fix(frame, DIAGONAL), (b,), message
+    message = NavSatFix(latitude=b[0], longitude=b[1], altitude=b[2])
+    message.status.status, message.status.service = -1, 1
+    yield messages.nav_sat_fix(frame, None), (b,), message
+    message = TwistWithCovarianceStamped()
+    message.twist.covariance = messages.diagonal(0.25, 0.25, 4.0, -1.0, -1.0, -1.0)
+    set_axes(message.twist.twist.linear, b)
+    yield messages.twist_with_covariance(frame, (0.25, 0.25, 4.0)), (b,), message
     message = QuaternionStamped()
     set_axes(message.quaternion, a)
     yield messages.stamped(frame, 4), (a,), message
@@ -168,12 +184,16 @@ def test_every_stream_sends_a_message_of_its_type_with_the_frames_of_the_paramet
     world, body, imu = 'map', 'top', 'a/much/longer/frame'
     simulation = simulate(world_frame=world, body_frame=body, imu__frame_id=imu)
     expected = {'pose': world, 'joint_states': '', 'ground_truth/odom': world,
-                'ground_truth/imu_odom': world, **dict.fromkeys((
+                'ground_truth/imu_odom': world, 'gnss/fix': body, 'ground_truth/gnss/fix': body,
+                'gnss/velocity': world, 'ground_truth/gnss/velocity': world, **dict.fromkeys((
                     'imu/data_raw', 'imu/data', 'ground_truth/imu', 'ground_truth/imu_bias',
                     'imu/mag', 'ground_truth/mag', 'imu/dq', 'imu/dv'), imu)}
     children, types = ({'ground_truth/odom': body, 'ground_truth/imu_odom': imu},
                        {one.topic: one.type_name for one in simulation.streams})
+    types.pop('/tf')                # its package is no part of the wheels of ROS
     for topic, _, data in play(simulation, 0):
+        if topic == '/tf':
+            continue
         message = deserialize_message(data, message_class(types.pop(topic)))
         assert_same(data, message)
         if topic in expected:

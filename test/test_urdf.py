@@ -51,9 +51,9 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
     joints = next(s for s in simulation.streams if s.topic == 'joint_states')
     taken = record(simulation, pose.topic, joints.topic)
     simulation.advance(SECOND)
-    poses, positions = ([stream.template.decode(data)[0][0] for topic, _, data in taken
+    poses, positions = ([stream.template.decode(data)[place][0] for topic, _, data in taken
                          if topic == stream.topic]
-                        for stream in (pose, joints))
+                        for stream, place in ((pose, 1), (joints, 0)))
     assert len(poses) == len(positions) == 101
     assert model.actuated_joint_names == list(JOINTS)
     arm = np.array(MOUNTED['imu.lever_arm'])

@@ -63,7 +63,7 @@ def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
         for message in reader.messages(topics=['/pose']):
             stamp_ns, row = shown.attitudes.at(message.log_time)
             assert stamp_ns == message.log_time
-            assert row[:4] == pytest.approx(template.decode(message.data)[0][0], abs=1e-15)
+            assert row[:4] == pytest.approx(template.decode(message.data)[1][0], abs=1e-15)
 
 
 def test_motions_of_a_log_begin_with_its_commands(shown):

@@ -3,6 +3,7 @@
 
 import importlib
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 from rclpy.node import Node
@@ -30,6 +31,15 @@ class StreamPublishers:
         return self._node.create_publisher(
             message_class, topic, QoSProfile(depth=10),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    @staticmethod
+    def check(outputs: Sequence[Output], values: Mapping[str, Any]) -> None:
+        """Raise ValueError for an enabled stream whose message package is not installed."""
+        for output in outputs:
+            package, parameter = output.stream.type_name.split('/')[0], output.stream.parameter
+            if journal.is_enabled(parameter, values) and find_spec(package) is None:
+                raise ValueError(f'{parameter}.enabled: needs the ROS package {package}, which is '
+                                 'not installed')
 
     def open(self, outputs: Sequence[Output], values: Mapping[str, Any]) -> None:
         """Create the publishers of enabled streams, and destroy those of disabled ones."""

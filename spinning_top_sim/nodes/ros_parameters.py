@@ -110,7 +110,7 @@ def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
 def _as_doubles(parameter: Parameter, value: Any) -> Any:
     if isinstance(value, list | array.array):
         return [_as_doubles(parameter, item) for item in value]
-    first = parameter.default[0] if isinstance(parameter.default, tuple) else None
+    first = (parameter.default or (0.0,))[0] if isinstance(parameter.default, tuple) else None
     with contextlib.suppress(ValueError):
         if type(value) in {int, str} and (parameter.is_double or isinstance(first, float)):
             return float(value)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -67,9 +68,11 @@ class Simulator(Node):
         self._report = reports.MotionReport(simulation, self.loop, self._session)
         self._status_timer: Timer | None = None
         self._status_period = 0.0
+        self._outputs.check(simulation.outputs, values)
         self._open_outputs(values)
         self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
+        self.create_subscription(Twist, '~/cmd_vel', self._on_velocity, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset),
                                 ('record', SetBool, self._record)):
@@ -169,6 +172,18 @@ class Simulator(Node):
         if reason:
             self._log.warning(f'~/commands: refused: {reason}')
 
+    def _on_velocity(self, message: Twist) -> None:
+        """Drive the pivot; the axes are those of the world."""
+        linear, angular = ([part.x, part.y, part.z] for part in (message.linear, message.angular))
+        try:
+            if any(angular):
+                raise ValueError(f'angular = {angular!r} rad/s: must be 0')
+            with self.lock:
+                self.loop.drive(linear)
+        except ValueError as error:
+            self.loop.rejected_commands += 1
+            self._log.warning(f'~/cmd_vel: refused: {error}')
+
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes or none."""
         for p in given:
@@ -209,6 +224,7 @@ class Simulator(Node):
         if self._date.follows and journal.is_enabled('clock', values):
             raise ValueError('clock.enabled, publish_clock: must be false while this node follows '
                              'another /clock (use_sim_time)')
+        self._outputs.check(self.simulation.outputs, values)
         lowest = self.simulation.lowest_imu_rate(restarted=restarted)
         if values['imu.rate'] < lowest:
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '

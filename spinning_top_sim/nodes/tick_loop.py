@@ -2,7 +2,7 @@
 """What a tick does: which samples are sent now, in real time, without ROS and without waiting."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from enum import Enum
 from typing import Any
@@ -15,6 +15,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.blocks import NEVER_NS
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.streams.simulation import checked_velocity
 
 # The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
 EPOCH_GRID_NS = 10_000_000
@@ -89,6 +90,8 @@ class TickLoop:
         self._clock = SimulatedClock(source, values['time_scale'])
         self._subscribers_due_ns = 0            # on the steady clock
         self._stop_at_ns = 0                    # on the steady clock: when a tick gives way
+        # Asked for the pivot, and not yet applied
+        self._velocity: tuple[float, float, float] | None = None
         self._block_unfinished = False          # `idle` goes on with a block of samples
         self.set_pace(values)
 
@@ -136,6 +139,7 @@ class TickLoop:
             self._update_subscribers()
             self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
         due_ns = self._advance()
+        self._apply_velocity()
         now_ns = self._simulation.now_ns
         if now_ns >= self._duration_ns:
             self._enter(LoopState.ENDED)
@@ -198,6 +202,7 @@ class TickLoop:
         if not self.paused:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
+        self._apply_velocity()
         target_ns = min(self.now_ns + length_ns, self._duration_ns)
         stop_at_ns = self._steady() + STEP_BUDGET_NS
 
@@ -236,6 +241,29 @@ class TickLoop:
         self._recording.write_event('state', **asdict(state))
         self.commands += 1
 
+    def drive(self, velocity: Sequence[float]) -> None:
+        """
+        Let the pivot go to a velocity [m/s] from the end of the next tick on, or raise ValueError.
+
+        Of several velocities between two ticks the last one counts.
+        """
+        self._velocity = checked_velocity(velocity)
+
+    def _apply_velocity(self) -> None:
+        velocity, self._velocity = self._velocity, None
+        if velocity is None or self.failure:
+            return
+        try:
+            stop_ns = self._simulation.drive(velocity)
+        except ValueError as error:
+            self.rejected_commands += 1
+            self._tell(f'~/cmd_vel: refused: {error}', False)
+            return
+        if stop_ns is not None:
+            x, y, z = velocity
+            self._recording.write_event('drive', x=x, y=y, z=z, stop_ns=stop_ns)
+            self.commands += 1
+
     def _send_before_change(self) -> None:
         if self._simulation.now_ns < 0:         # the change sends the samples of t = 0
             self._update_subscribers()
@@ -254,7 +282,7 @@ class TickLoop:
         epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
         simulation.restart(values)
         simulation.epoch_ns = epoch_ns
-        self.failure = None
+        self.failure = self._velocity = None
         if paused is not None:
             self.paused = paused
         self.interruptions += 1

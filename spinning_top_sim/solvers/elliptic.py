@@ -94,7 +94,9 @@ class GaussMean:
             h = (h + (h * h + sense * c * c).sqrt()) / 2
             if c < h * tolerance:
                 break
-        return self.mean / h
+        amplitude = self.mean / h
+        # The square may be 1 but for rounding: the sine is then 1.
+        return min(amplitude, Decimal(1)) if sense < 0 else amplitude
 
 
 def _tolerance() -> Decimal:

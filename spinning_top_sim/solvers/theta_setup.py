@@ -115,9 +115,11 @@ class ThetaMotion:
     m1: Decimal = ONE
 
 
-def set_up(top: Top, start: State) -> ThetaMotion:
+def set_up(top: Top, start: State, form: type[ThetaForm] = ThetaForm) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the doubles as they are.
+
+    form : of the series, which decides how many terms they have; the constants may be decimals
 
     Raises ValueError if none of DIGITS_TO_TRY tell the roots of the cubic apart.  They are never
     equal: on the separatrix, or in steady precession with theta' != 0, cos(theta0) would be
@@ -126,7 +128,7 @@ def set_up(top: Top, start: State) -> ThetaMotion:
     for digits in DIGITS_TO_TRY:
         with precision(digits):
             try:
-                return _set_up(top, start)
+                return _set_up(top, start, form)
             except RootsTooCloseError:
                 continue
             except (DecimalException, OverflowError) as error:
@@ -153,7 +155,7 @@ class _Side(NamedTuple):
     slope: Decimal
 
 
-def _set_up(top: Top, start: State) -> ThetaMotion:
+def _set_up(top: Top, start: State, form_type: type[ThetaForm]) -> ThetaMotion:
     torque = Decimal(top.mass) * Decimal(top.gravity) * Decimal(top.com_distance)
     lambda1, lambda3 = Decimal(top.lambda1), Decimal(top.lambda3)
     # Rounded now (+): a sum rounds its result, and -L3 must cancel Lz = L3 to the last digit.
@@ -170,7 +172,8 @@ def _set_up(top: Top, start: State) -> ThetaMotion:
     # theta -> pi - theta leaves P >= 0, and exchanges alpha and beta.
     sense = -1 if torque < 0 else 1
     return _nutating(sides[::sense], lambda1, sense, (
-        f0, sense * f1, f2, sense * f3 or NO_GRAVITY * abs(f2)), falling=sense * theta_dot > 0)
+        f0, sense * f1, f2, sense * f3 or NO_GRAVITY * abs(f2)),
+        falling=sense * theta_dot > 0, form_type=form_type)
 
 
 def _resting(side: _Side, lambda1: Decimal) -> Factor:
@@ -183,7 +186,8 @@ def _resting(side: _Side, lambda1: Decimal) -> Factor:
 
 
 def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int,
-              cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool) -> ThetaMotion:
+              cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool,
+              form_type: type[ThetaForm]) -> ThetaMotion:
     """Return a motion with P >= 0; with sense -1 that of which this is the mirror image."""
     roots, f3 = cubic_roots(*cubic), cubic[3]
     imaginary = roots.gap21 > roots.gap32
@@ -191,7 +195,7 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int,
     with precision(DIGITS):
         a, g, c = roots.gap31.sqrt(), roots.gap32.sqrt(), roots.gap21.sqrt()
         mean = GaussMean(a, g, c)
-        form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary)
+        form = form_type(GaussMean(a, c, g) if imaginary else mean, imaginary)
         quarter0, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
         stretch = form.mean.mean / mean.mean if imaginary else None
         sin = form.mean.amplitude(square, 1 if imaginary else -1)

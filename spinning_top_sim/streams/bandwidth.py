@@ -54,9 +54,9 @@ class LowPass:
             1.0 + s if self._order == 1 else 1.0 + math.sqrt(2.0) * s + s * s), np.complex128)
 
     def filtered(self, path: Path, times: range, signal: Signal) -> NDArray[np.float64]:
-        """Return the filtered signal at times [ns] within the present segment, (columns, n)."""
-        # Samples that see the present segment alone have the same nodes.
-        mixed = len(range(times.start, path.present.start_ns + self.memory_ns, times.step))
+        """Return the filtered signal at times [ns] within a segment, (columns, n)."""
+        # Samples that see this segment alone have the same nodes.
+        mixed = len(range(times.start, path.after(times.start).start_ns + self.memory_ns, times.step))
         parts = [self._sum(path, part, signal) for part in (times[:mixed], times[mixed:])
                  if len(part)]
         return np.concatenate(parts, axis=1)
@@ -99,7 +99,7 @@ class LowPass:
         before, weights = np.vstack((before, oldest)), np.vstack((weights, rest))
         at_ns = t_ns - np.rint(before).astype(np.int64)
         unique, places = np.unique(at_ns, return_inverse=True)
-        values = signal(segment.states(unique))[:, places.reshape(at_ns.shape)]
+        values = signal(segment.own_states(unique))[:, places.reshape(at_ns.shape)]
         total = np.zeros((len(values), len(t_ns)))
         for node in range(len(weights)):        # in one order, however many samples there are
             total += weights[node] * values[:, node]

@@ -48,16 +48,17 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
     """
     end_ns = min(until_ns, LAST_STAMP_NS - epoch_ns)
     while after_ns < end_ns:
-        block_end_ns = min(end_ns, after_ns + span_ns)
+        segment = path.after(after_ns)
+        block_end_ns = min(end_ns, after_ns + span_ns, segment.end_ns)
         failure = None
         try:
             for _ in range(-(-most_steps // STEPS_IN_A_PIECE)):
-                if path.present.reach(block_end_ns, STEPS_IN_A_PIECE):
+                if segment.reach(block_end_ns, STEPS_IN_A_PIECE):
                     break
                 yield None
         except IntegrationError as error:
             failure = error
-        block_end_ns = min(block_end_ns, path.present.reached_ns)
+        block_end_ns = min(block_end_ns, segment.reached_ns)
         if block_end_ns > after_ns:
             # Once for all streams of one rate.
             samples = cache(partial(Samples, path, epoch_ns=epoch_ns))
@@ -65,7 +66,9 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
             for stream in streams:
                 times = stream.times(after_ns, block_end_ns)
                 if times:
-                    parts.append((stream, *stream.encode(samples(times))))
+                    times_ns, rows = stream.encode(samples(times))
+                    if len(times_ns):       # a sensor may lose all samples of a block
+                        parts.append((stream, times_ns, rows))
                     yield None
             yield Block(block_end_ns, parts)
             after_ns = block_end_ns

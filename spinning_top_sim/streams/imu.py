@@ -145,10 +145,17 @@ class Imu:
     def _body_increments(self, samples: Samples) -> Increments:
         return self.intervals.increments(samples.path, samples.times, self._lever_arm)
 
-    def motion(self, states: States) -> tuple[Vector, Vector]:
-        """Return position in the world [m], and velocity in the frame of the IMU [m/s]."""
-        return (attitude.in_world(states.rows_quaternion, self._lever_arm),
-                self.from_body(states.velocity(self._lever_arm)))
+    def motion(self, samples: Samples) -> tuple[Vector, Quaternion, Vector]:
+        """Return position [m] and orientation in the world, velocity in the IMU's frame [m/s]."""
+        states = samples.states
+        x, y, z = attitude.in_world(states.rows_quaternion, self._lever_arm)
+        v1, v2, v3 = states.velocity(self._lever_arm)
+        if samples.segment.ride:
+            (a, b, c), (u, v, w), _ = samples.pivot
+            x, y, z = x + a, y + b, z + c
+            u, v, w = attitude.in_body(states.rows_quaternion, (u, v, w))
+            v1, v2, v3 = v1 + u, v2 + v, v3 + w
+        return (x, y, z), self.orientation(states), self.from_body((v1, v2, v3))
 
     def from_body(self, vector: Vector) -> Vector:
         """Return a vector in the frame of the IMU."""

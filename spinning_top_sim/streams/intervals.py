@@ -56,7 +56,7 @@ class Intervals:
     def increments(self, path: Path, times: range, point: Point) -> Increments:
         """Return the increments over the intervals that end at these times [ns], n of each."""
         # Those that may be shorter, or contain a command, are computed one by one.
-        since_ns = max(self.since_ns, path.present.start_ns)
+        since_ns = max(self.since_ns, path.after(times.start - 1).start_ns)
         single = len(range(times.start, since_ns + self.length_ns + 1, times.step))
         parts = [path.increments(self.begin_ns(end_ns), end_ns, point)
                  for end_ns in times[:single]]

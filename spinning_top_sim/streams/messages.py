@@ -32,8 +32,8 @@ EXACT = diagonal(0.0, 0.0, 0.0)
 
 @lru_cache(64)      # ensembles make it in every run
 def pose_stamped(frame_id: str) -> Template:
-    """geometry_msgs/PoseStamped at the origin; fields: orientation x, y, z, w."""
-    return Template(CdrWriter().header(frame_id).append('d', *ORIGIN).field(4))
+    """geometry_msgs/PoseStamped; fields: position, orientation x, y, z, w."""
+    return Template(CdrWriter().header(frame_id).field(3).field(4))
 
 
 @lru_cache(64)
@@ -62,21 +62,47 @@ def magnetic_field(frame_id: str) -> Template:
 
 
 @lru_cache(64)
-def odometry(frame_id: str, child_frame_id: str, *, moves: bool = False) -> Template:
+def nav_sat_fix(frame_id: str, covariance: tuple[float, ...] | None) -> Template:
+    """
+    sensor_msgs/NavSatFix of GPS; fields: latitude and longitude [deg], altitude [m].
+
+    covariance : east, north, up [m^2]; None: there is no fix
+    """
+    status, kind = (-1, 0) if covariance is None else (0, 2)    # 2: the diagonal is known
+    writer = CdrWriter().header(frame_id).append('b', status).append('H', 1).field(3)
+    return Template(writer.append('d', *(covariance or 9 * (0.0,))).append('B', kind))
+
+
+@lru_cache(64)
+def twist_with_covariance(frame_id: str, variances: tuple[float, ...]) -> Template:
+    """
+    geometry_msgs/TwistWithCovarianceStamped; fields: linear velocity.
+
+    variances : of the linear velocity; those of the angular one are -1, as ublox_gps has it
+    """
+    covariance = list(diagonal(*variances, *3 * (-1.0,)))
+    writer = CdrWriter().header(frame_id).field(3).append('d', *ORIGIN, *covariance)
+    return Template(writer)
+
+
+@lru_cache(64)
+def odometry(frame_id: str, child_frame_id: str) -> Template:
     """
     nav_msgs/Odometry with exact values.
 
-    Fields: orientation, angular velocity; for a point that `moves`: position, orientation,
-    velocity in the child frame, angular velocity.
+    Fields: position, orientation; velocity and angular velocity in the child frame.
     """
     writer = CdrWriter().header(frame_id).string(child_frame_id)
     for count in (4, 3):
-        if moves:
-            writer.field(3)
-        else:
-            writer.append('d', *ORIGIN)             # position and velocity of the pivot
-        writer.field(count).append('d', *diagonal(*6 * (0.0,)))
+        writer.field(3).field(count).append('d', *diagonal(*6 * (0.0,)))
     return Template(writer)
+
+
+@lru_cache(64)
+def transform(frame_id: str, child_frame_id: str) -> Template:
+    """tf2_msgs/TFMessage with one transform; fields: translation, rotation x, y, z, w."""
+    return Template(CdrWriter().append('I', 1).header(frame_id).string(child_frame_id)
+                    .field(3).field(4))
 
 
 @lru_cache(64)
@@ -106,8 +132,7 @@ def markers(frame_id: str, size: tuple[float, ...], lines: tuple[float, ...], li
     """
     visualization_msgs/MarkerArray: a cylinder, lines on it, and a trace if it has points.
 
-    Fields: position and orientation of the cylinder, orientation of the lines, points of the
-    trace.
+    Fields: position and orientation of the cylinder, and of the lines; points of the trace.
 
     size : diameters and height of the cylinder [m]
     lines : x, y and z of begin and end of each line, in the body frame [m]
@@ -116,7 +141,7 @@ def markers(frame_id: str, size: tuple[float, ...], lines: tuple[float, ...], li
     writer = CdrWriter().append('I', 3 if trace_points else 2)
     _begin(writer, frame_id, 'body', CYLINDER).field(3).field(4)
     _end(writer, size, BODY_COLOR, 0)
-    _begin(writer, frame_id, 'axis', LINE_LIST).append('d', *ORIGIN).field(4)
+    _begin(writer, frame_id, 'axis', LINE_LIST).field(3).field(4)
     _end(writer, (line_width, 0.0, 0.0), AXIS_COLOR, len(lines) // 3, lines)
     if trace_points:
         _begin(writer, frame_id, 'trace', LINE_STRIP).append('d', *ORIGIN, *NO_ROTATION)

@@ -27,6 +27,7 @@ class Purpose(enum.IntEnum):
 
     WHITE, TURN_ON, WALK, GAUSS_MARKOV, FLICKER, ORIENTATION = range(6)
     TIMING, MAG_WHITE, MAG_WALK, VIBRATION_RATE, VIBRATION_FORCE = range(6, 11)
+    GNSS_POSITION, GNSS_VELOCITY = range(11, 13)
 
 
 def white(seed: int, purpose: Purpose, numbers: NDArray[np.int64], columns: int,

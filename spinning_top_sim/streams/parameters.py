@@ -12,9 +12,12 @@ import math
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
+from spinning_top_sim.installation import remedy
+from spinning_top_sim.physics.pivot import PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
 
@@ -59,6 +62,12 @@ class Parameter:
         """Whether the value is a double; an integer is converted."""
         return self.default is None or isinstance(self.default, float)
 
+    @property
+    def _of_strings(self) -> bool:
+        """Whether it is a list of strings; an empty default is a list of numbers."""
+        return isinstance(self.default, tuple) and bool(self.default) and isinstance(
+            self.default[0], str)
+
     def describe(self, range_too: bool = True) -> str:
         """Return text, unit, range and effect in one line."""
         return '; '.join(filter(None, (
@@ -79,8 +88,8 @@ class Parameter:
         kind = {bool: 'true or false', int: 'an integer', str: 'a string', float: 'a number',
                 type(None): 'a number'}.get(type(self.default))
         if isinstance(self.default, tuple):
-            kind = ('a list of strings' if isinstance(self.default[0], str)
-                    else f'a list of {len(self.default)} numbers'
+            kind = ('a list of strings' if self._of_strings
+                    else f'a list of {len(self.default) or ""} numbers'.replace('  ', ' ')
                     + (', or a multiple of that,' if self.is_repeated else ''))
         return f'must be {kind} {self._bounds()}'.rstrip()
 
@@ -91,7 +100,8 @@ class Parameter:
         with contextlib.suppress(TypeError, OverflowError):
             if self._is_allowed(value):
                 if isinstance(self.default, tuple):
-                    return tuple(type(self.default[0])(item) for item in value)
+                    return tuple(str(item) if self._of_strings else float(item)
+                                 for item in value)
                 return float(value) if self.is_double else value
         raise ValueError(f'{self.name} = {shown(value)}: {self.allowed}')
 
@@ -100,10 +110,10 @@ class Parameter:
         if isinstance(default, tuple):
             if isinstance(value, str | bytes | Mapping | Set):       # iterable, but not lists
                 return False
-            if isinstance(default[0], str):
+            if self._of_strings:
                 return all(isinstance(item, str) for item in value)
             count = len(value) // len(default) if self.is_repeated else 1
-            return len(value) == max(count, 1) * len(default) and all(
+            return len(value) == (max(count, 1) * len(default) or len(value)) and all(
                 map(self._is_in_range, value))
         if isinstance(default, bool | str):
             return isinstance(value, type(default)) and (not self.choices or value in self.choices)
@@ -120,12 +130,15 @@ class Parameter:
 # Name, default rate [Hz], on by default, description.  Streams with None have the rate `imu.rate`.
 STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
     ('pose', 100.0, True, 'pose (geometry_msgs/PoseStamped)'),
+    ('tf', 100.0, False, '/tf (tf2_msgs/TFMessage), world_frame -> body_frame'),
     ('joint_states', 100.0, True, 'joint_states (sensor_msgs/JointState)'),
     ('imu', 200.0, True, 'imu/data_raw and ground_truth/imu_bias (sensor_msgs/Imu)'),
     ('imu_data', 200.0, False, 'imu/data (sensor_msgs/Imu with orientation)'),
     ('ground_truth_imu', 200.0, True, 'ground_truth/imu (sensor_msgs/Imu, noise-free)'),
     ('imu_timing', None, False, 'ground_truth/imu_timing (std_msgs/Float64MultiArray)'),
     ('mag', 100.0, False, 'imu/mag and ground_truth/mag (sensor_msgs/MagneticField)'),
+    ('gnss', 10.0, False, 'gnss/fix (sensor_msgs/NavSatFix), gnss/velocity '
+     '(geometry_msgs/TwistWithCovarianceStamped), and ground_truth/gnss of both'),
     ('increments', None, False, 'imu/dq (geometry_msgs/QuaternionStamped), imu/dv '
      '(geometry_msgs/Vector3Stamped), both at imu.rate, and ground_truth/imu_odom'),
     ('ground_truth_odom', 100.0, True, 'ground_truth/odom (nav_msgs/Odometry)'),
@@ -142,6 +155,8 @@ LOWEST_RATE_OF_INTERVALS = 1.0
 LARGEST = 1e30
 # Longest time [s], three years.
 LONGEST = 1e8
+# Speed of the pivot [m/s], and shortest time between two of its accelerations [s].
+FASTEST, SHORTEST_PIECE = 1e4, 1e-3
 
 _at_once = partial(Parameter, effect=Effect.NOW)
 _at_reset = partial(Parameter, effect=Effect.RESET)
@@ -191,6 +206,21 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('initial.theta_dot', 0.0, 'Nutation rate at the start', 'rad/s', -1e12, 1e12),
     _at_reset('initial.phi', 0.0, 'Precession angle at the start', 'rad', -1e12, 1e12),
     _at_reset('initial.psi', 0.0, 'Spin angle at the start', 'rad', -1e12, 1e12),
+    _at_reset('pivot.path', (), 'Path of the pivot: duration [s] and acceleration x, y, z '
+              '[m/s^2] in the world of each piece, one after the other; empty: none', '', -1e6,
+              1e8),
+    _at_reset('pivot.waypoints', (), 'Path of the pivot: x, y, z in the world of each point at '
+              'which it stops; empty: none', 'm', -1e6, 1e6),
+    _at_reset('pivot.speed', 1.0, 'Highest speed between the waypoints', 'm/s', above=0.0,
+              maximum=FASTEST),
+    _at_reset('pivot.acceleration', 1.0, 'Acceleration between the waypoints', 'm/s^2', above=0.0,
+              maximum=1e6),
+    _at_reset('pivot.repeat', False, 'Repeat the path for ever; the waypoints: back to the first '
+              'one'),
+    _at_reset('pivot.max_acceleration', 2.0, 'Acceleration with which ~/cmd_vel is followed',
+              'm/s^2', 1e-6, 1e6),
+    _at_reset('pivot.cmd_timeout', 0.5, 'The pivot brakes this long after the last ~/cmd_vel, '
+              '0 = never', 's', 0.0, LONGEST, smallest=1e-3),
     # No range: the limit depends on the motion.
     _at_once('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
               'kg m^2/s'),
@@ -270,6 +300,16 @@ TABLE: tuple[Parameter, ...] = (
                 f'end [s], and {text}, x, y, z [T]', '', -LONGEST, LONGEST, is_repeated=True)
       for frame, text in (('world', 'a field that is added to that of the world'),
                           ('body', 'the field of a magnet on the body, in its frame'))),
+    _at_reset('gnss.origin', (48.14, 11.58, 520.0), 'Latitude and longitude [deg] and height '
+              'above the ellipsoid of WGS-84 [m] of the origin of the world', '', -1e6, 1e6),
+    _at_reset('gnss.position_noise', (0.0, 0.0), 'Standard deviation of the white noise of a fix, '
+              'for each horizontal axis and for the vertical one', 'm', 0.0, 1e6, smallest=1e-12),
+    _at_reset('gnss.velocity_noise', (0.0, 0.0), 'The same of gnss/velocity', 'm/s', 0.0, 1e6,
+              smallest=1e-12),
+    _at_reset('gnss.latency', 0.0, 'How long after its stamp a measurement is sent', 's', 0.0,
+              1.0),
+    _at_reset('gnss.outages', (), 'Begin and end of each time without reception, ascending', 's',
+              0.0, LONGEST),
     _at_reset('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
               's', 0.0, 3600.0),
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
@@ -321,6 +361,8 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
     _check_sensor(result)
     top_of(result)
     start_state(result)
+    pivot_path(result)
+    _check_gnss(result)
     return result
 
 
@@ -347,6 +389,47 @@ def top_of(values: Mapping[str, Value]) -> Top:
     """Return the top that these parameters describe.  Raises ValueError like `Top`."""
     return Top(**{name: values[f'top.{name}']
                   for name in ('lambda1', 'lambda3', 'mass', 'com_distance', 'gravity')})
+
+
+def _check_gnss(values: Mapping[str, Value]) -> None:
+    latitude, longitude, _ = values['gnss.origin']
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+        raise ValueError(f'gnss.origin = {list(values["gnss.origin"])!r}: must be a latitude from '
+                         '-90 to 90, a longitude from -180 to 180, and a height')
+    edges = values['gnss.outages']
+    if len(edges) % 2 or any(not a < b for a, b in pairwise(edges)):
+        raise ValueError(f'gnss.outages = {list(edges)!r}: must be begin and end of each, '
+                         'ascending')
+    if values['gnss.enabled'] and find_spec('pymap3d') is None:
+        raise ValueError('gnss.enabled = True: needs pymap3d, which is not installed: '
+                         f'{remedy("gnss")}')
+
+
+def pivot_path(values: Mapping[str, Value]) -> PivotPath | None:
+    """Return the path of the pivot; None if it rests.  Raises ValueError."""
+    for name, count in (('pivot.path', 4), ('pivot.waypoints', 3)):
+        if len(values[name]) % count:
+            raise ValueError(f'{name} = {list(values[name])!r}: must be a multiple of {count} '
+                             'numbers')
+    path, points = (list(zip(*count * [iter(values[name])], strict=True)) for name, count in (
+        ('pivot.path', 4), ('pivot.waypoints', 3)))
+    if not path and not points:
+        return None
+    if path and points:
+        raise ValueError(f'pivot.waypoints = {points!r}: must be empty with pivot.path')
+    for duration, *_ in path:
+        if not duration >= SHORTEST_PIECE:
+            raise ValueError(f'pivot.path: the duration {duration!r} s: must be >= '
+                             f'{SHORTEST_PIECE:g} s')
+    try:
+        if path:
+            return PivotPath([(round(duration * 1e9), a) for duration, *a in path],
+                             repeat=values['pivot.repeat'])
+        return PivotPath.through(
+            points, speed=values['pivot.speed'], acceleration=values['pivot.acceleration'],
+            repeat=values['pivot.repeat'])
+    except ValueError as error:
+        raise ValueError(f'pivot.{"path" if path else "waypoints"}: {error}') from error
 
 
 def start_state(values: Mapping[str, Value]) -> State:

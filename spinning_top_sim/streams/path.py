@@ -1,35 +1,63 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motion of a run: segments of one solution each, joined by commands."""
+"""The motion of a run: segments of one solution each, joined by commands and by the pivot."""
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property, reduce
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.integrals import Increments
+from spinning_top_sim.physics.pivot import NEVER_NS, Kinematics, Piece
 from spinning_top_sim.physics.states import Point, States
-from spinning_top_sim.physics.top import State
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.world_states import WorldStates
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import Propagator
+from spinning_top_sim.solvers.vertical import (
+    AcceleratedMotion,
+    Posture,
+    Vertical,
+    posture_at,
+)
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS
+
+
+class Ride(NamedTuple):
+    """
+    What the pivot of a segment does.
+
+    top : in the gravity of the world
+    vertical : of the effective gravity, along which the segment's own frame stands
+    piece : of the path of the pivot
+    """
+
+    top: Top
+    vertical: Vertical
+    piece: Piece
 
 
 class Segment:
     """
-    A motion from its start, or from a command, until the next command.
+    A motion from its start, or from a command, until the next command or change of the pivot's.
 
-    Times are simulated times [ns]; those of `solver` count from `start_ns`.
+    Times are simulated times [ns]; those of `solver` count from `start_ns`.  Where the pivot
+    moves, `solver`, `exact`, `start` and the constants are about the effective vertical.
 
+    ride : what the pivot does; None while it rests at the origin
     reached_ns : time up to which the solver needs no further steps
     energy, l3, lz : constants of the motion, at its start
     """
 
-    def __init__(self, solver: Propagator, start: State, start_ns: int) -> None:
-        self.solver, self.start, self.start_ns = solver, start, start_ns
+    def __init__(self, solver: Propagator, start: State, start_ns: int,
+                 ride: Ride | None = None) -> None:
+        self.solver, self.start, self.start_ns, self.ride = solver, start, start_ns, ride
         self.reached_ns = start_ns + solver.reached_ns
         self._first = solver.states(range(1))
         self.energy, self.l3, self.lz = float(self._first.energy[0]), start.l3, start.lz
@@ -45,6 +73,11 @@ class Segment:
                 return exact
         return None
 
+    @property
+    def end_ns(self) -> int:
+        """When the acceleration of the pivot changes [ns]."""
+        return self.ride.piece.end_ns if self.ride else NEVER_NS
+
     def reach(self, t_ns: int, max_steps: int) -> bool:
         """
         Let the solver step up to a time [ns]; return False if that takes more steps.
@@ -57,8 +90,28 @@ class Segment:
             self.reached_ns = self.start_ns + self.solver.reached_ns
 
     def states(self, times: range | NDArray[np.int64]) -> States:
-        """Return the states at ascending times [ns]."""
+        """Return the states in the world at ascending times [ns]."""
+        return self._in_world(self.own_states(times))
+
+    def own_states(self, times: range | NDArray[np.int64]) -> States:
+        """Return the states about the vertical of the segment at ascending times [ns]."""
         return self.solver.states(self._since_start(times))
+
+    def _in_world(self, states: States) -> States:
+        ride = self.ride
+        return WorldStates(ride.top, states, ride.vertical.rows) if ride else states
+
+    def posture(self, t_ns: int) -> Posture:
+        """Return attitude and angular velocity in the world at a time [ns]."""
+        if isinstance(self.solver, AcceleratedMotion):
+            return self.solver.posture(t_ns - self.start_ns)
+        return posture_at(self.states(range(t_ns, t_ns + 1)))
+
+    def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
+        """Return what the pivot does at times (n,) [ns]."""
+        if self.ride:
+            return self.ride.piece.at(times_ns)
+        return Kinematics(*np.zeros((3, 3, len(times_ns))))
 
     def _since_start(self, times: range | NDArray[np.int64]) -> range | NDArray[np.int64]:
         if isinstance(times, np.ndarray):
@@ -71,59 +124,111 @@ class Segment:
             return np.zeros(len(times))
         if self.exact is None:
             return np.full(len(times), math.nan)
-        truth = self.exact.states(self._since_start(times)).rows_quaternion
+        truth = self._in_world(self.exact.states(self._since_start(times))).rows_quaternion
         return attitude.angle_between(states.rows_quaternion, truth)
 
-    def exact_axis(self, times_ns: NDArray[np.int64]) -> attitude.Vector:
-        """Return the exact axis in the world at times (n,) [ns]; its start where not known."""
-        if self.exact is not None:
-            return self.exact.states(times_ns - self.start_ns).rows_axis
-        x, y, z = (np.full(len(times_ns), part[0]) for part in self._first.rows_axis)
+    def exact_point(self, times_ns: NDArray[np.int64], along: float) -> attitude.Vector:
+        """Return where a point of the axis is at times (n,) [ns]; the start's where not known."""
+        states = (self._first if self.exact is None
+                  else self.exact.states(times_ns - self.start_ns))
+        # Of the first state alone, one value for all times.
+        x, y, z = (along * np.broadcast_to(part, times_ns.shape)
+                   for part in self._in_world(states).rows_axis)
+        if self.ride:
+            a, b, c = self.pivot(times_ns).position
+            x, y, z = x + a, y + b, z + c
         return x, y, z
 
 
 class Path:
     """
-    The segments of a run, in order; the last one is the present motion.
+    The segments of a run, in order.
 
+    follow : returns the segment behind the end of one; raises ValueError if there is none
     keep_ns : how long a segment is kept after its end [ns]
     keep_steps_ns : `release` keeps the integration steps of this time before its argument [ns]
     """
 
-    def __init__(self, first: Segment, *, keep_ns: int, keep_steps_ns: int) -> None:
-        self._segments = [first]
+    def __init__(self, first: Segment, follow: Callable[[Segment], Segment], *, keep_ns: int,
+                 keep_steps_ns: int) -> None:
+        self._segments, self._follow = [first], follow
+        self._gone_steps = self._gone_evaluations = 0       # of segments that are forgotten
         self._keep_ns, self.keep_steps_ns = keep_ns, keep_steps_ns
 
     @property
-    def present(self) -> Segment:
-        """The segment that goes on now."""
-        return self._segments[-1]
+    def steps(self) -> int:
+        """Integration steps taken so far."""
+        return self._gone_steps + sum(one.solver.steps for one in self._segments)
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the right-hand side so far."""
+        return self._gone_evaluations + sum(one.solver.evaluations for one in self._segments)
+
+    def after(self, t_ns: int) -> Segment:
+        """
+        Return the segment in which the motion goes on after a time [ns].
+
+        Raises IntegrationError where it does not.
+        """
+        while self._segments[-1].end_ns <= t_ns:
+            try:
+                self._append(self._follow(self._segments[-1]))
+            except ValueError as error:
+                raise IntegrationError(str(error)) from error
+        return next((one for one in reversed(self._segments) if one.start_ns <= t_ns),
+                    self._segments[0])
 
     def go_on_with(self, segment: Segment) -> None:
-        """End the present segment where another one starts."""
+        """Go on with another segment from its start; what was to come from there is dropped."""
+        self.end_after(segment.start_ns)
+        self._append(segment)
+
+    def end_after(self, t_ns: int) -> bool:
+        """Drop the segments that start later than a time [ns]; return whether there were any."""
+        late = [one for one in self._segments if one.start_ns > t_ns]
+        self._forget(late)
+        return bool(late)
+
+    def _append(self, segment: Segment) -> None:
         oldest_ns = segment.start_ns - max(self._keep_ns, self.keep_steps_ns)
         ends = [later.start_ns for later in self._segments[1:]] + [segment.start_ns]
-        self._segments = [one for one, end_ns in zip(self._segments, ends, strict=True)
-                          if end_ns >= oldest_ns] + [segment]
+        self._forget([one for one, end_ns in zip(self._segments, ends, strict=True)
+                      if end_ns < oldest_ns])
+        self._segments.append(segment)
 
-    def release(self, before_ns: int) -> None:
+    def _forget(self, segments: list[Segment]) -> None:
+        for one in segments:
+            self._segments.remove(one)
+            self._gone_steps += one.solver.steps
+            self._gone_evaluations += one.solver.evaluations
+
+    def release(self, now_ns: int) -> None:
         """Forget the integration steps that only times before this one [ns] need."""
-        self.present.solver.release(before_ns - self.keep_steps_ns - self.present.start_ns)
+        present = self.after(now_ns)
+        present.solver.release(now_ns - self.keep_steps_ns - present.start_ns)
 
-    def exact_axis(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the exact axis in the world at ascending times (n,) [ns], (n, 3)."""
+    def exact_points(self, times_ns: NDArray[np.int64], along: float) -> NDArray[np.float64]:
+        """Return where a point of the axis is at ascending times (n,) [ns], (n, 3)."""
         # A segment ends with the command that begins the next one, that instant included.
         ends = np.searchsorted(times_ns, [one.start_ns for one in self._segments[1:]], 'right')
         return np.concatenate([
-            np.stack(segment.exact_axis(times), axis=-1) for segment, times in zip(
+            np.stack(segment.exact_point(times, along), axis=-1) for segment, times in zip(
                 self._segments, np.split(times_ns, ends), strict=True) if len(times)])
 
     def pieces(self, begin_ns: int, end_ns: int) -> list[tuple[Segment, int, int]]:
         """Return the segments between two times [ns], and where each begins and ends there."""
         ends = [*(later.start_ns for later in self._segments[1:]), end_ns]
-        return [(segment, max(begin_ns, segment.start_ns), until_ns)
+        return [(segment, max(begin_ns, segment.start_ns), min(until_ns, end_ns))
                 for segment, until_ns in zip(self._segments, ends, strict=True)
-                if until_ns > begin_ns]
+                if begin_ns < until_ns and segment.start_ns < end_ns]
+
+    def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
+        """Return what the pivot does at ascending times (n,) [ns], those before now too."""
+        ends = np.searchsorted(times_ns, [one.start_ns for one in self._segments[1:]], 'right')
+        return Kinematics(*(np.concatenate(parts, axis=1) for parts in zip(*(
+            segment.pivot(times) for segment, times in zip(
+                self._segments, np.split(times_ns, ends), strict=True)), strict=True)))
 
     def increments(self, begin_ns: int, end_ns: int, point: Point, count: int = 1,
                    step_ns: int = 1) -> Increments:
@@ -131,17 +236,18 @@ class Path:
         Return the increments of a point of the body over intervals of one length.
 
         The first interval is [begin_ns, end_ns), the next one begins `step_ns` later.  They may
-        contain commands only if `count` is 1.  The impulsive torque of a command lets the velocity
-        of the point jump; the jump counts toward the interval [begin, end) that contains it.
+        contain the start of a segment only if `count` is 1.  The impulsive torque of a command
+        lets the velocity of the point jump; the jump counts toward the interval [begin, end) that
+        contains it.
         """
         pieces: list[Increments] = []
         for before, segment, after in zip([None, *self._segments], self._segments,
                                           [*self._segments[1:], None], strict=False):
             start_ns = segment.start_ns
-            if before is not None and start_ns >= begin_ns:
+            if before is not None and begin_ns <= start_ns < end_ns:
                 moment = range(start_ns, start_ns + 1)
                 (u1, u2, u3), (v1, v2, v3) = (
-                    one.states(moment).velocity(point) for one in (before, segment))
+                    one.own_states(moment).velocity(point) for one in (before, segment))
                 pieces.append(integrals.impulse((v1 - u1, v2 - u2, v3 - u3)))
             from_ns = max(begin_ns, start_ns)
             until_ns = end_ns if after is None else min(end_ns, after.start_ns)
@@ -157,5 +263,5 @@ def _within(segment: Segment, begins: range, length_ns: int, point: Point) -> li
     count = integrals.panels(rate, length_ns)
     edges = [length_ns * k // count for k in range(count + 1)]
     return [integrals.increments(
-        segment.states, range(begins.start + begin, begins.stop + begin, begins.step),
+        segment.own_states, range(begins.start + begin, begins.stop + begin, begins.step),
         end - begin, point, rate) for begin, end in pairwise(edges)]

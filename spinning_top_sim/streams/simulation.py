@@ -4,21 +4,29 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from spinning_top_sim.physics.pivot import NEVER_NS, PivotPath
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.exact import MOST_TURNS
-from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.solvers.propagator import Propagator, propagate
+from spinning_top_sim.solvers.vertical import (
+    AcceleratedMotion,
+    Posture,
+    about_vertical,
+    posture_of,
+)
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.intervals import LONGEST_NS
-from spinning_top_sim.streams.path import Path, Segment
+from spinning_top_sim.streams.path import Path, Ride, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import ImuStream, all_streams
 
@@ -28,6 +36,8 @@ FIRST_STEPS, OFFLINE_STEPS = 500, 2000
 # Offline, a block has so many bytes, but covers no more time than this, for the sake of progress;
 # nor are there more blocks than this.
 OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 4 << 20, 100 * NANOSECONDS, 20_000
+# Length of an entry of `Simulation.history` about the pivot.
+DRIVE = 5
 # Turns a second whose phases doubles hold up to the last stamp.
 MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
 
@@ -42,7 +52,9 @@ class Simulation:
     path : the motion
     now_ns : every sample up to here is done (-1: not even that of t = 0); may be set
     history : what was applied since the start: commands as (t_ns, l3, lz), states that were set as
-        t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate)
+        t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate), velocities of the
+        pivot as (t_ns, x, y, z, stop_ns)
+    pivot : the path of the pivot; None while it rests at the origin
     epoch_ns : stamp of t = 0 [ns]
     version : changes with all but `epoch_ns` that makes samples after `now_ns` other ones
 
@@ -72,14 +84,18 @@ class Simulation:
                 raise ValueError(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be >= 0 and '
                                  f'< {2 ** 31} s, in January 2038')
         top, start = parameters.top_of(values), parameters.start_state(values)
-        segment = _segment(top, start, 0, values)
+        pivot = parameters.pivot_path(values)
+        segment = _segment(top, start, 0, values, pivot)
         streams = all_streams(values)
         self.values, self.top, self.streams = dict(values), top, streams
-        self.history: list[tuple[int, *tuple[float, ...]]] = []
+        self.history: list[tuple[Any, ...]] = []
         self.now_ns = -1
-        # The trace of the markers, and intervals of the IMU, reach back across commands.
+        # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
-        self.path = Path(segment, keep_ns=max(trace_ns, LONGEST_NS, self.imu.keep_ns),
+        self.pivot, self._lz = pivot, start.lz
+        late_ns = round(values['gnss.latency'] * NANOSECONDS)
+        self.path = Path(segment, self._follow,
+                         keep_ns=max(trace_ns, LONGEST_NS + late_ns, self.imu.keep_ns),
                          keep_steps_ns=self.imu.keep_ns)
         self.version += 1
 
@@ -90,8 +106,8 @@ class Simulation:
 
     @property
     def segment(self) -> Segment:
-        """The motion since the last command."""
-        return self.path.present
+        """The motion since the last command, or since the pivot last changed its acceleration."""
+        return self.path.after(self.now_ns)
 
     @property
     def l3(self) -> float:
@@ -100,18 +116,18 @@ class Simulation:
 
     @property
     def lz(self) -> float:
-        """Lz as last commanded [kg m^2/s]."""
-        return self.segment.lz
+        """Lz as last commanded, about the vertical of the world [kg m^2/s]."""
+        return self._lz
 
     @property
     def steps(self) -> int:
         """Integration steps taken so far."""
-        return self._steps_before + self.segment.solver.steps
+        return self._steps_before + self.path.steps
 
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side so far."""
-        return self._evaluations_before + self.segment.solver.evaluations
+        return self._evaluations_before + self.path.evaluations
 
     def state(self) -> States:
         """Return the state (n = 1) at `now_ns`, or at the start before the first sample."""
@@ -132,8 +148,12 @@ class Simulation:
         return float(self.segment.orientation_error(self.state(), self._now())[0])
 
     def describe(self) -> Description | None:
-        """Return the present motion in numbers; None where the closed form cannot hold it."""
-        exact = self.segment.exact
+        """
+        Return the present motion in numbers.
+
+        None where the closed form cannot hold it, or the pivot moves.
+        """
+        exact = None if self.segment.ride else self.segment.exact
         return None if exact is None else exact.describe()
 
     def play(self, streams: Sequence[Stream], until_ns: int) -> Iterator[Block]:
@@ -179,7 +199,7 @@ class Simulation:
             raise ValueError(
                 f'lz = {lz!r} kg m^2/s with l3 = {l3!r}: the axis is at a pole (theta = '
                 f'{theta!r} rad), where lz must equal {pole!r}; command both together')
-        self._go_on_from(ContinuedState(
+        self._continue(ContinuedState(
             theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
             psi=float(now.psi[0]), l3=l3, lz=lz))
         self.history.append((self.now_ns, l3, lz))
@@ -191,8 +211,49 @@ class Simulation:
         Raises ValueError if no motion begins there; then the present one goes on unchanged.
         """
         self._settle()
-        self._go_on_from(state)
+        self._continue(state)
         self.history.append((self.now_ns, *astuple(state)))
+
+    def drive(self, velocity: Sequence[float], stop_ns: int | None = None) -> int | None:
+        """
+        Let the pivot go to a velocity in the world [m/s] from now on.
+
+        It accelerates by `pivot.max_acceleration`, and brakes to rest at a time.  To repeat a
+        command before that only puts this off.
+
+        stop_ns : when it begins to brake [ns]; None: after `pivot.cmd_timeout`
+        Returns that time; None if the pivot rests and is to rest.
+
+        Raises ValueError naming what is off; the motion goes on unchanged.
+        """
+        target = checked_velocity(velocity)
+        self._settle()
+        if self.pivot is None and not any(target):
+            return None
+        if stop_ns is None:
+            timeout_ns = round(self.values['pivot.cmd_timeout'] * NANOSECONDS)
+            stop_ns = self.now_ns + timeout_ns if timeout_ns else NEVER_NS
+        last = self.history[-1] if self.history else ()
+        if len(last) == DRIVE and last[1:4] == target and self.now_ns < last[4]:
+            self._put_off(stop_ns)
+            return stop_ns
+        pivot = self.segment.pivot(np.array([self.now_ns]))
+        self._begun = partial(
+            PivotPath.to_velocity, target, position=pivot.position[:, 0].tolist(),
+            velocity=pivot.velocity[:, 0].tolist(), start_ns=self.now_ns,
+            most_acceleration=self.values['pivot.max_acceleration'])
+        self._continue(self.segment.posture(self.now_ns), self._begun(stop_ns=stop_ns))
+        self.history.append((self.now_ns, *target, stop_ns))
+        return stop_ns
+
+    def _put_off(self, stop_ns: int) -> None:
+        """Let the velocity last until another time; the motion up to now is the same."""
+        self.pivot, segment = self._begun(stop_ns=stop_ns), self.segment
+        assert segment.ride is not None
+        segment.ride = segment.ride._replace(piece=self.pivot.piece(segment.start_ns))
+        if self.path.end_after(self.now_ns):
+            self.version += 1
+        self.history[-1] = *self.history[-1][:4], stop_ns
 
     def _settle(self) -> None:
         """Let the solver reach `now_ns`, and be at t = 0 at least."""
@@ -200,21 +261,38 @@ class Simulation:
         while not self.segment.reach(self.now_ns, OFFLINE_STEPS):
             pass
 
-    def _go_on_from(self, start: State) -> None:
-        segment = _segment(self.top, start, self.now_ns, self.values)
-        self._steps_before, self._evaluations_before = self.steps, self.evaluations
+    def _continue(self, start: State | Posture, pivot: PivotPath | None = None) -> None:
+        """Go on from another state, or from the present posture on another path of the pivot."""
+        pivot = pivot or self.pivot
+        segment = _segment(self.top, start, self.now_ns, self.values, pivot)
+        self.pivot = pivot
+        if isinstance(start, State):
+            self._lz = start.lz
         self.path.go_on_with(segment)
         self.version += 1
 
+    def _follow(self, last: Segment) -> Segment:
+        """Return the segment behind the end of one: the pivot changes its acceleration."""
+        while not last.reach(last.end_ns, OFFLINE_STEPS):
+            pass
+        return _segment(self.top, last.posture(last.end_ns), last.end_ns, self.values, self.pivot)
 
-def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -> Segment:
+
+def checked_velocity(velocity: Sequence[float]) -> tuple[float, float, float]:
+    """Return a velocity of the pivot [m/s].  Raises ValueError."""
+    x, y, z = target = tuple(map(float, velocity))
+    if not all(abs(part) <= parameters.FASTEST for part in target):
+        raise ValueError(f'linear = {list(target)!r} m/s: each must be finite and within '
+                         f'{parameters.FASTEST:g} m/s')
+    return x, y, z
+
+
+def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
+             pivot: PivotPath | None) -> Segment:
     """Return the motion from a start.  Raises ValueError if its first nanosecond shows none."""
     try:
-        solver = propagate(top, start, method=values['solver.method'],
-                           equations=values['solver.equations'], rtol=values['solver.rtol'],
-                           atol=values['solver.atol'])
         with np.errstate(over='ignore', invalid='ignore'):
-            segment = Segment(solver, start, start_ns)
+            segment = _begun(top, start, start_ns, values, pivot)
         if not math.isfinite(segment.energy):
             raise ValueError(f'the energy would be {segment.energy!r} J')
         if not segment.reach(start_ns + 1, FIRST_STEPS):
@@ -223,12 +301,36 @@ def _segment(top: Top, start: State, start_ns: int, values: Mapping[str, Any]) -
         if spin > MOST_RATE:
             raise ValueError(f'it turns too fast: {spin:.3g} times a second, must be at most '
                              f'{MOST_RATE:.2g}')
-        if solver.ns_limit < LAST_STAMP_NS:
+        ns_limit = segment.solver.ns_limit
+        if ns_limit < LAST_STAMP_NS:
             raise ValueError(f'it turns too fast: its phases are known for '
-                             f'{solver.ns_limit / NANOSECONDS:.3g} s, must be for '
+                             f'{ns_limit / NANOSECONDS:.3g} s, must be for '
                              f'{LAST_STAMP_NS / NANOSECONDS:g} s')
     except (ArithmeticError, RuntimeError, ValueError) as error:
-        raise ValueError(f'no motion from theta = {start.theta!r} rad, theta_dot = '
-                         f'{start.theta_dot!r} rad/s with l3 = {start.l3!r}, lz = {start.lz!r} '
-                         f'kg m^2/s, for {top}: {error}') from error
+        whence = (f'theta = {start.theta!r} rad, theta_dot = {start.theta_dot!r} rad/s with l3 = '
+                  f'{start.l3!r}, lz = {start.lz!r} kg m^2/s' if isinstance(start, State)
+                  else f't = {start_ns / NANOSECONDS!r} s on with another acceleration')
+        raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
     return segment
+
+
+def _begun(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
+           pivot: PivotPath | None) -> Segment:
+    """Return the motion from a start, unchecked."""
+    step = partial(propagate, method=values['solver.method'],
+                   equations=values['solver.equations'], rtol=values['solver.rtol'],
+                   atol=values['solver.atol'])
+    if pivot is None:
+        assert isinstance(start, State)
+        return Segment(step(top, start), start, start_ns)
+    posture, piece = start, pivot.piece(start_ns)
+    if isinstance(posture, State):
+        posture = posture_of(top, posture)
+    solver: Propagator
+    if values['solver.method'] == 'exact':
+        solver = AcceleratedMotion(top, posture, piece.acceleration)
+        vertical, state = solver.vertical, solver.start
+    else:
+        vertical, state = about_vertical(top, posture, piece.acceleration)
+        solver = step(vertical.top(top), state)
+    return Segment(solver, state, start_ns, Ride(top, vertical, piece))

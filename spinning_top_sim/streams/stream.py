@@ -9,9 +9,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.pivot import Kinematics
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
-from spinning_top_sim.streams.path import Path
+from spinning_top_sim.streams.path import Path, Segment
 from spinning_top_sim.streams.timing import Timing
 
 Result = TypeVar('Result')
@@ -26,7 +27,7 @@ class Samples:
     The motion at the times of a block; the streams of one rate share it.
 
     path : the motion
-    times : of the samples, within the present segment [ns]
+    times : of the samples, within one segment [ns]
     epoch_ns : stamp of t = 0 [ns]
     """
 
@@ -40,9 +41,19 @@ class Samples:
         return np.arange(self.times.start, self.times.stop, self.times.step)
 
     @cached_property
+    def segment(self) -> Segment:
+        """The segment in which they are."""
+        return self.path.after(self.times.start - 1)
+
+    @cached_property
     def states(self) -> States:
-        """The states at these times."""
-        return self.path.present.states(self.times)
+        """The states in the world at these times."""
+        return self.segment.states(self.times)
+
+    @cached_property
+    def pivot(self) -> Kinematics:
+        """Position, velocity and acceleration of the pivot in the world, (3, n) each."""
+        return self.segment.pivot(self.t_ns)
 
     def once(self, compute: Callable[['Samples'], Result]) -> Result:
         """Return `compute(self)`, which is called for the first of the streams that ask for it."""

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Vector
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
+from spinning_top_sim.streams.gnss import Fix, Velocity
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.stream import Samples, Stream
@@ -26,6 +28,29 @@ INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
 TIMING = ('stamp_sec', 'stamp_nanosec', 'true_sec', 'true_nanosec', 'copies')
 ARRAY, ODOMETRY = 'std_msgs/msg/Float64MultiArray', 'nav_msgs/msg/Odometry'
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+
+def _place(samples: Samples) -> Sequence[Any]:
+    """Return the position of the pivot in the world [m]."""
+    return tuple(samples.pivot.position) if samples.segment.ride else messages.ORIGIN
+
+
+def _pose(samples: Samples) -> Sequence[Field]:
+    return _place(samples), samples.states.rows_quaternion
+
+
+def _odometry(samples: Samples) -> Sequence[Field]:
+    """Return pose and twist of the body's frame; the twist is in that frame."""
+    states = samples.states
+    return (*_pose(samples), samples.once(_velocity), states.rows_angular_velocity)
+
+
+def _velocity(samples: Samples) -> Vector:
+    """Return the velocity of the pivot in the frame of the body [m/s]."""
+    if not samples.segment.ride:
+        return messages.ORIGIN
+    x, y, z = samples.pivot.velocity
+    return attitude.in_body(samples.states.rows_quaternion, (x, y, z))
 
 
 def _joints(samples: Samples) -> Sequence[Field]:
@@ -63,13 +88,12 @@ def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
 
 def _imu_odometry(imu: Imu, samples: Samples) -> Sequence[Field]:
     states = samples.states
-    position, velocity = imu.motion(states)
-    return position, imu.orientation(states), velocity, imu.true(states)[0]
+    return (*imu.motion(samples), imu.true(states)[0])
 
 
 def _invariants(samples: Samples) -> Sequence[Field]:
     """Return the constants of the motion, drifts, and errors of norm and orientation."""
-    segment, states = samples.path.present, samples.states
+    segment, states = samples.segment, samples.states
     now = (states.energy, states.l3, states.lz)
     drifts = map(relative_drift, now, (segment.energy, segment.l3, segment.lz))
     error = segment.orientation_error(states, samples.times)
@@ -161,8 +185,8 @@ class Markers(Stream):
 
     def _markers(self, samples: Samples) -> Sequence[Field]:
         states = samples.states
-        centre = tuple(self._shape.centre * part for part in states.rows_axis)
-        body = (centre, states.rows_quaternion, states.rows_quaternion)
+        body = (self._point(samples, self._shape.centre), states.rows_quaternion,
+                _place(samples), states.rows_quaternion)
         return (*body, self._traces(samples)) if self._count else body
 
     def _traces(self, samples: Samples) -> NDArray[np.float64]:
@@ -172,11 +196,22 @@ class Markers(Stream):
         numbers = newest + steps
         # The points that a trace shares with the one before it are computed once.
         is_new = numbers > np.vstack((numbers[0, 0] - 1, newest[:-1]))
-        points = samples.path.exact_axis(np.maximum(numbers[is_new], 0) * self._spacing_ns)
+        points = samples.path.exact_points(
+            np.maximum(numbers[is_new], 0) * self._spacing_ns, self._shape.tip)
         ends = np.cumsum(np.count_nonzero(is_new, axis=1))[:, np.newaxis]
-        last = np.stack(samples.states.rows_axis, axis=-1)[:, np.newaxis]
-        traces = np.concatenate((points[ends - 1 + steps], last), axis=1)
-        return self._shape.tip * traces.reshape(n, -1)
+        last = self._point(samples, self._shape.tip)
+        traces = np.concatenate((points[ends - 1 + steps], np.stack(last, axis=-1)[:, np.newaxis]),
+                                axis=1)
+        return traces.reshape(n, -1)
+
+    @staticmethod
+    def _point(samples: Samples, along: float) -> Vector:
+        """Return where a point of the axis is in the world."""
+        x, y, z = (along * part for part in samples.states.rows_axis)
+        if samples.segment.ride:
+            a, b, c = samples.pivot.position
+            x, y, z = x + a, y + b, z + c
+        return x, y, z
 
 
 def all_streams(values: Mapping[str, Any]) -> list[Stream]:
@@ -188,7 +223,8 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
     return [
         stream('clock', '/clock', 'rosgraph_msgs/msg/Clock', messages.clock()),
         stream('pose', 'pose', 'geometry_msgs/msg/PoseStamped', messages.pose_stamped(world),
-               lambda samples: (samples.states.rows_quaternion,)),
+               _pose),
+        stream('tf', '/tf', 'tf2_msgs/msg/TFMessage', messages.transform(world, body), _pose),
         stream('joint_states', 'joint_states', 'sensor_msgs/msg/JointState',
                messages.joint_state(JOINTS), _joints),
         of_imu('imu', 'imu/data_raw', partial(_readings, imu), has_orientation=False,
@@ -203,15 +239,18 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
                rate_parameter='imu.rate'),
         Mag(values, imu, 'imu/mag'),
         Mag(values, imu, 'ground_truth/mag', is_exact=True),
+        Fix(values, 'gnss/fix'),
+        Fix(values, 'ground_truth/gnss/fix', is_exact=True),
+        Velocity(values, 'gnss/velocity'),
+        Velocity(values, 'ground_truth/gnss/velocity', is_exact=True),
         increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped', messages.stamped(frame, 4),
                   partial(_increment, imu, 0)),
         increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', messages.stamped(frame, 3),
                   partial(_increment, imu, 1)),
         stream('ground_truth_odom', 'ground_truth/odom', ODOMETRY, messages.odometry(world, body),
-               lambda samples: (samples.states.rows_quaternion,
-                                samples.states.rows_angular_velocity)),
+               _odometry),
         stream('ground_truth_imu_odom', 'ground_truth/imu_odom', ODOMETRY,
-               messages.odometry(world, frame, moves=True), partial(_imu_odometry, imu)),
+               messages.odometry(world, frame), partial(_imu_odometry, imu)),
         stream('invariants', '~/invariants', ARRAY, messages.float64_multi_array(INVARIANTS),
                _invariants),
         Markers(values)]

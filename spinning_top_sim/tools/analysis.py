@@ -91,7 +91,9 @@ def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
             theta_dot * np.sin(psi) - across * np.cos(psi),
             theta_dot * np.cos(psi) + across * np.sin(psi), psi_dot + phi_dot * np.cos(theta),
             phi, psi, phi_dot))]
-    elif name not in ('pose', 'ground_truth/odom'):
+    elif name in ('pose', 'ground_truth/odom'):     # position, attitude, velocity, rates
+        rows = rows[1::2]
+    else:
         return None
     columns = np.vstack(rows)
     norm = np.linalg.norm(columns[:4], axis=0)

@@ -38,7 +38,9 @@ DATA, UNFINISHED = 'data', 'unfinished'
 FAILED = b'failed'
 ROWS_IN_A_GROUP = 40_000        # of a Parquet file
 # Names of the numbers in the fields of a topic, where they are not x, y, z and w.
-LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING}
+PLACE = ('latitude', 'longitude', 'altitude')
+LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING,
+          'gnss/fix': PLACE, 'ground_truth/gnss/fix': PLACE}
 
 # Times of samples (n,) [ns], and the numbers in their messages as columns (n,) by name.
 Samples = tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]

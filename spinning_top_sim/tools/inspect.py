@@ -205,7 +205,8 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
     exact, measured = motion.exact, motion.measured
     begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
                   for at_ns in (motion.begin_ns, motion.end_ns))
-    name = exact.name if exact is not None else 'beyond the closed form'
+    name = (exact.name if exact is not None else 'the pivot moves' if motion.segment.ride
+            else 'beyond the closed form')
     title = f'motion {number} ({motion.cause}), {begin:.6g} to {end:.6g} s: {name}'
     rows = []
     for text, key, factor in ROWS:

@@ -28,23 +28,27 @@ LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
 LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
 # Numbers of the events that begin another motion at the present time, in the order of
 # `Simulation.history`.
-FIELDS_OF = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fields(State))}
+FIELDS_OF = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fields(State)),
+             'drive': ('x', 'y', 'z', 'stop_ns')}
 # Names in the message definition of the arrays of numbers in a template, in their order, by topic
 # or by type.
 FIELDS = {
-    'geometry_msgs/msg/PoseStamped': ('pose.orientation',),
+    'geometry_msgs/msg/PoseStamped': ('pose.position', 'pose.orientation'),
+    'tf2_msgs/msg/TFMessage': ('transforms[0].transform.translation',
+                               'transforms[0].transform.rotation'),
     'sensor_msgs/msg/JointState': ('position', 'velocity'),
     'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
     'sensor_msgs/msg/MagneticField': ('magnetic_field', 'magnetic_field_covariance'),
-    'nav_msgs/msg/Odometry': ('pose.pose.orientation', 'twist.twist.angular'),
-    'ground_truth/imu_odom': ('pose.pose.position', 'pose.pose.orientation',
+    'sensor_msgs/msg/NavSatFix': ('position',),
+    'geometry_msgs/msg/TwistWithCovarianceStamped': ('twist.twist.linear',),
+    'nav_msgs/msg/Odometry': ('pose.pose.position', 'pose.pose.orientation',
                               'twist.twist.linear', 'twist.twist.angular'),
     'geometry_msgs/msg/QuaternionStamped': ('quaternion',),
     'geometry_msgs/msg/Vector3Stamped': ('vector',),
     'std_msgs/msg/Float64MultiArray': ('data',),
     'visualization_msgs/msg/MarkerArray': (
         'markers[0].pose.position', 'markers[0].pose.orientation',
-        'markers[1].pose.orientation', 'markers[2].points'),
+        'markers[1].pose.position', 'markers[1].pose.orientation', 'markers[2].points'),
 }
 
 
@@ -61,7 +65,7 @@ class ForeignLogError(Exception):
 class Event:
     """An entry of the journal."""
 
-    name: str                             # start, command, state, parameters or reset
+    name: str                             # start, command, state, drive, parameters or reset
     stamp_ns: int                         # log time [ns]
     t_ns: int                             # simulated time [ns]
     sent_ns: int                          # time up to which all samples had been sent [ns]
@@ -145,7 +149,7 @@ def _applied_before(epoch_ns: int, t_ns: int, *numbers: float) -> Event:
     if len(numbers) == 1:
         rate = parameters.BY_NAME['imu.rate'].check(numbers[0])
         return Event('parameters', epoch_ns + t_ns, t_ns, t_ns, {'imu.rate': rate})
-    name = 'command' if len(numbers) == len(FIELDS_OF['command']) else 'state'
+    name = next(name for name, keys in FIELDS_OF.items() if len(numbers) == len(keys))
     return Event(name, epoch_ns + t_ns, t_ns, t_ns,
                  dict(zip(FIELDS_OF[name], numbers, strict=True)))
 
@@ -178,7 +182,8 @@ def _event(stamp_ns: int, data: bytes) -> Event:
         raise ValueError('the bytes of the entry are not as it was written')
     operator.index(t_ns), operator.index(sent_ns)
     if name in FIELDS_OF:
-        details = {key: float(details[key]) for key in FIELDS_OF[name]}
+        details = {key: (operator.index if key == 'stop_ns' else float)(details[key])
+                   for key in FIELDS_OF[name]}
     elif name == 'parameters':
         details = {key: parameters.BY_NAME[key].check(value) for key, value in details.items()}
     elif name == 'reset':
@@ -263,9 +268,12 @@ def _apply(simulation: Simulation, event: Event) -> None:
     if event.name in FIELDS_OF:
         if event.name == 'command':
             simulation.command(**details)
+        elif event.name == 'drive':
+            *velocity, stop_ns = (details[key] for key in FIELDS_OF['drive'])
+            simulation.drive(velocity, stop_ns)
         else:
             simulation.set_state(State(**details))
-        applied_ns = simulation.history[-1][0]
+        applied_ns = simulation.now_ns
         if applied_ns != event.t_ns:
             raise ValueError(f'{event.name} at t = {event.t_ns} ns: applied at {applied_ns} ns')
     elif event.name == 'parameters':

@@ -69,7 +69,7 @@ class Section:
 class MotionReport:
     """A motion of the top, from its cause to the next one."""
 
-    cause: str                            # start, command, state or reset
+    cause: str                            # start, command, state, drive or reset
     origin_ns: int                        # log time of the t = 0 of `segment` [ns]
     segment: Segment                      # its constants and its exact solution
     exact: Description | None             # None if the closed form cannot represent it
@@ -153,7 +153,9 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
             begin_ns = simulation.epoch_ns + simulation.now_ns
             streams = {run.topics[stream.topic]: stream for stream in simulation.streams
                        if stream.topic in run.topics}
-            if event.name != 'parameters':
+            # The velocities of the pivot belong to one motion.
+            if event.name != 'parameters' and not (
+                    event.name == 'drive' and motions and motions[-1].cause == 'drive'):
                 exact = simulation.describe() if len(motions) < MOST_EXACT else None
                 motions.append(MotionReport(
                     event.name, simulation.epoch_ns + simulation.segment.start_ns,
@@ -206,6 +208,8 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
         return
     if topic == motion.source:
         motion.samples.append((data.stamps_ns, data.rows))
+    if segment.ride:                # there are other constants in each of its pieces
+        return
     values = data.constants(segment.solver.top)
     if values is not None and stream.topic != 'imu/data':       # which is noisy
         drifts = found.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})

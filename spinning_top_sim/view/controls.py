@@ -14,6 +14,9 @@ from spinning_top_sim.physics.top import Top
 from spinning_top_sim.view.page import Page, set_value
 
 STEPS = 1000                    # of a slider
+# Velocity x, y of the pivot [m/s] that a button asks for, until `pivot.cmd_timeout` ends it.
+PAD = {'−x': (-0.5, 0.0), '+x': (0.5, 0.0), '−y': (0.0, -0.5), '+y': (0.0, 0.5),
+       'stop': (0.0, 0.0)}
 LEFT_ALONE_S = 1.0              # after that a slider follows the node again
 
 
@@ -22,6 +25,7 @@ class Commands(Protocol):
 
     def call(self, name: str, *on: bool) -> str: ...
     def command(self, l3: float, lz: float) -> str: ...
+    def drive(self, x: float, y: float) -> str: ...
     def choose(self, scene: str) -> str: ...
 
 
@@ -47,11 +51,14 @@ class Controls:
             self._pause = gui.add_button('Pause')
             step, reset = gui.add_button('Step'), gui.add_button('Reset')
             self._record = gui.add_checkbox('record', False)
+            pad = gui.add_button_group('pivot', tuple(PAD), hint=(
+                'push the pivot: 0.5 m/s along an axis of the world; it brakes soon'))
         for slider in self._sliders:
             slider.on_update(self._on_slider)
         self._pause.on_click(lambda _: self._act(self._switch_pause))
         step.on_click(lambda _: self._act(lambda: node.call('step')))
         reset.on_click(lambda _: self._act(lambda: node.call('reset')))
+        pad.on_click(lambda _: self._act(lambda: node.drive(*PAD[pad.value])))
         self._record.on_update(self._on_record)
         self._scene.on_update(self._on_scene)
 

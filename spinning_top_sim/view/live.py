@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Twist, Vector3
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.client import Client
@@ -75,6 +75,7 @@ class LiveView(Node):
         self._listeners: dict[str, Subscription] = {}
         self._sim = self.resolve_topic_name(NODE_NAME)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, QOS)
+        self._velocity = self.create_publisher(Twist, f'{NODE_NAME}/cmd_vel', 10)
         self.create_timer(0.2, self._listen_as_needed)
         self._services_of_sim = {
             name: self.create_client(kind, f'{NODE_NAME}/{name}') for name, kind in (
@@ -242,13 +243,21 @@ class LiveView(Node):
         self._set(dict(zip(SPIN, (l3, lz), strict=True)))
         return f'spin.l3 = {l3:.4g}, spin.lz = {lz:.4g}'
 
+    def drive(self, x: float, y: float) -> str:
+        """Send a velocity of the pivot [m/s]; return it.  Raises RefusedError."""
+        if not self._velocity.get_subscription_count():
+            raise RefusedError(f'there is no {self._sim}')
+        self._velocity.publish(Twist(linear=Vector3(x=x, y=y)))
+        return f'pivot: {x:g}, {y:g} m/s'
+
     def choose(self, scene: str) -> str:
         """Set the top and the start of an installed scene, and reset.  Raises RefusedError."""
         values = parameters.checked(read_scene(parameter_files('scene')[scene]))
         values['spin.lz'] = parameters.start_state(values).lz
         try:
-            self._set({name: value for name, value in values.items()
-                       if name.startswith(('top.', 'initial.', 'spin.'))})
+            self._set({name: list(value) if isinstance(value, tuple) else value
+                       for name, value in values.items()
+                       if name.startswith(('top.', 'initial.', 'spin.', 'pivot.'))})
             return f'{scene}, {self.call("reset")}'
         finally:
             self._stale = True      # the node may do what it has not answered in time

@@ -12,7 +12,9 @@ from spinning_top_sim import State, Top
 ROOT = Path(__file__).resolve().parents[2]
 CASES = {case['name']: case for case in json.loads(
     (ROOT / 'test/data/reference_cases.json').read_text())['cases']}
-SCENES = sorted(path.stem for path in (ROOT / 'config').glob('*.yaml'))
+# Those with a pivot at rest, and the others.
+SCENES, RIDES = (sorted(path.stem for path in (ROOT / 'config').glob('*.yaml')
+                        if ('  pivot.' in path.read_text()) == moves) for moves in (False, True))
 
 
 def scene_parameters(name):

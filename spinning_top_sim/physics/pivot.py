@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The path of a moving pivot: pieces of constant acceleration, without any rounding that adds up.
+
+Boundaries are integer nanoseconds, and accelerations, velocities and positions at the boundaries
+are fractions.  So a closed path that is repeated returns to its start exactly, however often.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.top import shown
+
+NANOSECONDS = 1_000_000_000
+NEVER_NS = 2 ** 63 - 1
+# x, y, z in the world; doubles are fractions, too.
+Exact = tuple[Fraction, Fraction, Fraction]
+Given = Sequence[float | Fraction]
+ZERO: Exact = (Fraction(0), Fraction(0), Fraction(0))
+
+
+class Kinematics(NamedTuple):
+    """What a pivot does at n times: (3, n) each, in the world [m], [m/s], [m/s^2]."""
+
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+
+
+class Piece(NamedTuple):
+    """
+    A time of constant acceleration.
+
+    start_ns, end_ns : first time, and the first one after it; NEVER_NS if it never ends [ns]
+    acceleration : in the world [m/s^2]
+    position, velocity : (3, 1) at the start [m], [m/s]
+    """
+
+    start_ns: int
+    end_ns: int
+    acceleration: Exact
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+
+    def at(self, times_ns: NDArray[np.int64]) -> Kinematics:
+        """Return what the pivot does at times (n,) [ns]."""
+        t, a = (times_ns - self.start_ns) * 1e-9, _doubles([self.acceleration]).T
+        return Kinematics(self.position + t * (self.velocity + 0.5 * t * a),
+                          self.velocity + t * a, np.repeat(a, len(t), axis=1))
+
+
+class PivotPath:
+    """
+    The path of a pivot that accelerates piecewise uniformly.
+
+    After the last piece the pivot keeps its velocity, or the first one follows.
+
+    Parameters
+    ----------
+    pieces : sequence of (duration [ns], acceleration (3,) [m/s^2])
+        A duration is an integer > 0.
+    repeat : bool, default False
+        Whether they are repeated for ever; then they must leave the velocity as it was.
+    position, velocity : (3,) sequence
+        At the start, in the world [m], [m/s].
+    start_ns : int, default 0
+        When the path starts [ns].
+
+    Raises ValueError naming what is wrong, its value, and what is allowed.
+    """
+
+    def __init__(self, pieces: Iterable[tuple[int, Given]], *, repeat: bool = False,
+                 position: Given = ZERO, velocity: Given = ZERO, start_ns: int = 0) -> None:
+        self.start_ns = start_ns
+        self._starts, self._accelerations = [0], []
+        places, velocities = [_exact('position', position)], [_exact('velocity', velocity)]
+        for duration_ns, given in pieces:
+            if isinstance(duration_ns, bool) or not (
+                    isinstance(duration_ns, int) and duration_ns > 0):
+                raise ValueError(f'duration = {shown(duration_ns)} ns: must be an integer > 0')
+            acceleration, t = _exact('acceleration', given), Fraction(duration_ns, NANOSECONDS)
+            v = velocities[-1]
+            places.append(_sum((1, places[-1]), (t, v), (t * t / 2, acceleration)))
+            velocities.append(_sum((1, v), (t, acceleration)))
+            self._starts.append(self._starts[-1] + duration_ns)
+            self._accelerations.append(acceleration)
+        self._cycle_ns, self._per_cycle = 0, np.zeros(3)
+        if repeat and any(any(one) for one in self._accelerations):
+            if velocities[-1] != velocities[0]:
+                change = [float(x) for x in _sum((1, velocities[-1]), (-1, velocities[0]))]
+                raise ValueError(f'a repeated path changes the velocity by {change} m/s: it must '
+                                 'end with the velocity that it starts with')
+            self._cycle_ns = self._starts.pop()
+            self._per_cycle = _doubles([_sum((1, places.pop()), (-1, places[0]))])[0]
+            velocities.pop()
+        else:
+            self._accelerations.append(ZERO)
+        self._places, self._velocities = _doubles(places), _doubles(velocities)
+
+    @classmethod
+    def through(cls, waypoints: Sequence[Given], *, speed: float, acceleration: float,
+                repeat: bool = False, start_ns: int = 0) -> PivotPath:
+        """
+        Return the path along straight lines that stops at each waypoint.
+
+        On each line the pivot accelerates, cruises and brakes; speed and acceleration are the
+        greatest, and slightly smaller where a duration is rounded up to nanoseconds.
+
+        Parameters
+        ----------
+        waypoints : sequence of (3,)
+            Two or more [m].  Points that repeat their predecessor are passed over.
+        speed, acceleration : float
+            [m/s], [m/s^2], > 0.
+        repeat : bool, default False
+            Whether the path leads from the last waypoint to the first, and goes on for ever.
+        """
+        points = [_exact('waypoint', point) for point in waypoints]
+        if len(set(points)) < 2:
+            raise ValueError(f'waypoints = {shown(waypoints)}: must be two different points or '
+                             'more')
+        for name, value in (('speed', speed), ('acceleration', acceleration)):
+            _check_positive(name, value)
+        pieces: list[tuple[int, Given]] = []
+        ends = points[1:] + points[:1] if repeat else points[1:]
+        for begin, end in zip(points, ends, strict=False):
+            if begin != end:
+                pieces += _leg(_sum((1, end), (-1, begin)), speed, acceleration)
+        return cls(pieces, repeat=repeat, position=points[0], start_ns=start_ns)
+
+    @classmethod
+    def to_velocity(cls, target: Given, *, most_acceleration: float, position: Given = ZERO,
+                    velocity: Given = ZERO, start_ns: int = 0,
+                    stop_ns: int = NEVER_NS) -> PivotPath:
+        """
+        Return the path that changes the velocity into `target` uniformly, keeps it, and stops.
+
+        Parameters
+        ----------
+        target : (3,) sequence
+            In the world [m/s].
+        most_acceleration : float
+            > 0 [m/s^2]; the acceleration is slightly smaller: whole nanoseconds.
+        position, velocity : (3,) sequence
+            At the start [m], [m/s].
+        stop_ns : int
+            When the pivot begins to brake, even if it has not reached the target [ns].
+        """
+        _check_positive('most_acceleration', most_acceleration)
+        goal, now = _exact('target', target), _exact('velocity', velocity)
+        pieces = list(_ramp(now, goal, most_acceleration))
+        left_ns = stop_ns - start_ns - sum(duration_ns for duration_ns, _ in pieces)
+        if stop_ns < NEVER_NS:
+            if left_ns > 0:
+                pieces.append((left_ns, ZERO))
+            elif left_ns < 0:
+                (duration_ns, acceleration), = pieces
+                pieces = [(duration_ns + left_ns, acceleration)]
+                goal = _sum((1, now), (Fraction(duration_ns + left_ns, NANOSECONDS),
+                                       acceleration))
+            pieces += _ramp(goal, ZERO, most_acceleration)
+        return cls(pieces, position=position, velocity=velocity, start_ns=start_ns)
+
+    def piece(self, t_ns: int) -> Piece:
+        """Return the piece that a time [ns] from the start on belongs to."""
+        since_ns = t_ns - self.start_ns
+        cycle, phase = divmod(since_ns, self._cycle_ns) if self._cycle_ns else (0, since_ns)
+        k = bisect_right(self._starts, phase) - 1
+        if k < 0:
+            raise ValueError(f't = {t_ns} ns: must not be before the start of the path at '
+                             f'{self.start_ns} ns')
+        offset = self.start_ns + cycle * self._cycle_ns
+        end = [*self._starts[1:], self._cycle_ns or NEVER_NS - offset][k]
+        return Piece(offset + self._starts[k], offset + end, self._accelerations[k],
+                     (self._places[k] + cycle * self._per_cycle)[:, np.newaxis],
+                     self._velocities[k][:, np.newaxis])
+
+
+def _ramp(begin: Exact, end: Exact, most_acceleration: float) -> Iterator[tuple[int, Exact]]:
+    """Yield the piece that leads from one velocity to another, none if they are equal."""
+    change = _sum((1, end), (-1, begin))
+    if any(change):
+        duration_ns = _whole_ns(_length(change) / most_acceleration)
+        yield duration_ns, _sum((Fraction(NANOSECONDS, duration_ns), change))
+
+
+def _leg(way: Exact, speed: float, acceleration: float) -> list[tuple[int, Given]]:
+    """Return the pieces that lead a pivot at rest to rest again, displaced by `way`."""
+    length = _length(way)
+    ramp = min(speed / acceleration, math.sqrt(length / acceleration))
+    ramp_ns = _whole_ns(ramp)
+    cruise_ns = math.ceil(max(length / speed - ramp, 0.0) * 1e9)
+    # The distance is acceleration * ramp * (ramp + cruise).
+    scale = Fraction(NANOSECONDS ** 2, ramp_ns * (ramp_ns + cruise_ns))
+    pieces: list[tuple[int, Given]] = [(ramp_ns, _sum((scale, way)))]
+    if cruise_ns:
+        pieces.append((cruise_ns, ZERO))
+    return [*pieces, (ramp_ns, _sum((-scale, way)))]
+
+
+def _whole_ns(seconds: float) -> int:
+    """Return a duration in nanoseconds, rounded up to 1 or more; at most the range of int64."""
+    if not seconds < 9e9:
+        raise ValueError(f'the acceleration lasts {seconds!r} s: must be less than 9e9 s')
+    return max(1, math.ceil(seconds * 1e9))
+
+
+def _length(v: Exact) -> float:
+    return math.hypot(*(float(x) for x in v))
+
+
+def _sum(*terms: tuple[int | Fraction, Exact]) -> Exact:
+    """Return the sum of factor * vector."""
+    x, y, z = (sum((factor * v[k] for factor, v in terms), Fraction(0)) for k in range(3))
+    return x, y, z
+
+
+def _exact(name: str, given: Given) -> Exact:
+    try:
+        x, y, z = (Fraction(value) for value in given)
+        _length((x, y, z))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f'{name} = {shown(given)}: must be three finite numbers') from error
+    return x, y, z
+
+
+def _doubles(vectors: Sequence[Exact]) -> NDArray[np.float64]:
+    return np.array([[float(x) for x in v] for v in vectors]).reshape(-1, 3)
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not 0.0 < value < math.inf:
+        raise ValueError(f'{name} = {shown(value)}: must be a finite number > 0')

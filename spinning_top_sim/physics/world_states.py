@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""States of a top on a pivot that accelerates, as they are in the world."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
+from spinning_top_sim.physics.states import Point, States
+from spinning_top_sim.physics.top import Top
+
+
+class WorldStates(States):
+    """
+    States about another vertical, seen from the world.
+
+    Attitude and Euler angles are those in the world: theta in [0, pi], phi and psi within two
+    turns.  Energy and Lz are those in the frame of the pivot about the vertical there, constants
+    of the motion.
+
+    Parameters
+    ----------
+    top : Top
+        In the gravity of the world.
+    moved : States
+        In the frame of the vertical.
+    rotation : (4, 1)
+        q(world <- frame) as x, y, z, w.
+    """
+
+    def __init__(self, top: Top, moved: States, rotation: Quaternion) -> None:
+        super().__init__(top, moved.start, len(moved))
+        self.solver, self._moved, self._rotation = moved.solver, moved, rotation
+
+    @cached_property
+    def t(self) -> Column:
+        return self._moved.t
+
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        return attitude.product(self._rotation, self._moved.rows_quaternion)
+
+    @cached_property
+    def transverse_velocity(self) -> tuple[Column, Column]:
+        return self._moved.transverse_velocity
+
+    @cached_property
+    def rows_angular_acceleration(self) -> Vector:
+        return self._moved.rows_angular_acceleration
+
+    def specific_force(self, point: Point) -> Vector:
+        return self._moved.specific_force(point)
+
+    @cached_property
+    def angles(self) -> tuple[Column, Column, Column]:
+        x, y, z, w = self.rows_quaternion
+        half_sum, half_difference = np.arctan2(z, w), np.arctan2(-x, y)
+        return half_sum + half_difference, self.theta_folded, half_sum - half_difference
+
+    @cached_property
+    def _rates(self) -> tuple[Column, Column]:
+        """Theta' and phi' sin(theta), eq. (4) of "Analysis of Symmetric Spinning Top"."""
+        (w1, w2), cosine, sine = self.transverse_velocity, np.cos(self.psi), np.sin(self.psi)
+        return w1 * sine + w2 * cosine, w2 * sine - w1 * cosine
+
+    @cached_property
+    def theta_dot(self) -> Column:
+        return self._rates[0]
+
+    @cached_property
+    def phi_dot(self) -> Column:
+        """0 where the axis is vertical."""
+        cos2, sin2 = self.half_angle_squares
+        sine = 2.0 * np.sqrt(cos2 * sin2)
+        return np.where(sine > 0.0, self._rates[1] / np.where(sine > 0.0, sine, 1.0), 0.0)
+
+    @cached_property
+    def energy(self) -> Column:
+        return self._moved.energy
+
+    @cached_property
+    def l3(self) -> Column:
+        return self._moved.l3
+
+    @cached_property
+    def lz(self) -> Column:
+        return self._moved.lz

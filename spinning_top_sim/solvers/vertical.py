@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The exact motion of a top while its pivot accelerates uniformly, and how it is handed over.
+
+In the frame of a pivot with the acceleration a, gravity is g - a: the top is the same top about
+another vertical.  A change of a leaves attitude and angular velocity as they are.  They are handed
+over in long decimals: in doubles every change would move the constants of the motion by a
+rounding, and the phase would drift by that much times the angle that follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from decimal import Decimal
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from spinning_top_sim.physics.attitude import Quaternion
+from spinning_top_sim.physics.pivot import Exact
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.decimal_math import ONE, ZERO, atan2, pi, precision, sin_cos
+from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.theta_long import LongForm, short
+from spinning_top_sim.solvers.theta_series import SIN_ODD
+from spinning_top_sim.solvers.theta_setup import DIGITS_TO_TRY, Factor, ThetaMotion, set_up
+
+DIGITS = DIGITS_TO_TRY[0]
+# An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
+# as this has zeros.
+POLE = Decimal('1e-30')
+# A motion that misses a pole by this share of what it could passes it exactly: the set-up squares
+# the share, and has 40 digits.
+THROUGH = Decimal('1e-19')
+Complex = tuple[Decimal, Decimal]
+LongQuaternion = tuple[Decimal, Decimal, Decimal, Decimal]
+
+
+class Posture(NamedTuple):
+    """
+    Attitude and angular velocity of a top at one instant, in long decimals.
+
+    alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
+    across : omega_1 + i omega_2 in the body [rad/s]
+    l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
+    """
+
+    alpha: Complex
+    beta: Complex
+    across: Complex
+    l3: float
+
+
+class LongTop(NamedTuple):
+    """The constants of `Top` in long decimals."""
+
+    lambda1: Decimal
+    lambda3: Decimal
+    mass: Decimal
+    com_distance: Decimal
+    gravity: Decimal
+
+
+class LongState(NamedTuple):
+    """The fields of `State` in long decimals; theta is in [0, pi/2]."""
+
+    theta: Decimal
+    theta_dot: Decimal
+    phi: Decimal
+    psi: Decimal
+    l3: Decimal
+    lz: Decimal
+
+    def rounded(self) -> State:
+        """Return the state in doubles."""
+        theta, lz = float(self.theta), float(self.lz)
+        return State(theta=theta, theta_dot=float(self.theta_dot), phi=float(self.phi),
+                     psi=float(self.psi), l3=float(self.l3),
+                     lz=lz if theta else float(self.l3))
+
+
+class Vertical:
+    """
+    The line of effective gravity, and a frame with its z axis along it.
+
+    Of the two directions z is the one on the side of the axis, and gravity has a sign: the axis
+    can only meet the pole theta = 0, where doubles and decimals are dense.  Without effective
+    gravity z stays the line of the world's vertical.
+
+    gravity : downwards along z positive [m/s^2]
+    alpha, beta : Cayley-Klein parameters of the least rotation from the world to the frame
+    rows : the same rotation, q(world <- frame), in doubles
+
+    Parameters
+    ----------
+    gravity : float
+        Of the world, downwards positive [m/s^2].
+    acceleration : (3,)
+        Of the pivot in the world [m/s^2].
+    posture : Posture
+    """
+
+    def __init__(self, gravity: float, acceleration: Exact, posture: Posture) -> None:
+        x, y, z = (Decimal(a.numerator) / Decimal(a.denominator) for a in acceleration)
+        z += Decimal(gravity)
+        (w0, z0), (y0, minus_x0) = posture.alpha, posture.beta
+        n = (2 * (w0 * y0 - z0 * minus_x0), 2 * (y0 * z0 + w0 * minus_x0),
+             _square(posture.alpha) - _square(posture.beta))
+        size = (x * x + y * y + z * z).sqrt()
+        if not size:
+            z = ONE
+        side = ONE if n[0] * x + n[1] * y + n[2] * z >= 0 else -ONE
+        scale = side / (size or ONE)
+        self.gravity = side * size
+        self.alpha, self.beta = _least_rotation(scale * x, scale * y, scale * z)
+        parts = -self.beta[1], self.beta[0], self.alpha[1], self.alpha[0]
+        qx, qy, qz, qw = (np.array([float(part)]) for part in parts)
+        self.rows: Quaternion = qx, qy, qz, qw
+
+    def start(self, top: Top, posture: Posture) -> LongState:
+        """Return a posture as a state in this frame."""
+        alpha, beta = _product(_inverse(self.alpha, self.beta), (posture.alpha, posture.beta))
+        cosine2, sine2 = _square(alpha), _square(beta)
+        size = (cosine2 + sine2).sqrt()
+        cosine, sine = cosine2.sqrt() / size, sine2.sqrt() / size
+        l3, half_sum = Decimal(posture.l3), atan2(alpha[1], alpha[0])
+        o1, o2 = posture.across
+        if 2 * sine < POLE:         # all the motion of the axis is nutation: psi from omega
+            theta_dot = _square(posture.across).sqrt()
+            psi = atan2(o1, o2) if theta_dot else ZERO
+            return LongState(ZERO, theta_dot, 2 * half_sum - psi, psi, +l3, +l3)
+        half_difference = atan2(beta[1], beta[0])
+        # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
+        # + i theta') exp(-i psi)
+        turn = _times(alpha, (beta[0], -beta[1]))
+        minus_across, theta_dot = _times(posture.across, turn)
+        unit = (cosine2 * sine2).sqrt()
+        lambda1 = Decimal(top.lambda1)
+        tilt = 2 * sine * cosine
+        lz = (1 - 2 * sine2) * l3 - lambda1 * minus_across / unit * tilt
+        fastest = (_square(posture.across) + abs(self.gravity * Decimal(top.mass) * Decimal(
+            top.com_distance)) / lambda1).sqrt()
+        for pole in (l3, -l3):
+            if abs(lz - pole) <= THROUGH * tilt * (abs(l3) * tilt + lambda1 * fastest):
+                lz = +pole
+        return LongState(2 * atan2(sine, cosine), theta_dot / unit, half_sum + half_difference,
+                         half_sum - half_difference, +l3, lz)
+
+    def top(self, top: Top) -> Top:
+        """Return the top in the effective gravity."""
+        return replace(top, gravity=float(self.gravity))
+
+
+class AcceleratedMotion(ExactSolution):
+    """
+    The exact motion while the pivot accelerates uniformly, in the frame of `vertical`.
+
+    `States` of it have their attitude, theta, phi and Lz about that vertical.  Rates in the body
+    and specific forces are those of the moving top as they are.
+
+    Parameters
+    ----------
+    top : Top
+        In the gravity of the world.
+    posture : Posture
+        At t = 0.
+    acceleration : (3,)
+        Of the pivot in the world [m/s^2].
+    """
+
+    def __init__(self, top: Top, posture: Posture, acceleration: Exact) -> None:
+        with precision(DIGITS):
+            self.vertical = Vertical(top.gravity, acceleration, posture)
+            long_start = self.vertical.start(top, posture)
+            long_top = LongTop(
+                Decimal(top.lambda1), Decimal(top.lambda3), Decimal(top.mass),
+                Decimal(top.com_distance), self.vertical.gravity)
+        self._posture = posture
+        self._turns, self._sign, self._half_turn = 0, 1.0, 0.0
+        # All that follows turns these into decimals.
+        self.top, self.start = cast(Top, long_top), cast(State, long_start)
+        self._motion = set_up(self.top, self.start, LongForm)
+        self._long = long_top, long_start
+        with precision(DIGITS):
+            self._take_constants(short(self._motion))
+        self.top = self.vertical.top(top)
+        self.start = long_start.rounded()
+        self._check_start()
+
+    def posture(self, ns: int) -> Posture:
+        """
+        Return the posture in the world at a time [ns] since the start.
+
+        It is right to 38 digits, times what the motion makes of such an error.
+        """
+        if not ns:                  # perhaps at a pole, where the axis does not tell its rates
+            return self._posture
+        with precision(DIGITS):
+            vertical, (top, start) = self.vertical, self._long
+            alpha, beta, u_dot = _cayley_klein(self._motion, Decimal(ns).scaleb(-9))
+            across = _across(top, start, alpha, beta, u_dot)
+            alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
+            return Posture(alpha, beta, across, float(start.l3))
+
+
+def about_vertical(top: Top, posture: Posture, acceleration: Exact) -> tuple[Vertical, State]:
+    """Return the vertical while the pivot accelerates so, and the state there in doubles."""
+    with precision(DIGITS):
+        vertical = Vertical(top.gravity, acceleration, posture)
+        return vertical, vertical.start(top, posture).rounded()
+
+
+def posture_of(top: Top, state: State) -> Posture:
+    """Return the posture of a state about the vertical of the world."""
+    with precision(DIGITS):
+        sine, cosine = sin_cos(Decimal(state.theta) / 2)
+        phi, psi = +Decimal(state.phi), +Decimal(state.psi)
+        (s_sum, c_sum), (s_difference, c_difference), (s_psi, c_psi) = (
+            sin_cos(_reduced(angle)) for angle in ((phi + psi) / 2, (phi - psi) / 2, psi))
+        l3, lz, two_lambda1 = Decimal(state.l3), Decimal(state.lz), 2 * Decimal(top.lambda1)
+        swing = ZERO                # phi' sin(theta)
+        if lz + l3:
+            swing += (lz + l3) / two_lambda1 * sine / cosine
+        if lz - l3:
+            swing += (lz - l3) / two_lambda1 * cosine / sine
+        return Posture((cosine * c_sum, cosine * s_sum),
+                       (sine * c_difference, sine * s_difference),
+                       _times((-swing, Decimal(state.theta_dot)), (c_psi, -s_psi)), state.l3)
+
+
+def posture_at(states: States) -> Posture:
+    """Return the posture of states (n = 1) in the world, as far as doubles know it."""
+    x, y, z, w, o1, o2 = (Decimal(float(part[0])) for part in (
+        *states.rows_quaternion, *states.transverse_velocity))
+    return Posture((w, z), (y, -x), (o1, o2), states.start.l3)
+
+
+def _reduced(angle: Decimal) -> Decimal:
+    """Return an angle less whole turns [rad]."""
+    with precision(DIGITS + max(0, angle.adjusted())):
+        return angle.remainder_near(2 * pi())
+
+
+def _cayley_klein(motion: ThetaMotion, t: Decimal) -> tuple[Complex, Complex, Decimal]:
+    """Return alpha, beta and cos(theta)' at t [s] in the frame of a motion."""
+    quarters = motion.quarter0 + motion.offset0 + motion.quarter_rate * t
+    whole = int(quarters.to_integral_value())
+    rest = (motion.quarter0 - whole) + motion.quarter_rate * t + motion.offset0
+    y = pi() / 2 * rest
+    if motion.stretch:
+        sine = _sinh(motion.stretch * y)
+        xi = -sine * sine
+    else:
+        sine, _ = sin_cos(y)
+        xi = sine * sine
+    cosine = (1 - xi).sqrt()
+    point = sine, cosine, xi
+    alpha, beta = (_factor(factor, whole, y, t, point) for factor in (motion.alpha, motion.beta))
+    size2 = _square(alpha) + _square(beta)
+    slope = motion.u_dot_series.at(2 * sine * cosine, 1 - 2 * xi, 4 * xi * (1 - xi))
+    u_dot = motion.u_dot[whole % 2] * slope / (size2 * size2)
+    scale = 1 / size2.sqrt()
+    return _scaled(scale, alpha), _scaled(scale, beta), u_dot
+
+
+def _factor(factor: Factor, whole: int, y: Decimal, t: Decimal,
+            point: tuple[Decimal, Decimal, Decimal]) -> Complex:
+    """Return alpha D or beta D; `whole`, y, `point`: N, y and the arguments of `Series.at`."""
+    parts = factor.parts[whole % 2]
+    real, imag = (part.at(*point) for part in parts)
+    passes = any(one[0].prefactor == SIN_ODD for one in factor.parts)
+    if passes and whole % 4 >= 2:
+        real = -real
+    turn = factor.rate * t + 2 * pi() * factor.phase_turns + factor.drift * y
+    sine, cosine = sin_cos(turn.remainder_near(2 * pi()))
+    return _times((real, imag), (cosine, sine))
+
+
+def _across(top: LongTop, start: LongState, alpha: Complex, beta: Complex,
+            u_dot: Decimal) -> Complex:
+    """Return omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta))."""
+    cosine2, sine2 = _square(alpha), _square(beta)
+    if not (cosine2 and sine2):
+        return ZERO, ZERO           # it rests at a pole
+    # Lz - L3 u, without cancellation at either pole
+    momentum = ((start.lz - start.l3) + 2 * start.l3 * sine2 if sine2 < cosine2
+                else (start.lz + start.l3) - 2 * start.l3 * cosine2)
+    # 1/(alpha conj(beta)) = conj(alpha) beta/|alpha beta|^2
+    inverse = _scaled(-1 / (2 * cosine2 * sine2), _times((alpha[0], -alpha[1]), beta))
+    return _times((momentum / top.lambda1, u_dot), inverse)
+
+
+def _sinh(x: Decimal) -> Decimal:
+    """Return sinh, to an absolute accuracy, and relative to itself where x is small."""
+    if abs(x) < Decimal('1e-3'):
+        square, term, total = x * x, x, x
+        for n in range(2, 22, 2):
+            term *= square / (n * (n + 1))
+            total += term
+        return total
+    return (x.exp() - (-x).exp()) / 2
+
+
+def _least_rotation(x: Decimal, y: Decimal, z: Decimal) -> tuple[Complex, Complex]:
+    """Return the Cayley-Klein parameters of the least rotation of (0, 0, 1) to a unit vector."""
+    across = (x * x + y * y).sqrt()
+    if not across:                  # perhaps a half turn, about the x axis
+        return ((ONE, ZERO), (ZERO, ZERO)) if z > 0 else ((ZERO, ZERO), (ZERO, -ONE))
+    if z > 0:
+        cosine = ((1 + z) / 2).sqrt()
+        sine = across / (2 * cosine)
+    else:
+        sine = ((1 - z) / 2).sqrt()
+        cosine = across / (2 * sine)
+    return (cosine, ZERO), (sine * x / across, sine * y / across)
+
+
+def _product(p: Sequence[Complex], q: Sequence[Complex]) -> tuple[Complex, Complex]:
+    """Return the Cayley-Klein parameters of p q: first the rotation q, then p."""
+    (a, b), (c, d) = p, q
+    conj_c, conj_d = (c[0], -c[1]), (d[0], -d[1])
+    (r1, i1), (r2, i2) = _times(a, c), _times(b, conj_d)
+    (r3, i3), (r4, i4) = _times(a, d), _times(b, conj_c)
+    return (r1 - r2, i1 - i2), (r3 + r4, i3 + i4)
+
+
+def _inverse(alpha: Complex, beta: Complex) -> tuple[Complex, Complex]:
+    return (alpha[0], -alpha[1]), (-beta[0], -beta[1])
+
+
+def _times(a: Complex, b: Complex) -> Complex:
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+def _scaled(factor: Decimal, a: Complex) -> Complex:
+    return factor * a[0], factor * a[1]
+
+
+def _square(a: Complex) -> Decimal:
+    return a[0] * a[0] + a[1] * a[1]

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The satellite receiver (GNSS), with its antenna at the pivot: fixes, velocities, and their truth.
+
+Axes of noise and covariances are those of the world: east, north, up.  docs/sensor.md describes
+delay and outages.
+"""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.attitude import Vector
+from spinning_top_sim.streams import messages, noise
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.stream import Encoded, Samples, Stream
+
+NAN = 3 * (np.nan,)
+
+
+class Gnss(Stream):
+    """
+    Fixes or velocities of the pivot, as a receiver measures them or exact.
+
+    A measurement at t = k * period_ns is stamped with t, and sent `gnss.latency` later.
+
+    is_exact : no noise, delay or outages
+    """
+
+    type_name: str
+    _index: int             # of position or velocity in `Kinematics`
+    _noise: str             # parameter of the standard deviations
+    _purpose: noise.Purpose
+
+    def __init__(self, values: Mapping[str, Any], topic: str, template: Any, *,
+                 is_exact: bool) -> None:
+        super().__init__(values, 'gnss', topic, self.type_name, template)
+        self._seed, self._is_exact = values['seed'], is_exact
+        level, vertical = values[self._noise]
+        self._deviation = np.array([[level], [level], [vertical]]) * (not is_exact)
+        self._latency_ns = 0 if is_exact else round(values['gnss.latency'] * NANOSECONDS)
+        # Begin and end of each outage, in turn; an odd number of them is past within an outage.
+        self._edges_ns = np.rint(np.array(() if is_exact else values['gnss.outages'])
+                                 * NANOSECONDS).astype(np.int64)
+
+    def times(self, after_ns: int, until_ns: int) -> range:
+        """Return the times after `after_ns` and up to `until_ns` at which messages are sent."""
+        late_ns = self._latency_ns
+        valid = super().times(max(after_ns - late_ns, -1), until_ns - late_ns)
+        return range(valid.start + late_ns, valid.stop + late_ns, valid.step)
+
+    def encode(self, samples: Samples) -> Encoded:
+        valid_ns = samples.t_ns - self._latency_ns
+        return self._sent(samples.t_ns, samples.epoch_ns + valid_ns, self._measured(
+            samples, valid_ns), np.searchsorted(self._edges_ns, valid_ns, 'right') % 2 == 1)
+
+    def _measured(self, samples: Samples, valid_ns: NDArray[np.int64]) -> Vector:
+        value = samples.path.pivot(valid_ns)[self._index]
+        if self._deviation.any():
+            value = value + self._deviation * noise.white(
+                self._seed, self._purpose, valid_ns // self.period_ns, 3)
+        x, y, z = value
+        return x, y, z
+
+    def _sent(self, t_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64], measured: Vector,
+              is_out: NDArray[np.bool_]) -> Encoded:
+        """Return the messages of these measurements; `is_out`: they fall into an outage."""
+        raise NotImplementedError
+
+
+class Fix(Gnss):
+    """sensor_msgs/NavSatFix; in an outage without a fix, and NaN."""
+
+    type_name = 'sensor_msgs/msg/NavSatFix'
+    _index, _noise, _purpose = 0, 'gnss.position_noise', noise.Purpose.GNSS_POSITION
+
+    def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
+        level, vertical = (0.0, 0.0) if is_exact else values[self._noise]
+        super().__init__(values, topic, messages.nav_sat_fix(
+            values['body_frame'], messages.diagonal(level ** 2, level ** 2, vertical ** 2)),
+            is_exact=is_exact)
+        self._no_fix = messages.nav_sat_fix(values['body_frame'], None)
+        self._origin = values['gnss.origin']
+
+    def _sent(self, t_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64], measured: Vector,
+              is_out: NDArray[np.bool_]) -> Encoded:
+        rows = self.template.encode(stamps_ns, self._geodetic(measured))
+        if is_out.any():
+            rows = rows.copy()      # the template's own rows keep what is the same in all
+            rows[is_out] = self._no_fix.encode(stamps_ns[is_out], NAN)
+        return t_ns, rows
+
+    @cached_property
+    def _enu2geodetic(self) -> Any:
+        from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
+        return enu2geodetic
+
+    def _geodetic(self, position: Vector) -> Vector:
+        """Return latitude and longitude [deg] and height above the ellipsoid of WGS-84 [m]."""
+        latitude, longitude, altitude = self._enu2geodetic(*position, *self._origin)
+        return latitude, longitude, altitude
+
+
+class Velocity(Gnss):
+    """geometry_msgs/TwistWithCovarianceStamped in the axes of the world; none in an outage."""
+
+    type_name = 'geometry_msgs/msg/TwistWithCovarianceStamped'
+    _index, _noise, _purpose = 1, 'gnss.velocity_noise', noise.Purpose.GNSS_VELOCITY
+
+    def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
+        level, vertical = (0.0, 0.0) if is_exact else values[self._noise]
+        super().__init__(values, topic, messages.twist_with_covariance(
+            values['world_frame'], (level ** 2, level ** 2, vertical ** 2)), is_exact=is_exact)
+
+    def _sent(self, t_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64], measured: Vector,
+              is_out: NDArray[np.bool_]) -> Encoded:
+        rows = self.template.encode(stamps_ns, measured)
+        return t_ns[~is_out], rows[~is_out]

@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pivot that moves: paths as parameters, commanded velocities, and what is sent about it."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers.reference import RIDES, scene_parameters
+from helpers.simulations import play, stream
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.tools import inspect
+
+S = 10 ** 9
+SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.speed': 1.5,
+           'pivot.acceleration': 2.0, 'pivot.repeat': True}
+METHODS = ('exact', 'rk45')
+DRIVES = ((S // 2, (1.0, 0.0, 0.0)), (3 * S // 4, (1.0, 0.0, 0.0)), (S, (0.0, -0.5, 0.2)),
+          (4 * S, (0.3, 0.0, 0.0)))
+
+
+def simulation_of(kind=Simulation, **values):
+    return kind(parameters.checked({**values}))
+
+
+def everything(values):
+    return {f'{row[0]}.enabled': True for row in parameters.STREAM_DEFAULTS} | values
+
+
+def sent_offline(values, drives, until_ns):
+    simulation, sent = simulation_of(**values), []
+    for t_ns, velocity in (*drives, (until_ns, None)):
+        for block in simulation.play(simulation.streams, t_ns):
+            sent += [(t, one.topic, row.tobytes()) for one, times, rows in block.parts
+                     for t, row in zip(times.tolist(), rows, strict=True)]
+        if velocity:
+            simulation.drive(velocity)
+    return sorted(sent)
+
+
+@pytest.mark.parametrize('values', [
+    {'solver.method': method, **more} for method in METHODS
+    for more in (SHUTTLE, {'pivot.path': (0.7, 1.0, 0.0, 9.0, 0.7, -1.0, 0.0, -9.0)})])
+def test_live_and_offline_agree_to_the_last_bit(values):
+    values = everything({'imu.lever_arm': (0.1, 0.2, 0.3), 'markers.trace_points': 20, **values})
+    live, sent = simulation_of(LiveSimulation, **values), []
+    for output in live.outputs:
+        output.publish = lambda data, topic=output.stream.topic: sent.append(
+            (live.now_ns, topic, data))
+    drives, now = list(DRIVES), 0
+    while now < 6 * S:
+        now = min(now + 137_000_001, drives[0][0] if drives else 6 * S)
+        live.advance(now)
+        live.prepare(now + S // 4)
+        if drives and drives[0][0] == now:
+            live.drive(drives.pop(0)[1])
+            live.prepare(now + 2 * S)
+    assert sorted(sent) == sent_offline(values, DRIVES, 6 * S)
+
+
+@pytest.mark.parametrize(('method', 'arm', 'seconds'), [
+    ('exact', (0.0, 0.0, 0.0), 60), ('rk45', (0.1, -0.2, 0.3), 12)])
+def test_increments_along_a_shuttle_add_up_to_its_motion(method, arm, seconds):
+    simulation = simulation_of(**{
+        **scene_parameters('shuttle'), 'solver.method': method, 'increments.enabled': True,
+        'imu.lever_arm': arm, 'imu.rate': 200.0, 'ground_truth_imu_odom.rate': 200.0})
+    taken = {'imu/dq': [], 'imu/dv': [], 'ground_truth/imu_odom': []}
+    streams = [one for one in simulation.streams if one.topic in taken]
+    for block in simulation.play(streams, seconds * S):
+        for one, _, rows in block.parts:
+            taken[one.topic].append(np.hstack(one.template.decode(rows.tobytes())))
+    turns, pushes, truth = (np.vstack(taken[topic]) for topic in taken)
+    place, q, v = truth[0, :3], tuple(truth[0, 3:7, np.newaxis]), world(truth[0])
+    dt, gravity = 1 / 200, np.array((0.0, 0.0, -9.80665))
+    for turn, push in zip(turns[1:], pushes[1:], strict=True):
+        change = np.ravel(attitude.in_world(q, push)) + gravity * dt
+        place = place + dt * (v + 0.5 * change)
+        v, q = v + change, attitude.product(q, turn)
+    last = truth[-1]
+    assert attitude.angle_between(q, tuple(last[3:7, np.newaxis])).max() < 1e-12
+    assert abs(v - world(last)).max() < 1e-10
+    if not any(arm):        # else the mean velocity of an interval is not that of its ends
+        assert abs(place - last[:3]).max() < 1e-9
+
+
+def world(row):
+    """Return the velocity in the world of a row of odometry."""
+    return np.ravel(attitude.in_world(tuple(row[3:7, np.newaxis]), row[7:10]))
+
+
+def test_the_specific_force_is_that_of_the_place_in_the_world():
+    values = {'solver.method': 'exact', 'imu.lever_arm': (0.1, -0.2, 0.3),
+              'ground_truth_imu.rate': 1000.0, 'ground_truth_imu_odom.enabled': True,
+              'ground_truth_imu_odom.rate': 1000.0, **SHUTTLE}
+    simulation = simulation_of(**values)
+    force, place = (np.vstack([stream(simulation, topic).template.decode(data)[number]
+                               for _, _, data in taken]) for topic, number, taken in (
+        ('ground_truth/imu', 2, play(simulation_of(**values), S // 2, 'ground_truth/imu')),
+        ('ground_truth/imu_odom', 0,
+         play(simulation_of(**values), S // 2, 'ground_truth/imu_odom'))))
+    q = simulation.segment.states(range(0, S // 2 + 1, 10 ** 6)).rows_quaternion
+    acceleration = (place[2:] - 2 * place[1:-1] + place[:-2]) * 1e6
+    expected = attitude.in_body(tuple(part[1:-1] for part in q),
+                                tuple((acceleration + np.array((0.0, 0.0, 9.80665))).T))
+    assert np.stack(expected, axis=-1) == pytest.approx(force[1:-1], abs=2e-2)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_driven_pivot_goes_to_the_velocity_and_stops(method):
+    simulation = simulation_of(**{'solver.method': method, 'pivot.cmd_timeout': 1.0})
+    list(simulation.play((), S))
+    assert simulation.drive((0.0, 0.0, 0.0)) is None and simulation.segment.ride is None
+    assert simulation.drive((0.0, 0.8, 0.0)) == 2 * S
+    list(simulation.play((), 3 * S // 2))
+    segment = simulation.segment
+    assert simulation.drive((0.0, 0.8, 0.0)) == 5 * S // 2      # to repeat it only lasts longer
+    assert simulation.segment is segment and len(simulation.history) == 1
+    list(simulation.play((), 10 * S))
+    found = simulation.segment.pivot(np.array([simulation.now_ns]))
+    assert not found.velocity.any() and not found.acceleration.any()
+    # Half a ramp of 0.4 s at each end, and 1.1 s of cruise.
+    assert np.ravel(found.position) == pytest.approx((0.0, 0.8 * 1.5, 0.0), abs=1e-12)
+    assert simulation.history == [(S, 0.0, 0.8, 0.0, 5 * S // 2)]
+
+
+@pytest.mark.parametrize('velocity', [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 1e5)])
+def test_a_bad_velocity_is_refused_with_its_value(velocity):
+    simulation = simulation_of()
+    with pytest.raises(ValueError, match=r'linear = \[.*(nan|inf|100000).*within 10000 m/s'):
+        simulation.drive(velocity)
+    assert not simulation.history
+
+
+@pytest.mark.parametrize(('values', 'words'), [
+    ({'pivot.path': (1.0, 2.0, 3.0)}, 'pivot.path = .*multiple of 4'),
+    ({'pivot.path': (1e-6, 0.0, 0.0, 0.0)}, 'duration 1e-06 s: must be >= 0.001'),
+    ({'pivot.path': (1.0, 1.0, 0.0, 0.0), 'pivot.repeat': True}, 'changes the velocity'),
+    ({'pivot.waypoints': (1.0, 1.0, 0.0)}, 'two different points'),
+    ({'pivot.waypoints': (1.0, 1.0, 0.0, 2.0)}, 'multiple of 3'),
+    ({'pivot.waypoints': (1.0, math.nan, 0.0)}, 'pivot.waypoints = .*nan.*a list of numbers'),
+    ({'pivot.path': (1.0, 0.0, 0.0, 1.0), **SHUTTLE}, 'must be empty with pivot.path')])
+def test_a_bad_path_is_refused_in_words(values, words):
+    with pytest.raises(ValueError, match=words):
+        parameters.checked(values)
+
+
+def test_commands_of_the_spin_count_about_the_vertical_of_the_world():
+    simulation = simulation_of(**{'solver.method': 'exact', **SHUTTLE})
+    list(simulation.play((), S // 2))
+    before = simulation.state()
+    simulation.command(1.2, 0.9)
+    after, top = simulation.state(), simulation.top
+    assert abs(before.quaternion - after.quaternion).max() < 4e-15
+    w1, w2, w3 = after.angular_velocity[0]
+    z1, z2, z3 = (float(part[0]) for part in after.rows_vertical)
+    lz = top.lambda1 * (w1 * z1 + w2 * z2) + top.lambda3 * w3 * z3
+    assert lz == pytest.approx(0.9, rel=1e-14)
+    assert top.lambda3 * w3 == pytest.approx(1.2, rel=1e-15)
+    assert (simulation.l3, simulation.lz) == (1.2, 0.9)
+
+
+@pytest.mark.parametrize('frame', ['world', 'map/θ', ''])
+def test_a_transform_is_the_pose(frame):
+    typesys = pytest.importorskip('rosbags.typesys')
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    values = {'solver.method': 'exact', 'tf.enabled': True, 'world_frame': frame, **SHUTTLE}
+    sent = {topic: play(simulation_of(**values), S, topic)[-1][2] for topic in ('/tf', 'pose')}
+    (found,) = store.deserialize_cdr(sent['/tf'], 'tf2_msgs/msg/TFMessage').transforms
+    pose = store.deserialize_cdr(sent['pose'], 'geometry_msgs/msg/PoseStamped')
+    assert found.header == pose.header and found.header.frame_id == frame
+    assert found.child_frame_id == 'base_link'
+    for one, other in ((found.transform.translation, pose.pose.position),
+                       (found.transform.rotation, pose.pose.orientation)):
+        assert [getattr(one, axis) for axis in 'xyz'] == [getattr(other, axis) for axis in 'xyz']
+    assert found.transform.translation.x > 0.1
+
+
+def test_odometry_has_the_twist_in_the_frame_of_the_body():
+    values = {'solver.method': 'exact', **SHUTTLE}
+    simulation = simulation_of(**values)
+    (position, q, velocity, rates) = stream(simulation, 'ground_truth/odom').template.decode(
+        play(simulation, S, 'ground_truth/odom')[-1][2])
+    pivot, state = simulation.segment.pivot(np.array([S])), simulation.state()
+    assert (position[0] == pivot.position[:, 0]).all() and (q == state.quaternion).all()
+    assert (rates == state.angular_velocity).all()
+    assert np.ravel(attitude.in_world(tuple(q.T), tuple(velocity.T))) == pytest.approx(
+        pivot.velocity[:, 0], abs=1e-15)
+
+
+@pytest.mark.parametrize('scene', RIDES)
+def test_a_scene_with_a_moving_pivot_goes_on(scene):
+    simulation = simulation_of(**scene_parameters(scene))
+    assert len(list(play(simulation, 20 * S, 'ground_truth/odom'))) == 2001
+    assert simulation.top.is_realizable
+    assert len(simulation.path._segments) < 10           # the others are forgotten
+    force = simulation_of(**scene_parameters(scene))
+    readings = np.vstack([stream(force, 'ground_truth/imu').template.decode(data)[2]
+                          for _, _, data in play(force, 9 * S, 'ground_truth/imu')])
+    expected = {'shuttle': (9.80665, math.hypot(9.80665, 2.0)), 'elevator': (7.80665, 11.80665),
+                'free_fall': (0.0, 2 * 9.80665),
+                'braking': (9.80665, math.hypot(9.80665, 8.0))}[scene]
+    sizes = np.linalg.norm(readings, axis=1)
+    assert (sizes.min(), sizes.max()) == pytest.approx(expected, rel=1e-15, abs=1e-30)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_driven_node_is_recorded_and_verified(tmp_path, method, capsys):
+    msg = pytest.importorskip('geometry_msgs.msg')
+    own_node = pytest.importorskip('helpers.own_node')
+
+    def twist(linear, angular=0.0):
+        return msg.Twist(linear=msg.Vector3(x=linear), angular=msg.Vector3(z=angular))
+
+    with own_node.OwnNode(tmp_path, solver__method=method, record__enabled=True,
+                          pivot__cmd_timeout=0.2) as top:
+        node, told = top.node, []
+        node.get_logger().warning = told.append
+        for linear in (0.1, 0.7, 0.7, -0.3):
+            for _ in range(50):             # a storm: the last one of a tick counts
+                node._on_velocity(twist(linear))
+            top.wait_until(top.simulation.now_ns + S // 10)
+        assert top.simulation.segment.ride is not None
+        refused = (twist(math.nan), twist(math.inf), twist(1e9), twist(0.0, 2.0))
+        for message in refused:
+            node._on_velocity(message)
+        assert top.loop.rejected_commands == len(refused)
+        top.wait_until(top.simulation.now_ns + S)
+        rests = top.simulation.segment.pivot(np.array([top.simulation.now_ns]))
+        assert not rests.velocity.any() and 4 <= top.loop.commands <= 10
+    assert inspect.main([str(tmp_path / 'run.mcap'), '--verify']) == 0
+    assert 'identical' in capsys.readouterr().out

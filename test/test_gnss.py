@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The satellite receiver: its place on Earth, noise, delay and outages, from logs."""
+
+import math
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.readings import run
+from helpers.simulations import SECOND, play, record, simulate
+
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools import inspect
+from spinning_top_sim.tools import simulate as simulate_command
+
+pymap3d = pytest.importorskip('pymap3d')
+
+FIX, VELOCITY = 'gnss/fix', 'gnss/velocity'
+TRUE_FIX, TRUE_VELOCITY = 'ground_truth/gnss/fix', 'ground_truth/gnss/velocity'
+TOPICS = FIX, VELOCITY, TRUE_FIX, TRUE_VELOCITY
+ORIGIN = (48.14, 11.58, 520.0)
+# Forth and back along a slanted line, for ever.
+SHUTTLE = {'gnss.enabled': True, 'solver.method': 'exact', 'pivot.speed': 3.0,
+           'pivot.waypoints': (0.0, 0.0, 0.0, 40.0, 20.0, 5.0), 'pivot.repeat': True}
+NOISY = {**SHUTTLE, 'gnss.position_noise': (1.5, 3.0), 'gnss.velocity_noise': (0.05, 0.1),
+         'gnss.latency': 0.12, 'gnss.outages': (100.0, 120.0, 200.05, 200.15)}
+PERIOD_NS = SECOND // 10
+
+
+def enu(fixes):
+    """Return positions (n, 3) in the world [m]."""
+    return np.stack(pymap3d.geodetic2enu(*fixes.T, *ORIGIN), axis=-1)
+
+
+@pytest.fixture(scope='module')
+def noisy():
+    return run(NOISY, 400 * SECOND, *TOPICS)[1]
+
+
+def test_the_truth_is_the_path_of_the_pivot_on_the_ellipsoid():
+    simulation, found = run({**SHUTTLE, 'gnss.latency': 0.3}, 60 * SECOND, TRUE_FIX, TRUE_VELOCITY)
+    t_ns, stamps_ns, fixes = found[TRUE_FIX]
+    assert np.array_equal(stamps_ns - simulation.epoch_ns, t_ns)
+    assert np.array_equal(t_ns, np.arange(601) * PERIOD_NS)
+    position, velocity = enu(fixes), found[TRUE_VELOCITY][2]
+    # Along the line between the waypoints, from one to the other, at 3 m/s at most.
+    line = np.array((40.0, 20.0, 5.0))
+    share = position @ line / (line @ line)
+    assert position == pytest.approx(share[:, np.newaxis] * line, abs=1e-7)
+    assert (share.min(), share.max()) == pytest.approx((0.0, 1.0), abs=1e-3)
+    assert np.linalg.norm(velocity, axis=1).max() == pytest.approx(3.0, rel=1e-6)
+    # The rule of Simpson is exact for a piecewise quadratic path, but where its pieces meet.
+    middle = (position[2:] - position[:-2]) / (2.0 * PERIOD_NS * 1e-9)
+    error = np.linalg.norm(middle - (velocity[2:] + 4.0 * velocity[1:-1] + velocity[:-2]) / 6.0,
+                           axis=1)
+    assert np.median(error) < 1e-6 and error.max() < 0.05
+
+
+def test_a_pivot_at_rest_is_at_the_origin():
+    _, found = run({'gnss.enabled': True, 'gnss.origin': (-33.9, 151.2, 12.0)}, SECOND, FIX,
+                   VELOCITY)
+    assert found[FIX][2] == pytest.approx(np.tile((-33.9, 151.2, 12.0), (11, 1)), abs=1e-9)
+    assert not found[VELOCITY][2].any()
+
+
+def test_noise_is_white_with_the_standard_deviations(noisy):
+    for topic, exact, convert, levels in (
+            (FIX, TRUE_FIX, enu, (1.5, 1.5, 3.0)),
+            (VELOCITY, TRUE_VELOCITY, np.asarray, (0.05, 0.05, 0.1))):
+        _, stamps_ns, measured = noisy[topic]
+        is_valid = np.isfinite(measured).all(axis=1)
+        _, known_ns, truth = noisy[exact]
+        errors = (convert(measured[is_valid])
+                  - convert(truth[np.isin(known_ns, stamps_ns[is_valid])]))
+        count = len(errors)
+        assert count > 3700
+        assert np.std(errors, axis=0) == pytest.approx(levels, rel=4.0 / math.sqrt(2.0 * count))
+        assert np.abs(errors.mean(axis=0) / levels).max() < 4.0 / math.sqrt(count)
+        assert np.abs(np.corrcoef(errors.T) - np.eye(3)).max() < 4.0 / math.sqrt(count)
+        assert np.abs((errors[1:] * errors[:-1]).mean(axis=0) / np.square(levels)).max() < (
+            4.0 / math.sqrt(count))
+
+
+def test_delay_and_outages_are_exact(noisy):
+    t_ns, stamps_ns, fixes = noisy[FIX]
+    late_ns = t_ns - (stamps_ns - noisy[TRUE_FIX][1][0])
+    assert (late_ns.min(), late_ns.max()) == (120_000_000, 120_000_000)
+    valid_ns = t_ns - 120_000_000
+    assert np.array_equal(valid_ns, np.arange(len(t_ns)) * PERIOD_NS)
+    is_out = ((valid_ns >= 100 * SECOND) & (valid_ns < 120 * SECOND)) | (
+        valid_ns == 200_100_000_000)
+    assert np.array_equal(np.isnan(fixes), np.repeat(is_out[:, np.newaxis], 3, axis=1))
+    velocity_ns = noisy[VELOCITY][0] - 120_000_000
+    assert np.array_equal(velocity_ns, valid_ns[~is_out])
+
+
+def test_a_live_run_gives_the_same_bytes():
+    values = {**NOISY, 'gnss.rate': 37.0, 'gnss.outages': (1.0, 1.5)}
+    live, offline = simulate(values), simulate(values)
+    taken = record(live, *TOPICS)
+    for t_ns in range(0, 30 * SECOND, 73_000_001):
+        live.prepare(t_ns + 200_000_000)
+        live.advance(t_ns)
+    assert sorted(taken) == sorted(play(offline, live.now_ns, *TOPICS))
+
+
+def test_a_late_fix_is_where_the_pivot_was_before_it_was_driven():
+    _, found = run({'gnss.enabled': True, 'gnss.latency': 0.5, 'gnss.rate': 50.0}, 3 * SECOND,
+                   *TOPICS, events=[(SECOND, lambda simulation: simulation.drive((1.0, 0.0, 0.0))
+                                     )])
+    for topic, exact in ((FIX, TRUE_FIX), (VELOCITY, TRUE_VELOCITY)):
+        count = len(found[topic][1])
+        assert np.array_equal(found[topic][1], found[exact][1][:count])
+        assert np.array_equal(found[topic][2], found[exact][2][:count])
+    assert found[VELOCITY][2].max() > 0.5
+
+
+def test_a_log_is_verified(tmp_path, capsys):
+    """With an outage longer than a block, in which there is then no velocity."""
+    path = tmp_path / 'gnss.mcap'
+    values = [f'{name}:={list(value) if isinstance(value, tuple) else str(value).lower()}'
+              for name, value in {**NOISY, 'gnss.outages': (2.8, 5.0)}.items()]
+    assert simulate_command.main([*(part for value in values for part in ('-p', value)), '-o',
+                                  str(path), '--duration', '5', '--quiet']) == 0
+    assert inspect.main([str(path), '--verify']) == 0
+    assert 'gnss/fix' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('gnss.origin', (90.5, 0.0, 0.0)), ('gnss.origin', (0.0, -181.0, 0.0)),
+    ('gnss.outages', (1.0,)), ('gnss.outages', (2.0, 1.0)), ('gnss.outages', (1.0, 3.0, 2.0, 4.0)),
+    ('gnss.latency', -0.1), ('gnss.position_noise', (1.0, math.nan))])
+def test_bad_values_are_refused(name, value):
+    with pytest.raises(ValueError, match=name):
+        parameters.checked({name: value})
+
+
+def test_the_library_is_needed_only_with_a_receiver(monkeypatch):
+    monkeypatch.setattr(parameters, 'find_spec', lambda name: None)
+    parameters.checked({})
+    with pytest.raises(ValueError, match=r'needs pymap3d.*pip install .*pymap3d\S*>=3'):
+        parameters.checked({'gnss.enabled': True})
+
+
+def test_the_filter_of_the_example_follows_the_pivot(tmp_path, monkeypatch):
+    """Its errors are far below those of the fixes, also in an outage, and as it expects them."""
+    log, picture = str(tmp_path / 'ride.mcap'), tmp_path / 'position.png'
+    assert simulate_command.main([
+        '--scene', 'shuttle', '--duration', '20', '-o', log, '--quiet',
+        *(part for value in (
+            'gnss.enabled:=true', 'gnss.position_noise:=[1.0, 2.0]', 'gnss.latency:=0.1',
+            'gnss.velocity_noise:=[0.05, 0.1]', 'gnss.outages:=[12.0, 15.0]', 'imu.sampling:=mean',
+            'imu.rate:=100.0', 'imu.gyroscope_noise_density:=2e-4',
+            'imu.accelerometer_noise_density:=2e-3') for part in ('-p', value))]) == 0
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / 'examples')
+    errors = import_module('ekf_position').main([log, '--plot', str(picture)])
+    assert np.sqrt(np.mean(np.sum(errors[100:] ** 2, axis=1))) < 0.6
+    assert picture.stat().st_size > 10_000

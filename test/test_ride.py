@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The top on a moving pivot.
+
+data/ride.json holds motions to 30 digits, from Taylor series of Newton's and Euler's equations in
+the frame of the pivot (data/make_ride_references.py): nothing of a closed form is in them.
+"""
+
+import json
+import math
+import random
+from decimal import Decimal
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.random_tops import random_case
+from helpers.ride import Ride, changes, kinematics
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spinning_top_sim import State, Top, solve
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.pivot import NEVER_NS, PivotPath
+from spinning_top_sim.solvers.vertical import AcceleratedMotion, posture_of
+
+BOUND = 5e-15
+S = 10 ** 9
+CASES = {case['name']: case for case in json.loads(
+    (Path(__file__).parent / 'data' / 'ride.json').read_text())['cases']}
+LONGEST = '1000 changes'
+GENERAL = State(theta=0.5, theta_dot=0.3, phi=0.1, psi=0.2, l3=1.6, lz=1.3)
+TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+REST, NOWHERE = (Fraction(0),) * 3, (0.0, 0.0, 0.0)
+
+
+def ride_of(case):
+    path = PivotPath(case['pieces'], position=case['position'], velocity=case['velocity'])
+    return Ride(Top(**case['top']), State(**case['start']), path, case['times_ns'][-1] + 1)
+
+
+def errors(case):
+    """
+    Return the worst error of each quantity over max(1, its true size).
+
+    Euler's equations give alpha as a difference of products of rates: it has the size of omega^2.
+    """
+    found = ride_of(case).at(case['times_ns'], case['point'])
+    worst = {}
+    for name, rows in (('q', np.roll(found.quaternion, 1, axis=1)), ('omega', found.omega),
+                       ('alpha', found.alpha), ('position', found.position)):
+        worst[name] = 0.0
+        for row, state in zip(rows, case['states'], strict=True):
+            true = [Decimal(x) for x in state[name]]
+            size = max(1, *map(abs, true))
+            if name == 'alpha':
+                size = max(size, *(Decimal(x) ** 2 for x in state['omega']))
+            worst[name] = max(worst[name], *(float(abs(Decimal(float(x)) - y) / size)
+                                             for x, y in zip(row, true, strict=True)))
+    return worst
+
+
+@pytest.mark.parametrize('name', [name for name in CASES if name != LONGEST])
+def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
+    worst = errors(CASES[name])
+    assert max(worst.values()) <= BOUND, worst
+
+
+def test_a_thousand_changes_of_acceleration_add_no_error():
+    assert len(CASES[LONGEST]['pieces']) == 1000
+    worst = errors(CASES[LONGEST])
+    # An error grows by some 1e10 on the way: the true motion is chaotic.
+    assert max(worst.values()) <= BOUND, worst
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_what_is_handed_over_has_all_digits_of_the_references(name):
+    case, errors = CASES[name], []
+    ride, end = ride_of(case), case['times_ns'][-1]
+    (w, z), (y, minus_x), (o1, o2), l3 = ride.motions[-1].posture(end - ride.pieces[-1].start_ns)
+    last = {key: [*map(Decimal, values)] for key, values in case['states'][-1].items()}
+    for value, true in zip((w, minus_x, y, z, o1, o2), (*last['q'], *last['omega'][:2]),
+                           strict=True):
+        errors.append(min(abs(value - true), abs(value + true)) / max(1, abs(true)))
+    assert l3 == case['start']['l3']
+    # Half of the thirtieth digit, unless the motion is chaotic.
+    assert max(errors) <= Decimal('1e-26' if name == LONGEST else '5e-30'), errors
+
+
+def test_changes_that_change_nothing_leave_the_motion_as_it_is():
+    path = PivotPath([(S // 7, NOWHERE)] * 40)
+    times = [k * S // 5 for k in range(30)]
+    ride = Ride(TOP, GENERAL, path, times[-1] + 1)
+    assert len(ride.motions) == 41
+    still = solve(TOP, GENERAL, np.array(times) / S)
+    found = ride.at(times)
+    assert abs(found.quaternion - still.quaternion).max() <= BOUND
+    largest = abs(still.angular_velocity).max()
+    assert abs(found.omega - still.angular_velocity).max() <= BOUND * largest
+
+
+@pytest.mark.parametrize('acceleration', [
+    NOWHERE, (0.0, 0.0, -9.80665), (0.0, 0.0, -30.0), (4.0, -3.0, 2.0), (1e-12, 0.0, -9.80665),
+    (1e-9, 0.0, -30.0), (-1e-9, 1e-9, 0.0), (1e4, 0.0, 0.0)])
+@pytest.mark.parametrize('start', [
+    GENERAL, State(theta=0.0, theta_dot=0.7, phi=1.0, psi=2.0, l3=0.5, lz=0.5),
+    State(theta=math.pi, phi=1.0, psi=2.0, l3=0.5, lz=-0.5),
+    State(theta=1e-9, theta_dot=0.2, phi=1.0, psi=2.0, l3=0.5, lz=0.5),
+    State(theta=1.5707963267948966, l3=0.0, lz=0.0), State(theta=1e-6, l3=0.0, lz=0.0),
+    State(theta=0.0018, theta_dot=0.008803139254, l3=0.0, lz=0.0),     # next to the separatrix
+    State(theta=0.0, theta_dot=1e-50, l3=0.5, lz=0.5),
+    State(theta=1e-15, theta_dot=1e-15, psi=1.0, l3=0.5, lz=0.5)])
+def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
+    exact = tuple(map(Fraction, acceleration))
+    posture = posture_of(TOP, start)
+    motion = AcceleratedMotion(TOP, posture, exact)
+    whole, back = motion.posture(S), posture
+    for length in (1000, S // 3, S - S // 3 - 1000):
+        back = AcceleratedMotion(TOP, back, exact).posture(length)
+    for one, other in zip(whole[:3], back[:3], strict=True):
+        scale = max(1, *map(abs, one))
+        assert max(abs(a - b) for a, b in zip(one, other, strict=True)) < scale * Decimal('1e-30')
+    for t, ((w, z), (y, minus_x), across, _) in (0, posture), (S, whole):
+        states = motion.states(range(t, t + 1))
+        q = np.ravel(attitude.product(motion.vertical.rows, states.rows_quaternion))
+        assert abs(q - np.array([-minus_x, y, z, w], float)).max() < 2e-15
+        rates = np.array(across, float)
+        assert abs(states.angular_velocity[0, :2] - rates).max() < 5e-15 * max(1.0, *abs(rates))
+    assert back.l3 == start.l3 == motion.start.l3
+    assert 0.0 <= motion.start.theta <= math.pi / 2
+    # The vertical of the frame is the line of the effective gravity.
+    line = np.array(acceleration) + np.array((0.0, 0.0, TOP.gravity))
+    assert motion.top.gravity == pytest.approx(
+        math.copysign(np.linalg.norm(line), motion.top.gravity), rel=1e-15)
+    z = np.array(attitude.axis_in_world(motion.vertical.rows)).ravel()
+    assert abs(motion.top.gravity * z - line).max() <= 1e-15 * max(1.0, np.linalg.norm(line))
+
+
+def special_acceleration(chance, top, start):
+    """Return nothing, free fall, a reversal, a push, or one along the axis of the start."""
+    g, size = top.gravity, chance.choice((1, -1)) * 10 ** chance.uniform(-12, 2)
+    axis = np.array((math.sin(start.theta) * math.cos(start.phi),
+                     math.sin(start.theta) * math.sin(start.phi), math.cos(start.theta)))
+    return chance.choice((
+        NOWHERE, (0.0, 0.0, -g), (0.0, 0.0, -2 * g), (0.0, 0.0, size), (size, 0.0, 0.0),
+        tuple(chance.uniform(-9, 9) for _ in range(3)), (0.0, size, -g),
+        tuple((size * axis - (0.0, 0.0, g)).tolist())))
+
+
+def test_random_tops_go_on_where_they_were():
+    for seed in range(150):
+        case, chance, worst = random_case(seed), random.Random(seed), 0.0
+        pieces = [(int(10 ** chance.uniform(3, 9.5)),
+                   special_acceleration(chance, case.top, case.start)) for _ in range(6)]
+        ride = Ride(case.top, case.start, PivotPath(pieces), 10 ** 11)
+        for k, piece in enumerate(ride.pieces[:-1]):
+            before, after = ride.motions[k:k + 2]
+            length = piece.end_ns - piece.start_ns
+            one, other = before.states(range(length, length + 1)), after.states(range(1))
+            (w1, w2, _), (u1, u2, _) = one.angular_velocity[0], other.angular_velocity[0]
+            largest = max(1.0, abs(one.angular_velocity).max())
+            worst = max(worst, abs(np.subtract(
+                attitude.product(before.vertical.rows, one.rows_quaternion),
+                attitude.product(after.vertical.rows, other.rows_quaternion))).max(),
+                math.hypot(w1 - u1, w2 - u2) / largest)
+        assert worst <= BOUND, case
+
+
+def test_the_specific_force_of_a_moving_frame_is_that_in_the_world():
+    path = PivotPath([(2 * S, (3.0, -2.0, 1.0))])
+    point, step = (0.02, -0.01, 0.3), 10 ** 5
+    times = [S, S - step, S + step]
+    found = Ride(TOP, GENERAL, path, 2 * S).at(times, point)
+    middle, before, after = found.position
+    acceleration = (after - 2 * middle + before) / (step / S) ** 2
+    q = tuple(found.quaternion[:1].T)
+    force = np.array(attitude.in_body(q, acceleration + np.array((0.0, 0.0, TOP.gravity)))).ravel()
+    assert abs(force - found.force[0]).max() < 1e-5
+    at_pivot = Ride(TOP, GENERAL, path, 2 * S).at(times).force
+    assert np.linalg.norm(at_pivot, axis=1) == pytest.approx(math.hypot(3.0, 2.0, 10.80665),
+                                                             rel=1e-15)
+
+
+def test_in_free_fall_the_angular_momentum_in_the_world_is_constant():
+    path = PivotPath([(S, (0.0, 0.0, -TOP.gravity))])
+    found = Ride(TOP, GENERAL, path, S).at(range(0, S, S // 10))
+    momentum = attitude.in_world(tuple(found.quaternion.T), (
+        TOP.lambda1 * found.omega[:, 0], TOP.lambda1 * found.omega[:, 1],
+        TOP.lambda3 * found.omega[:, 2]))
+    assert max(map(np.ptp, momentum)) < 2e-15
+
+
+# The path of the pivot
+
+SQUARE = [(0.0, 0.0, 0.5), (1.1, 0.0, 0.5), (1.1, 1.1, 0.5), (0.0, 1.1, 0.5)]
+TRIANGLE = [(0.1, 0.2, 0.3), (1.7, 0.3, -0.4), (0.6, 2.1, 0.9)]
+
+
+def test_pieces_of_constant_acceleration_are_parabolas_that_join():
+    pieces = [(S, (1.0, 0.0, 0.5)), (2 * S, (0.0, -3.0, 0.0)), (S // 2, (-2.0, 6.0, 0.25))]
+    path = PivotPath(pieces, position=(1.0, 2.0, 3.0), velocity=(0.0, 0.5, 0.0), start_ns=S)
+    found = kinematics(path, np.array([1, 2, 4]) * S)
+    assert found.position.tolist() == [[1.0, 2.0, 3.0], [1.5, 2.5, 3.25], [3.5, -2.5, 4.25]]
+    assert found.velocity.tolist() == [[0.0, 0.5, 0.0], [1.0, 0.5, 0.5], [1.0, -5.5, 0.5]]
+    # The acceleration at a boundary is that of the piece which begins.
+    assert found.acceleration.tolist() == [[1.0, 0.0, 0.5], [0.0, -3.0, 0.0], [-2.0, 6.0, 0.25]]
+    assert changes(path, 0 + S, 10 * S) == [S, 2 * S, 4 * S, 4 * S + S // 2]
+    assert path.piece(5 * S)[:3] == (4 * S + S // 2, NEVER_NS, REST)
+    coasting = kinematics(path, np.array([5, 105]) * S)
+    assert (np.diff(coasting.position, axis=0) == 100.0 * coasting.velocity[0]).all()
+
+
+@pytest.mark.parametrize('waypoints', [SQUARE, TRIANGLE, TRIANGLE[:2]])
+def test_a_repeated_path_closes_exactly(waypoints):
+    path = PivotPath.through(waypoints, speed=0.7, acceleration=1.3, repeat=True)
+    piece, ends = path.piece(0), []
+    while len(ends) < len(waypoints):
+        piece = path.piece(piece.end_ns)
+        if not kinematics(path, range(piece.start_ns, piece.start_ns + 1)).velocity.any():
+            ends.append(piece.start_ns)
+    cycle = ends[-1]
+    for times in (0, cycle // 3, ends[0], cycle - 1):
+        once, late = (kinematics(path, [t]) for t in (times, times + 10 ** 15 // cycle * cycle))
+        assert all(map(np.array_equal, once, late))
+    corners = kinematics(path, np.array([0, *ends]))
+    assert abs(corners.position - [*waypoints, waypoints[0]]).max() <= 4e-16
+    assert not corners.velocity.any()
+
+
+def test_a_path_keeps_to_its_speed_and_acceleration():
+    for distance in (0.01, 1.0, 1000.0):
+        path = PivotPath.through([NOWHERE, (0.0, distance, 0.0)], speed=2.0, acceleration=3.0)
+        ends = changes(path, 0, 10 ** 13)
+        found = kinematics(path, range(0, ends[-1] + 1, max(1, ends[-1] // 1000)))
+        assert abs(found.acceleration).max() <= 3.0 and found.velocity.max() <= 2.0 + 1e-15
+        assert found.velocity.max() == pytest.approx(min(2.0, math.sqrt(3.0 * distance)), rel=3e-3)
+        end = kinematics(path, range(ends[-1], ends[-1] + 1))
+        assert end.position[0, 1] == pytest.approx(distance, rel=1e-15)
+        assert not end.velocity.any()
+        ideal = distance / 2.0 + 2.0 / 3.0 if distance >= 4 / 3 else 2 * math.sqrt(distance / 3.0)
+        assert 0 <= ends[-1] - ideal * S <= 4
+
+
+def test_a_commanded_velocity_is_reached_by_one_acceleration():
+    path = PivotPath.to_velocity((0.3, -0.2, 0.1), most_acceleration=0.7, position=(1.0, 0.0, 0.0),
+                                 velocity=(0.1, 0.1, 0.1), start_ns=5 * S)
+    begin, end = changes(path, 5 * S, 100 * S)
+    assert begin == 5 * S and end - begin == math.ceil(math.hypot(0.2, 0.3) / 0.7 * S)
+    found = kinematics(path, np.array([begin, end, 90 * S]))
+    assert found.velocity[1:].tolist() == [[0.3, -0.2, 0.1]] * 2
+    assert found.position[0].tolist() == [1.0, 0.0, 0.0]
+    assert np.linalg.norm(found.acceleration[0]) == pytest.approx(0.7, rel=1e-8)
+    assert not found.acceleration[1:].any()
+    same = PivotPath.to_velocity((1.0, 0.0, 0.0), most_acceleration=1.0, velocity=(1.0, 0.0, 0.0))
+    assert changes(same, 0, S) == [0]
+    assert kinematics(same, [S]).position.tolist() == [[1.0, 0.0, 0.0]]
+
+
+def test_a_commanded_velocity_ends_in_a_stop():
+    for stop_ns, places in ((10 * S, [0, S, 10 * S, 11 * S]), (S // 2, [0, S // 2, S])):
+        path = PivotPath.to_velocity((2.0, 0.0, 0.0), most_acceleration=2.0, stop_ns=stop_ns)
+        assert changes(path, 0, 20 * S) == places
+        assert not kinematics(path, [places[-1]]).velocity.any()
+        area = 2.0 * 10 if stop_ns == 10 * S else 0.5
+        assert kinematics(path, [15 * S]).position[0, 0] == area
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 10 ** 11), st.tuples(*3 * [st.floats(-50, 50)])),
+                min_size=1, max_size=6), st.booleans())
+def test_position_and_velocity_are_those_of_exact_arithmetic(pieces, there_and_back):
+    if there_and_back:
+        pieces = [*pieces, *((length, tuple(-x for x in a)) for length, a in pieces)]
+    path = PivotPath(pieces, repeat=there_and_back)
+    cycle = sum(length for length, _ in pieces)
+    place, velocity, now = [Fraction(0)] * 3, [Fraction(0)] * 3, 0
+    for length, a in (2 if there_and_back else 1) * pieces:
+        t = Fraction(length, S)
+        place = [p + t * v + t * t / 2 * Fraction(x) for p, v, x in zip(
+            place, velocity, a, strict=True)]
+        velocity = [v + t * Fraction(x) for v, x in zip(velocity, a, strict=True)]
+        now += length
+        # One before the boundary, where the parabola ends that leads here.
+        found = kinematics(path, np.array([now - 1, now]))
+        # Sums of terms that may cancel: each is within the largest speed times the time.
+        scale = max(1.0, 50 * (cycle / S), 50 * (cycle / S) ** 2)
+        assert abs(found.position[1] - [float(x) for x in place]).max() <= 1e-15 * scale
+        assert abs(found.velocity[1] - [float(x) for x in velocity]).max() <= 1e-15 * scale
+        assert abs(np.diff(found.position, axis=0)).max() <= 1e-15 * scale + 2e-9 * (
+            1e2 * cycle / S + 1)
+
+
+@pytest.mark.parametrize('make, words', [
+    (lambda: PivotPath([(0, NOWHERE)]), 'duration = 0 ns'),
+    (lambda: PivotPath([(1.5, NOWHERE)]), 'duration = 1.5 ns'),
+    (lambda: PivotPath([(1, (0.0, math.nan, 0.0))]), 'acceleration = .*nan'),
+    (lambda: PivotPath([(1, (0.0, 1.0))]), 'acceleration = .*three finite'),
+    (lambda: PivotPath([(S, (1.0, 0.0, 0.0))], repeat=True), 'changes the velocity by .1.0'),
+    (lambda: PivotPath([], velocity=(math.inf, 0.0, 0.0)), 'velocity = .*inf'),
+    (lambda: PivotPath.through([NOWHERE], speed=1.0, acceleration=1.0), 'two different points'),
+    (lambda: PivotPath.through([NOWHERE, (1.0, 0.0, 0.0)], speed=0.0, acceleration=1.0),
+     'speed = 0.0'),
+    (lambda: PivotPath.to_velocity((1e300, 0.0, 0.0), most_acceleration=1.0), 'lasts 1e'),
+    (lambda: PivotPath.to_velocity(NOWHERE, most_acceleration=-1.0), 'most_acceleration = -1.0'),
+    (lambda: PivotPath([], start_ns=7).piece(6), 't = 6 ns'),
+])
+def test_a_bad_path_is_refused_in_words(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
