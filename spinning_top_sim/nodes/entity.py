@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.nodes.simulation_standard import RefusedError
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.pivot import Kinematics
 from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
@@ -22,8 +23,9 @@ SMALLEST_LENGTH, SMALLEST_SPEED, LENGTH_ERROR = 1e-6, 1e-6, 1e-3
 UNSUPPORTED, INVALID_POSE = 0, 101      # of Result and SetEntityState
 
 
-def fill_state(message: Message, states: States, stamp_ns: int, frame: str) -> None:
-    """Write a state (n = 1) into an EntityState, in the world frame; the pivot is at rest."""
+def fill_state(message: Message, states: States, pivot: Kinematics, stamp_ns: int,
+               frame: str) -> None:
+    """Write a state (n = 1) and what the pivot does into an EntityState, in the world frame."""
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
     message.header.frame_id = frame
@@ -33,7 +35,10 @@ def fill_state(message: Message, states: States, stamp_ns: int, frame: str) -> N
             (message.twist.angular, attitude.in_world(rotation, states.rows_angular_velocity),
              'xyz'),
             (message.acceleration.angular,
-             attitude.in_world(rotation, states.rows_angular_acceleration), 'xyz')):
+             attitude.in_world(rotation, states.rows_angular_acceleration), 'xyz'),
+            (message.pose.position, pivot.position, 'xyz'),
+            (message.twist.linear, pivot.velocity, 'xyz'),
+            (message.acceleration.linear, pivot.acceleration, 'xyz')):
         for name, column in zip(names, rows, strict=True):
             setattr(target, name, float(column[0]))
 

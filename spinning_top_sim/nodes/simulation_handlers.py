@@ -13,6 +13,7 @@ from collections.abc import Callable, Generator
 from functools import partial
 from typing import Any
 
+import numpy as np
 from rclpy.action import ActionServer, CancelResponse
 
 from spinning_top_sim.nodes import entity
@@ -251,7 +252,8 @@ class SimulationHandlers:
     def _fill_state(self, message: Any) -> None:
         simulation = self._simulation
         with self._lock:
-            entity.fill_state(message, simulation.state(),
+            pivot = simulation.segment.pivot(np.array([self._loop.now_ns]))
+            entity.fill_state(message, simulation.state(), pivot,
                               simulation.epoch_ns + self._loop.now_ns,
                               self._node.values['world_frame'])
 
