@@ -30,6 +30,8 @@ STEP_BUDGET_NS = 2_000_000_000
 LATEST_NS = 500_000_000         # samples later than this are recorded, but not published any more
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
+# Velocities of the pivot are applied at most this often: each of them begins another motion.
+DRIVE_PERIOD_NS = 20_000_000
 # No motion begins later than a day before the stamps end.
 LAST_EPOCH_NS = LAST_STAMP_NS - 86_400 * NANOSECONDS
 
@@ -92,6 +94,7 @@ class TickLoop:
         self._stop_at_ns = 0                    # on the steady clock: when a tick gives way
         # Asked for the pivot, and not yet applied
         self._velocity: tuple[float, float, float] | None = None
+        self._drive_from_ns = 0                 # simulated time of the next velocity
         self._block_unfinished = False          # `idle` goes on with a block of samples
         self.set_pace(values)
 
@@ -243,16 +246,17 @@ class TickLoop:
 
     def drive(self, velocity: Sequence[float]) -> None:
         """
-        Let the pivot go to a velocity [m/s] from the end of the next tick on, or raise ValueError.
+        Let the pivot go to a velocity [m/s] from the end of a tick on, or raise ValueError.
 
-        Of several velocities between two ticks the last one counts.
+        Of several velocities in DRIVE_PERIOD_NS of simulated time the last one counts.
         """
         self._velocity = checked_velocity(velocity)
 
     def _apply_velocity(self) -> None:
-        velocity, self._velocity = self._velocity, None
-        if velocity is None or self.failure:
+        velocity, now_ns = self._velocity, self.now_ns
+        if velocity is None or self.failure or now_ns < self._drive_from_ns:
             return
+        self._velocity, self._drive_from_ns = None, now_ns + DRIVE_PERIOD_NS
         try:
             stop_ns = self._simulation.drive(velocity)
         except ValueError as error:
@@ -283,6 +287,7 @@ class TickLoop:
         simulation.restart(values)
         simulation.epoch_ns = epoch_ns
         self.failure = self._velocity = None
+        self._drive_from_ns = 0
         if paused is not None:
             self.paused = paused
         self.interruptions += 1
