@@ -20,7 +20,7 @@ MAG = {f'mag.{name}' for name in ('noise_density', 'random_walk', 'range', 'reso
 # What else is an error; the others of `imu` and `mag` say where it sits, how often it is read, and
 # what the flat of a bias instability of 0 would be.
 ALL_ERRORS = {name for name in parameters.BY_NAME if name.startswith(('imu.', 'mag.')) and not (
-    name.endswith(('.enabled', '.rate', '_correlation_time')))} - {
+    name.endswith(('.enabled', 'imu.rate', 'mag.rate', '_correlation_time')))} - {
         'imu.frame_id', 'imu.lever_arm', 'imu.rpy', 'imu.sampling', 'imu.bias_instability_band',
         'mag.field'}
 DEG, G = math.radians(1.0), 9.80665

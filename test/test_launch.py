@@ -179,7 +179,7 @@ def test_a_path_is_a_scene_too(installed, tmp_path):
 
 
 @pytest.mark.parametrize(('given', 'said'), [
-    ({'scene': 'nope'}, "scene = 'nope'.*one of cusp"), ({'set': 'spin.l3'}, 'NAME:=VALUE'),
+    ({'scene': 'nope'}, "scene = 'nope'.*one of braking"), ({'set': 'spin.l3'}, 'NAME:=VALUE'),
     ({'set': 'top.mass:=-1'}, r'top\.mass = -1'), ({'params_file': 'none.yaml'}, r'none\.yaml'),
     ({'set': 'use_sim_time:=true'}, 'use_sim_time is an argument of its own')])
 def test_bad_arguments_of_sim_are_named(installed, given, said):

@@ -56,7 +56,8 @@ class LowPass:
     def filtered(self, path: Path, times: range, signal: Signal) -> NDArray[np.float64]:
         """Return the filtered signal at times [ns] within a segment, (columns, n)."""
         # Samples that see this segment alone have the same nodes.
-        mixed = len(range(times.start, path.after(times.start).start_ns + self.memory_ns, times.step))
+        start_ns = path.after(times.start).start_ns
+        mixed = len(range(times.start, start_ns + self.memory_ns, times.step))
         parts = [self._sum(path, part, signal) for part in (times[:mixed], times[mixed:])
                  if len(part)]
         return np.concatenate(parts, axis=1)

@@ -62,12 +62,6 @@ class Parameter:
         """Whether the value is a double; an integer is converted."""
         return self.default is None or isinstance(self.default, float)
 
-    @property
-    def _of_strings(self) -> bool:
-        """Whether it is a list of strings; an empty default is a list of numbers."""
-        return isinstance(self.default, tuple) and bool(self.default) and isinstance(
-            self.default[0], str)
-
     def describe(self, range_too: bool = True) -> str:
         """Return text, unit, range and effect in one line."""
         return '; '.join(filter(None, (
@@ -88,8 +82,8 @@ class Parameter:
         kind = {bool: 'true or false', int: 'an integer', str: 'a string', float: 'a number',
                 type(None): 'a number'}.get(type(self.default))
         if isinstance(self.default, tuple):
-            kind = ('a list of strings' if self._of_strings
-                    else f'a list of {len(self.default) or ""} numbers'.replace('  ', ' ')
+            kind = ('a list of strings' if isinstance(self.default[0], str)
+                    else f'a list of {len(self.default)} numbers'
                     + (', or a multiple of that,' if self.is_repeated else ''))
         return f'must be {kind} {self._bounds()}'.rstrip()
 
@@ -100,8 +94,8 @@ class Parameter:
         with contextlib.suppress(TypeError, OverflowError):
             if self._is_allowed(value):
                 if isinstance(self.default, tuple):
-                    return tuple(str(item) if self._of_strings else float(item)
-                                 for item in value)
+                    kind = type(self.default[0])
+                    return tuple(map(kind, value))
                 return float(value) if self.is_double else value
         raise ValueError(f'{self.name} = {shown(value)}: {self.allowed}')
 
@@ -110,10 +104,10 @@ class Parameter:
         if isinstance(default, tuple):
             if isinstance(value, str | bytes | Mapping | Set):       # iterable, but not lists
                 return False
-            if self._of_strings:
+            if isinstance(default[0], str):
                 return all(isinstance(item, str) for item in value)
             count = len(value) // len(default) if self.is_repeated else 1
-            return len(value) == (max(count, 1) * len(default) or len(value)) and all(
+            return len(value) == max(count, 1) * len(default) and all(
                 map(self._is_in_range, value))
         if isinstance(default, bool | str):
             return isinstance(value, type(default)) and (not self.choices or value in self.choices)
@@ -206,11 +200,11 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('initial.theta_dot', 0.0, 'Nutation rate at the start', 'rad/s', -1e12, 1e12),
     _at_reset('initial.phi', 0.0, 'Precession angle at the start', 'rad', -1e12, 1e12),
     _at_reset('initial.psi', 0.0, 'Spin angle at the start', 'rad', -1e12, 1e12),
-    _at_reset('pivot.path', (), 'Path of the pivot: duration [s] and acceleration x, y, z '
-              '[m/s^2] in the world of each piece, one after the other; empty: none', '', -1e6,
-              1e8),
-    _at_reset('pivot.waypoints', (), 'Path of the pivot: x, y, z in the world of each point at '
-              'which it stops; empty: none', 'm', -1e6, 1e6),
+    _at_reset('pivot.path', 4 * (0.0,), 'Path of the pivot: duration [s] and acceleration x, y, z '
+              '[m/s^2] in the world of each piece, one after the other; zeros: none', '', -1e6,
+              1e8, is_repeated=True),
+    _at_reset('pivot.waypoints', 3 * (0.0,), 'Path of the pivot: x, y, z in the world of each '
+              'point at which it stops; zeros: none', 'm', -1e6, 1e6, is_repeated=True),
     _at_reset('pivot.speed', 1.0, 'Highest speed between the waypoints', 'm/s', above=0.0,
               maximum=FASTEST),
     _at_reset('pivot.acceleration', 1.0, 'Acceleration between the waypoints', 'm/s^2', above=0.0,
@@ -308,8 +302,8 @@ TABLE: tuple[Parameter, ...] = (
               smallest=1e-12),
     _at_reset('gnss.latency', 0.0, 'How long after its stamp a measurement is sent', 's', 0.0,
               1.0),
-    _at_reset('gnss.outages', (), 'Begin and end of each time without reception, ascending', 's',
-              0.0, LONGEST),
+    _at_reset('gnss.outages', (0.0, 0.0), 'Begin and end of each time without reception, '
+              'ascending; zeros: none', 's', 0.0, LONGEST, is_repeated=True),
     _at_reset('markers.trace_length', 4.0, 'How far back the trace of the tip goes, 0 = no trace',
               's', 0.0, 3600.0),
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
@@ -397,7 +391,7 @@ def _check_gnss(values: Mapping[str, Value]) -> None:
         raise ValueError(f'gnss.origin = {list(values["gnss.origin"])!r}: must be a latitude from '
                          '-90 to 90, a longitude from -180 to 180, and a height')
     edges = values['gnss.outages']
-    if len(edges) % 2 or any(not a < b for a, b in pairwise(edges)):
+    if any(edges) and any(not a < b for a, b in pairwise(edges)):
         raise ValueError(f'gnss.outages = {list(edges)!r}: must be begin and end of each, '
                          'ascending')
     if values['gnss.enabled'] and find_spec('pymap3d') is None:
@@ -407,16 +401,13 @@ def _check_gnss(values: Mapping[str, Value]) -> None:
 
 def pivot_path(values: Mapping[str, Value]) -> PivotPath | None:
     """Return the path of the pivot; None if it rests.  Raises ValueError."""
-    for name, count in (('pivot.path', 4), ('pivot.waypoints', 3)):
-        if len(values[name]) % count:
-            raise ValueError(f'{name} = {list(values[name])!r}: must be a multiple of {count} '
-                             'numbers')
-    path, points = (list(zip(*count * [iter(values[name])], strict=True)) for name, count in (
-        ('pivot.path', 4), ('pivot.waypoints', 3)))
+    path, points = (
+        list(zip(*count * [iter(values[name])], strict=True)) if any(values[name]) else []
+        for name, count in (('pivot.path', 4), ('pivot.waypoints', 3)))
     if not path and not points:
         return None
     if path and points:
-        raise ValueError(f'pivot.waypoints = {points!r}: must be empty with pivot.path')
+        raise ValueError(f'pivot.waypoints = {points!r}: must be zeros with pivot.path')
     for duration, *_ in path:
         if not duration >= SHORTEST_PIECE:
             raise ValueError(f'pivot.path: the duration {duration!r} s: must be >= '
