@@ -19,7 +19,6 @@ from spinning_top_sim.streams.path import Path
 from spinning_top_sim.streams.stream import Rows, Samples, Stream
 
 STEPS_IN_A_PIECE = 4
-NEVER_NS = 2 ** 63 - 1
 
 
 class Block(NamedTuple):
