@@ -9,10 +9,10 @@ from typing import Any
 
 from spinning_top_sim.nodes.pacing import SimulatedClock
 from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.physics.pivot import NEVER_NS
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams.blocks import NEVER_NS
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.simulation import checked_velocity
