@@ -15,7 +15,7 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.inspected import as_json, log_of, rewritten, told
+from helpers.inspected import as_json, log_of, rewritten, short_log, stepped_log, told
 from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.writer import Writer
 
@@ -41,16 +41,12 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def stepped(folder):
-    """Four motions by steps, with noise, in a namespace."""
-    return log_of(folder / 'stepped.mcap', '--duration', 3, '--command', '1.0:2.0:1.5',
-                  '--command', '0:1.7:1.4', '--command', '2.0031:1.6:1.0', '--namespace', '/a/b',
-                  '-p', 'imu.gyroscope_noise_density:=0.01', '-p', 'markers.enabled:=true')
+    return stepped_log(folder / 'stepped.mcap')
 
 
 @pytest.fixture(scope='module')
 def short(folder):
-    """Two motions in half a second."""
-    return log_of(folder / 'short.mcap', '--duration', 0.5, '--command', '0.3:1.7:1.4')
+    return short_log(folder / 'short.mcap')
 
 
 def surveyed(path):

@@ -6,14 +6,11 @@ What was recovered is read by rosbags, mcap-ros2-support and mcap, none of them 
 are the places of records in a file.  Children are killed for good after a timeout.
 """
 
-import functools
 import os
 import random
 import struct
-from types import SimpleNamespace
 
 import pytest
-import yaml  # type: ignore[import-untyped]
 from helpers.logs import (
     ALL_KEPT,
     CHUNKS,
@@ -31,7 +28,9 @@ from helpers.logs import (
     seen_by_mcap,
     seen_by_rosbags,
     seen_by_us,
+    small_log,
     torn,
+    without_sync,
     write_anew,
     write_log,
 )
@@ -48,30 +47,12 @@ from spinning_top_sim.recording.writer import create_file
 
 @pytest.fixture(scope='module')
 def log(tmp_path_factory):
-    """A small log of ours: bytes, messages, and (opcode, start, end) of each record."""
-    path = tmp_path_factory.mktemp('log') / 'run.mcap'
-    messages = write_log(path)
-    content = path.read_bytes()
-    records = records_of(content)
-    chunks = [record for record in records if record[0] == Opcode.CHUNK]
-    assert len(chunks) == CHUNKS
-    return SimpleNamespace(content=content, messages=messages, records=records, chunks=chunks)
+    return small_log(tmp_path_factory.mktemp('log') / 'run.mcap')
 
 
 @pytest.fixture
 def no_sync(monkeypatch):
-    """For thousands of recoveries that nobody pulls the plug on; of one YAML, parsed once."""
-    dumped, dump = {}, yaml.dump
-
-    def dump_once(value, **options):
-        key = repr((value, sorted(options)))
-        if key not in dumped:
-            dumped[key] = dump(value, **options)
-        return dumped[key]
-
-    monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
-    monkeypatch.setattr(yaml, 'dump', dump_once)
-    monkeypatch.setattr(yaml, 'safe_load', functools.cache(yaml.safe_load))
+    without_sync(monkeypatch)
 
 
 def check_with_all_readers(path, messages) -> None:

@@ -9,11 +9,9 @@ import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-from helpers.logs import ALL_KEPT, CHUNKS, FAILED, SOME_LOST, TOPICS, records_of, run, write_log
-from mcap.opcode import Opcode
+from helpers.logs import ALL_KEPT, FAILED, SOME_LOST, TOPICS, run, small_log
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import log_file
@@ -28,14 +26,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope='module')
 def log(tmp_path_factory):
-    """A small log of ours: bytes, messages, and (opcode, start, end) of each record."""
-    path = tmp_path_factory.mktemp('log') / 'run.mcap'
-    messages = write_log(path)
-    content = path.read_bytes()
-    records = records_of(content)
-    chunks = [record for record in records if record[0] == Opcode.CHUNK]
-    assert len(chunks) == CHUNKS
-    return SimpleNamespace(content=content, messages=messages, records=records, chunks=chunks)
+    return small_log(tmp_path_factory.mktemp('log') / 'run.mcap')
 
 
 def run_process(*argv, **options) -> subprocess.CompletedProcess:

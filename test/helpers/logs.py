@@ -2,11 +2,16 @@
 """Logs for the tests of `recover` and of the readers, and what three readers see in them."""
 
 import contextlib
+import functools
 import io
+import os
 import random
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
+import yaml  # type: ignore[import-untyped]
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
@@ -164,3 +169,28 @@ def write_stranger(path, options, profile='', count=300):
                 writer.add_attachment(3, 4, 'calibration.bin', 'x/y', b'\x06' * 3000)
         writer.finish()
     return messages
+
+
+def small_log(path) -> SimpleNamespace:
+    """Write a small log of ours; return bytes, messages, and (opcode, start, end) of records."""
+    messages = write_log(path)
+    content = path.read_bytes()
+    records = records_of(content)
+    chunks = [record for record in records if record[0] == Opcode.CHUNK]
+    assert len(chunks) == CHUNKS
+    return SimpleNamespace(content=content, messages=messages, records=records, chunks=chunks)
+
+
+def without_sync(monkeypatch) -> None:
+    """For thousands of recoveries that nobody pulls the plug on; of one YAML, parsed once."""
+    dumped, dump = {}, yaml.dump
+
+    def dump_once(value, **options):
+        key = repr((value, sorted(options)))
+        if key not in dumped:
+            dumped[key] = dump(value, **options)
+        return dumped[key]
+
+    monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
+    monkeypatch.setattr(yaml, 'dump', dump_once)
+    monkeypatch.setattr(yaml, 'safe_load', functools.cache(yaml.safe_load))
