@@ -7,6 +7,7 @@ or a published filter by name.
   spinning-top examine --node "python examples/attitude_node.py" --topic imu/data
   spinning-top examine --topic imu/data                      # of a node that runs already
   spinning-top examine --filter vqf --level full --page vqf.png
+  spinning-top examine --filter vqf --data broad/data_mat    # with real readings
 
 exit codes:
   0    no fault was found
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from spinning_top_sim.exam.adapters import FILTERS
+from spinning_top_sim.exam.broad import examine_data, trials_in
 from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.log import NORTHS, examine_log
 from spinning_top_sim.exam.report import Report
@@ -35,7 +37,7 @@ from spinning_top_sim.tools import cli, scene_file
 
 # Options for each kind of subject.
 OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 'imu', 'seeds'),
-           '--filter': ('level', 'imu', 'seeds')}
+           '--filter': ('level', 'imu', 'seeds'), '--data': ('data',)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,6 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'and imu/mag; each run starts it anew, and waits for its answer to each sample')
     add('--filter', choices=FILTERS, metavar='NAME',
         help=f'examine a published filter: {", ".join(FILTERS)}')
+    add('--data', type=Path, metavar='FOLDER', help='examine --filter with the trials of BROAD in '
+        'this folder: readings of a real IMU beside an optical truth (.mat; .hdf5 needs h5py)')
     add('--level', choices=SEEDS, help='level of the exam of a filter or node; default: quick')
     add('--imu', metavar='NAME', help='errors of an IMU: name of an installed one, or path of '
         'a parameter file; "help" lists the names')
@@ -87,6 +91,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the given options by name.  Raises ValueError for those of another subject."""
     subject = ('a log' if arguments.log is not None else
+               '--data' if arguments.data is not None else
                '--filter' if arguments.filter is not None else 'a node')
     options = {name: value for names in OPTIONS.values() for name in names
                if (value := getattr(arguments, name)) is not None}
@@ -99,9 +104,10 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _report(arguments: argparse.Namespace) -> Report:
     if ([arguments.log, arguments.node, arguments.filter].count(None) < 2
-            or arguments.filter is arguments.topic is None):
-        raise ValueError('give either a log and --topic, --node and --topic, --topic alone, or '
-                         '--filter')
+            or arguments.filter is arguments.topic is None
+            or arguments.filter is None is not arguments.data):
+        raise ValueError('give either a log and --topic, --node and --topic, --topic alone, '
+                         '--filter, or --filter and --data')
     options = _options(arguments)
     if arguments.log is not None:
         options['north'] = options.pop('heading', None)
@@ -110,6 +116,10 @@ def _report(arguments: argparse.Namespace) -> Report:
         make_filter = FILTERS[arguments.filter]
         with needed(f'the filter {arguments.filter}'):
             make_filter()       # imports its package once, before the runs fork
+        if arguments.data is not None:
+            with cli.progress('examined', len(trials_in(arguments.data)), 'trials') as show:
+                return examine_data(make_filter, arguments.data, subject=arguments.filter,
+                                    show=show)
         return examine(make_filter, subject=arguments.filter, **options)
     before = signal.signal(signal.SIGINT, lambda *_: INTERRUPTED.set())
     try:
