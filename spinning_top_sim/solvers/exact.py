@@ -76,18 +76,18 @@ class ExactSolution:
             theta=min(abs(theta), math.pi), theta_dot=self._sign * start.theta_dot,
             phi=start.phi + self._half_turn, psi=start.psi - self._half_turn,
             l3=start.l3, lz=start.lz)
-        motion = set_up(top, self.start)
+        motion = set_up(top, Decimal(top.gravity), self.start)
         with precision(DIGITS):
-            self._take_constants(motion)
+            self._take_constants(motion, Decimal(start.l3), Decimal(start.lz))
         self._check_start()
 
-    def _take_constants(self, motion: ThetaMotion) -> None:
+    def _take_constants(self, motion: ThetaMotion, l3: Decimal, lz: Decimal) -> None:
         top, start = self.top, self.start
         self.m, self.m1 = float(motion.m), float(motion.m1)
         # 2 K/w, two quarter periods
         self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
         alpha, beta = motion.alpha, motion.beta
-        l3, lz, two_lambda1 = Decimal(start.l3), Decimal(start.lz), 2 * Decimal(top.lambda1)
+        two_lambda1 = 2 * Decimal(top.lambda1)
         bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
         in_range('the fastest rate', max(map(abs, (
             motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
