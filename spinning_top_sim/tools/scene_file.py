@@ -137,7 +137,6 @@ def parse_yaml(text: str | bytes, source: str) -> object:
 
 
 def _flatten(section: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
-    """Yield the dotted names and the values of parameters."""
     for name, value in section.items():
         if isinstance(value, Mapping):
             yield from _flatten(value, f'{prefix}{name}.')
