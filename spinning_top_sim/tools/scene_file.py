@@ -18,7 +18,6 @@ from spinning_top_sim.streams import parameters
 NODES = ('/**', '/*', 'spinning_top', '/spinning_top', '/**/spinning_top')
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
-STRING_TAG = 'tag:yaml.org,2002:str'
 
 
 class _Loader(yaml.SafeLoader):
@@ -27,9 +26,6 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, *place: object) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError('rcl supports no aliases')
-        tag = getattr(self.peek_event(), 'tag', None)
-        if tag not in (None, STRING_TAG):
-            raise yaml.YAMLError(f'the tag {tag}: must be !!str, as rcl ignores all others')
         return super().compose_node(*place)
 
 
