@@ -138,7 +138,6 @@ class ExactSolution:
         return across
 
     def describe(self) -> Description:
-        """Return the motion in the numbers that a physicist asks for."""
         top, start = self.top, self.start
         rests = axis_rests(top, start)
         low, high = 2 * (start.theta,) if rests else (self.theta_min, self.theta_max)

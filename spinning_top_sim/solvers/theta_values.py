@@ -156,7 +156,6 @@ class ThetaValues:
 
     @cached_property
     def half_theta(self) -> Matrix:
-        """Cosine and sine of theta/2, (2, n)."""
         alpha, beta = self.moduli
         scale: Column = 1.0 / np.sqrt(alpha * alpha + beta * beta)
         return self.moduli * scale
@@ -175,7 +174,6 @@ class ThetaValues:
 
     @cached_property
     def quaternion(self) -> Matrix:
-        """x, y, z, w (4, n)."""
         real, imag = self._alpha_beta
         squares = self._real * self._real + self._imag * self._imag
         scale = 1.0 / np.sqrt(squares[0] + squares[1])
@@ -211,7 +209,6 @@ class ThetaValues:
 
     @cached_property
     def theta_dot(self) -> Column:
-        """[rad/s]."""
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.
         constants, xi, (alpha, beta) = self._constants, self._xi, self.moduli
         if not constants.u_dot.any():

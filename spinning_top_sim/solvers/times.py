@@ -67,12 +67,10 @@ class Times:
 
     @classmethod
     def from_seconds(cls, t: Column) -> Times:
-        """Return the times of doubles [s]."""
         return cls('s', t.copy(), 0.0, float(np.abs(t).max(initial=0.0)))
 
     @property
     def seconds(self) -> Column:
-        """(n,) [s]."""
         return self.high if self.unit == 's' else self.high / 1e9 + self.low / 1e9
 
     def __len__(self) -> int:

@@ -62,7 +62,6 @@ class Imu:
 
     @property
     def present_sensor(self) -> 'Sensor':
-        """The sensor at the present rate."""
         return self.sensor(self.intervals.length_ns)
 
     def set_rate(self, rate: float, now_ns: int) -> bool:
@@ -158,7 +157,6 @@ class Imu:
         return (x, y, z), self.orientation(states), self.from_body((v1, v2, v3))
 
     def from_body(self, vector: Vector) -> Vector:
-        """Return a vector in the frame of the IMU."""
         # The mounting is q(body <- IMU), and `in_body` applies the inverse of its argument.
         return attitude.in_body(self._mounting, vector) if self._is_rotated else vector
 
@@ -250,7 +248,6 @@ class Sensor:
                 (v1 + f1, v2 + f2, v3 + f3))
 
     def bias(self, times: range) -> tuple[Vector, Vector]:
-        """Return the bias [rad/s], [m/s^2] at these times [ns]."""
         _, (w1, w2, w3, f1, f2, f3) = self._noise.at(times)
         return (w1, w2, w3), (f1, f2, f3)
 

@@ -102,7 +102,6 @@ class Simulation:
 
     @property
     def imu(self) -> Imu:
-        """The ideal IMU, which all streams of the IMU share."""
         return next(stream.imu for stream in self.streams if isinstance(stream, ImuStream))
 
     @property
@@ -122,12 +121,10 @@ class Simulation:
 
     @property
     def steps(self) -> int:
-        """Integration steps taken so far."""
         return self._steps_before + self.path.steps
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the right-hand side so far."""
         return self._evaluations_before + self.path.evaluations
 
     def state(self) -> States:
@@ -317,7 +314,6 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
 
 def _begun(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
            pivot: PivotPath | None) -> Segment:
-    """Return the motion from a start, unchecked."""
     step = partial(propagate, method=values['solver.method'],
                    equations=values['solver.equations'], rtol=values['solver.rtol'],
                    atol=values['solver.atol'])

@@ -37,17 +37,14 @@ class Samples:
 
     @cached_property
     def t_ns(self) -> NDArray[np.int64]:
-        """The times (n,) [ns]."""
         return np.arange(self.times.start, self.times.stop, self.times.step)
 
     @cached_property
     def segment(self) -> Segment:
-        """The segment in which they are."""
         return self.path.after(self.times.start - 1)
 
     @cached_property
     def states(self) -> States:
-        """The states in the world at these times."""
         return self.segment.states(self.times)
 
     @cached_property
@@ -84,11 +81,9 @@ class Stream:
 
     @property
     def size(self) -> int:
-        """Size of a message [bytes]."""
         return len(self.template)
 
     def apply(self, changes: Mapping[str, Any]) -> None:
-        """Take over a new rate, if it is among these parameters."""
         if self.rate_parameter in changes:
             self.period_ns = period_ns(changes[self.rate_parameter])
 

@@ -198,7 +198,6 @@ def _stamps(samples: Sequence[LogMessage]) -> Stamps:
 
 
 def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogMessage]) -> None:
-    """Compare samples of a stream with their motion."""
     stream, segment = motion.streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     stamps_ns = _stamps(fitting)
@@ -229,7 +228,6 @@ def _largest(values: Rows) -> float:
 
 
 def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topic: str) -> None:
-    """Count the messages of a topic; compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
     if report.count > 1:
         duration_ns = int(stamps_ns[-1] - stamps_ns[0])
@@ -253,7 +251,6 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
 
 
 def _measure(found: Survey, motion: MotionReport) -> None:
-    """Measure a motion from the samples of its source."""
     samples, motion.samples = motion.samples, []
     data = analysis.longest_run(samples) if samples else None
     if data is None or len(data.stamps_ns) < 2:
