@@ -12,6 +12,7 @@ from decimal import Context, Decimal, getcontext, localcontext
 from functools import lru_cache, reduce
 
 ZERO, ONE = Decimal(0), Decimal(1)
+DIGITS = 40             # that are left of long decimals once nothing cancels any more
 SMALL = Decimal('1e-9')
 # Parts of a quarter turn whose sines and cosines are tabulated.
 PARTS = 64

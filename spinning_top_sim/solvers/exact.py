@@ -18,8 +18,8 @@ from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.decimal_math import pi, precision
-from spinning_top_sim.solvers.theta_setup import DIGITS, ThetaMotion, set_up
+from spinning_top_sim.solvers.decimal_math import DIGITS, pi, precision
+from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import MOST, ThetaFunctions, ThetaValues, in_range
 from spinning_top_sim.solvers.times import LARGEST_NS, Times
 
@@ -109,7 +109,8 @@ class ExactSolution:
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""
-        start, first = self.start, ThetaValues(self._theta, Times.from_ns(range(1)))
+        start, self._at_start = self.start, ThetaValues(self._theta, Times.from_ns(range(1)))
+        first = self._at_start
         alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
@@ -186,6 +187,8 @@ class _ExactStates(States):
 
     @cached_property
     def _block(self) -> ThetaValues:
+        if len(self) == 1 and not self._times.latest:
+            return self._solution._at_start
         return ThetaValues(self._solution._theta, self._times)
 
     def _rows(self, name: str) -> NDArray[np.float64]:

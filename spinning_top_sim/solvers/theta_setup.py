@@ -53,6 +53,7 @@ from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.cubic import Roots, RootsTooCloseError, cubic_roots
 from spinning_top_sim.solvers.decimal_math import (
+    DIGITS,
     ONE,
     ZERO,
     asinh,
@@ -74,7 +75,6 @@ from spinning_top_sim.solvers.theta_series import (
 )
 
 DIGITS_TO_TRY = 60, 120, 240, 480
-DIGITS = 40             # that are left once nothing cancels any more
 NO_GRAVITY = Decimal('1e-1000')     # so small that u3 is infinite to all digits
 
 

@@ -14,6 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -22,11 +23,18 @@ from spinning_top_sim.physics.attitude import Quaternion
 from spinning_top_sim.physics.pivot import Exact
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.decimal_math import ONE, ZERO, atan2, pi, precision, sin_cos
+from spinning_top_sim.solvers.decimal_math import (
+    DIGITS,
+    ONE,
+    ZERO,
+    atan2,
+    pi,
+    precision,
+    sin_cos,
+)
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.theta_series import DIGITS_HANDED_OVER, SIN_ODD
 from spinning_top_sim.solvers.theta_setup import (
-    DIGITS,
     DIGITS_TO_TRY,
     Factor,
     HalfAngles,
@@ -128,7 +136,7 @@ class Vertical:
 
     def top(self, top: Top) -> Top:
         """Return the top in the effective gravity."""
-        return replace(top, gravity=float(self.gravity))
+        return _in_gravity(top, float(self.gravity))
 
 
 class AcceleratedMotion(ExactSolution):
@@ -172,6 +180,11 @@ class AcceleratedMotion(ExactSolution):
             across = _across(Decimal(self.top.lambda1), *self._momenta, alpha, beta, u_dot)
             alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
             return Posture(alpha, beta, across, self.start.l3)
+
+
+@lru_cache(16)
+def _in_gravity(top: Top, gravity: float) -> Top:
+    return replace(top, gravity=gravity)
 
 
 def about_vertical(top: Top, posture: Posture, acceleration: Exact,
