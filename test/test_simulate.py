@@ -124,6 +124,13 @@ def test_wrong_arguments_are_told_in_a_line_and_leave_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(('option', 'name'), [('--scene', 'wavy'), ('--imu', 'bmi088')])
+def test_help_lists_the_installed_names_without_an_output(option, name, capsys):
+    with pytest.raises(SystemExit, match='0'):
+        main([option, 'help'])
+    assert re.search(f'^{name} +[A-Z]', capsys.readouterr().out, re.MULTILINE)
+
+
 @pytest.mark.parametrize(('name', 'arguments', 'message'), [
     ('run.mcap', ['-p', 'initial.theta:=0.0', '-p', 'solver.method:=exact',
                   '--command', '0.5:2.0:1.0'],

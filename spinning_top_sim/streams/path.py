@@ -210,11 +210,15 @@ class Path:
 
     def exact_points(self, times_ns: NDArray[np.int64], along: float) -> NDArray[np.float64]:
         """Return where a point of the axis is at ascending times (n,) [ns], (n, 3)."""
+        return np.concatenate([np.stack(segment.exact_point(times, along), axis=-1)
+                               for segment, times in self._shares(times_ns)])
+
+    def _shares(self, times_ns: NDArray[np.int64]) -> list[tuple[Segment, NDArray[np.int64]]]:
+        """Return the segments at ascending times (n,) [ns], with those of each."""
         # A segment ends with the command that begins the next one, that instant included.
         ends = np.searchsorted(times_ns, [one.start_ns for one in self._segments[1:]], 'right')
-        return np.concatenate([
-            np.stack(segment.exact_point(times, along), axis=-1) for segment, times in zip(
-                self._segments, np.split(times_ns, ends), strict=True) if len(times)])
+        return [(segment, times) for segment, times in zip(
+            self._segments, np.split(times_ns, ends), strict=True) if len(times)]
 
     def pieces(self, begin_ns: int, end_ns: int) -> list[tuple[Segment, int, int]]:
         """Return the segments between two times [ns], and where each begins and ends there."""
@@ -225,10 +229,9 @@ class Path:
 
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at ascending times (n,) [ns], those before now too."""
-        ends = np.searchsorted(times_ns, [one.start_ns for one in self._segments[1:]], 'right')
+        shares = self._shares(times_ns) or [(self._segments[-1], times_ns)]
         return Kinematics(*(np.concatenate(parts, axis=1) for parts in zip(*(
-            segment.pivot(times) for segment, times in zip(
-                self._segments, np.split(times_ns, ends), strict=True)), strict=True)))
+            segment.pivot(times) for segment, times in shares), strict=True)))
 
     def increments(self, begin_ns: int, end_ns: int, point: Point, count: int = 1,
                    step_ns: int = 1) -> Increments:

@@ -20,6 +20,7 @@ from spinning_top_sim.solvers.vertical import (
     Posture,
     about_vertical,
     posture_of,
+    rounded,
 )
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
@@ -327,6 +328,7 @@ def _begun(top: Top, start: State | Posture, start_ns: int, values: Mapping[str,
         solver = AcceleratedMotion(top, posture, piece.acceleration)
         vertical, state = solver.vertical, solver.start
     else:
-        vertical, state = about_vertical(top, posture, piece.acceleration)
+        vertical, halves = about_vertical(top, posture, piece.acceleration)
+        state = rounded(halves)
         solver = step(vertical.top(top), state)
     return Segment(solver, state, start_ns, Ride(top, vertical, piece))

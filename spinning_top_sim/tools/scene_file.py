@@ -4,9 +4,9 @@
 import argparse
 import difflib
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -41,17 +41,33 @@ for _type, _pattern in (
     _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_type}', re.compile(f'({_pattern})$'), None)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options --scene and --imu."""
+class _Name(argparse.Action):
+    """The name of an installed file; "help" prints the names and exits, as --help does."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
+                 value: Any, option: str | None = None) -> None:
+        if value == 'help':
+            for stem, path in parameter_files(self.dest).items():
+                # The first sentence of the comment at the head, behind the licence.
+                text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
+                                if line.startswith('# '))
+                print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
+            parser.exit()
+        setattr(namespace, self.dest, value)
+
+
+def add_arguments(parser: argparse.ArgumentParser, *kinds: str) -> None:
+    """Add the options --scene and --imu, or one of them."""
     for kind, what in (('scene', 'top and start of a scene'), ('imu', 'errors of an IMU')):
-        parser.add_argument(
-            f'--{kind}', metavar='NAME', help=f'{what}: the name of one that is installed, or the '
-            'path of a parameter file; "help" lists the names')
+        if kind in (kinds or ('scene', 'imu')):
+            parser.add_argument(
+                f'--{kind}', metavar='NAME', action=_Name, help=f'{what}: the name of one that is '
+                'installed, or the path of a parameter file; "help" lists the names')
 
 
 def chosen_files(arguments: argparse.Namespace) -> list[Path]:
     """
-    Return the parameter files of --scene and --imu; exit after the list that "help" asks for.
+    Return the parameter files of --scene and --imu.
 
     Raises ValueError for a name that is not there.
     """
@@ -61,13 +77,6 @@ def chosen_files(arguments: argparse.Namespace) -> list[Path]:
         if name is None:
             continue
         files = parameter_files(kind)
-        if name == 'help':
-            for stem, path in files.items():
-                # The first sentence of the comment at the head, behind the licence.
-                text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
-                                if line.startswith('# '))
-                print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
-            sys.exit()
         if name not in files and '/' not in name and not name.endswith('.yaml'):
             raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
                              f'{", ".join(files)}')

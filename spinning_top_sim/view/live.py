@@ -129,7 +129,7 @@ class LiveView(Node):
                 self._controls.tell_status(status.message, numbers)
                 origin_ns = int(numbers['stamp of t = 0 [ns]'])
                 if self._origin_ns not in (None, origin_ns):
-                    self._stale = True      # not `|=`: another thread may set it meanwhile
+                    self._stale = True      # not `|=`: that could undo what `choose` writes
                 self._origin_ns = origin_ns
                 self._errors = float(numbers['energy drift']), float(
                     numbers['orientation error [rad]'])
