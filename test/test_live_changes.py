@@ -44,14 +44,14 @@ def test_late_samples_are_recorded_and_counted_but_not_published(ahead):
     simulation.advance(0)
     if ahead:
         simulation.prepare(SECOND)
-    assert simulation.advance(10 * SECOND, publish_from_ns=9 * SECOND + 1)
+    assert simulation.advance(10 * SECOND, publish_from_ns=9 * SECOND)
     assert times(recorded, 'pose') == list(range(0, 10 * SECOND + 1, PERIOD_NS))
     for topic in ('pose', 'joint_states'):
-        assert [name for name, _ in published].count(topic) == 101
-        assert (output(simulation, topic).sent, output(simulation, topic).skipped) == (101, 900)
+        assert [name for name, _ in published].count(topic) == 102
+        assert (output(simulation, topic).sent, output(simulation, topic).skipped) == (102, 899)
     assert encoded['pose'].count == 1001
     if not ahead:       # nobody takes the samples that are left out
-        assert encoded['joint_states'].count == 101
+        assert encoded['joint_states'].count == 102
 
 
 @pytest.mark.parametrize(('before', 'after'), [(100.0, 33.0), (10000.0, 10.0)])
