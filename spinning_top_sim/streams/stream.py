@@ -68,7 +68,12 @@ class Stream:
     fields : returns the numbers that go into the fields of `template`
     timing : the timing faults of its messages
     rate_parameter : name of the parameter that is its rate
+    late_ns : time from a sample to its message [ns]
+    silences_ns : begin and end of the times without messages [ns]
     """
+
+    late_ns = 0
+    silences_ns: Sequence[tuple[int, int]] = ()
 
     def __init__(self, values: Mapping[str, Any], parameter: str, topic: str, type_name: str,
                  template: Template, fields: Callable[[Samples], Sequence[Field]] = lambda _: (),

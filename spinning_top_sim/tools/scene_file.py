@@ -65,6 +65,25 @@ def add_arguments(parser: argparse.ArgumentParser, *kinds: str) -> None:
                 'installed, or the path of a parameter file; "help" lists the names')
 
 
+def add_parameters(parser: argparse.ArgumentParser) -> None:
+    """Add the options --scene, --imu, --params and -p."""
+    add_arguments(parser)
+    parser.add_argument('--params', metavar='FILE', action='append', default=[],
+                        help='parameter file as for the node; may be repeated')
+    parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
+                        help='one parameter; may be repeated')
+
+
+def given(arguments: argparse.Namespace) -> dict[str, object]:
+    """Return the parameters that these options give, not checked.  Raises as `read_scene`."""
+    values: dict[str, object] = {}
+    for path in (*chosen_files(arguments), *arguments.params):
+        values.update(read_scene(path))
+    values.update((name, value) for name, value in map(parse_assignment, arguments.param)
+                  if not is_of_ros(name))
+    return values
+
+
 def chosen_files(arguments: argparse.Namespace) -> list[Path]:
     """
     Return the parameter files of --scene and --imu.
