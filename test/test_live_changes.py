@@ -75,6 +75,7 @@ def test_a_change_of_rates_reaches_every_stream():
     assert at_once == {name for name in parameters.BY_NAME if name.endswith('.rate')
                        and not name.startswith('imu.vibration')}
     assert all(parameters.BY_NAME[name].effect is parameters.Effect.NOW for name in at_once)
+    simulation.apply({'imu.rate': 100.0})
     simulation.advance(SECOND)
     simulation.apply({**dict.fromkeys(at_once, 50.0), 'tick_rate': 100.0})
     taken = record(simulation)
@@ -82,7 +83,7 @@ def test_a_change_of_rates_reaches_every_stream():
     for one in simulation.streams:
         assert times(taken, one.topic) == list(range(SECOND + 20 * MILLISECOND, 2 * SECOND + 1,
                                                      20 * MILLISECOND)), one.topic
-    assert simulation.history == [(SECOND, 50.0)], 'the rate of the IMU'
+    assert simulation.history == [(0, 100.0), (SECOND, 50.0)], 'the rates of the IMU'
 
 
 @pytest.mark.parametrize(('l3', 'lz', 'named'), [
