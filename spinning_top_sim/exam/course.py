@@ -25,6 +25,9 @@ WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its answer; the 
 NEVER_ZERO = 1e-6
 KICK_S, KICK = 0.1, np.radians((0.7, 0.0, 0.7))     # of the gyroscope only; axes of the world
 
+# Limits of a right filter; docs/exam.md compares them with the values of filters.
+TILT, HEADING = np.radians(0.3), np.radians(0.8)    # rms errors [rad]
+
 
 class Course(NamedTuple):
     """
@@ -169,3 +172,18 @@ def untilted(run: Run) -> Run:
     true = Rotation.from_quat(run.truth)
     level = Rotation.from_euler('z', true.as_euler('ZYX')[:, :1])
     return replace(run, magnetometer=level.inv().apply(true.apply(run.magnetometer)))
+
+
+class Clean(NamedTuple):
+    """Errors without noise, rms [rad]: at rest, and in motion."""
+
+    tilt: float
+    heading: float
+    tilt_moving: float
+    heading_moving: float
+
+    @property
+    def wrong(self) -> bool:
+        """Whether one is larger than that of a right filter."""
+        return (max(self.tilt, self.tilt_moving) > TILT
+                or max(self.heading, self.heading_moving) > HEADING)

@@ -177,7 +177,7 @@ class _Exam:
     """The runs of one exam, and what they show."""
 
     finer: Sequence[float] = FINER
-    judges_covariance = True
+    judges_covariance = restarts = True
 
     def __init__(self, subject: _NewFilter, seeds: Sequence[int]) -> None:
         self._subject, self._seeds, self._imu = subject, seeds, subject.imu
@@ -251,7 +251,8 @@ class _Exam:
 
     def _identify(self) -> None:
         """Name the causes that show in the answers to single inputs; they are undone from now."""
-        self._responses = found = Responses(self._subject.follow, self._imu, self._absolute)
+        self._responses = found = Responses(
+            self._subject.follow, self._imu, self._absolute, self.restarts)
         try:
             found.identify()
         finally:
@@ -359,7 +360,7 @@ class _OneFilterExam(_Exam):
 
     finer = FINER[:1]
     # After minutes of learning the bias the filter is too sure of it when the motion changes.
-    judges_covariance = False
+    judges_covariance = restarts = False
 
     def sit(self, extra: Sequence[Scenario]) -> None:
         """Do all runs."""

@@ -12,9 +12,10 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import measures, scenarios
@@ -22,7 +23,9 @@ from spinning_top_sim.exam.course import (
     ANSWER_S,
     EARLY,
     LATEST,
+    TILT,
     WHOLE,
+    Clean,
     Gyroscope,
     axes,
     course,
@@ -54,10 +57,10 @@ from spinning_top_sim.exam.trial import ChangeReadings, InvalidOutputError, Outc
 BIAS = np.array((0.01, -0.01, 0.02))    # of the gyroscope [rad/s]; its norm is 1.4 deg/s
 
 # Limits; docs/exam.md compares them with the values of filters.
-TILT, HEADING = np.radians(0.3), np.radians(0.8)    # rms errors [rad]
 SCATTER = 0.05                  # share of squared increments that a good matrix leaves
 GAIN, GROSS_GAIN = 0.03, 0.25   # by which the gyroscope's matrix differs from the identity
-LIKELY = 5                      # signed permutations of the accelerometer that are tried
+LIKELY = 6                      # signed permutations of a sensor that are tried
+START = 50                      # samples after which a filter that starts has an attitude
 SURE = 0.2                      # of the largest error that explains: nothing else is tried
 WORST = 30.0                    # condition of a matrix that can be undone
 STAYS = 0.98                    # of a kick
@@ -76,21 +79,6 @@ ONE_STEP = (        # no fault: the filter corrects before it takes the step
     Hypothesis((), 'a step ahead', read=lambda q: moved(q, -1)))
 
 
-class Clean(NamedTuple):
-    """Errors without noise, rms [rad]: at rest, and in motion."""
-
-    tilt: float
-    heading: float
-    tilt_moving: float
-    heading_moving: float
-
-    @property
-    def wrong(self) -> bool:
-        """Whether one is larger than that of a right filter."""
-        return (max(self.tilt, self.tilt_moving) > TILT
-                or max(self.heading, self.heading_moving) > HEADING)
-
-
 Tried = tuple[Hypothesis, Outcome]
 
 
@@ -106,11 +94,13 @@ class Responses:
         Its place and field count.
     absolute : bool
         Whether the heading can be judged.
+    restarts : bool
+        Whether each run has a new filter.
     """
 
     def __init__(self, follow: Callable[[Run, Sequence[Hypothesis]], Outcome],
-                 imu: Mapping[str, Any], absolute: bool) -> None:
-        self._follow, self._absolute = follow, absolute
+                 imu: Mapping[str, Any], absolute: bool, restarts: bool) -> None:
+        self._follow, self._absolute, self._restarts = follow, absolute, restarts
         self.course = course(imu, scenarios.SLOW.rate)
         self.faults: list[Fault] = []
         self.undone: list[Hypothesis] = []
@@ -236,13 +226,14 @@ class Responses:
         """Try signs, axes and scales of the accelerometer that fit the verticals at rest."""
         if self.clean(self.outcome).tilt < TILT:
             return iter(())
-        said, true = (Rotation.from_quat(rows[self.course.rests]).inv().apply((0.0, 0.0, 1.0))
-                      for rows in (self.outcome.estimates, self.outcome.run.truth))
+        attitudes, rows = self._at_rest()
+        said, true = (turns.inv().apply((0.0, 0.0, 1.0)) for turns in (
+            attitudes, Rotation.from_quat(self.course.run.truth[rows])))
         name = 'accelerometer'
         likely = sorted(SIGNED, key=lambda one: -float(np.sum(said * (true @ one.T))))[:LIKELY]
         # said x (matrix true) = 0
-        rows = np.einsum('ijk,nj,nl->nikl', LEVI_CIVITA, said, true).reshape(-1, 9)
-        matrix = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+        products = np.einsum('ijk,nj,nl->nikl', LEVI_CIVITA, said, true).reshape(-1, 9)
+        matrix = np.linalg.svd(products)[2][-1].reshape(3, 3)
         matrix *= 3.0 ** 0.5 * np.sign(np.sum(said * (true @ matrix.T)))
         tried = [GRAVITY_SIGN, *(Hypothesis(
             (f'{name}_wiring',), f'with {axes(one)} of the {name} for its x, y, z',
@@ -256,13 +247,22 @@ class Responses:
                   for by in (scenarios.GRAVITY, 1.0 / scenarios.GRAVITY)]
         return self._tried(tried)
 
+    def _at_rest(self) -> tuple[Rotation, NDArray[np.intp]]:
+        """Return attitudes at rest, at the end and of filters that start there, and the rows."""
+        rests = self.course.rests
+        said = list(self.outcome.estimates[rests])
+        if self._restarts:
+            said += [self._answer((), self.course.run.part(slice(row - START, row))).estimates[-1]
+                     for row in rests]
+        return Rotation.from_quat(said), np.resize(rests, len(said))
+
     def _of_axes(self) -> Iterator[Tried]:
         """Try signs and axes of the magnetometer that fit the headings at rest best."""
         before, name = self.clean(self.outcome), 'magnetometer'
         if not self._absolute or max(before.tilt, before.heading) < TILT:
             return iter(())
-        said = Rotation.from_quat(self.outcome.estimates[self.course.rests])
-        field = self.course.run.magnetometer[self.course.rests]
+        said, rows = self._at_rest()
+        field = self.course.run.magnetometer[rows]
 
         def north(one: Reals) -> float:
             there = said.apply(field @ one.T)
@@ -272,7 +272,7 @@ class Responses:
             Hypothesis((f'{name}_wiring',), 'with the field of a level sensor', given=untilted),
             *(Hypothesis((f'{name}_wiring',), f'with {axes(one)} of the {name} for its x, y, z',
                          given=mapped(name, one.T))
-              for one in sorted(SIGNED, key=north, reverse=True))))
+              for one in sorted(SIGNED, key=north, reverse=True)[:LIKELY])))
 
     def _of_field(self) -> Iterator[Tried]:
         """Try a hard iron, scales and units of the magnetometer."""
