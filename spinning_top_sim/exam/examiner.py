@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import diagnosis, measures, scenarios
 from spinning_top_sim.exam.diagnosis import Fault, Hypothesis
+from spinning_top_sim.exam.field import examine_field
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.report import Report
@@ -33,7 +34,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
 
 # Seeds of the noisy runs.
-SEEDS = {'quick': range(3), 'full': range(10)}
+SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
 # Gyroscope bias [rad/s]; its norm is 1.4 deg/s.
 BIAS = np.array((0.01, -0.01, 0.02))
 BIASED = replace(scenarios.PIVOT, name='bias', duration=120.0, rate=25.0)
@@ -69,8 +70,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     make_filter : callable
         Returns a new filter: its class, a function, or one of `adapters.FILTERS`.  It is called
         for every run.
-    level : {'quick', 'full'}
-        'full' has more seeds and motions.
+    level : {'quick', 'full', 'field'}
+        'full' has more seeds and motions, and a seed of the scenes of 'field'.
     imu : mapping or path, optional
         Parameters imu.* and mag.* by name, or the path of a parameter file such as those in
         config/imu.  The default, `scenarios.CALIBRATED`, is the noise of a calibrated device.
@@ -104,9 +105,18 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     values = _imu_parameters(imu)
     numbers = list(SEEDS[level]) if seeds is None else _seed_numbers(seeds)
+    in_field = partial(examine_field, make_filter, subject=subject,
+                       imu=None if imu is None else values,
+                       feed=feed_apart if isolated else feed)
+    if level == 'field':
+        if not restart:
+            raise ValueError("level = 'field': the filter must be made anew for each scene")
+        return in_field(numbers)
     exam = (_Exam(_NewFilter(make_filter, feed_apart if isolated else feed, values), numbers)
             if restart else _OneFilterExam(_OneFilter(cache(make_filter), feed, values), numbers))
     exam.sit(EXTRA if level == 'full' else ())
+    if level == 'full' and restart and exam.outcomes:
+        exam.measures |= in_field(numbers[:1]).measures
     return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
                   tuple(diagnosis.one_of_each(exam.faults)), exam.measures, exam.outcomes)
 
