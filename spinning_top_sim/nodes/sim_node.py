@@ -46,7 +46,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _interface() -> Iterator[str]:
-    """Yield the lines about topics, services and parameters."""
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
     yield INTERFACE
     for *_, text in parameters.STREAM_DEFAULTS:
