@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.exam import diagnosis, measures, scenarios
 from spinning_top_sim.exam.course import increments
 from spinning_top_sim.exam.diagnosis import Fault, Hypothesis
+from spinning_top_sim.exam.field import examine_field
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.report import Report
@@ -35,7 +36,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
 
 # Seeds of the noisy runs.
-SEEDS = {'quick': range(3), 'full': range(10)}
+SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
 # Sampling rates for the order of convergence, as multiples of the rate of the fast motion.
 FINER = (1.0, 2.0)
 FIELD_ASKED = 200, 1000     # updates after which a filter has shown whether it uses the field
@@ -70,8 +71,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     make_filter : callable
         Returns a new filter: its class, a function, or one of `adapters.FILTERS`.  It is called
         for every run.
-    level : {'quick', 'full'}
-        'full' has more seeds and motions.
+    level : {'quick', 'full', 'field'}
+        'full' has more seeds and motions, and a seed of the scenes of 'field'.
     imu : mapping or path, optional
         Parameters imu.* and mag.* by name, or the path of a parameter file such as those in
         config/imu.  The default, `scenarios.CALIBRATED`, is the noise of a calibrated device.
@@ -105,9 +106,18 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     values = _imu_parameters(imu)
     numbers = list(SEEDS[level]) if seeds is None else _seed_numbers(seeds)
+    in_field = partial(examine_field, make_filter, subject=subject,
+                       imu=None if imu is None else values,
+                       feed=feed_apart if isolated else feed)
+    if level == 'field':
+        if not restart:
+            raise ValueError("level = 'field': the filter must be made anew for each scene")
+        return in_field(numbers)
     exam = (_Exam(_NewFilter(make_filter, feed_apart if isolated else feed, values), numbers)
             if restart else _OneFilterExam(_OneFilter(cache(make_filter), feed, values), numbers))
     exam.sit(EXTRA if level == 'full' else ())
+    if level == 'full' and restart and exam.outcomes:
+        exam.measures |= in_field(numbers[:1]).measures
     return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
                   tuple(diagnosis.one_of_each(exam.faults)), exam.measures, exam.outcomes)
 
@@ -326,7 +336,7 @@ class _Exam:
         for outcome in outcomes:
             said, true = map(increments, (outcome.estimates, outcome.run.truth))
             answers.append(float(np.sum(said * true) / np.sum(true * true)))
-        if len(answers) < 2 or abs(answers[-1] / answers[0] - 1.0) < STEP:
+        if abs(answers[-1] - answers[0]) <= STEP * abs(answers[0]):
             return
         # A wrong step turns up as a wrong scale at one rate.
         self.faults = [fault for fault in self.faults if not (

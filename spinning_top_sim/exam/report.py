@@ -28,6 +28,8 @@ MEANINGS = {
     'bias_found': 'share of the bias in the estimate',
     'nees': 'error^2 of the tilt over its covariance; right from nees_low to nees_high',
     'nees_attitude': 'the same of the whole attitude',
+    'field_rms_deg': 'in scenes of the field, in motion: mean over the scenes',
+    'field_heading_rms_deg': 'heading alone', 'field_tilt_rms_deg': 'tilt alone',
     'data_rms_deg': 'of real readings in motion, mean over the trials',
     'data_heading_rms_deg': 'heading alone', 'data_tilt_rms_deg': 'tilt alone'}
 
