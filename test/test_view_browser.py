@@ -46,6 +46,13 @@ def apart(shown, orientation):
 
 
 @pytest.fixture(scope='module')
+def ride(tmp_path_factory):
+    path = tmp_path_factory.mktemp('view') / 'shuttle.mcap'
+    assert simulate.main(['--scene', 'shuttle', '--duration', '2', '-o', str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope='module')
 def log(tmp_path_factory):
     path = tmp_path_factory.mktemp('view') / 'cusp.mcap'
     assert simulate.main(['--params', str(ROOT / 'config/cusp.yaml'), '--duration', '6', '-o',
@@ -97,6 +104,14 @@ def test_live(browser, peer, tmp_path):
             visit.tick('torque')
             visit.wait("[...document.querySelectorAll('.top-legend')].some("
                        "e => e.textContent.includes('torque'))")
+
+            # The pad pushes the pivot: the ground moves under it.
+            visit.press('+x')
+            visit.read(r'pivot: 0\.5, 0 m/s')
+            visit.read('The pivot moves')
+            visit.read(r'Pivot\s+0\.\d+, 0, 0')
+            assert visit.place('/ground')[0] < 0.0 == visit.place('/ground')[1]
+            assert visit.place('/top0') == [0, 0, 0]
 
             # A chosen scene is another top, from its start.
             visit.choose('scene', 'wavy')
@@ -173,3 +188,13 @@ def test_file_without_a_network(browser, log, tmp_path):
             " !== 'translate(46 0)'")
         assert visit.errors == []
         assert visit.hosts <= {'', None}
+
+
+def test_a_file_of_a_ride_moves_the_ground(browser, ride, tmp_path):
+    page = tmp_path / 'ride.html'
+    assert command.main([str(ride), '--html', str(page)]) == 0
+    with Visit(browser, str(page), offline=True, framed=True) as visit:
+        visit.read('The pivot moves')
+        visit.wait("window.__viserMutable.nodePoseData['/ground'].position[0] < -0.1")
+        assert visit.place('/top0') == [0, 0, 0]
+        assert visit.errors == []
