@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.reference import RIDES, scene_parameters
 from helpers.simulations import play, stream
+from numpy.lib.stride_tricks import sliding_window_view
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.solvers.vertical import AcceleratedMotion
@@ -63,7 +64,7 @@ def test_live_and_offline_agree_to_the_last_bit(values):
 
 
 @pytest.mark.parametrize(('method', 'arm', 'seconds'), [
-    ('exact', (0.0, 0.0, 0.0), 60), ('rk45', (0.1, -0.2, 0.3), 12)])
+    ('exact', (0.1, -0.2, 0.3), 60), ('rk45', (0.0, 0.0, 0.0), 12)])
 def test_increments_along_a_shuttle_add_up_to_its_motion(method, arm, seconds):
     simulation = simulation_of(**{
         **scene_parameters('shuttle'), 'solver.method': method, 'increments.enabled': True,
@@ -74,17 +75,37 @@ def test_increments_along_a_shuttle_add_up_to_its_motion(method, arm, seconds):
         for one, _, rows in block.parts:
             taken[one.topic].append(np.hstack(one.template.decode(rows.tobytes())))
     turns, pushes, truth = (np.vstack(taken[topic]) for topic in taken)
-    place, q, v = truth[0, :3], tuple(truth[0, 3:7, np.newaxis]), world(truth[0])
+    q, velocities = tuple(truth[0, 3:7, np.newaxis]), [world(truth[0])]
     dt, gravity = 1 / 200, np.array((0.0, 0.0, -9.80665))
     for turn, push in zip(turns[1:], pushes[1:], strict=True):
-        change = np.ravel(attitude.in_world(q, push)) + gravity * dt
-        place = place + dt * (v + 0.5 * change)
-        v, q = v + change, attitude.product(q, turn)
+        velocities.append(velocities[-1] + np.ravel(attitude.in_world(q, push)) + gravity * dt)
+        q = attitude.product(q, turn)
     last = truth[-1]
     assert attitude.angle_between(q, tuple(last[3:7, np.newaxis])).max() < 1e-12
-    assert abs(v - world(last)).max() < 1e-10
-    if not any(arm):        # else the mean velocity of an interval is not that of its ends
-        assert abs(place - last[:3]).max() < 1e-9
+    assert abs(velocities[-1] - world(last)).max() < 1e-10
+    place = truth[0, :3] + dt * integral(np.array(velocities))
+    assert abs(place - last[:3]).max() < 1e-9
+
+
+def integral(values, points=8):
+    """
+    Return the integral of samples (n, 3) at distance 1 whose derivative may jump at a sample.
+
+    Each interval has the polynomial through so many of its neighbours that varies least (A. Harten
+    et al., "Uniformly high order accurate essentially non-oscillatory schemes III", 1987).
+    """
+    sizes = np.linalg.norm(np.diff(values, points - 1, axis=0), axis=1)
+    around = np.pad(sizes, points - 2, constant_values=math.inf)
+    offsets = points - 2 - np.argmin(sliding_window_view(around, points - 1), axis=1)
+    total = np.zeros(3)
+    for offset in range(points - 1):
+        first = np.flatnonzero(offsets == offset) - offset
+        for k in range(points):     # the integral of Lagrange's polynomial k over the interval
+            others = [x for x in range(points) if x != k]
+            basis = np.polynomial.Polynomial.fromroots([x - offset for x in others]).integ()
+            weight = basis(1.0) / math.prod(k - x for x in others)
+            total += weight * values[first + k].sum(axis=0)
+    return total
 
 
 def world(row):

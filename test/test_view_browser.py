@@ -147,7 +147,8 @@ def test_log(browser, log, tmp_path):
     poses = poses_of(log)
     view = SimNode(tmp_path, program=(*VIEW, str(log)))
     with view, Visit(browser, address_of(view)) as visit:
-        visit.press('Pause')
+        if visit.page.get_by_role('button', name='Pause').count():      # it is not at its end
+            visit.press('Pause')
         visit.page.get_by_role('button', name='Play').wait_for()
         visit.put('time [s]', 1.25)
         visit.read(r't = 1\.250')
