@@ -114,11 +114,16 @@ def _report(arguments: argparse.Namespace) -> Report:
         options['north'] = options.pop('heading', None)
         return examine_log(arguments.log, **options)
     if arguments.filter is not None:
-        make_filter, subject = _filter(arguments.filter)
-        if arguments.data is not None:
-            with cli.progress('examined', len(trials_in(arguments.data)), 'trials') as show:
-                return examine_data(make_filter, arguments.data, subject=subject, show=show)
-        return examine(make_filter, subject=subject, **options)
+        make_filter, subject = FILTERS.get(arguments.filter), arguments.filter
+        if make_filter is None:
+            make_filter, subject = _own_filter(arguments.filter), None
+        else:
+            with needed(f'the filter {arguments.filter}'):
+                make_filter()       # imports its package once, before the runs fork
+        if arguments.data is None:
+            return examine(make_filter, subject=subject, **options)
+        with cli.progress('examined', len(trials_in(arguments.data)), 'trials') as show:
+            return examine_data(make_filter, arguments.data, subject=subject, show=show)
     before = signal.signal(signal.SIGINT, lambda *_: INTERRUPTED.set())
     try:
         from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS
@@ -128,21 +133,18 @@ def _report(arguments: argparse.Namespace) -> Report:
         signal.signal(signal.SIGINT, before)
 
 
-def _filter(given: str) -> tuple[Callable[[], Filter], str]:
-    """Return a published filter or the class FILE.py:CLASS, and its name.  Raises ValueError."""
-    if given in FILTERS:
-        with needed(f'the filter {given}'):
-            FILTERS[given]()        # imports its package once, before the runs fork
-        return FILTERS[given], given
+def _own_filter(given: str) -> Callable[[], Filter]:
+    """Return the class FILE.py:CLASS.  Raises ValueError, with the reason."""
     path, _, name = given.rpartition(':')
     if not path.endswith('.py'):
         raise ValueError(f'--filter {given}: must be FILE.py:CLASS, or one of '
                          f'{", ".join(FILTERS)}')
     sys.path.insert(0, str(Path(path).resolve().parent))    # for what the file imports
-    found = runpy.run_path(path)
-    if name not in found:
-        raise ValueError(f'--filter {given}: there is no {name} in {path}')
-    return found[name], name
+    try:
+        made: Callable[[], Filter] = runpy.run_path(path)[name]
+    except KeyError:
+        raise ValueError(f'--filter {given}: there is no {name} in {path}') from None
+    return made
 
 
 if __name__ == '__main__':

@@ -18,7 +18,6 @@ from spinning_top_sim.streams import parameters
 NODES = ('/**', '/*', 'spinning_top', '/spinning_top', '/**/spinning_top')
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
-STRING_TAG = 'tag:yaml.org,2002:str'
 
 
 class _Loader(yaml.SafeLoader):
@@ -27,9 +26,6 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, *place: object) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError('rcl supports no aliases')
-        tag = getattr(self.peek_event(), 'tag', None)
-        if tag not in (None, STRING_TAG):
-            raise yaml.YAMLError(f'the tag {tag}: must be !!str, as rcl ignores all others')
         return super().compose_node(*place)
 
 
@@ -67,6 +63,25 @@ def add_arguments(parser: argparse.ArgumentParser, *kinds: str) -> None:
             parser.add_argument(
                 f'--{kind}', metavar='NAME', action=_Name, help=f'{what}: the name of one that is '
                 'installed, or the path of a parameter file; "help" lists the names')
+
+
+def add_parameters(parser: argparse.ArgumentParser) -> None:
+    """Add the options --scene, --imu, --params and -p."""
+    add_arguments(parser)
+    parser.add_argument('--params', metavar='FILE', action='append', default=[],
+                        help='parameter file as for the node; may be repeated')
+    parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
+                        help='one parameter; may be repeated')
+
+
+def given(arguments: argparse.Namespace) -> dict[str, object]:
+    """Return the parameters that these options give, not checked.  Raises as `read_scene`."""
+    values: dict[str, object] = {}
+    for path in (*chosen_files(arguments), *arguments.params):
+        values.update(read_scene(path))
+    values.update((name, value) for name, value in map(parse_assignment, arguments.param)
+                  if not is_of_ros(name))
+    return values
 
 
 def chosen_files(arguments: argparse.Namespace) -> list[Path]:
