@@ -148,11 +148,12 @@ class Player:
         self._now = self._commands[behind % len(self._commands)]
 
     def play(self) -> None:
-        """Show pictures until KeyboardInterrupt."""
+        """Show pictures until KeyboardInterrupt; the log waits for somebody who looks at it."""
         due = time.monotonic()
         while True:
             due = max(due + 1.0 / RATE, time.monotonic() - CATCH_UP_S)
-            self.draw_next(float(self._speed.value) / RATE if self._plays else 0.0)
+            plays = self._plays and self._page.server.get_clients()
+            self.draw_next(float(self._speed.value) / RATE if plays else 0.0)
             time.sleep(max(due - time.monotonic(), 0.0))
 
     def draw_next(self, step: float) -> None:
