@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pivot that moves: paths as parameters, commanded velocities, and what is sent about it."""
 
+import json
 import math
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -255,8 +257,9 @@ def test_a_driven_node_is_recorded_and_verified(tmp_path, method, capsys):
     def twist(linear, angular=0.0):
         return msg.Twist(linear=msg.Vector3(x=linear), angular=msg.Vector3(z=angular))
 
+    receiver = {'gnss__enabled': True, 'gnss__latency': 0.05} if find_spec('pymap3d') else {}
     with own_node.OwnNode(tmp_path, solver__method=method, record__enabled=True,
-                          pivot__cmd_timeout=0.2) as top:
+                          pivot__cmd_timeout=0.2, **receiver) as top:
         node, told = top.node, []
         node.get_logger().warning = told.append
         for linear in (0.1, 0.7, 0.7, -0.3):
@@ -271,5 +274,9 @@ def test_a_driven_node_is_recorded_and_verified(tmp_path, method, capsys):
         top.wait_until(top.simulation.now_ns + S)
         rests = top.simulation.segment.pivot(np.array([top.simulation.now_ns]))
         assert not rests.velocity.any() and 4 <= top.loop.commands <= 10
-    assert inspect.main([str(tmp_path / 'run.mcap'), '--verify']) == 0
-    assert 'identical' in capsys.readouterr().out
+    capsys.readouterr()
+    assert inspect.main([str(tmp_path / 'run.mcap'), '--verify', '--json']) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said['verify']['identical']
+    assert not receiver or (said['topics']['/gnss/fix']['missing'] == 0
+                            and said['verify']['compared']['/gnss/fix'] > 10)

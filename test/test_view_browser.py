@@ -184,8 +184,9 @@ def test_file_without_a_network(browser, tmp_path):
         assert visit.hosts <= {'', None}
 
 
-def test_a_file_of_a_ride_moves_the_ground(browser, ride, tmp_path):
-    page = tmp_path / 'ride.html'
+def test_a_file_of_a_ride_moves_the_ground(browser, tmp_path):
+    page, ride = tmp_path / 'ride.html', tmp_path / 'ride.mcap'
+    assert simulate.main(['--scene', 'shuttle', '--duration', '2', '-o', str(ride)]) == 0
     assert command.main([str(ride), '--html', str(page)]) == 0
     with Visit(browser, str(page), offline=True, framed=True) as visit:
         visit.read('The pivot moves')
