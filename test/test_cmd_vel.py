@@ -16,7 +16,7 @@ from spinning_top_sim.solvers.vertical import AcceleratedMotion
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.simulation import Simulation
-from spinning_top_sim.tools import inspect
+from spinning_top_sim.tools import inspect, simulate
 
 S = 10 ** 9
 SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.speed': 1.5,
@@ -231,6 +231,20 @@ def test_odometry_has_the_twist_in_the_frame_of_the_body():
     assert (rates == state.angular_velocity).all()
     assert np.ravel(attitude.in_world(tuple(q.T), tuple(velocity.T))) == pytest.approx(
         pivot.velocity[:, 0], abs=1e-15)
+
+
+def test_a_table_has_the_pivot(tmp_path):
+    path = tmp_path / 'truth.csv'
+    assert simulate.main(['--scene', 'shuttle', '--duration', '3', '--quiet', '-o',
+                          str(path)]) == 0
+    table = np.genfromtxt(path, delimiter=',', names=True)
+    t = table['t_s']
+    late = np.maximum(t - 2.0, 0.0)         # 2 m/s^2 for 2 s, 4 m/s for 0.5 s, then braking
+    assert table['vx_ms'] == pytest.approx(
+        2.0 * np.minimum(t, 2.0) - 2.0 * np.maximum(late - 0.5, 0.0), abs=1e-12)
+    assert table['x_m'] == pytest.approx(
+        np.minimum(t, 2.0) ** 2 + 4.0 * late - np.maximum(late - 0.5, 0.0) ** 2, abs=1e-12)
+    assert not any(table[name].any() for name in ('y_m', 'z_m', 'vy_ms', 'vz_ms'))
 
 
 @pytest.mark.parametrize('scene', RIDES)
