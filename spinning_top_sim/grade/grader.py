@@ -152,9 +152,9 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
     faults += _motion_faults(motions, rates, orders, dt, tolerance, kinematic)
     faults += _energy_faults(motions, rates)
     derived = rates[0] is motions[0].rates
-    for kind, of in sensors.KINDS.items():
+    for kind in sensors.KINDS:
         runs = [one for motion, w in zip(motions, rates, strict=True)
-                if (one := of(motion, w)) is not None]
+                if (one := sensors.readings_of(kind, motion, w)) is not None]
         if runs:
             more, found = sensors.judge(kind, runs, motions[0], derived)
             faults, marks = [*faults, *more], {**marks, **found}

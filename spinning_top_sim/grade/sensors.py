@@ -30,6 +30,7 @@ UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
 NOISY = 1e-4                # of the reading: smaller noise is rounding
 NOISE_BAND = 0.07           # of the noise, to either side of what is declared
 LEAST_KURTOSIS = 2.4        # normal 3, uniform 1.8
+KINDS = ('gyroscope', 'accelerations', 'magnetometer', 'rotations', 'velocities')
 UNITS = {'gyroscope': (180.0 / math.pi, math.pi / 180.0), 'accelerations': (1.0 / 9.80665,),
          'magnetometer': (1e4, 1e6, 1e9)}
 UNITS.update(rotations=UNITS['gyroscope'], velocities=UNITS['accelerations'])
@@ -67,11 +68,6 @@ class Readings:
         whole: Reals = sum(self.terms.values())     # type: ignore[assignment]
         return whole
 
-    def rate(self, values: Reals) -> Reals:
-        """Return the change of values (m, 3) per step."""
-        change: Reals = np.gradient(values, axis=0)
-        return change
-
     def late(self, lag: int) -> tuple[Reals, slice]:
         """Return the readings `lag` samples after the terms, and the rows of the terms."""
         m = len(self.total)
@@ -80,76 +76,43 @@ class Readings:
         return self.reading[begin + skip:end], slice(skip, end - begin)
 
 
-def gyroscope_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what a gyroscope reads; w (n - 6, 3) as `dynamics.rates_of` returns it."""
-    return _readings(motion, motion.trajectory.gyroscope, {'rates': w}, MARGIN)
+def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
+    """
+    Return the readings of a sensor, None if there are none.
 
-
-def magnetometer_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what a magnetometer reads."""
-    field = motion.trajectory.rotation[MARGIN:-MARGIN].inv().apply(motion.body.field)
-    return _readings(motion, motion.trajectory.magnetometer, {'field': field}, MARGIN)
-
-
-def accelerometer_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what an accelerometer reads."""
-    return _readings(motion, motion.trajectory.accelerations, _forces(motion, w), 2 * MARGIN,
-                     [np.add(*_accelerations(motion, w, axis)) for axis in np.eye(3)])
-
-
-def rotations_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what rotation increments are, per second."""
-    told, rotation = motion.trajectory.increments, motion.trajectory.rotation
-    turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec() / motion.trajectory.step
-    return _readings(motion, None if told is None else told[:, :3] / motion.trajectory.step,
-                     {'rates': turned[MARGIN:-MARGIN]}, MARGIN + 1)
-
-
-def velocities_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what velocity increments are, per second."""
-    told = motion.trajectory.increments
-    arms = [np.add(*_accelerations(motion, w, axis)) for axis in np.eye(3)]
-    return _readings(motion, None if told is None else told[:, 3:] / motion.trajectory.step,
-                     {name: _means(values) for name, values in _forces(motion, w).items()},
-                     2 * MARGIN + 1, [_means(arm) for arm in arms])
-
-
-def _means(values: Reals) -> Reals:
-    means: Reals = 0.5 * (values[:-1] + values[1:])
-    return means
-
-
-# What makes `Readings` of a motion and its rates (n - 6, 3), as `dynamics.rates_of` returns them.
-KINDS = {'gyroscope': gyroscope_of, 'accelerations': accelerometer_of,
-         'magnetometer': magnetometer_of, 'rotations': rotations_of, 'velocities': velocities_of}
-
-
-def _forces(motion: Motion, w: Reals) -> dict[str, Reals]:
-    """Return the terms of the specific force at the IMU in the body frame (n - 12, 3)."""
-    z = motion.trajectory.rotation[2 * MARGIN:-2 * MARGIN].inv().apply((0.0, 0.0, 1.0))
-    tangential, centripetal = _accelerations(motion, w, np.array(motion.body.lever_arm))
-    return {'gravity': motion.body.gravity * z, 'tangential': tangential,
-            'centripetal': centripetal}
-
-
-def _accelerations(motion: Motion, w: Reals, arm: Reals) -> tuple[Reals, Reals]:
-    """Return a x r and w x (w x r) in the body frame (n - 12, 3)."""
-    inner = w[MARGIN:-MARGIN]
-    return (np.cross(derivative(w, motion.trajectory.step), arm),
-            np.cross(inner, np.cross(inner, arm)))
-
-
-def _readings(motion: Motion, reading: Reals | None, terms: Mapping[str, Reals],
-              first: int, arms: Sequence[Reals] = ()) -> Readings | None:
+    kind : one of KINDS
+    w : rates (n - 6, 3), as `dynamics.rates_of` returns them
+    """
+    said, body, inner = motion.trajectory, motion.body, slice(MARGIN, -MARGIN)
+    reading: Reals | None = getattr(said, 'increments' if kind in ('rotations', 'velocities')
+                                    else kind)
     if reading is None:
         return None
-    w, x, y, z = motion.body.mounting
-    mounting = Rotation.from_quat((x, y, z, w))
-    m = len(next(iter(terms.values())))
-    return Readings(reading, first, {name: mounting.inv().apply(values)
-                                     for name, values in terms.items()}, motion.trajectory.step,
-                    motion.trajectory.rotation[first:first + m] * mounting, mounting,
-                    [mounting.inv().apply(arm) for arm in arms])
+    rotation, first, arms = said.rotation[inner], MARGIN, np.empty((0, len(w), 3))
+    if kind == 'gyroscope':
+        terms = {'rates': w}
+    elif kind == 'magnetometer':
+        terms = {'field': rotation.inv().apply(body.field)}
+    elif kind == 'rotations':
+        reading, first = reading[:, :3] / said.step, first + 1
+        terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
+    else:
+        first, a, w = 2 * MARGIN, derivative(w, said.step), w[inner]
+        axes = np.eye(3)[:, np.newaxis]
+        tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
+        arms = tangential + centripetal
+        terms = {'gravity': body.gravity * rotation[inner].inv().apply((0.0, 0.0, 1.0)),
+                 'tangential': np.tensordot(body.lever_arm, tangential, 1),
+                 'centripetal': np.tensordot(body.lever_arm, centripetal, 1)}
+        if kind == 'velocities':
+            reading, first = reading[:, 3:] / said.step, first + 1
+            arms = 0.5 * (arms[:, :-1] + arms[:, 1:])
+            terms = {name: 0.5 * (term[:-1] + term[1:]) for name, term in terms.items()}
+    mounting = Rotation.from_quat((*body.mounting[1:], body.mounting[0]))
+    to_imu, m = mounting.inv().apply, len(next(iter(terms.values())))
+    return Readings(reading, first, {name: to_imu(term) for name, term in terms.items()},
+                    said.step, said.rotation[first:first + m] * mounting, mounting,
+                    [to_imu(arm) for arm in arms])
 
 
 def judge(kind: str, runs: Sequence[Readings], motion: Motion,
@@ -229,7 +192,7 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals,
         as_if = ''.join(f' ({name})' for name, factor in known.items()
                         if abs(ratio / factor - 1.0) < NOISE_BAND)
         yield Fault('noise_scale', f'{text}, {ratio:.4g}{as_if} times what is declared', ratio)
-    if exists:
+    if exists and rms(residual) < 1.05 * noise:
         kurtosis = float(np.mean(residual ** 4) / np.mean(residual ** 2) ** 2)
         if kurtosis < LEAST_KURTOSIS:
             yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; '
@@ -244,7 +207,7 @@ def _lag(runs: Sequence[Readings]) -> int:
             reading, part = run.late(lag)
             rows.append(reading / run.size)
             columns.append(np.stack([values[part] / run.size for values in
-                                     (*run.terms.values(), run.rate(run.total))]))
+                                     (*run.terms.values(), _rate(run.total))]))
         target = np.concatenate(rows)
         return rms(least_squares(target, list(np.concatenate(columns, axis=1)))[1])
 
@@ -255,6 +218,12 @@ def _lag(runs: Sequence[Readings]) -> int:
     found = {0: now} | {lag: left(lag) for lag in LAGS if lag < len(runs[0].total) // 4}
     best = min(found, key=lambda lag: found[lag])
     return best if found[best] < 0.5 * now else 0
+
+
+def _rate(values: Reals) -> Reals:
+    """Return the change of values (m, 3) per step."""
+    change: Reals = np.gradient(values, axis=0)
+    return change
 
 
 def _noise(run: Readings, lag: int) -> float:
@@ -268,17 +237,17 @@ def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, R
     """Return reading minus right reading (m, 3) and effects of causes, relative to the reading."""
     reading, part = run.late(lag)
     total = run.total
-    effects = {**run.terms, 'total': total, 'step': run.rate(total),
+    effects = {**run.terms, 'total': total, 'step': _rate(total),
                'mounted': run.mounting.apply(total),
                'world': (world := run.rotation.apply(total)),
                'reversed': run.rotation.apply(world)}
     if kind in FORCES:
         kinematic = total - run.terms['gravity']
         effects['kinematic'] = kinematic
-        effects['difference'] = run.rotation.inv().apply(run.rate(run.rotation.apply(kinematic)))
-        effects['turned'] = run.rotation.inv().apply(run.rate(run.rotation.apply(total))) \
-            - run.rate(total)
-        effects['tangential step'] = run.rate(run.terms['tangential'])
+        effects['difference'] = run.rotation.inv().apply(_rate(run.rotation.apply(kinematic)))
+        effects['turned'] = run.rotation.inv().apply(_rate(run.rotation.apply(total))) \
+            - _rate(total)
+        effects['tangential step'] = _rate(run.terms['tangential'])
         for k in range(3):
             effects[f'fixed {k}'] = np.tile(np.eye(3)[k], (len(total), 1))
         for k, arm in enumerate(run.arms):
@@ -349,16 +318,19 @@ def _gravity_frame(kind: str, body: Body, found: Reals) -> Fault | None:
 
 def _difference(kind: str, found: Reals) -> Fault | None:
     delay = -float(found[0])
-    if not 0.25 < delay < 0.8:
-        return None
-    return Fault('finite_differences', f'{kind}: the acceleration, without gravity, is that of '
-                 f'{delay:.3g} steps before, as a difference of two velocities', delay)
+    return None if not 0.25 < delay < 0.8 else Fault(
+        'finite_differences', f'{kind}: the acceleration, without gravity, is that of {delay:.3g} '
+        'steps before, as a difference of two velocities', delay)
 
 
 def _arm(kind: str, body: Body, found: Reals) -> Fault:
-    point, sizes = found + body.lever_arm, [np.linalg.norm(body.com),
-                                            np.linalg.norm(body.lever_arm)]
-    of = ', the centre of mass' if np.linalg.norm(point - body.com) < 0.1 * max(sizes) else ''
-    shown = [', '.join(f'{x:.3g}' for x in one) for one in (point, body.lever_arm)]
+    arm, point = np.array(body.lever_arm), found + body.lever_arm
+    size = float(np.linalg.norm(arm))
+    share = float(point @ arm) / (size * size or 1.0)
+    if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * share * size:
+        return _term(kind, 'kinematic', np.array([share - 1.0]))
+    of = ', the centre of mass' if np.linalg.norm(point - body.com) < 0.1 * max(
+        size, abs(body.com_distance)) else ''
+    shown = [', '.join(f'{x:.3g}' for x in one) for one in (point, arm)]
     return Fault('no_lever_arm', f'{kind}: the readings are those at ({shown[0]}) m{of}, not at '
                  f'({shown[1]}) m', float(np.linalg.norm(found)))
