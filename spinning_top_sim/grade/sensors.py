@@ -16,13 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
-from spinning_top_sim.grade.regression import Cause, explain, least_squares
+from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, least_squares
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
 LAGS = range(-3, 31)        # samples that are tried
 LATE = 0.75                 # steps
-NEAR = 0.25                 # of a coefficient to the value it has for a fault
 STRANGE = 2e-3              # of the reading, beside its noise: it is not what it should be
 CONSISTENT = 1e-3           # of the reading: the lag is not looked for
 MEANS_STRANGE = 2e-2        # of means over a step that are those of its ends
@@ -35,9 +34,10 @@ UNITS = {'gyroscope': (180.0 / math.pi, math.pi / 180.0), 'accelerations': (1.0 
          'magnetometer': (1e4, 1e6, 1e9)}
 UNITS.update(rotations=UNITS['gyroscope'], velocities=UNITS['accelerations'])
 FORCES = ('accelerations', 'velocities')
+_rate = partial(np.gradient, axis=0)        # change per step of values (m, 3)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Readings:
     """
     What a sensor reads in one motion, and what it should read.
@@ -48,6 +48,7 @@ class Readings:
     step : time between samples [s]
     rotation, mounting : world <- IMU (m), body <- IMU
     arms : of an accelerometer, the acceleration (m, 3) at 1 m along each axis of the body
+    size, total : rms of the reading, and the sum of the terms (m, 3)
     """
 
     reading: Reals
@@ -58,15 +59,8 @@ class Readings:
     mounting: Rotation
     arms: Sequence[Reals] = ()
 
-    @property
-    def size(self) -> float:
-        return rms(self.reading) or 1.0
-
-    @property
-    def total(self) -> Reals:
-        """The right reading (m, 3)."""
-        whole: Reals = sum(self.terms.values())     # type: ignore[assignment]
-        return whole
+    def __post_init__(self) -> None:
+        self.size, self.total = rms(self.reading) or 1.0, np.sum([*self.terms.values()], axis=0)
 
     def late(self, lag: int) -> tuple[Reals, slice]:
         """Return the readings `lag` samples after the terms, and the rows of the terms."""
@@ -174,8 +168,8 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals,
     density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
                motion.body.accelerometer_noise_density)
     covariance = (motion.trajectory.covariance or {}).get(kind)
-    exists = noise > NOISY * run.size
-    declared = None if density is None else density / math.sqrt(run.step)
+    exists, root = noise > NOISY * run.size, math.sqrt(run.step)
+    declared = None if density is None else density / root
     text = f'{kind}: the noise has a standard deviation of {noise:.4g}'
     if covariance is not None and not np.any(covariance):
         if exists:
@@ -184,14 +178,12 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals,
         declared = math.sqrt(float(np.trace(covariance)) / 3.0)
     if declared == 0.0 and exists:
         yield Fault('noise_scale', f'{text}, it is declared as 0', math.inf)
-    elif declared and abs(noise / declared - 1.0) > NOISE_BAND:
-        ratio = noise / declared
-        root = math.sqrt(run.step)
-        known = {'sqrt(2)': math.sqrt(2.0), '1/sqrt(2)': math.sqrt(0.5), 'sqrt(dt)': root,
-                 '1/sqrt(dt)': 1.0 / root, 'dt': root * root, '1/dt': 1.0 / root ** 2}
-        as_if = ''.join(f' ({name})' for name, factor in known.items()
-                        if abs(ratio / factor - 1.0) < NOISE_BAND)
-        yield Fault('noise_scale', f'{text}, {ratio:.4g}{as_if} times what is declared', ratio)
+    elif declared and abs((ratio := noise / declared) - 1.0) > NOISE_BAND:
+        as_if = [f' ({name})' for name, factor in (
+            ('sqrt(2)', math.sqrt(2.0)), ('1/sqrt(2)', math.sqrt(0.5)), ('sqrt(dt)', root),
+            ('1/sqrt(dt)', 1.0 / root)) if abs(ratio / factor - 1.0) < NOISE_BAND]
+        yield Fault('noise_scale', f'{text}, {ratio:.4g}{"".join(as_if)} times what is declared',
+                    ratio)
     if exists and rms(residual) < 1.05 * noise:
         kurtosis = float(np.mean(residual ** 4) / np.mean(residual ** 2) ** 2)
         if kurtosis < LEAST_KURTOSIS:
@@ -220,17 +212,10 @@ def _lag(runs: Sequence[Readings]) -> int:
     return best if found[best] < 0.5 * now else 0
 
 
-def _rate(values: Reals) -> Reals:
-    """Return the change of values (m, 3) per step."""
-    change: Reals = np.gradient(values, axis=0)
-    return change
-
-
 def _noise(run: Readings, lag: int) -> float:
     """Return the standard deviation of white noise, by differences in which motions vanish."""
     reading, part = run.late(lag)
-    differences = np.diff(reading - run.total[part], 6, axis=0)
-    return rms(differences) / math.sqrt(924.0)
+    return rms(np.diff(reading - run.total[part], 6, axis=0)) / math.sqrt(924.0)
 
 
 def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, Reals]]:
@@ -243,15 +228,12 @@ def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, R
                'reversed': run.rotation.apply(world)}
     if kind in FORCES:
         kinematic = total - run.terms['gravity']
-        effects['kinematic'] = kinematic
-        effects['difference'] = run.rotation.inv().apply(_rate(run.rotation.apply(kinematic)))
-        effects['turned'] = run.rotation.inv().apply(_rate(run.rotation.apply(total))) \
-            - _rate(total)
-        effects['tangential step'] = _rate(run.terms['tangential'])
-        for k in range(3):
-            effects[f'fixed {k}'] = np.tile(np.eye(3)[k], (len(total), 1))
-        for k, arm in enumerate(run.arms):
-            effects[f'arm {k}'] = arm
+        back, forth = run.rotation.inv().apply, run.rotation.apply
+        effects |= {'kinematic': kinematic, 'difference': back(_rate(forth(kinematic))),
+                    'turned': back(_rate(forth(total))) - _rate(total),
+                    'tangential step': _rate(run.terms['tangential']),
+                    **{f'fixed {k}': 0.0 * total + axis for k, axis in enumerate(np.eye(3))},
+                    **{f'arm {k}': arm for k, arm in enumerate(run.arms)}}
     return (reading - total[part]) / run.size, {
         name: values[part] / run.size for name, values in effects.items()}
 
@@ -261,11 +243,12 @@ def _causes(kind: str, effects: Mapping[str, Reals], body: Body) -> list[Cause]:
     def only(judge: object, *names: str) -> Cause:
         return Cause([effects[name] for name in names], judge)      # type: ignore[arg-type]
 
+    in_world = 'rates_in_world' if kind == 'gyroscope' else 'reading_in_world'
+    text = f'{kind}: the readings are in axes of '
     causes = [only(partial(_scale, kind), 'total'), only(lambda found: None, 'step'),
-              only(partial(_frame, kind, 'mounting', 'the body'), 'total', 'mounted'),
-              only(partial(_frame, kind, 'rates_in_world' if kind == 'gyroscope' else
-                           'reading_in_world', 'the world'), 'total', 'world'),
-              only(partial(_frame, kind, 'rotation_reversed', 'a sensor that turns backwards'),
+              only(instead('mounting', f'{text}the body, not of the IMU'), 'total', 'mounted'),
+              only(instead(in_world, f'{text}the world, not of the IMU'), 'total', 'world'),
+              only(instead('rotation_reversed', f'{text}a sensor that turns against the IMU'),
                    'total', 'reversed')]
     if kind in FORCES:
         causes += [only(partial(_term, kind, name), name) for name in _TERMS]
@@ -283,12 +266,6 @@ def _scale(kind: str, found: Reals) -> Fault:
         return Fault('units', text, factor)
     return Fault('reading_sign' if factor < 0.0 else 'acceleration_scale' if
                  kind == 'accelerations' else 'reading_scale', text, factor)
-
-
-def _frame(kind: str, name: str, of: str, found: Reals) -> Fault | None:
-    if not np.allclose(found, (-1.0, 1.0), atol=NEAR):
-        return None
-    return Fault(name, f'{kind}: the readings are in axes of {of}, not of the IMU')
 
 
 # Terms of a specific force: what each is, and the fault where it is missing.
@@ -310,10 +287,9 @@ def _term(kind: str, term: str, found: Reals) -> Fault:
 
 def _gravity_frame(kind: str, body: Body, found: Reals) -> Fault | None:
     fixed = float(np.linalg.norm(found[1:]))
-    if abs(found[0] + 1.0) > NEAR or abs(fixed / body.gravity - 1.0) > NEAR:
-        return None
-    return Fault('gravity_frame', f'{kind}: gravity, {fixed:.4g} m/s^2, does not turn with the '
-                 'IMU', fixed)
+    other = abs(found[0] + 1.0) > NEAR or abs(fixed / body.gravity - 1.0) > NEAR
+    return None if other else Fault('gravity_frame', f'{kind}: gravity, {fixed:.4g} m/s^2, does '
+                                    'not turn with the IMU', fixed)
 
 
 def _difference(kind: str, found: Reals) -> Fault | None:
