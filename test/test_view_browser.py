@@ -45,10 +45,8 @@ def apart(shown, orientation):
     return float(angle_between(*(tuple(np.array([x]) for x in q) for q in (shown, published)))[0])
 
 
-@pytest.fixture(scope='module')
-def log(tmp_path_factory):
-    path = tmp_path_factory.mktemp('view') / 'cusp.mcap'
-    assert simulate.main(['--params', str(ROOT / 'config/cusp.yaml'), '--duration', '6', '-o',
+def write_log(path, duration):
+    assert simulate.main(['--params', str(ROOT / 'config/cusp.yaml'), '--duration', duration, '-o',
                           str(path), '--command', '2.5:2.0:1.5']) == 0
     return path
 
@@ -128,7 +126,8 @@ def stamp_of(poses):
     return str(seconds), f'{nanoseconds:09d}'
 
 
-def test_log(browser, log, tmp_path):
+def test_log(browser, tmp_path):
+    log = write_log(tmp_path / 'cusp.mcap', '120')      # longer than a slow browser takes to pause
     poses = poses_of(log)
     view = SimNode(tmp_path, program=(*VIEW, str(log)))
     with view, Visit(browser, address_of(view)) as visit:
@@ -146,7 +145,8 @@ def test_log(browser, log, tmp_path):
         assert visit.hosts <= {'127.0.0.1', None}
 
 
-def test_file_without_a_network(browser, log, tmp_path):
+def test_file_without_a_network(browser, tmp_path):
+    log = write_log(tmp_path / 'cusp.mcap', '6')
     page = tmp_path / 'page.html'
     assert command.main([str(log), '--html', str(page)]) == 0
     assert page.stat().st_size < 2.5e6      # for 6 s
