@@ -27,7 +27,8 @@ CONSISTENT = 1e-3           # of the reading: the lag is not looked for
 MEANS_STRANGE = 2e-2        # of means over a step that are those of its ends
 UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
 NOISY = 1e-4                # of the reading: smaller noise is rounding
-NOISE_BAND = 0.07           # of the noise, to either side of what is declared
+NOISE_BAND = 0.05           # of the noise, to either side of what is declared, beside its doubt
+FOUR_SIGMA = 4.0            # that doubt
 LEAST_KURTOSIS = 2.4        # normal 3, uniform 1.8
 KINDS = ('gyroscope', 'accelerations', 'magnetometer', 'rotations', 'velocities')
 UNITS = {'gyroscope': (180.0 / math.pi, math.pi / 180.0), 'accelerations': (1.0 / 9.80665,),
@@ -129,7 +130,9 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
                for name in parts[0][1]}
     floor = math.sqrt(float(np.mean([(one / run.size) ** 2
                                      for one, run in zip(noise, runs, strict=True)])))
-    before = math.sqrt(max(rms(target) ** 2 - 1.05 * floor ** 2, 0.0))
+    doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
+    most = floor * math.sqrt(1.05 + 2.0 * doubt)
+    before = math.sqrt(max(rms(target) ** 2 - most ** 2, 0.0))
     # The acceleration of a step may be that of its begin, without a lag of the reading.
     fractions, left = least_squares(target, [effects[name] for name in (
         'step', 'tangential step') if name in effects])
@@ -148,7 +151,7 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
         causes = _causes(kind, effects, motion.body)
         found, residual, _ = explain(target, causes, floor)
         faults += found
-        rest = math.sqrt(max(rms(residual) ** 2 - floor ** 2, 0.0))
+        rest = math.sqrt(max(rms(residual) ** 2 - most ** 2, 0.0))
         if rest > max(UNEXPLAINED * before, strange):
             faults.append(Fault('inconsistent_reading', f'{kind}: {100.0 * rest:.3g} % of the '
                                 'reading is not that of the motion', rest))
@@ -158,13 +161,14 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
         ends = np.cumsum([len(one) for one, _ in parts])[:-1]
         noises = np.concatenate([run.size * one for run, one in zip(
             runs, np.split(residual, ends), strict=True)])
-        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), noises, motion)
+        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), noises, motion,
+                                NOISE_BAND + doubt)
     return faults, marks
 
 
-def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals,
-                  motion: Motion) -> Iterator[Fault]:
-    """Compare the noise with what is declared."""
+def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motion: Motion,
+                  band: float) -> Iterator[Fault]:
+    """Compare the noise with what is declared; `band`: of the ratio, to either side of 1."""
     density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
                motion.body.accelerometer_noise_density)
     covariance = (motion.trajectory.covariance or {}).get(kind)
@@ -178,10 +182,10 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals,
         declared = math.sqrt(float(np.trace(covariance)) / 3.0)
     if declared == 0.0 and exists:
         yield Fault('noise_scale', f'{text}, it is declared as 0', math.inf)
-    elif declared and abs((ratio := noise / declared) - 1.0) > NOISE_BAND:
+    elif declared and abs((ratio := noise / declared) - 1.0) > band:
         as_if = [f' ({name})' for name, factor in (
             ('sqrt(2)', math.sqrt(2.0)), ('1/sqrt(2)', math.sqrt(0.5)), ('sqrt(dt)', root),
-            ('1/sqrt(dt)', 1.0 / root)) if abs(ratio / factor - 1.0) < NOISE_BAND]
+            ('1/sqrt(dt)', 1.0 / root)) if abs(ratio / factor - 1.0) < band]
         yield Fault('noise_scale', f'{text}, {ratio:.4g}{"".join(as_if)} times what is declared',
                     ratio)
     if exists and rms(residual) < 1.05 * noise:
@@ -205,7 +209,7 @@ def _lag(runs: Sequence[Readings]) -> int:
 
     floor = rms(np.array([_noise(run, 0) / run.size for run in runs]))
     now = left(0)
-    if now ** 2 < 1.05 * floor ** 2 + CONSISTENT ** 2:
+    if now ** 2 < 1.1 * floor ** 2 + CONSISTENT ** 2:
         return 0
     found = {0: now} | {lag: left(lag) for lag in LAGS if lag < len(runs[0].total) // 4}
     best = min(found, key=lambda lag: found[lag])
