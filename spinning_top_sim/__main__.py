@@ -22,6 +22,7 @@ COMMANDS = {
     'recover': ('tools.recover', 'copy what is left of a damaged log'),
     'ensemble': ('tools.ensemble', 'simulate many tops with sampled parameters'),
     'examine': ('exam.command', 'examine an attitude filter'),
+    'grade': ('grade.command', 'grade the trajectory of a simulator'),
     'view': ('view.command', 'show a running node or a log in the browser'),
 }
 INTERRUPTED = 130

@@ -82,6 +82,10 @@ class Recorded:
             name: np.stack([np.interp(even[within], at, column) for column in values.T], axis=1)
             for name, (at, values) in others.items()}}, even[within])
 
+    def begin_at(self, time: float) -> None:
+        """Count the times from this one on."""
+        self.parts = {name: (at - time, values) for name, (at, values) in self.parts.items()}
+
     def _without_gaps(self, times: Reals, values: Reals) -> tuple[Reals, Reals]:
         steps = np.diff(times)
         ends = [0, *(np.flatnonzero(steps > GAP * np.median(steps)) + 1), len(times)]

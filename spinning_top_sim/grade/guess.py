@@ -15,12 +15,12 @@ from spinning_top_sim.physics import attitude
 Reals = NDArray[np.float64]
 
 
-def spin_rate(times: Reals, q: Reals, hint: float | None) -> float:
+def spin_rate(times: Reals, q: Reals, hint: float | None) -> tuple[float, bool]:
     """
-    Return omega_3 [rad/s] from attitudes (4, n).
+    Return omega_3 [rad/s] from attitudes (4, n), and whether the hint tells its whole turns.
 
-    Evenly sampled attitudes tell it up to whole turns per sample: the one next to `hint` is
-    returned, or else the slowest.
+    Evenly sampled attitudes tell it up to whole turns per sample: without a hint that is near
+    one of these values, the slowest is returned.
     """
     x, y, z, w = q[:, :-1]
     _, _, dz, dw = attitude.product((-x, -y, -z, w), tuple(q[:, 1:]))
@@ -28,10 +28,11 @@ def spin_rate(times: Reals, q: Reals, hint: float | None) -> float:
     step = float(np.median(dt))
     usual = np.abs(dt - step) < 0.1 * step
     rate = float(np.angle(np.mean(np.exp(1j * turn[usual])))) / step
-    if hint is not None:
-        rate += math.tau / step * round((hint - rate) * step / math.tau)
+    turns = 0.0 if hint is None else (hint - rate) * step / math.tau
+    sure = hint is not None and abs(turns - round(turns)) < 0.1
+    rate += math.tau / step * round(turns) if sure else 0.0
     rest = np.remainder(turn - rate * dt + math.pi, math.tau) - math.pi
-    return rate + float(np.sum(rest) / np.sum(dt))
+    return rate + float(np.sum(rest) / np.sum(dt)), sure
 
 
 def weak(times: Reals, axis: Reals) -> list[tuple[int, float, float]]:
@@ -114,12 +115,19 @@ def small_nutation(times: Reals, axis: Reals) -> Iterator[tuple[float, float]]:
             yield l3, l3 * rate - rate * rate * height
 
 
-def transverse_rates(times: Reals, q: Reals, axis: Reals) -> tuple[float, float]:
-    """Return omega_1 and omega_2 at the first time [rad/s], from a cubic through the axis."""
+def transverse_rates(times: Reals, q: Reals, axis: Reals) -> tuple[float, float, float]:
+    """
+    Return omega_1 and omega_2 at the first time, and their standard deviation [rad/s].
+
+    They are those of a cubic through the first attitudes of the axis.
+    """
     size = min(16, len(times))
     t = times[:size] - times[0]
     powers = np.vander(t / t[-1], 4, increasing=True)
-    slope = np.linalg.lstsq(powers, axis[:, :size].T, rcond=None)[0][1] / t[-1]
+    found = np.linalg.lstsq(powers, axis[:, :size].T, rcond=None)[0]
+    rest = float(np.sqrt(np.mean((axis[:, :size].T - powers @ found) ** 2)))
+    slope = found[1] / t[-1]
+    error = rest * math.sqrt(float(np.linalg.inv(powers.T @ powers)[1, 1])) / float(t[-1])
     momentum = np.cross(axis[:, 0], slope)
     w1, w2, _ = attitude.in_body(tuple(q[:, :1]), tuple(np.array([v]) for v in momentum))
-    return float(w1[0]), float(w2[0])
+    return float(w1[0]), float(w2[0]), error

@@ -2,9 +2,9 @@
 """
 The least-squares problem of the fit: readings against the exact motion of a top.
 
-Poses do not depend on the scale of the inertia: the unknowns are those of a top with lambda1 = 1.
-They are regular at the poles: attitude and angular velocity of the body at t = 0, L3/lambda1 and
-P/lambda1.
+Attitudes do not depend on the scale of the inertia: the unknowns are those of a top with
+lambda1 = 1.  They are regular at the poles: attitude and angular velocity of the body at t = 0,
+L3/lambda1 and P/lambda1; and of an IMU its mounting, its place and how late its stamps are.
 """
 
 from __future__ import annotations
@@ -12,27 +12,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spinning_top_sim.grade.scenes import Reals, Start
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
-Reals = NDArray[np.float64]
-# The unknowns: small rotation of the reference attitude [rad], angular velocity [rad/s], L3/lambda1
-# [rad/s], P/lambda1 [1/s^2]; then of the sensor: small rotation of its mounting [rad], place in the
-# body [m], and how late its stamps are [s].
-MOTION, SENSOR = slice(0, 8), slice(8, 15)
-TURN, RATES, L3, P = slice(0, 3), slice(3, 6), 6, 7
+# The unknowns: rotation of the reference attitude [rad], angular velocity [rad/s], L3/lambda1
+# [rad/s], P/lambda1 [1/s^2], rotation of the reference mounting [rad], place in the body [m],
+# lateness [s].
+TURN, RATES, SPIN, L3, P = slice(0, 3), slice(3, 6), 5, 6, 7
 MOUNTING, PLACE, LATE = slice(8, 11), slice(11, 14), 14
+MOTION, SENSOR = range(8), range(8, 15)
 UNKNOWNS = 15
-# A step of finite differences changes the readings by this [rad], [rad/s], [m/s^2].
-CHANGE = 1e-6
-AT_POLE = 1e-9              # sin(theta) of an axis that is vertical
+CHANGE = 1e-6               # of the readings by a step of finite differences [rad], [rad/s], ..
+AT_POLE = 1e-9              # sin(theta/2) of an axis that is vertical
 
 
 @dataclass
@@ -40,16 +37,10 @@ class Readings:
     """
     Readings at times.
 
-    Parameters
-    ----------
-    kind : {'attitude', 'rates', 'force'}
-        Quaternions q(world <- body) as x, y, z, w, angular velocities [rad/s] or specific forces
-        [m/s^2] of the sensor.
-    times : (n,) array
-        Ascending [s].
-    values : (4, n) or (3, n) array
-    sigma : float
-        Standard deviation of a component.
+    kind : 'attitude', q(world <- body) as x, y, z, w; 'rates' or 'force' of an IMU
+    times : (n,), ascending [s]
+    values : (4, n) or (3, n), [rad/s] or [m/s^2]
+    sigma : standard deviation of a component
     """
 
     kind: str
@@ -58,136 +49,101 @@ class Readings:
     sigma: float = 1.0
 
 
-class Start(NamedTuple):
-    """A top with lambda1 = 1, its state at t = 0, and how much faster than L3 it spins [rad/s]."""
-
-    top: Top
-    state: State
-    extra_spin: float
-
-
 class Problem:
     """
     Residuals and Jacobian of readings.
 
-    reference : attitude at t = 0, about which the unknown rotation is small (4,)
-    mounting : q(body <- sensor), likewise (4,)
+    reference, mounting : q(world <- body) at t = 0 and q(body <- IMU), from which the unknown
+        rotations count, as x, y, z, w
     """
 
     def __init__(self, readings: Sequence[Readings], reference: Reals, gravity: float,
                  mounting: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> None:
-        self.readings, self._reference, self._gravity = readings, reference, gravity
-        self._mounting = mounting
+        self.readings, self.reference, self.gravity = readings, reference, gravity
+        self.mounting = mounting
         self._steps = np.full(UNKNOWNS, 1e-6)
-        self._seen: dict[tuple[object, ...], tuple[States, Reals]] = {}
+        self._seen: dict[tuple[object, ...], tuple[States, Reals, Reals]] = {}
 
-    def start(self, x: Reals) -> Start:
-        """Return the motion of the unknowns.  Raises ValueError where there is none."""
-        q = attitude.product(_quaternion(self._reference), _small(x[TURN]))
-        state = state_of([float(part[0]) for part in q], x[RATES], float(x[L3]))
+    def start(self, x: Reals) -> tuple[Top, State]:
+        """Return top and state with lambda1 = lambda3 = 1, which spins at L3 instead of omega_3."""
+        qx, qy, qz, qw = (float(part[0]) for part in turned(self.reference, x[TURN]))
+        if math.hypot(qx, qy) < AT_POLE:
+            qx = qy = 0.0
+        elif math.hypot(qz, qw) < AT_POLE:
+            qz = qw = 0.0
         top = Top(lambda1=1.0, lambda3=1.0, mass=1.0, com_distance=float(x[P]), gravity=1.0)
-        return Start(top, state, float(x[5] - x[L3]))
-
-    def turn_to(self, q: attitude.Quaternion) -> list[float]:
-        """Return the unknown rotation of an attitude at t = 0."""
-        x, y, z, w = _quaternion(self._reference)
-        turn = attitude.product((-x, -y, -z, w), q)
-        sign = 1.0 if float(turn[3][0]) >= 0.0 else -1.0
-        x, y, z, w = (sign * part for part in turn)
-        return [float(part[0]) for part in attitude.rotation_vector((x, y, z, w))]
+        return top, Start((qw, qx, qy, qz), (float(x[3]), float(x[4]), float(x[L3]))).state_of(top)
 
     def residuals(self, x: Reals) -> Reals:
-        """Return (readings - model)/sigma, (m,).  Raises ValueError."""
-        return np.concatenate([self._residual(x, one).ravel() / one.sigma
+        """Return (readings - model)/sigma (m,).  Raises ValueError where there is no motion."""
+        return np.concatenate([self.residual(x, one).ravel() / one.sigma
                                for one in self.readings])
 
     def jacobian(self, x: Reals, free: Sequence[int], central: bool = False) -> Reals:
         """Return the derivatives of the residuals (m, len(free)), by finite differences."""
         base = None if central else self.residuals(x)
-        columns = []
+        columns, sigma = [], min(one.sigma for one in self.readings)
         for k in free:
             step = np.zeros(UNKNOWNS)
             step[k] = self._steps[k]
             ahead = self.residuals(x + step)
             behind = self.residuals(x - step) if base is None else base
-            column = (ahead - behind) / (step[k] if base is not None else 2.0 * step[k])
-            columns.append(column)
-            largest = float(np.max(np.abs(column))) * min(one.sigma for one in self.readings)
+            columns.append((ahead - behind) / ((1.0 if central is False else 2.0) * step[k]))
+            largest = float(np.max(np.abs(columns[-1]))) * sigma
             self._steps[k] = min(max(CHANGE / max(largest, 1e-300), 1e-12), 1e-4)
         return np.stack(columns, axis=1)
 
-    def _residual(self, x: Reals, one: Readings) -> Reals:
-        if one.kind == 'attitude':
-            states, q = self._states(x[MOTION], one, 0.0)
-            a, b, c, d = q
-            x1, y1, z1, w1 = attitude.product((-a, -b, -c, d), tuple(one.values))
-            sign = np.where(w1 < 0.0, -1.0, 1.0)
-            return np.stack(attitude.rotation_vector((sign * x1, sign * y1, sign * z1, sign * w1)))
-        states, q = self._states(x[MOTION], one, float(x[LATE]))
-        mount = attitude.product(_quaternion(self._mounting), _small(x[MOUNTING]))
-        model = self._rates(x, states) if one.kind == 'rates' else self._force(x, states, q)
-        return one.values - np.stack(np.broadcast_arrays(
-            *attitude.in_body(mount, model)))
+    def rates(self, x: Reals, times: Reals) -> Reals:
+        """Return the angular velocity in the body (3, n) at the times of readings of an IMU."""
+        return self._motion(x, times, float(x[LATE]))[2]
 
-    def _states(self, motion: Reals, one: Readings, late: float,
-                ) -> tuple[States, Reals]:
-        """Return the states at the times of readings, and attitudes with the true spin (4, n)."""
-        key = (motion.tobytes(), late, id(one.times))
+    def residual(self, x: Reals, one: Readings) -> Reals:
+        """Return readings - model (3, n)."""
+        late = 0.0 if one.kind == 'attitude' else float(x[LATE])
+        states, q, w = self._motion(x, one.times, late)
+        if one.kind == 'attitude':
+            a, b, c, d = q
+            *axis, real = attitude.product((-a, -b, -c, d), tuple(one.values))
+            sign = np.where(real < 0.0, -1.0, 1.0)
+            return np.stack(attitude.rotation_vector((*(sign * part for part in axis), sign * real)))
+        model = w if one.kind == 'rates' else self._force(x, q, w)
+        return one.values - np.stack(attitude.in_body(
+            turned(self.mounting, x[MOUNTING]), tuple(model)))
+
+    def _motion(self, x: Reals, times: Reals, late: float) -> tuple[States, Reals, Reals]:
+        """Return states, and attitudes (4, n) and angular velocities (3, n) of the true spin."""
+        key = (x[:8].tobytes(), late, id(times))
         if key not in self._seen:
-            if len(self._seen) > 3:
+            if len(self._seen) > 2:
                 self._seen.pop(next(iter(self._seen)))      # the oldest
-            top, state, extra = self.start(motion)
-            times = one.times - late
-            states = ExactSolution(top, state).states_at_seconds(times)
-            x, y, z, w = states.rows_quaternion
-            sine, cosine = np.sin(0.5 * extra * times), np.cos(0.5 * extra * times)
-            self._seen[key] = states, np.stack((
-                x * cosine + y * sine, y * cosine - x * sine, z * cosine + w * sine,
-                w * cosine - z * sine))
+            t = times - late
+            states = ExactSolution(*self.start(x)).states_at_seconds(t)
+            angle = (x[SPIN] - x[L3]) * t
+            sine, cosine = np.sin(0.5 * angle), np.cos(0.5 * angle)
+            qx, qy, qz, qw = states.rows_quaternion
+            q = np.stack((qx * cosine + qy * sine, qy * cosine - qx * sine,
+                          qz * cosine + qw * sine, qw * cosine - qz * sine))
+            w = np.empty((3, 0))
+            if any(one.kind != 'attitude' and one.times is times for one in self.readings):
+                (w1, w2), sine, cosine = states.transverse_velocity, np.sin(angle), np.cos(angle)
+                w = np.stack((cosine * w1 + sine * w2, cosine * w2 - sine * w1,
+                              np.full(len(t), x[SPIN])))
+            self._seen[key] = states, q, w
         return self._seen[key]
 
-    def _rates(self, x: Reals, states: States) -> attitude.Vector:
-        """Return the angular velocity in the body that spins truly [rad/s]."""
-        w1, w2 = states.transverse_velocity
-        angle = (x[5] - x[L3]) * states.t
-        cosine, sine = np.cos(angle), np.sin(angle)
-        return cosine * w1 + sine * w2, cosine * w2 - sine * w1, np.full(len(states), x[5])
-
-    def _force(self, x: Reals, states: States, q: Reals) -> attitude.Vector:
-        """Return the specific force, as `States.specific_force` does for its own spin."""
-        w1, w2, w3 = w = np.stack(self._rates(x, states))
-        z = z1, z2, _ = attitude.vertical_in_body(tuple(q))
-        slower, r = x[L3] - x[5], x[PLACE]
-        turning = np.stack((x[P] * z2 - slower * w2, slower * w1 - x[P] * z1, 0.0 * w3))
-        # The other term of lambda1 - lambda3 over lambda1 times w3 is w3 itself.
-        force = np.cross(turning, r, axis=0) + np.cross(w, np.cross(w, r, axis=0), axis=0)
-        return tuple(force + self._gravity * np.stack(z))
+    def _force(self, x: Reals, q: Reals, w: Reals) -> Reals:
+        """Return the specific force at the IMU, as `States.specific_force` for its own spin."""
+        z1, z2, _ = z = np.stack(attitude.vertical_in_body(tuple(q)))
+        gyroscopic, place = x[SPIN] - x[L3], x[PLACE]
+        change = np.stack((gyroscopic * w[1] + x[P] * z2, -gyroscopic * w[0] - x[P] * z1,
+                           np.zeros(len(z1))))
+        turning = np.cross(w, place, axis=0)
+        force: Reals = np.cross(change, place, axis=0) + np.cross(w, turning, axis=0)
+        return force + self.gravity * z
 
 
-def state_of(q: Sequence[float], rates: Sequence[float], l3: float) -> State:
-    """Return the state of a top with lambda1 = 1 from attitude and angular velocity."""
-    x, y, z, w = q
-    w1, w2, _ = rates
-    theta = 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w))
-    half_sum, half_difference = math.atan2(z, w), math.atan2(-x, y)
-    phi, psi = half_sum + half_difference, half_sum - half_difference
-    if math.sin(theta) < AT_POLE:       # all the motion of the axis is nutation
-        psi = math.atan2(w1, w2)
-        up = theta < 1.0
-        return State(theta=0.0 if up else math.pi, theta_dot=math.hypot(w1, w2), psi=psi,
-                     phi=2.0 * half_sum - psi if up else 2.0 * half_difference + psi,
-                     l3=l3, lz=l3 if up else -l3)
-    theta_dot = w1 * math.sin(psi) + w2 * math.cos(psi)
-    across = w2 * math.sin(psi) - w1 * math.cos(psi)        # phi' sin(theta)
-    return State(theta=theta, theta_dot=theta_dot, phi=phi, psi=psi, l3=l3,
-                 lz=l3 * math.cos(theta) + across * math.sin(theta))
-
-
-def _quaternion(q: Sequence[float]) -> attitude.Quaternion:
-    x, y, z, w = (np.array([part]) for part in q)
-    return x, y, z, w
-
-
-def _small(vector: Reals) -> attitude.Quaternion:
+def turned(reference: Sequence[float] | Reals, vector: Reals) -> attitude.Quaternion:
+    """Return the attitude after a rotation vector in the body, components (1,)."""
+    a, b, c, d = (np.array([part]) for part in reference)
     x, y, z = (np.array([part]) for part in vector)
-    return attitude.quaternion_of_vector((x, y, z))
+    return attitude.product((a, b, c, d), attitude.quaternion_of_vector((x, y, z)))

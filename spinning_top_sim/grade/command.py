@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Grade the trajectory of a simulator: its motion beside the exact one, its IMU
+beside its motion.
+
+  spinning-top grade run.mcap                       # a log of this package
+  spinning-top grade poses.csv --scene looping      # top and start as given
+  spinning-top grade poses.csv --fit                # top and start are fitted
+
+exit codes:
+  0    no fault was found
+  1    the simulator has faults, or the file cannot be read
+  2    wrong arguments, or a file without what is needed
+  130  interrupted
+The faults, and what files may contain, are in docs/grade.md.
+"""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.grade import files
+from spinning_top_sim.grade.fit import Fit, fit, near_start
+from spinning_top_sim.grade.grader import grade_trajectory
+from spinning_top_sim.grade.scenes import Body
+from spinning_top_sim.physics.top import State
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools import cli, scene_file
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with these arguments, by default the program's; return its exit code."""
+    return cli.run('grade', __doc__, argv, add_arguments, _run, (LogError,))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    add = parser.add_argument
+    add('file', type=Path, help='.mcap, .csv, .parquet or .npz')
+    scene_file.add_arguments(parser)
+    add('--params', metavar='FILE', action='append', default=[],
+        help='parameter file with top, start and IMU; may be repeated')
+    add('--fit', action='store_true', help='fit top and start to the attitudes; the default '
+        'without --scene, --params and parameters in the file')
+    add('--fit-imu', action='store_true', help='the same, and mounting, place and stamps of the '
+        'IMU to its readings')
+    add('--lever-arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+        help='position of the IMU in the body [m]; default: 0 0 0, or as the parameters tell')
+    add('--topic', help='topic of the attitudes in a log; default: the first that has some')
+    add('--json', action='store_true', help='print everything as JSON')
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    recorded = files.read(arguments.file, arguments.topic)
+    given = [values for path in (*scene_file.chosen_files(arguments), *arguments.params)
+             for values in (scene_file.read_scene(path),)]
+    fits = arguments.fit or arguments.fit_imu
+    known = bool(arguments.scene or arguments.params)
+    if fits and known:
+        raise ValueError('give either --fit, or --scene and --params')
+    values = parameters.checked({name: value for one in given for name, value in one.items()})
+    if not given and recorded.parameters is not None:
+        values = recorded.parameters
+    fits = fits or not (known or recorded.parameters is not None)
+    body, state = _body(values), parameters.start_state(values)
+    if arguments.lever_arm is not None:
+        body = replace(body, lever_arm=tuple(arguments.lever_arm))
+    found = None
+    if fits:
+        found = fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
+                    imu=arguments.fit_imu)
+        body, state = found.body(body), found.start
+        recorded.begin_at(found.begin)
+    trajectory = recorded.trajectory()
+    if not fits:
+        off = near_start(recorded.parts, body, state)
+        if off:
+            raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
+                             '--fit finds top and start')
+    report = grade_trajectory(trajectory, body, state, subject=arguments.file.name)
+    if arguments.json:
+        print(json.dumps({**json.loads(report.as_json()), 'notes': recorded.notes,
+                          'fit': found and found.as_dict()}, indent=2))
+    else:
+        lines = [*(f'{arguments.file.name}: {note}' for note in recorded.notes),
+                 *(found.lines() if found else ()), *str(report).splitlines()]
+        for line in lines:
+            cli.print_line(line)
+    return cli.OK if report.passed and (found is None or found.reached) else cli.FAILED
+
+
+def _body(values: Mapping[str, Any]) -> Body:
+    """Return the top and the IMU of parameters."""
+    x, y, z, w = Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()
+    return Body.of(parameters.top_of(values), lever_arm=tuple(values['imu.lever_arm']),
+                   mounting=(w, x, y, z), field=tuple(values['mag.field']))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
