@@ -2,13 +2,14 @@
 """Runs a simulator through the scenes, and grades what it returns."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from spinning_top_sim.exam.measures import convergence_order
-from spinning_top_sim.grade.motion import Motion
+from spinning_top_sim.grade import dynamics, sensors
+from spinning_top_sim.grade.motion import MARGIN, Motion
 from spinning_top_sim.grade.report import Fault, Report
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Reals, Scene, Start
 from spinning_top_sim.grade.trajectory import (
@@ -21,6 +22,7 @@ from spinning_top_sim.physics.top import State, Top
 Run = Callable[[Body, Start, Reals, float], Any]
 # The largest error of an attitude that is no fault [rad].
 TOLERANCE = math.radians(0.1)
+WRONG_ENERGY = 0.1      # of the change of the potential energy
 
 
 def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[Scene] = SCENES,
@@ -67,25 +69,24 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
         raise ValueError(f'dt = {dt!r} s: must be in (0, 0.05]')
     subject = subject or getattr(run, '__name__', type(run).__name__)
     faults: list[Fault] = []
-    motions, finer = [], {}
+    motions: list[Motion] = []
+    orders: dict[str, float] = {}
     for scene in scenes:
         start = scene.start_of(body, seed)
         times = dt * np.arange(math.floor(scene.duration / dt + 1e-9) + 1)
         try:
-            motions.append(Motion(scene.name, body, start, _run(run, body, start, times, dt)))
-            finer[scene.name] = [
-                motions[-1], *(Motion(scene.name, body, start,
-                                      _run(run, body, start, times, dt / divided))
-                               for divided in scene.divided[1:])]
+            same = [Motion(scene.name, body, start, _run(run, body, start, times, dt / divided))
+                    for divided in scene.divided]
+            motions.append(same[0])
+            orders[scene.name] = convergence_order(scene.divided, [one.worst for one in same])
+            if scene is scenes[0]:
+                again = _run(run, body, start, times, dt).attitudes
+                if not np.array_equal(again, same[0].trajectory.attitudes):
+                    faults.append(Fault('not_deterministic', f'{scene.name}: the attitudes of the '
+                                        'same run twice differ'))
         except InvalidTrajectoryError as error:
             faults.append(Fault('invalid_output', f'{scene.name}: {error}'))
-    if motions:
-        first = motions[0]
-        again = _run(run, body, first.start, first.trajectory.t, dt)
-        if not np.array_equal(again.attitudes, first.trajectory.attitudes):
-            faults.append(Fault('not_deterministic', f'{first.name}: attitudes of the same run '
-                                'twice differ'))
-    return _judge(subject, motions, finer, faults, dt, tolerance)
+    return _judge(subject, motions, orders, faults, dt, tolerance)
 
 
 def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
@@ -137,16 +138,59 @@ def _run(run: Run, body: Body, start: Start, times: Reals, dt: float) -> Traject
     return Trajectory.of(said, times)
 
 
-def _judge(subject: str, motions: Sequence[Motion], finer: Mapping[str, Sequence[Motion]],
+def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
            faults: list[Fault], dt: float, tolerance: float) -> Report:
-    """Return the report on these motions; `finer` are those with smaller steps."""
-    marks: dict[str, float] = {}
-    for motion in motions:
-        for name, value in motion.marks(motion.rates).items():
-            marks[f'{name}: {motion.name}'] = value
-    for motion in motions:
-        if motion.worst > tolerance:
-            faults.append(Fault('inaccurate', f'{motion.name}: {math.degrees(motion.worst):.3g} '
-                                'deg', math.degrees(motion.worst)))
-            break
+    """Return the report on these motions, and orders of convergence by the name of the scene."""
+    if not motions:
+        return Report(subject, faults, {})
+    rates, more = dynamics.rates_of(motions)
+    faults += more
+    marks = {f'{name}: {motion.name}': value for motion, w in zip(motions, rates, strict=True)
+             for name, value in motion.marks(w).items()}
+    marks.update({f'order: {name}': order for name, order in orders.items()})
+    kinematic = any(fault.name == 'rates_scale' for fault in more)
+    faults += _motion_faults(motions, rates, orders, dt, tolerance, kinematic)
+    faults += _energy_faults(motions, rates)
+    for kind, of in sensors.KINDS.items():
+        runs = [one for motion, w in zip(motions, rates, strict=True)
+                if (one := of(motion, w)) is not None]
+        if runs:
+            more, found = sensors.judge(kind, runs, motions[0])
+            faults, marks = [*faults, *more], {**marks, **found}
     return Report(subject, faults, marks)
+
+
+def _motion_faults(motions: Sequence[Motion], rates: Sequence[Reals], orders: Mapping[str, float],
+                   dt: float, tolerance: float, kinematic: bool) -> Iterator[Fault]:
+    """
+    Yield what is wrong with the motions, if anything is.
+
+    kinematic : a fault of the rates explains the error
+    """
+    worst = max(motions, key=lambda motion: motion.worst)
+    if worst.worst <= tolerance:
+        return
+    text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
+    first = {name: order for name, order in orders.items() if 0.5 < order < 1.5}
+    if first:
+        name, order = next(iter(first.items()))
+        yield Fault('first_order', f'{text}; {name}: the error falls as dt^{order:.2f}', order)
+    causes = dynamics.faults_of(motions, rates, dt)
+    yield from (fault._replace(evidence=f'{text}; {fault.evidence}') for fault in causes)
+    if not (first or causes or kinematic):
+        yield Fault('inaccurate', text, math.degrees(worst.worst))
+
+
+def _energy_faults(motions: Sequence[Motion], rates: Sequence[Reals]) -> Iterator[Fault]:
+    """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
+    for motion, w in zip(motions, rates, strict=True):
+        if motion.trajectory.energy is None:
+            continue
+        energy = motion.constants(w)[0]
+        off = motion.trajectory.energy[MARGIN:-MARGIN] - energy
+        scale = float(np.ptp(motion.body.gravity_torque * motion.height)) or 1.0
+        if (share := float(np.ptp(off)) / scale) > WRONG_ENERGY:
+            yield Fault('energy', f'{motion.name}: the energy told differs from that of attitude '
+                        f'and rates by up to {100.0 * share:.3g} % of the change of the potential '
+                        'energy', share)
+            return

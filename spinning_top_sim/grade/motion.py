@@ -95,22 +95,33 @@ class Motion:
         """Body rates at all samples but `MARGIN` at each end, from the attitudes (n - 6, 3)."""
         return rates_of_attitudes(self.trajectory.rotation, self.trajectory.step)
 
+    @cached_property
+    def height(self) -> Reals:
+        """cos(theta) at all samples but `MARGIN` at each end (n - 6,)."""
+        height: Reals = self.trajectory.rotation[MARGIN:-MARGIN].apply((0.0, 0.0, 1.0))[:, 2]
+        return height
+
+    def constants(self, rates: Reals) -> tuple[Reals, Reals, Reals]:
+        """Return E [J], L3 and Lz [kg m^2/s] (n - 6,), given rates as `rates` has them."""
+        constants = self._data(rates).constants(self.body)
+        assert constants is not None
+        return constants
+
+    def _data(self, rates: Reals) -> Attitudes:
+        part = self.trajectory.attitudes[MARGIN:-MARGIN, [1, 2, 3, 0]]
+        stamps = np.rint(1e9 * self.trajectory.t[MARGIN:-MARGIN]).astype(np.int64)
+        return Attitudes(stamps, np.vstack((part.T, rates.T)))
+
     def marks(self, rates: Reals) -> dict[str, float]:
         """Return the measures, given rates as `rates` has them; docs/grade.md defines them."""
-        part, errors = self.trajectory.attitudes[MARGIN:-MARGIN], self.errors
         marks = {f'{name}_error_deg': math.degrees(float(np.max(np.abs(values))))
-                 for name, values in vars(errors).items()}
-        stamps = np.rint(1e9 * self.trajectory.t[MARGIN:-MARGIN]).astype(np.int64)
-        data = Attitudes(stamps, np.vstack((part[:, [1, 2, 3, 0]].T, rates.T)))
-        constants = data.constants(self.body)
-        assert constants is not None
-        names = ('energy', 'l3', 'lz')
+                 for name, values in vars(self.errors).items()}
         first = self.solution.states_at_seconds(np.zeros(1))
-        for name, values in zip(names, constants, strict=True):
+        for name, values in zip(('energy', 'l3', 'lz'), self.constants(rates), strict=True):
             marks[f'{name}_drift'] = float(np.max(np.abs(relative_drift(
                 values, float(getattr(first, name)[0])))))
         exact = self.solution.describe()
-        found = measure(data, exact.nutation_period)
+        found = measure(self._data(rates), exact.nutation_period)
         for name in ('nutation_period', 'mean_precession_rate'):
             value, right = getattr(found, name), getattr(exact, name)
             marks[f'{name}_error'] = value / right - 1.0 if value and right else math.nan

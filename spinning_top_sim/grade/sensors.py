@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Compares readings of an IMU with the motion that the same simulator tells.
+
+A reading is fitted with its physical terms: for the accelerometer gravity, a x r and w x (w x r).
+The error of the motion does not matter.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam.measures import rms
+from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
+from spinning_top_sim.grade.regression import Cause, explain, least_squares
+from spinning_top_sim.grade.report import Fault
+from spinning_top_sim.grade.scenes import Body, Reals
+
+LAGS = range(-3, 31)        # samples that are tried
+LATE = 0.75                 # steps
+NEAR = 0.25                 # of a coefficient to the value it has for a fault
+STRANGE = 2e-3              # of the reading, beside its noise: it is not what it should be
+MEANS_STRANGE = 2e-2        # of means over a step that are those of its ends
+UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
+NOISY = 1e-4                # of the reading: smaller noise is rounding
+NOISE_BAND = 0.07           # of the noise, to either side of what is declared
+LEAST_KURTOSIS = 2.4        # normal 3, uniform 1.8
+UNITS = {'gyroscope': (180.0 / math.pi, math.pi / 180.0), 'accelerations': (1.0 / 9.80665,),
+         'magnetometer': (1e4, 1e6, 1e9)}
+UNITS.update(rotations=UNITS['gyroscope'], velocities=UNITS['accelerations'])
+FORCES = ('accelerations', 'velocities')
+
+
+@dataclass(frozen=True)
+class Readings:
+    """
+    What a sensor reads in one motion, and what it should read.
+
+    reading : (n, 3)
+    first : index of the reading that `terms` begin with
+    terms : terms of the right reading by name, (m, k) x 3
+    step : time between samples [s]
+    rotation, mounting : world <- IMU (m), body <- IMU
+    arms : of an accelerometer, the acceleration (m, 3) at 1 m along each axis of the body
+    """
+
+    reading: Reals
+    first: int
+    terms: Mapping[str, Reals]
+    step: float
+    rotation: Rotation
+    mounting: Rotation
+    arms: Sequence[Reals] = ()
+
+    @property
+    def size(self) -> float:
+        return rms(self.reading) or 1.0
+
+    @property
+    def total(self) -> Reals:
+        """The right reading (m, 3)."""
+        whole: Reals = sum(self.terms.values())     # type: ignore[assignment]
+        return whole
+
+    def rate(self, values: Reals) -> Reals:
+        """Return the change of values (m, 3) per step."""
+        change: Reals = np.gradient(values, axis=0)
+        return change
+
+    def late(self, lag: int) -> tuple[Reals, slice]:
+        """Return the readings `lag` samples after the terms, and the rows of the terms."""
+        m = len(self.total)
+        begin, end = self.first + lag, min(self.first + lag + m, len(self.reading))
+        skip = max(0, -begin)
+        return self.reading[begin + skip:end], slice(skip, end - begin)
+
+
+def gyroscope_of(motion: Motion, w: Reals) -> Readings | None:
+    """Return what a gyroscope reads; w (n - 6, 3) as `dynamics.rates_of` returns it."""
+    return _readings(motion, motion.trajectory.gyroscope, {'rates': w}, MARGIN)
+
+
+def magnetometer_of(motion: Motion, w: Reals) -> Readings | None:
+    """Return what a magnetometer reads."""
+    field = motion.trajectory.rotation[MARGIN:-MARGIN].inv().apply(motion.body.field)
+    return _readings(motion, motion.trajectory.magnetometer, {'field': field}, MARGIN)
+
+
+def accelerometer_of(motion: Motion, w: Reals) -> Readings | None:
+    """Return what an accelerometer reads."""
+    return _readings(motion, motion.trajectory.accelerations, _forces(motion, w), 2 * MARGIN,
+                     [sum(_accelerations(motion, w, axis)) for axis in np.eye(3)])
+
+
+def rotations_of(motion: Motion, w: Reals) -> Readings | None:
+    """Return what rotation increments are, per second."""
+    told, rotation = motion.trajectory.increments, motion.trajectory.rotation
+    turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec() / motion.trajectory.step
+    return _readings(motion, None if told is None else told[:, :3] / motion.trajectory.step,
+                     {'rates': turned[MARGIN:-MARGIN]}, MARGIN + 1)
+
+
+def velocities_of(motion: Motion, w: Reals) -> Readings | None:
+    """Return what velocity increments are, per second."""
+    told = motion.trajectory.increments
+    means = {name: 0.5 * (values[:-1] + values[1:]) for name, values in _forces(motion, w).items()}
+    return _readings(motion, None if told is None else told[:, 3:] / motion.trajectory.step, means,
+                     2 * MARGIN + 1, [0.5 * (sum(one)[:-1] + sum(one)[1:]) for one in (
+                         _accelerations(motion, w, axis) for axis in np.eye(3))])
+
+
+# What makes `Readings` of a motion and its rates (n - 6, 3), as `dynamics.rates_of` returns them.
+KINDS = {'gyroscope': gyroscope_of, 'accelerations': accelerometer_of,
+         'magnetometer': magnetometer_of, 'rotations': rotations_of, 'velocities': velocities_of}
+
+
+def _forces(motion: Motion, w: Reals) -> dict[str, Reals]:
+    """Return the terms of the specific force at the IMU in the body frame (n - 12, 3)."""
+    z = motion.trajectory.rotation[2 * MARGIN:-2 * MARGIN].inv().apply((0.0, 0.0, 1.0))
+    tangential, centripetal = _accelerations(motion, w, np.array(motion.body.lever_arm))
+    return {'gravity': motion.body.gravity * z, 'tangential': tangential,
+            'centripetal': centripetal}
+
+
+def _accelerations(motion: Motion, w: Reals, arm: Reals) -> tuple[Reals, Reals]:
+    """Return a x r and w x (w x r) in the body frame (n - 12, 3)."""
+    inner = w[MARGIN:-MARGIN]
+    return (np.cross(derivative(w, motion.trajectory.step), arm),
+            np.cross(inner, np.cross(inner, arm)))
+
+
+def _readings(motion: Motion, reading: Reals | None, terms: Mapping[str, Reals],
+              first: int, arms: Sequence[Reals] = ()) -> Readings | None:
+    if reading is None:
+        return None
+    w, x, y, z = motion.body.mounting
+    mounting = Rotation.from_quat((x, y, z, w))
+    m = len(next(iter(terms.values())))
+    return Readings(reading, first, {name: mounting.inv().apply(values)
+                                     for name, values in terms.items()}, motion.trajectory.step,
+                    motion.trajectory.rotation[first:first + m] * mounting, mounting,
+                    [mounting.inv().apply(arm) for arm in arms])
+
+
+def judge(kind: str, runs: Sequence[Readings],
+          motion: Motion) -> tuple[list[Fault], dict[str, float]]:
+    """
+    Compare the readings of a sensor in several motions with what they should be.
+
+    kind : one of KINDS
+    motion : one of the motions
+
+    Returns the faults and the measures.
+    """
+    lag = _lag(runs)
+    noise = [_noise(run, lag) for run in runs]
+    parts = [_discrepancy(kind, run, lag) for run in runs]
+    target = np.concatenate([one for one, _ in parts])
+    effects = {name: np.concatenate([columns[name] for _, columns in parts])
+               for name in parts[0][1]}
+    floor = math.sqrt(float(np.mean([(one / run.size) ** 2
+                                     for one, run in zip(noise, runs, strict=True)])))
+    before = math.sqrt(max(rms(target) ** 2 - 1.05 * floor ** 2, 0.0))
+    (fraction,), left = least_squares(target, [effects['step']])
+    late = lag - float(fraction) if rms(left) < UNEXPLAINED * rms(target) else float(lag)
+    marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(noise)),
+             f'{kind}_discrepancy': before}
+    faults, residual = [], target
+    if abs(late) > LATE:
+        faults.append(Fault('imu_one_step_late', f'{kind}: readings belong to the motion of '
+                            f'{late:.3g} steps ({1e3 * late * runs[0].step:.3g} ms) before', late))
+    strange = MEANS_STRANGE if kind == 'velocities' else STRANGE
+    if before > strange:
+        causes = _causes(kind, effects, motion.body)
+        found, residual, _ = explain(target, causes, floor)
+        faults += found
+        left = math.sqrt(max(rms(residual) ** 2 - floor ** 2, 0.0))
+        if left > max(UNEXPLAINED * before, strange):
+            faults.append(Fault('inconsistent_reading', f'{kind}: {100.0 * left:.3g} % of the '
+                                'reading is not that of the motion', left))
+            return faults, marks
+    if kind in ('gyroscope', 'accelerations'):
+        ends = np.cumsum([len(one) for one, _ in parts])[:-1]
+        rest = np.concatenate([run.size * one for run, one in zip(
+            runs, np.split(residual, ends), strict=True)])
+        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), rest, motion)
+    return faults, marks
+
+
+def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals,
+                  motion: Motion) -> Iterator[Fault]:
+    """Compare the noise with what is declared."""
+    density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
+               motion.body.accelerometer_noise_density)
+    covariance = (motion.trajectory.covariance or {}).get(kind)
+    exists = noise > NOISY * run.size
+    declared = None if density is None else density / math.sqrt(run.step)
+    text = f'{kind}: the noise has a standard deviation of {noise:.4g}'
+    if covariance is not None and not np.any(covariance):
+        if exists:
+            yield Fault('covariance_zero', f'{text}, its covariance is told as 0', noise)
+    elif covariance is not None and declared is None:
+        declared = math.sqrt(float(np.trace(covariance)) / 3.0)
+    if declared == 0.0 and exists:
+        yield Fault('noise_scale', f'{text}, it is declared as 0', math.inf)
+    elif declared and abs(noise / declared - 1.0) > NOISE_BAND:
+        ratio = noise / declared
+        root = math.sqrt(run.step)
+        known = {'sqrt(2)': math.sqrt(2.0), '1/sqrt(2)': math.sqrt(0.5), 'sqrt(dt)': root,
+                 '1/sqrt(dt)': 1.0 / root, 'dt': root * root, '1/dt': 1.0 / root ** 2}
+        as_if = ''.join(f' ({name})' for name, factor in known.items()
+                        if abs(ratio / factor - 1.0) < NOISE_BAND)
+        yield Fault('noise_scale', f'{text}, {ratio:.4g}{as_if} times what is declared', ratio)
+    if exists:
+        kurtosis = float(np.mean(residual ** 4) / np.mean(residual ** 2) ** 2)
+        if kurtosis < LEAST_KURTOSIS:
+            yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; '
+                        'normal noise has 3, uniform noise 1.8', kurtosis)
+
+
+def _lag(runs: Sequence[Readings]) -> int:
+    """Return the number of samples by which readings are late, with any size of their terms."""
+    def left(lag: int) -> float:
+        rows, columns = [], []
+        for run in runs:
+            reading, part = run.late(lag)
+            rows.append(reading / run.size)
+            columns.append(np.stack([values[part] / run.size for values in
+                                     (*run.terms.values(), run.rate(run.total))]))
+        target = np.concatenate(rows)
+        return rms(least_squares(target, list(np.concatenate(columns, axis=1)))[1])
+
+    shortest = min(len(run.reading) - len(run.total) - run.first for run in runs)
+    assert shortest >= 0
+    found = {lag: left(lag) for lag in LAGS if lag < len(runs[0].total) // 4}
+    best = min(found, key=lambda lag: found[lag])
+    return best if found[best] < 0.5 * found[0] else 0
+
+
+def _noise(run: Readings, lag: int) -> float:
+    """Return the standard deviation of white noise, by differences in which motions vanish."""
+    reading, part = run.late(lag)
+    differences = np.diff(reading - run.total[part], 6, axis=0)
+    return rms(differences) / math.sqrt(924.0)
+
+
+def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, Reals]]:
+    """Return reading minus right reading (m, 3) and effects of causes, relative to the reading."""
+    reading, part = run.late(lag)
+    total = run.total
+    effects = {**run.terms, 'total': total, 'step': run.rate(total),
+               'mounted': run.mounting.apply(total),
+               'world': (world := run.rotation.apply(total)),
+               'reversed': run.rotation.apply(world)}
+    if kind in FORCES:
+        kinematic = total - run.terms['gravity']
+        effects['kinematic'] = kinematic
+        effects['difference'] = run.rotation.inv().apply(run.rate(run.rotation.apply(kinematic)))
+        effects['turned'] = run.rotation.inv().apply(run.rate(run.rotation.apply(total))) \
+            - run.rate(total)
+        effects['tangential step'] = run.rate(run.terms['tangential'])
+        for k in range(3):
+            effects[f'fixed {k}'] = np.tile(np.eye(3)[k], (len(total), 1))
+        for k, arm in enumerate(run.arms):
+            effects[f'arm {k}'] = arm
+    return (reading - total[part]) / run.size, {
+        name: values[part] / run.size for name, values in effects.items()}
+
+
+def _causes(kind: str, effects: Mapping[str, Reals], body: Body) -> list[Cause]:
+    """Return what may be wrong with the readings of a sensor."""
+    def only(judge: object, *names: str) -> Cause:
+        return Cause([effects[name] for name in names], judge)      # type: ignore[arg-type]
+
+    causes = [only(partial(_scale, kind), 'total'), only(lambda found: None, 'step'),
+              only(partial(_frame, kind, 'mounting', 'the body'), 'total', 'mounted'),
+              only(partial(_frame, kind, 'rates_in_world' if kind == 'gyroscope' else
+                           'reading_in_world', 'the world'), 'total', 'world'),
+              only(partial(_frame, kind, 'rotation_reversed', 'a sensor that turns backwards'),
+                   'total', 'reversed')]
+    if kind in FORCES:
+        causes += [only(partial(_term, kind, name), name) for name in _TERMS]
+        causes += [only(partial(_gravity_frame, kind, body), 'gravity', *(
+            f'fixed {k}' for k in range(3))), only(partial(_difference, kind), 'difference'),
+            only(lambda found: None, 'tangential step'), only(lambda found: None, 'turned'),
+            only(partial(_arm, kind, body), 'arm 0', 'arm 1', 'arm 2')]
+    return causes
+
+
+def _scale(kind: str, found: Reals) -> Fault:
+    factor = 1.0 + float(found[0])
+    text = f'{kind}: the readings are {factor:.4g} times what they should be'
+    if any(abs(abs(factor) / unit - 1.0) < 0.01 for unit in UNITS[kind]):
+        return Fault('units', text, factor)
+    return Fault('reading_sign' if factor < 0.0 else 'acceleration_scale' if
+                 kind == 'accelerations' else 'reading_scale', text, factor)
+
+
+def _frame(kind: str, name: str, of: str, found: Reals) -> Fault | None:
+    if not np.allclose(found, (-1.0, 1.0), atol=NEAR):
+        return None
+    return Fault(name, f'{kind}: the readings are in axes of {of}, not of the IMU')
+
+
+# Terms of a specific force: what each is, and the fault where it is missing.
+_TERMS = {'gravity': ('gravity', 'no_gravity'), 'tangential': ('a x r', 'no_tangential_term'),
+          'centripetal': ('w x (w x r)', 'no_centripetal_term'),
+          'kinematic': ('motion', 'no_lever_arm')}
+
+
+def _term(kind: str, term: str, found: Reals) -> Fault:
+    share = 1.0 + float(found[0])
+    what, missing = _TERMS[term]
+    text = f'{kind}: the term of {what} has {share:.3g} times its size'
+    if abs(share) < NEAR:
+        return Fault(missing, text, share)
+    if share < 0.0:
+        return Fault('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
+    return Fault('acceleration_scale', text, share)
+
+
+def _gravity_frame(kind: str, body: Body, found: Reals) -> Fault | None:
+    fixed = float(np.linalg.norm(found[1:]))
+    if abs(found[0] + 1.0) > NEAR or abs(fixed / body.gravity - 1.0) > NEAR:
+        return None
+    return Fault('gravity_frame', f'{kind}: gravity, {fixed:.4g} m/s^2, does not turn with the '
+                 'IMU', fixed)
+
+
+def _difference(kind: str, found: Reals) -> Fault | None:
+    delay = -float(found[0])
+    if not 0.25 < delay < 0.8:
+        return None
+    return Fault('finite_differences', f'{kind}: the acceleration, without gravity, is that of '
+                 f'{delay:.3g} steps before, as a difference of two velocities', delay)
+
+
+def _arm(kind: str, body: Body, found: Reals) -> Fault:
+    point, sizes = found + body.lever_arm, [np.linalg.norm(body.com),
+                                            np.linalg.norm(body.lever_arm)]
+    of = ', the centre of mass' if np.linalg.norm(point - body.com) < 0.1 * max(sizes) else ''
+    shown = [', '.join(f'{x:.3g}' for x in one) for one in (point, body.lever_arm)]
+    return Fault('no_lever_arm', f'{kind}: the readings are those at ({shown[0]}) m{of}, not at '
+                 f'({shown[1]}) m', float(np.linalg.norm(found)))
