@@ -54,11 +54,13 @@ class Recorded:
     What is in a file.
 
     parts : times (n,) [s] and values (n, k) by name: `Trajectory` has the names
+    covariance : (3, 3) that the first message of an IMU tells, by name
     parameters : of the run, where the file tells them, as `parameters.checked` returns them
     notes : what was chosen or left out
     """
 
     parts: dict[str, tuple[Reals, Reals]]
+    covariance: dict[str, Reals] = field(default_factory=dict)
     parameters: Mapping[str, Any] | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -80,7 +82,8 @@ class Recorded:
             within &= (even >= at[0] - SAME_S) & (even <= at[-1] + SAME_S)
         return Trajectory.of({'attitudes': turns[within], **{
             name: np.stack([np.interp(even[within], at, column) for column in values.T], axis=1)
-            for name, (at, values) in others.items()}}, even[within])
+            for name, (at, values) in others.items()},
+            'covariance': self.covariance or None}, even[within])
 
     def begin_at(self, time: float) -> None:
         """Count the times from this one on."""
@@ -315,6 +318,8 @@ MESSAGES = {
     'tf2_msgs/msg/TFMessage': lambda m: {ATTITUDES: _wxyz(m.transforms[0].transform.rotation)},
     'sensor_msgs/msg/Imu': _imu,
     'sensor_msgs/msg/MagneticField': lambda m: {MAGNETOMETER: _xyz(m.magnetic_field)}}
+COVARIANCES = {GYROSCOPE: 'angular_velocity_covariance',
+               ACCELERATIONS: 'linear_acceleration_covariance'}
 NOT_OF_BODY = ('imu_odom', 'imu_bias')      # of this package
 
 
@@ -343,6 +348,9 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
                 stamp_ns = stamp.sec * 10 ** 9 + stamp.nanosec or message.log_time
                 for kind, values in MESSAGES[types[message.topic]](content).items():
                     found[message.topic][kind].append((stamp_ns, values))
+                    if kind in COVARIANCES and not found[message.topic][kind][1:]:
+                        recorded.covariance[kind] = getattr(
+                            content, COVARIANCES[kind]).reshape(3, 3)
             except Exception as error:
                 raise LogError(f'cannot read {path}: a message of {message.topic} is no '
                                f'{types[message.topic]}: {error}') from error

@@ -8,7 +8,6 @@ top and its start.  A log whose motion is not found counts as a failure.
 
 import math
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -64,8 +63,8 @@ def make(seed):
     return Log(true, t, (attitudes(true, t) * noise).as_quat(), sigma)
 
 
-def bound(log):
-    """Return the least standard deviations of unbiased estimates (8,)."""
+def information(log):
+    """Return the Fisher information of the parameters (8, 8)."""
     columns = []
     for k, value in enumerate(log.true):
         step = np.zeros(8)
@@ -73,21 +72,37 @@ def bound(log):
         behind, ahead = (attitudes(log.true + sign * step, log.t) for sign in (-1, 1))
         columns.append((behind.inv() * ahead).as_rotvec().ravel() / (2.0 * step[k]))
     jacobian = np.stack(columns, axis=1) / log.sigma
-    scale = np.linalg.norm(jacobian, axis=0)
-    return np.sqrt(np.diag(np.linalg.inv((jacobian / scale).T @ (jacobian / scale)))) / scale
+    return jacobian.T @ jacobian
+
+
+class Check(NamedTuple):
+    """
+    What came of a fit.
+
+    over_bound, over_deviation : errors over their bound and over their estimated deviations
+        (8,), NaN where the log hardly tells the parameter
+    squares : error, Fisher information, error: chi squared of 8 degrees of freedom
+    """
+
+    over_bound: np.ndarray
+    over_deviation: np.ndarray
+    squares: float
 
 
 def check(seed):
-    """Return errors over the bound and over the estimated deviation (8,), NaN where vague."""
+    """Fit a log; raise if the fit does not reach the noise."""
     log = make(seed)
     found = fit({'attitudes': (log.t, np.roll(log.q, 1, axis=1))})
+    assert found.reached, f'residual {found.residual}, noise {log.sigma}'
     error = np.array(list(found.values.values())) - log.true
     error[ANGLES] = np.remainder(error[ANGLES] + math.pi, math.tau) - math.pi
-    least = bound(log)
+    fisher = information(log)
+    scale = 1.0 / np.sqrt(np.diag(fisher))
+    least = scale * np.sqrt(np.diag(np.linalg.inv(fisher * np.outer(scale, scale))))
     vague = least > VAGUE * np.maximum(np.abs(log.true), 1.0)
     deviations = np.array(list(found.deviations.values()))
-    assert found.reached, f'seed {seed}: residual {found.residual}, noise {log.sigma}'
-    return np.where(vague, np.nan, error / least), np.where(vague, np.nan, error / deviations)
+    return Check(np.where(vague, np.nan, error / least),
+                 np.where(vague, np.nan, error / deviations), float(error @ fisher @ error))
 
 
 def _guarded(seed):
@@ -100,10 +115,10 @@ def _guarded(seed):
 def stress(first, count, processes):
     """Fit so many logs; print the statistics and return the exit code."""
     with ProcessPoolExecutor(processes) as pool:
-        results = list(pool.map(partial(_guarded), range(first, first + count), chunksize=4))
+        results = list(pool.map(_guarded, range(first, first + count), chunksize=4))
     failures = [text for _, text in results if text]
     print(*failures, sep='\n')
-    over_bound, over_deviation = (np.array(part) for part in zip(
+    over_bound, over_deviation, _ = (np.array(part) for part in zip(
         *(found for found, _ in results if found), strict=True))
     told = np.isfinite(over_bound)
     coverage = float(np.mean(np.abs(over_deviation[told]) <= INTERVAL))
