@@ -48,8 +48,8 @@ def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
     target = pooled(derived) - pooled(told)
     if not rms(target):
         return told, []
-    step = np.concatenate([size * motion.trajectory.step * derivative(rates, motion.trajectory.step)
-                           for size, rates, motion in zip(sizes, told, motions, strict=True)])
+    step = np.concatenate([size * derivative(rates, 1.0)
+                           for size, rates in zip(sizes, told, strict=True)])
     (lead,), left = least_squares(target, [step])
     if abs(lead) <= LATE and rms(left) <= STRANGE:
         return told, []
@@ -83,17 +83,20 @@ def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
 def faults_of(motions: Sequence[Motion], rates: Sequence[Reals], dt: float) -> list[Fault]:
     """Return the causes of the error of motions; rates as `rates_of` returns them."""
     blocks = [_terms(motion, w, dt) for motion, w in zip(motions, rates, strict=True)]
-    target, columns = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    # Motions count the same, unless what is not explained is small there.
+    sizes = [rms(target) for target, _ in blocks]
+    weights = [1.0 / max(size, 0.1 * max(sizes), UNIMPORTANT) for size in sizes]
+    target, columns = (np.concatenate([weight * part for weight, part in zip(
+        weights, parts, strict=True)]) for parts in zip(*blocks, strict=True))
     # Columns as `_terms` has them.
     gyroscopic, gyroscopic_step, gravity_step, in_world, damping, axis_damping, *others = (
         columns.transpose(1, 0, 2))
     arms, euler = others[:3], others[3:]
     body = motions[0].body
-    if rms(target) < UNIMPORTANT:
+    if max(sizes) < UNIMPORTANT:
         return []
     found = explain(target, [
-        Cause([gyroscopic], _gyroscopic), Cause([gyroscopic_step], _step),
-        Cause([gravity_step], lambda found: None), Cause([gyroscopic_step, gravity_step], _step),
+        Cause([gyroscopic], _gyroscopic), Cause([gyroscopic_step, gravity_step], _step),
         Cause([gyroscopic, in_world], _in_world),
         Cause([damping, axis_damping], _damping), Cause(arms, lambda found: _com(body, found)),
         Cause(euler, lambda found: _inertia(body, found))])
@@ -178,8 +181,9 @@ def _inertia(body: Body, found: Reals) -> Fault | None:
     # (I2 - I3)/I1, (I3 - I1)/I2 are told by the first two.
     right = (body.lambda1 - body.lambda3) / body.lambda1
     third = 0.5 * (second - first * (right + found[2]) + first + second * (found[3] - right))
-    return Fault('inertia', f'the motion is that of moments of inertia {_listed((first, second))}, '
-                 f'{third:.4g} kg m^2, not {_listed(body.inertia)}', float(first))
+    return Fault('inertia', 'the motion is that of moments of inertia '
+                 f'{_listed((first, second, third))} kg m^2, not {_listed(body.inertia)}',
+                 float(first))
 
 
 def _listed(values: Sequence[float] | Reals) -> str:

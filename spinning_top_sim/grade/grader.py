@@ -67,13 +67,13 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
         raise TypeError(f'run = {run!r}: must be run(top, start, times, dt)')
     if not 0.0 < dt <= 0.05:
         raise ValueError(f'dt = {dt!r} s: must be in (0, 0.05]')
-    subject = subject or getattr(run, '__name__', type(run).__name__)
+    name = str(subject or getattr(run, '__name__', type(run).__name__))
     faults: list[Fault] = []
     motions: list[Motion] = []
     orders: dict[str, float] = {}
     for scene in scenes:
         start = scene.start_of(body, seed)
-        times = dt * np.arange(math.floor(scene.duration / dt + 1e-9) + 1)
+        times: Reals = np.arange(math.floor(scene.duration / dt + 1e-9) + 1.0) * dt
         try:
             same = [Motion(scene.name, body, start, _run(run, body, start, times, dt / divided))
                     for divided in scene.divided]
@@ -86,7 +86,7 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
                                         'same run twice differ'))
         except InvalidTrajectoryError as error:
             faults.append(Fault('invalid_output', f'{scene.name}: {error}'))
-    return _judge(subject, motions, orders, faults, dt, tolerance)
+    return _judge(name, motions, orders, faults, dt, tolerance)
 
 
 def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
@@ -151,11 +151,12 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
     kinematic = any(fault.name == 'rates_scale' for fault in more)
     faults += _motion_faults(motions, rates, orders, dt, tolerance, kinematic)
     faults += _energy_faults(motions, rates)
+    derived = rates[0] is motions[0].rates
     for kind, of in sensors.KINDS.items():
         runs = [one for motion, w in zip(motions, rates, strict=True)
                 if (one := of(motion, w)) is not None]
         if runs:
-            more, found = sensors.judge(kind, runs, motions[0])
+            more, found = sensors.judge(kind, runs, motions[0], derived)
             faults, marks = [*faults, *more], {**marks, **found}
     return Report(subject, faults, marks)
 

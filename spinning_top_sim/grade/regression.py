@@ -11,7 +11,7 @@ from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Reals
 
 MOST_CAUSES = 3
-ENOUGH = 0.1            # of the discrepancy may remain: further causes are not looked for
+ENOUGH = 0.2            # of the discrepancy may remain: further causes are not looked for
 WORTHWHILE = 0.8        # of what remains is left at most by another cause
 AS_GOOD = 2.0           # a cause with fewer columns may leave so many times more
 
@@ -52,7 +52,7 @@ def explain(target: Reals, causes: Sequence[Cause], floor: float = 0.0) -> Expla
         tried = [(one, _fit(target, [*chosen, one])) for one in causes
                  if not any(one is other for other in chosen)]
         after = [_excess(left, floor) for _, (_, left) in tried]
-        good = max(AS_GOOD * min(after), 0.05 * before)
+        good = max(AS_GOOD * min(after), 0.02 * before)
         size, left, number = min((len(one.columns), left, number)
                                  for number, ((one, _), left) in enumerate(
                                      zip(tried, after, strict=True)) if left <= good)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a simulator is given: a top with an IMU on it, and how it starts; and the motions graded."""
+"""What a simulator is given: a top with an IMU on it and its start; and the motions graded."""
 
 import math
 from collections.abc import Mapping
@@ -62,7 +62,7 @@ class Body(Top):
         if isinstance(top, cls) and not imu:
             return top
         given = {one.name: getattr(top, one.name) for one in fields(top)}
-        return cls(**{**given, **imu})      # type: ignore[arg-type]
+        return cls(**{**given, **imu})
 
     @property
     def inertia(self) -> tuple[float, float, float]:
@@ -142,7 +142,7 @@ class Scene:
     name : of the motion
     start : l3, lz, theta and theta_dot of the start
     duration : [s]
-    divided : numbers by which dt is divided; with more than one the order of convergence is measured
+    divided : numbers by which dt is divided, 1 first; more than one give the order of convergence
     """
 
     name: str

@@ -24,6 +24,7 @@ LAGS = range(-3, 31)        # samples that are tried
 LATE = 0.75                 # steps
 NEAR = 0.25                 # of a coefficient to the value it has for a fault
 STRANGE = 2e-3              # of the reading, beside its noise: it is not what it should be
+CONSISTENT = 1e-3           # of the reading: the lag is not looked for
 MEANS_STRANGE = 2e-2        # of means over a step that are those of its ends
 UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
 NOISY = 1e-4                # of the reading: smaller noise is rounding
@@ -93,7 +94,7 @@ def magnetometer_of(motion: Motion, w: Reals) -> Readings | None:
 def accelerometer_of(motion: Motion, w: Reals) -> Readings | None:
     """Return what an accelerometer reads."""
     return _readings(motion, motion.trajectory.accelerations, _forces(motion, w), 2 * MARGIN,
-                     [sum(_accelerations(motion, w, axis)) for axis in np.eye(3)])
+                     [np.add(*_accelerations(motion, w, axis)) for axis in np.eye(3)])
 
 
 def rotations_of(motion: Motion, w: Reals) -> Readings | None:
@@ -107,10 +108,15 @@ def rotations_of(motion: Motion, w: Reals) -> Readings | None:
 def velocities_of(motion: Motion, w: Reals) -> Readings | None:
     """Return what velocity increments are, per second."""
     told = motion.trajectory.increments
-    means = {name: 0.5 * (values[:-1] + values[1:]) for name, values in _forces(motion, w).items()}
-    return _readings(motion, None if told is None else told[:, 3:] / motion.trajectory.step, means,
-                     2 * MARGIN + 1, [0.5 * (sum(one)[:-1] + sum(one)[1:]) for one in (
-                         _accelerations(motion, w, axis) for axis in np.eye(3))])
+    arms = [np.add(*_accelerations(motion, w, axis)) for axis in np.eye(3)]
+    return _readings(motion, None if told is None else told[:, 3:] / motion.trajectory.step,
+                     {name: _means(values) for name, values in _forces(motion, w).items()},
+                     2 * MARGIN + 1, [_means(arm) for arm in arms])
+
+
+def _means(values: Reals) -> Reals:
+    means: Reals = 0.5 * (values[:-1] + values[1:])
+    return means
 
 
 # What makes `Readings` of a motion and its rates (n - 6, 3), as `dynamics.rates_of` returns them.
@@ -146,13 +152,15 @@ def _readings(motion: Motion, reading: Reals | None, terms: Mapping[str, Reals],
                     [mounting.inv().apply(arm) for arm in arms])
 
 
-def judge(kind: str, runs: Sequence[Readings],
-          motion: Motion) -> tuple[list[Fault], dict[str, float]]:
+def judge(kind: str, runs: Sequence[Readings], motion: Motion,
+          derived: bool) -> tuple[list[Fault], dict[str, float]]:
     """
     Compare the readings of a sensor in several motions with what they should be.
 
     kind : one of KINDS
     motion : one of the motions
+    derived : whether the rates are those of the attitudes, which may be half a step apart from
+        those of the simulator
 
     Returns the faults and the measures.
     """
@@ -165,8 +173,10 @@ def judge(kind: str, runs: Sequence[Readings],
     floor = math.sqrt(float(np.mean([(one / run.size) ** 2
                                      for one, run in zip(noise, runs, strict=True)])))
     before = math.sqrt(max(rms(target) ** 2 - 1.05 * floor ** 2, 0.0))
-    (fraction,), left = least_squares(target, [effects['step']])
-    late = lag - float(fraction) if rms(left) < UNEXPLAINED * rms(target) else float(lag)
+    # The acceleration of a step may be that of its begin, without a lag of the reading.
+    fractions, left = least_squares(target, [effects[name] for name in (
+        'step', 'tangential step') if name in effects])
+    late = lag - float(fractions[0]) if rms(left) < UNEXPLAINED * rms(target) else float(lag)
     marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(noise)),
              f'{kind}_discrepancy': before}
     faults, residual = [], target
@@ -174,20 +184,24 @@ def judge(kind: str, runs: Sequence[Readings],
         faults.append(Fault('imu_one_step_late', f'{kind}: readings belong to the motion of '
                             f'{late:.3g} steps ({1e3 * late * runs[0].step:.3g} ms) before', late))
     strange = MEANS_STRANGE if kind == 'velocities' else STRANGE
+    if derived:
+        strange += 0.25 * max((run.rotation[0].inv() * run.rotation[1]).magnitude() ** 2
+                              for run in runs)
     if before > strange:
         causes = _causes(kind, effects, motion.body)
         found, residual, _ = explain(target, causes, floor)
         faults += found
-        left = math.sqrt(max(rms(residual) ** 2 - floor ** 2, 0.0))
-        if left > max(UNEXPLAINED * before, strange):
-            faults.append(Fault('inconsistent_reading', f'{kind}: {100.0 * left:.3g} % of the '
-                                'reading is not that of the motion', left))
+        rest = math.sqrt(max(rms(residual) ** 2 - floor ** 2, 0.0))
+        if rest > max(UNEXPLAINED * before, strange):
+            faults.append(Fault('inconsistent_reading', f'{kind}: {100.0 * rest:.3g} % of the '
+                                'reading is not that of the motion', rest))
             return faults, marks
-    if kind in ('gyroscope', 'accelerations'):
+    if kind in ('gyroscope', 'accelerations') and not any(
+            fault.name in ('units', 'reading_scale') for fault in faults):
         ends = np.cumsum([len(one) for one, _ in parts])[:-1]
-        rest = np.concatenate([run.size * one for run, one in zip(
+        noises = np.concatenate([run.size * one for run, one in zip(
             runs, np.split(residual, ends), strict=True)])
-        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), rest, motion)
+        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), noises, motion)
     return faults, marks
 
 
@@ -234,11 +248,13 @@ def _lag(runs: Sequence[Readings]) -> int:
         target = np.concatenate(rows)
         return rms(least_squares(target, list(np.concatenate(columns, axis=1)))[1])
 
-    shortest = min(len(run.reading) - len(run.total) - run.first for run in runs)
-    assert shortest >= 0
-    found = {lag: left(lag) for lag in LAGS if lag < len(runs[0].total) // 4}
+    floor = rms(np.array([_noise(run, 0) / run.size for run in runs]))
+    now = left(0)
+    if now ** 2 < 1.05 * floor ** 2 + CONSISTENT ** 2:
+        return 0
+    found = {0: now} | {lag: left(lag) for lag in LAGS if lag < len(runs[0].total) // 4}
     best = min(found, key=lambda lag: found[lag])
-    return best if found[best] < 0.5 * found[0] else 0
+    return best if found[best] < 0.5 * now else 0
 
 
 def _noise(run: Readings, lag: int) -> float:

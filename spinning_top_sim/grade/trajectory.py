@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.scenes import Body, Reals, unit_quaternions
+from spinning_top_sim.grade.scenes import Reals, unit_quaternions
 
 # Columns of each optional part.
 _PARTS = {'rates': 3, 'accelerations': 3, 'gyroscope': 3, 'magnetometer': 3, 'increments': 6}

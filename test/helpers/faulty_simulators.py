@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulators of a top with an IMU: right ones, and those with one defect, some of them published."""
+"""Simulators of a top with an IMU: right ones, and ones with a defect, most of them published."""
 
-import cmath
 import math
 from dataclasses import dataclass
 
@@ -244,14 +243,14 @@ class Imu:
         """isaac-sim/IsaacSim#735: velocities differentiated in axes of the body, without w x v."""
         self._set_force(said, self.force(centripetal=0.0))
 
-    def no_tangential_term(self, said):
+    def without_tangential_term(self, said):
         self._set_force(said, self.force(tangential=0.0))
 
     def velocity_of_com(self, said):
         """isaac-sim/IsaacSim#825: the velocity of the centre of mass, not of the sensor."""
         self._set_force(said, self.force(arm=np.array(self.top.com)))
 
-    def no_lever_arm(self, said):
+    def force_at_pivot(self, said):
         """Field-Robotics-Japan/UnitySensors#162: accelerations of the origin."""
         self._set_force(said, self.force(arm=np.zeros(3)))
 
@@ -259,7 +258,7 @@ class Imu:
         """isaac-sim/IsaacLab#7163, o3de/o3de-extras#484: differences over 4 steps, over one dt."""
         self._set_force(said, 4.0 * self._differences() + self.force(0.0, 0.0))
 
-    def finite_differences(self, said):
+    def differences(self, said):
         """gazebosim/gazebo-classic#893: the difference of the last two velocities."""
         self._set_force(said, self._differences() + self.force(0.0, 0.0))
 
@@ -268,22 +267,22 @@ class Imu:
         a = np.diff(v, axis=0, prepend=v[:1]) / self.h
         return self.rotation.inv().apply(a)
 
-    def gravity_sign(self, said):
+    def gravity_added(self, said):
         """Field-Robotics-Japan/UnitySensors#116: gravity is added, not subtracted."""
         self._set_force(said, self.force(gravity=-1.0))
 
-    def gravity_frame(self, said):
+    def gravity_fixed(self, said):
         """carla-simulator/carla#2795: gravity is added after the rotation into the sensor."""
-        said['accelerations'] += (self.mounting.inv().apply(self.force(gravity=0.0) - self.force())
-                                  + (0.0, 0.0, self.top.gravity))
+        self._set_force(said, self.force(gravity=0.0))
+        said['accelerations'][:, 2] += self.top.gravity
 
-    def no_gravity(self, said):
+    def without_gravity(self, said):
         self._set_force(said, self.force(gravity=0.0))
 
     def in_g(self, said):
         said['accelerations'] /= 9.80665
 
-    def rates_in_world(self, said):
+    def gyroscope_in_world(self, said):
         """carla-simulator/carla#2939: the gyroscope reads in axes of the world."""
         said['gyroscope'] += self.rotation.apply(self.w) - self.mounting.inv().apply(self.w)
 
@@ -312,7 +311,7 @@ class Imu:
     def gyroscope_sign(self, said):
         said['gyroscope'] = -said['gyroscope']
 
-    def field_in_world(self, said):
+    def field_reversed(self, said):
         """gazebosim/gz-sim#2536: the field turns against the rotation of the sensor."""
         turn = self.rotation * self.mounting
         said['magnetometer'] = turn.apply(self.top.field)
@@ -338,12 +337,12 @@ class Imu:
                         * self.top.gyroscope_noise_density
                         * self._random.standard_normal(self.w.shape))
 
-    def uniform_noise(self, said):
+    def uniform(self, said):
         """jdelacroix/simiam#3: uniform instead of normal noise."""
         self._set_noise(said, 'accelerations', self.sigma * math.sqrt(3.0)
                         * self._random.uniform(-1.0, 1.0, self.w.shape))
 
-    def covariance_zero(self, said):
+    def covariance_unknown(self, said):
         """ros-simulation/gazebo_ros_pkgs#1240: covariances of zeros beside noise."""
         said['covariance'] = np.zeros((3, 3))
 
@@ -357,8 +356,8 @@ class Imu:
         """Right increments."""
         turned = (self.rotation[:-1].inv() * self.rotation[1:]).as_rotvec()
         v = self.rotation.apply(np.cross(self.w, self.arm))
-        gained = self.rotation[:-1].inv().apply(
-            np.diff(v, axis=0) + (0.0, 0.0, self.top.gravity * self.h))
+        gravity = np.array((0.0, 0.0, self.top.gravity * self.h))
+        gained = self.rotation[:-1].inv().apply(np.diff(v, axis=0) + gravity)
         both = np.hstack((self.mounting.inv().apply(turned), self.mounting.inv().apply(gained)))
         said['increments'] = np.vstack((np.zeros(6), both))
 
@@ -370,3 +369,59 @@ class Imu:
         w, top = self.w, self.top
         said['energy'] = 0.5 * top.lambda1 * (w[:, 0] ** 2 + w[:, 1] ** 2) \
             - top.gravity_torque * self.up[:, 2]
+
+
+# What is wrong with each simulator, and the faults that name it.  These are published:
+PUBLISHED = {
+    'no_transport_term': ('no_centripetal_term',),
+    'velocity_of_com': ('no_lever_arm',),
+    'force_at_pivot': ('no_lever_arm',),
+    'wrong_dt': ('acceleration_scale',),
+    'differences': ('finite_differences',),
+    'gravity_added': ('gravity_sign',),
+    'gravity_fixed': ('gravity_frame',),
+    'gyroscope_in_world': ('rates_in_world',),
+    'mounting_ignored': ('mounting',),
+    'late': ('imu_one_step_late',),
+    'field_reversed': ('rotation_reversed',),
+    'residuals': ('noise_scale',),
+    'density_as_deviation': ('noise_scale',),
+    'uniform': ('uniform_noise',),
+    'covariance_unknown': ('covariance_zero',)}
+OTHER = {
+    'without_tangential_term': ('no_tangential_term',),
+    'without_gravity': ('no_gravity',),
+    'in_g': ('units',),
+    'in_degrees': ('units',),
+    'states_in_world': ('rates_in_world',),
+    'states_in_degrees': ('units',),
+    'late_by_seven': ('imu_one_step_late',),
+    'gyroscope_sign': ('reading_sign',),
+    'field_sign': ('reading_sign',),
+    'times_root_two': ('noise_scale',),
+    'increments_in_degrees': ('units',),
+    'wrong_energy': ('energy',)}
+NOISY = ('density_as_deviation', 'uniform', 'covariance_unknown', 'times_root_two')
+STEPPED = {
+    # avianphysics/avian#420: the term of the begin of a step adds energy.
+    'semi-implicit': (Stepped(method='semi-implicit'),
+                      ('first_order', 'explicit_gyroscopic_term')),
+    # bulletphysics/bullet3#346: that of its end damps.
+    'implicit': (Stepped(method='implicit'), ('first_order', 'implicit_damping')),
+    # google-deepmind/mujoco_warp#1662: the derivative has the wrong sign.
+    'wrong derivative': (Stepped(method='wrong derivative'), ('first_order', 'coriolis_sign')),
+    # godotengine/godot#80703, NVIDIAGameWorks/PhysX#394, jrouwe/JoltPhysics#803, google/brax#48.
+    'no gyroscopic term': (Stepped(without_gyroscopic_term, 'semi-implicit'),
+                           ('no_gyroscopic_term',)),
+    # gszauer/GamePhysicsCookbook#14: the inertia of the body in axes of the world.
+    'world inertia': (Stepped(method='world inertia'), ('inertia_frame',)),
+    # google/brax#62: the attitude turns twice as fast.
+    'turns twice': (Stepped(turn=2.0), ('rates_scale',)),
+    # dimforge/parry#334: Steiner's term is wrong.
+    'inertia at com': (Stepped(inertia_at_com), ('inertia',)),
+    'midpoint': (Stepped(method='midpoint'), ('first_order',)),
+    'gyroscopic sign': (Stepped(gyroscopic_sign), ('coriolis_sign',)),
+    'upwards': (Stepped(upwards), ('gravity_sign',)),
+    'damped': (Stepped(damped), ('damping',)),
+    'offset': (Stepped(offset_com((0.003, -0.002, 0.004))), ('com_offset',))}
+RIGHT = {'exact': exact, 'rk45': rk45, 'DOP853': dop853, 'RK4': Stepped()}
