@@ -12,12 +12,11 @@ exit codes:
   1    the simulator has faults, or the file cannot be read
   2    wrong arguments, or a file without what is needed
   130  interrupted
-The faults, and what files may contain, are in docs/grade.md.
+What a file may contain is in docs/grade_files.md.
 """
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -63,55 +62,48 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     recorded = files.read(arguments.file, arguments.topic)
-    given = [values for path in (*scene_file.chosen_files(arguments), *arguments.params)
-             for values in (scene_file.read_scene(path),)]
+    paths = [*scene_file.chosen_files(arguments), *arguments.params]
     fits = arguments.fit or arguments.fit_imu
-    known = bool(arguments.scene or arguments.params)
-    if fits and known:
+    if fits and paths:
         raise ValueError('give either --fit, or --scene and --params')
-    values = parameters.checked({name: value for one in given for name, value in one.items()})
-    if not given and recorded.parameters is not None:
-        values = recorded.parameters
-    fits = fits or not (known or recorded.parameters is not None)
-    body, state = _body(values), parameters.start_state(values)
+    given: dict[str, object] = {}
+    for path in paths:
+        given.update(scene_file.read_scene(path))
+    known = recorded.parameters if not paths else None
+    values = parameters.checked(given) if known is None else known
+    body, state, found = _body(values), parameters.start_state(values), None
     if arguments.lever_arm is not None:
         body = replace(body, lever_arm=tuple(arguments.lever_arm))
-    found = None
-    if fits:
+    if fits or not (paths or known):
         found = fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
                     imu=arguments.fit_imu)
         body, state = found.body(body), found.start
         recorded.begin_at(found.begin)
-    trajectory = recorded.trajectory()
-    if not fits:
-        off = near_start(recorded.parts, body, state)
-        if off:
-            raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
-                             '--fit finds top and start')
-    trajectory, notes = _without_noise(trajectory, body, state)
-    recorded.notes += notes
+    elif off := near_start(recorded.parts, body, state):
+        raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
+                         '--fit finds top and start')
+    trajectory = _without_noise(recorded, body, state)
     report = grade_trajectory(trajectory, body, state, subject=arguments.file.name)
     if arguments.json:
         print(json.dumps({**json.loads(report.as_json()), 'notes': recorded.notes,
                           'fit': found and found.as_dict()}, indent=2))
     else:
-        lines = [*(f'{arguments.file.name}: {note}' for note in recorded.notes),
-                 *(found.lines() if found else ()), *str(report).splitlines()]
+        lines = (*recorded.notes, *(found.lines() if found else ()), *str(report).splitlines())
         for line in lines:
             cli.print_line(line)
     return cli.OK if report.passed and (found is None or found.reached) else cli.FAILED
 
 
-def _without_noise(trajectory: Trajectory, body: Body,
-                   state: State) -> tuple[Trajectory, list[str]]:
-    """Return the trajectory with the exact attitudes, if it has them but for white noise."""
+def _without_noise(recorded: files.Recorded, body: Body, state: State) -> Trajectory:
+    """Return the trajectory, with the exact attitudes if it has them but for white noise."""
+    trajectory = recorded.trajectory()
     q = ExactSolution(body, state).states_at_seconds(trajectory.t).quaternion
-    rest = (Rotation.from_quat(q).inv() * trajectory.rotation).as_rotvec()
-    level, white = whiteness(rest.T)
+    level, white = whiteness((Rotation.from_quat(q).inv() * trajectory.rotation).as_rotvec().T)
     if not white or not EXACT < level < LARGEST:
-        return trajectory, []
-    return replace(trajectory, attitudes=np.roll(q, 1, axis=1)), [
-        f'the attitudes are exact but for noise of {level:.3g} rad: graded without it']
+        return trajectory
+    recorded.notes.append(f'the attitudes are exact but for noise of {level:.3g} rad: graded '
+                          'without it')
+    return replace(trajectory, attitudes=np.roll(q, 1, axis=1))
 
 
 def _body(values: Mapping[str, Any]) -> Body:

@@ -206,7 +206,7 @@ def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
 
 
 def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
-    """Fit longer and longer parts; L3 and P from 2 `size` attitudes on, 0: when all are there."""
+    """Fit longer and longer parts; L3 and P beyond 2 `size` attitudes, with 0 in the last."""
     problem = Problem([one], one.values[:, 0], gravity)
     count, last = FIRST, len(one.times)
     while count < last:
@@ -226,11 +226,11 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
 def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
             tolerance: float = 1e-10) -> Reals:
     """Return the unknowns at the least sum of squares."""
-    free = list(free)
+    chosen = [*free]
 
     def at(y: Reals) -> Reals:
         moved = x.copy()
-        moved[free] = y
+        moved[chosen] = y
         return moved
 
     def residuals(y: Reals) -> Reals:
@@ -241,8 +241,8 @@ def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 
 
     far = np.full(len(problem.residuals(x)), 1e9)
     return at(least_squares(
-        residuals, x[free], lambda y: problem.jacobian(at(y), free), method='lm', x_scale='jac',
-        max_nfev=evaluations, ftol=tolerance, xtol=1e-15, gtol=1e-15).x)
+        residuals, x[chosen], lambda y: problem.jacobian(at(y), chosen), method='lm',
+        x_scale='jac', max_nfev=evaluations, ftol=tolerance, xtol=1e-15, gtol=1e-15).x)
 
 
 def whiteness(rest: Reals) -> tuple[float, bool]:
@@ -286,9 +286,9 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
     (one,), problem.readings = problem.readings, streams[:1]
     model = problem.rates(x, streams[0].times)
     problem.mounting = Rotation.align_vectors(model.T, streams[0].values.T)[0].as_quat()
-    for stream, free in zip(streams, ((8, 9, 10, LATE), (11, 12, 13)), strict=True):
+    for stream, own in zip(streams, ((8, 9, 10, LATE), (11, 12, 13)), strict=True):
         problem.readings = [stream]
-        x = descend(problem, x, free)
+        x = descend(problem, x, own)
     problem.readings = [one, *streams]
     free = [k for k in (*MOTION, *SENSOR) if k not in trial.frozen]
     for _ in range(2):          # noise of each, then all with it
@@ -335,7 +335,7 @@ def _not_told(names: Sequence[str], values: Reals, deviations: Reals,
               hidden: NDArray[np.bool_]) -> Iterator[str]:
     """Yield what the readings do not tell; `hidden`: the names of each combination (k, m)."""
     for column in hidden.T:
-        several = [names[k] for k in np.flatnonzero(column)]
+        several = [name for name, part in zip(names, column, strict=True) if part]
         yield f'{", ".join(several)}' + (' apart' if len(several) > 1 else '')
     if np.all(np.isinf(deviations[[*ANGLES]])):
         yield f'phi and psi, but for their {"sum" if values[0] < 1.0 else "difference"}'
@@ -420,4 +420,5 @@ def near_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State)
     noise = 6.0 * error
     if apart <= OFF + noise * float(one.times[1]) and off <= OFF * np.linalg.norm(right) + noise:
         return ''
-    return f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates {off:.3g} rad/s'
+    return (f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates '
+            f'{off:.3g} rad/s')

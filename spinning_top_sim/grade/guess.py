@@ -59,9 +59,10 @@ def weak(times: Reals, axis: Reals) -> list[tuple[int, float, float]]:
                 normal).T * np.mean(rest * rest)
             error = math.sqrt(abs(float(np.trace(spread)))) / (
                 float(np.linalg.norm(solution)) + 1e-300)
-        found.append((error, size, *(float(v) for v in solution / scale)))
+        l3, p = (solution / scale).tolist()
+        found.append((error, size, l3, p))
         size = math.ceil(1.5 * size)
-    return [tuple(one[1:]) for one in sorted(found)]
+    return [(size, l3, p) for _, size, l3, p in sorted(found)]
 
 
 def _balance(times: Reals, axis: Reals, size: int) -> Reals:
@@ -128,6 +129,6 @@ def transverse_rates(times: Reals, q: Reals, axis: Reals) -> tuple[float, float,
     rest = float(np.sqrt(np.mean((axis[:, :size].T - powers @ found) ** 2)))
     slope = found[1] / t[-1]
     error = rest * math.sqrt(float(np.linalg.inv(powers.T @ powers)[1, 1])) / float(t[-1])
-    momentum = np.cross(axis[:, 0], slope)
-    w1, w2, _ = attitude.in_body(tuple(q[:, :1]), tuple(np.array([v]) for v in momentum))
+    x, y, z = np.cross(axis[:, 0], slope).tolist()
+    w1, w2, _ = attitude.in_body(tuple(q[:, :1]), (x, y, z))
     return float(w1[0]), float(w2[0]), error

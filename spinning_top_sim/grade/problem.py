@@ -65,7 +65,7 @@ class Problem:
         self._seen: dict[tuple[object, ...], tuple[States, Reals, Reals]] = {}
 
     def start(self, x: Reals) -> tuple[Top, State]:
-        """Return top and state with lambda1 = lambda3 = 1, which spins at L3 instead of omega_3."""
+        """Return top and state with lambda1 = lambda3 = 1: its spin is L3, not omega_3."""
         qx, qy, qz, qw = (float(part[0]) for part in turned(self.reference, x[TURN]))
         if math.hypot(qx, qy) < AT_POLE:
             qx = qy = 0.0
@@ -103,9 +103,9 @@ class Problem:
         states, q, w = self._motion(x, one.times, late)
         if one.kind == 'attitude':
             a, b, c, d = q
-            *axis, real = attitude.product((-a, -b, -c, d), tuple(one.values))
-            sign = np.where(real < 0.0, -1.0, 1.0)
-            return np.stack(attitude.rotation_vector((*(sign * part for part in axis), sign * real)))
+            x1, y1, z1, w1 = attitude.product((-a, -b, -c, d), tuple(one.values))
+            sign = np.where(w1 < 0.0, -1.0, 1.0)
+            return np.stack(attitude.rotation_vector((sign * x1, sign * y1, sign * z1, sign * w1)))
         model = w if one.kind == 'rates' else self._force(x, q, w)
         return one.values - np.stack(attitude.in_body(
             turned(self.mounting, x[MOUNTING]), tuple(model)))

@@ -124,7 +124,7 @@ def stress(first, count, processes):
     coverage = float(np.mean(np.abs(over_deviation[told]) <= INTERVAL))
     efficiency = math.sqrt(float(np.mean(over_bound[told] ** 2)))
     print(f'fit: seeds {first} to {first + count - 1}: {len(failures)} not fitted; of '
-          f'{np.count_nonzero(told)} parameters {100 * coverage:.1f} % are in their 95 % intervals; '
-          f'errors are {efficiency:.3f} times the Cramer-Rao bound')
+          f'{np.count_nonzero(told)} parameters {100 * coverage:.1f} % are in their 95 % '
+          f'intervals; errors are {efficiency:.3f} times the Cramer-Rao bound')
     good = COVERAGE[0] <= coverage <= COVERAGE[1] and efficiency <= EFFICIENCY
     return 0 if good and not failures else 1
