@@ -9,6 +9,7 @@ from helpers.reference import RIDES, scene_parameters
 from helpers.simulations import play, stream
 
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.solvers.vertical import AcceleratedMotion
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.simulation import Simulation
@@ -124,6 +125,25 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops(method):
     # Half a ramp of 0.4 s at each end, and 1.1 s of cruise.
     assert np.ravel(found.position) == pytest.approx((0.0, 0.8 * 1.5, 0.0), abs=1e-12)
     assert simulation.history == [(S, 0.0, 0.8, 0.0, 5 * S // 2)]
+
+
+def test_a_storm_of_velocities_costs_the_same_from_first_to_last(monkeypatch):
+    """Also with a filter that remembers all of them."""
+    states, counts = AcceleratedMotion.states, [0]
+
+    def counted(motion, times):
+        counts[-1] += len(times)
+        return states(motion, times)
+    monkeypatch.setattr(AcceleratedMotion, 'states', counted)
+    simulation = simulation_of(**{'solver.method': 'exact', 'imu.bandwidth': 1.0})
+    imu = [stream(simulation, 'imu/data_raw')]
+    simulation.drive((0.0, 0.0, 0.1))
+    for k in range(1, 61):
+        list(simulation.play(imu, k * S // 50))
+        simulation.drive((0.1 * (k % 7), 0.2, 0.0))
+        counts.append(0)
+    assert max(counts[40:-1]) <= 1.2 * max(counts[1:10])
+    assert simulation.imu.keep_ns > 60 * S // 50
 
 
 @pytest.mark.parametrize('velocity', [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 1e5)])

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.inspected import rewritten
 from helpers.readings import run
 from helpers.simulations import SECOND, play, record, simulate
 
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect
 from spinning_top_sim.tools import simulate as simulate_command
+from spinning_top_sim.tools.survey import survey
 
 pymap3d = pytest.importorskip('pymap3d')
 
@@ -124,7 +127,19 @@ def test_a_log_is_verified(tmp_path, capsys):
     assert simulate_command.main([*(part for value in values for part in ('-p', value)), '-o',
                                   str(path), '--duration', '5', '--quiet']) == 0
     assert inspect.main([str(path), '--verify']) == 0
-    assert 'gnss/fix' in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert 'gnss/fix' in text and '--verify compares each message' in text
+    # Neither the delay nor the outage is a gap; a message that is lost is one.
+    lossy = rewritten(path, tmp_path / 'lossy.mcap',
+                      lambda topic, number, data: None if number == 10 else data)
+    for log, lost in ((path, 0), (lossy, 1)):
+        with LogReader(log) as reader:
+            topics = survey(reader).topics
+        for topic, count, late_ns in ((FIX, 49, 120_000_000), (VELOCITY, 49 - 21, 120_000_000),
+                                      (TRUE_FIX, 51, 0)):
+            report, at_ns = topics[f'/{topic}'], SECOND + 10 * PERIOD_NS + late_ns
+            assert (report.count, report.missing) == (count - lost, lost)
+            assert report.gaps_ns == lost * [(at_ns, at_ns)]
 
 
 @pytest.mark.parametrize(('name', 'value'), [

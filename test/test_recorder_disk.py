@@ -66,19 +66,6 @@ def test_a_policy_that_is_not_understood_is_the_default(value):
     assert parsed_qos(text) == (DEFAULT_QOS,)
 
 
-def test_an_existing_file_is_left_alone(tmp_path):
-    path = tmp_path / 'run.mcap'
-    path.write_text('precious')
-    with pytest.raises(RecordingError, match=r'run\.mcap.*exists'):
-        McapRecorder(path, TOPICS, METADATA, min_free_bytes=0)
-    assert path.read_text() == 'precious'
-
-
-def test_a_missing_directory_is_named(tmp_path):
-    with pytest.raises(RecordingError, match=f'no directory {tmp_path}/logs'):
-        McapRecorder(tmp_path / 'logs' / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
-
-
 def test_too_little_space_at_the_start_leaves_no_file(tmp_path):
     with pytest.raises(RecordingError, match=r'run\.mcap: \d+ bytes are free .* 10{30}'):
         McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=10 ** 30)

@@ -290,21 +290,6 @@ def test_a_page_as_a_file_is_never_overwritten(log, tmp_path, capsys):
     assert path.read_text() == 'mine'
 
 
-def test_the_body_stands_on_its_pivot_and_has_marks(shown):
-    shape, length = shown.shape, model.reach(shown)
-    parts = {part.name: part.mesh for part in body.wheel(shape, length)}
-    rim, axle = parts['rim'], parts['axle']
-    assert np.hypot(*rim.vertices.T[:2]).max() == pytest.approx(shape.radius)
-    assert np.hypot(*rim.vertices.T[:2]).min() > 0.8 * shape.radius        # it hides nothing
-    assert rim.vertices[:, 2].mean() == pytest.approx(shape.centre)
-    assert sorted(axle.bounds[:, 2]) == pytest.approx([0.0, length])
-    turned = parts['mark'].vertices @ Rotation.from_euler('z', 45.0, degrees=True).as_matrix()
-    assert abs(np.sort(turned[:, 0]) - np.sort(parts['mark'].vertices[:, 0])).max() > 0.01
-    peg = body.stand(1.0)
-    assert peg.bounds[:, 2] == pytest.approx([-1.0, 0.0])
-    assert np.hypot(*peg.vertices[peg.vertices[:, 2] > -0.5].T[:2]).max() < 0.05
-
-
 def test_a_player_follows_its_buttons_and_the_slider(shown, page):
     player = logs.Player(page, [shown])
     assert player.length == pytest.approx(6.0)

@@ -26,7 +26,9 @@ MEANINGS = {
     'bias_error_s': f'deg left by 1 deg/s; fault from {diagnosis.BIAS_LEFT_S:g} unless learned',
     'bias_found': f'share of the bias in the estimate; learned from {diagnosis.BIAS_FOUND:g}',
     'nees': 'error^2 of the tilt over its covariance; right from nees_low to nees_high',
-    'nees_attitude': 'the same of the whole attitude'}
+    'nees_attitude': 'the same of the whole attitude',
+    'data_rms_deg': 'of real readings in motion, mean over the trials',
+    'data_heading_rms_deg': 'heading alone', 'data_tilt_rms_deg': 'tilt alone'}
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,8 @@ class Report:
 
     def measure_lines(self) -> list[str]:
         """Return the measures, with what they mean, except those that could not be measured."""
-        return [f'{name:<26}{value:>12.4g}  {MEANINGS.get(name, "")}'.rstrip()
+        width = max(map(len, self.measures), default=0)
+        return [f'{name:<{width}}{value:>12.4g}  {MEANINGS.get(name, "")}'.rstrip()
                 for name, value in self.measures.items() if not math.isnan(value)]
 
     def as_json(self) -> str:

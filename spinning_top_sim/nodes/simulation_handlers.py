@@ -68,7 +68,6 @@ class SimulationHandlers:
         return response
 
     def _outcome(self, act: Callable[[], str | None]) -> tuple[int, str]:
-        """Return the result code and the text of an action."""
         error, text = self._node.outcome(act)
         if error is None:
             return self._results.RESULT_OK, text

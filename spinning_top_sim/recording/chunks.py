@@ -68,7 +68,6 @@ class PlainChunk:
         return self._memory[:self.size]
 
     def record(self) -> Chunk:
-        """Return the chunk, compressed."""
         start_ns, end_ns = time_span(self.entries)
         return Chunk(
             compression='' if self._compression == 'none' else self._compression,
@@ -78,7 +77,6 @@ class PlainChunk:
 
     def add(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
             data: bytes | bytearray | memoryview) -> None:
-        """Add a message."""
         offset = self.size
         start = offset + MESSAGE.size
         end = start + len(data)

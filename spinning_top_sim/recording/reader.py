@@ -122,7 +122,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.profile, self.library = header.profile, header.library
 
     def close(self) -> None:
-        """Close the file."""
         self.file.close()
 
     def __exit__(self, *exception: object) -> None:
@@ -258,7 +257,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     @property
     def _messages(self) -> list[Part]:
-        """The parts of the file that hold messages."""
         return [part for part in self._index.parts if part.channel_ids]
 
     def _leads_to_chunk(self, index: ChunkIndex) -> bool:

@@ -95,7 +95,6 @@ class TransportEquations(Equations):
                 0.5j * momentum / lambda1)
 
     def derivative(self, alpha: complex, beta: complex, m: complex) -> Vector:
-        """Return (alpha', beta', m')."""
         return (self._turn_alpha * alpha + m * beta.conjugate(),
                 self._turn_beta * beta - m * alpha.conjugate(),
                 self._fall * (alpha * beta))

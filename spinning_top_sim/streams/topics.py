@@ -31,7 +31,6 @@ NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
 def _place(samples: Samples) -> Sequence[Any]:
-    """Return the position of the pivot in the world [m]."""
     return tuple(samples.pivot.position) if samples.segment.ride else messages.ORIGIN
 
 
@@ -40,13 +39,11 @@ def _pose(samples: Samples) -> Sequence[Field]:
 
 
 def _odometry(samples: Samples) -> Sequence[Field]:
-    """Return pose and twist of the body's frame; the twist is in that frame."""
     states = samples.states
     return (*_pose(samples), samples.once(_velocity), states.rows_angular_velocity)
 
 
 def _velocity(samples: Samples) -> Vector:
-    """Return the velocity of the pivot in the frame of the body [m/s]."""
     if not samples.segment.ride:
         return messages.ORIGIN
     x, y, z = samples.pivot.velocity
@@ -54,7 +51,6 @@ def _velocity(samples: Samples) -> Vector:
 
 
 def _joints(samples: Samples) -> Sequence[Field]:
-    """Return angles and rates of the joints of the URDF."""
     states = samples.states
     return ((states.phi, states.theta, states.psi),
             (states.phi_dot, states.theta_dot, states.psi_dot))
@@ -65,14 +61,12 @@ def _readings(imu: Imu, samples: Samples) -> Sequence[Field]:
 
 
 def _estimates(imu: Imu, samples: Samples) -> Sequence[Field]:
-    """Return the readings with the orientation that the sensor estimates."""
     _, *readings = _readings(imu, samples)
     exact = imu.orientation(samples.states)
     return (imu.present_sensor.orientation(exact, samples.times), *readings)
 
 
 def _increment(imu: Imu, place: int, samples: Samples) -> Sequence[Field]:
-    """Return the rotation (place 0) or velocity increment over the interval that ends there."""
     return (samples.once(imu.measured_increments)[place],)
 
 
@@ -206,7 +200,6 @@ class Markers(Stream):
 
     @staticmethod
     def _point(samples: Samples, along: float) -> Vector:
-        """Return where a point of the axis is in the world."""
         x, y, z = (along * part for part in samples.states.rows_axis)
         if samples.segment.ride:
             a, b, c = samples.pivot.position

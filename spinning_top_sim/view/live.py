@@ -128,7 +128,8 @@ class LiveView(Node):
                 numbers = {pair.key: pair.value for pair in status.values}
                 self._controls.tell_status(status.message, numbers)
                 origin_ns = int(numbers['stamp of t = 0 [ns]'])
-                self._stale |= self._origin_ns not in (None, origin_ns)
+                if self._origin_ns not in (None, origin_ns):
+                    self._stale = True      # not `|=`: that could undo what `choose` writes
                 self._origin_ns = origin_ns
                 self._errors = float(numbers['energy drift']), float(
                     numbers['orientation error [rad]'])

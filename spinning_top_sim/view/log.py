@@ -91,7 +91,6 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
 
 
 def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> None:
-    """Compute the run again to find its motions and commands."""
     for simulation, event in recorded_run.rerun(run, end_ns):
         if isinstance(event, Block) or event.name == 'parameters':
             continue
@@ -143,7 +142,6 @@ class Player:
         self._button.label = 'Pause' if self._plays else 'Play'
 
     def _go_to_next(self) -> None:
-        """Go to the next command, from the last one to the first."""
         behind = bisect_right(self._commands, self._now + 1e-9)
         self._now = self._commands[behind % len(self._commands)]
 
@@ -170,7 +168,6 @@ class Player:
         self.draw(self._now)
 
     def draw(self, now: float) -> None:
-        """Draw the picture of a time [s]."""
         self._page.draw(self._begin_ns + round(now * NANOSECONDS), self._origin_ns)
 
     def write_html(self, path: Path) -> str:

@@ -45,7 +45,6 @@ def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns:
 
 
 def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
-    """Yield label, value and note of each number."""
     moves = motion.description
     if moves is not None:
         low, high = (number(math.degrees(theta)) for theta in (moves.theta_min, moves.theta_max))

@@ -84,9 +84,12 @@ class Visit:
         box.press('Enter')
 
     def choose(self, label, option):
-        """Choose from a drop-down."""
-        self.page.get_by_label(label, exact=True).first.click()
-        self.page.get_by_role('option', name=option, exact=True).click()
+        """Choose from a drop-down by keys: its list scrolls while a mouse moves to an option."""
+        box = self.page.get_by_label(label, exact=True).first
+        box.fill(option)
+        self.page.get_by_role('option', name=option, exact=True).wait_for()
+        box.press('ArrowDown')
+        box.press('Enter')
 
     def tick(self, label):
         self.page.get_by_label(label, exact=True).click()
