@@ -77,7 +77,8 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
                 if 0.5 < norm < 2.0:
                     found[stamp_ns] = quaternion / norm
         if found:
-            rows = Samples(np.array(list(found), np.int64), np.array(list(found.values())))
+            rows = Samples(np.array(list(found), np.int64), np.pad(
+                np.array(list(found.values())), ((0, 0), (0, 3))))
             track.add('pose', rows)
             track.origin_ns = track.span[0]
             break
@@ -90,7 +91,8 @@ def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> 
             continue
         begin_ns = simulation.epoch_ns + max(simulation.now_ns, 0)
         track.motions.append(DescribedMotion.of(
-            begin_ns, track.top, simulation.segment.start, simulation.describe()))
+            begin_ns, track.top, simulation.segment.start, simulation.describe(),
+            rides=simulation.segment.ride is not None))
         if event.name == 'command':
             track.commands_ns.append(begin_ns)
 
@@ -140,11 +142,12 @@ class Player:
         self._now = self._commands[behind % len(self._commands)]
 
     def play(self) -> None:
-        """Show pictures until KeyboardInterrupt."""
+        """Show pictures until KeyboardInterrupt; the log waits for somebody who looks at it."""
         due = time.monotonic()
         while True:
             due = max(due + 1.0 / RATE, time.monotonic() - CATCH_UP_S)
-            self.draw_next(float(self._speed.value) / RATE if self._plays else 0.0)
+            plays = self._plays and self._page.server.get_clients()
+            self.draw_next(float(self._speed.value) / RATE if plays else 0.0)
             time.sleep(max(due - time.monotonic(), 0.0))
 
     def draw_next(self, step: float) -> None:
