@@ -14,6 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from functools import cached_property
+from operator import sub
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +59,9 @@ class ThetaFunctions:
     def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
         self.rates = Rates([motion.quarter_rate, *(x.rate / pi() for x in factors)])
-        whole = [motion.quarter0, *(round(2 * x.phase_turns) for x in factors)]
-        rest = [motion.offset0, *(2 * x.phase_turns - round(2 * x.phase_turns) for x in factors)]
+        turns = [2 * x.phase_turns for x in factors]
+        whole = [motion.quarter0, *map(round, turns)]
+        rest = [motion.offset0, *map(sub, turns, whole[1:])]
         self.start_whole = _column(whole)
         self.offset, self.offset_rest = map(_column, zip(*map(double_double, rest), strict=True))
         self.drifts = _column(0.5 * float(factor.drift) for factor in factors)
