@@ -16,8 +16,8 @@ $(if $(filter-out jazzy kilted,$(ROS)),$(error ROS=$(ROS) is neither jazzy nor k
 .NOTPARALLEL:
 .SUFFIXES:
 MAKEFLAGS += --no-builtin-rules
-.PHONY: help run view test coverage mutation stress performance performance-check benchmark docs \
-    dependencies lint build clean FORCE
+.PHONY: help run view test coverage mutation stress performance performance-check benchmark engines \
+    docs dependencies lint build clean FORCE
 
 # DDS stays on this machine.  Its default is to discover nodes in the whole network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
@@ -107,6 +107,13 @@ performance-check: dependencies
 benchmark performance:
 	@$(MAKE) --no-print-directory VENV=.venv-benchmark dependencies
 	@benchmark/all .venv-benchmark $@
+
+#: make engines
+#:              install physics engines into .venv-engines, grade them, and write
+#:              docs/measured/engines.md; an hour
+engines:
+	@$(MAKE) --no-print-directory VENV=.venv-engines .venv-engines/.deps-engines
+	PYTHONPATH=. .venv-engines/bin/python benchmark/engines.py
 
 #: make stress  random inputs, faults and kills, more than an hour; SECONDS=180 a
 #:              part

@@ -85,7 +85,8 @@ recording, or only at the start of the node (read-only).
 |---|---|---|---|---|---|
 """
 
-COMMANDS = 'sim_node', 'replay_node', 'simulate', 'inspect', 'recover', 'examine', 'ensemble', 'view'
+COMMANDS = ('sim_node', 'replay_node', 'simulate', 'inspect', 'recover', 'export', 'examine',
+            'ensemble', 'view')
 AFTER_PARAMETERS = """
 ## Commands
 

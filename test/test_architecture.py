@@ -18,6 +18,7 @@ MAY_IMPORT = {
     'recording': set(),
     'tools': {'physics', 'solvers', 'streams', 'recording'},
     'exam': {'physics', 'solvers', 'streams', 'recording', 'tools'},
+    'grade': {'physics', 'solvers', 'streams', 'recording', 'tools', 'exam'},
     'nodes': {'physics', 'solvers', 'streams', 'recording', 'tools'},
     'view': {'physics', 'solvers', 'streams', 'recording', 'tools', 'nodes'},
 }
@@ -30,6 +31,7 @@ MAY_NOT_IMPORT = {
     'recording': {'rclpy', 'scipy'},
     'tools': {'rclpy'},
     'exam': set(),
+    'grade': {'rclpy'},
     'nodes': {'scipy', 'viser'},
     'view': {'scipy'},
 }

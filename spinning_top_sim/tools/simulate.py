@@ -12,14 +12,10 @@ exit codes:
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.reader import LogReader
@@ -30,17 +26,12 @@ from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
-from spinning_top_sim.streams.stream import Encoded, Samples, Stream, period_ns
+from spinning_top_sim.streams.stream import Stream, period_ns
 from spinning_top_sim.tools import cli, export, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
+from spinning_top_sim.tools.table import RideTable, Table, write_csv, write_parquet
 
 FORMATS = ('mcap', 'csv', 'parquet')
-# Names and units of the columns of a table.
-UNITS = {
-    't': 's', 'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'phi_dot': 'rad/s',
-    'psi': 'rad', 'psi_dot': 'rad/s', 'qx': '1', 'qy': '1', 'qz': '1', 'qw': '1',
-    'omega_1': 'rad/s', 'omega_2': 'rad/s', 'omega_3': 'rad/s', 'energy': 'J',
-    'l3': 'kg m^2/s', 'lz': 'kg m^2/s'}
 
 # Time [ns], and L3 and Lz commanded there [kg m^2/s], None at the end of the run.
 Stop = tuple[int, tuple[float, float] | None]
@@ -55,11 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add = parser.add_argument
-    scene_file.add_arguments(parser)
-    add('--params', metavar='FILE', action='append', default=[],
-        help='parameter file as for the node; may be repeated')
-    add('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
-        help='one parameter; may be repeated')
+    scene_file.add_parameters(parser)
     add('--duration', type=float, metavar='S',
         help='simulated time [s]; default: the parameter duration')
     add('-o', '--output', metavar='FILE', required=True, type=Path,
@@ -99,8 +86,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if file_format == 'mcap':
             summary = write_log(output, simulation, stops, show, arguments.namespace)
         else:
-            _write_table(output, file_format, simulation, stops, show)
-            summary = ', '.join(UNITS)
+            summary = ', '.join(_write_table(output, file_format, simulation, stops, show))
     lines = [f'{output}: {summary}']
     if arguments.export:
         with LogReader(output) as reader:
@@ -112,21 +98,19 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
-                 show: Callable[[float], object]) -> None:
-    table = Table(period_ns(simulation.values['pose.rate']))
-    write = _write_csv if file_format == 'csv' else _write_parquet
+                 show: Callable[[float], object]) -> Mapping[str, str]:
+    """Write a table; return the units of its columns."""
+    table = (RideTable if simulation.pivot else Table)(period_ns(simulation.values['pose.rate']))
+    write = write_csv if file_format == 'csv' else write_parquet
     # A command changes the rows after its time.
     write(path, (rows for done in _play(simulation, [table], stops, show)
-                 if isinstance(done, Block) for _, _, rows in done.parts))
+                 if isinstance(done, Block) for _, _, rows in done.parts), table.units)
+    return table.units
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the checked parameters of the command line.  Raises ValueError or OSError."""
-    given: dict[str, object] = {}
-    for path in (*scene_file.chosen_files(arguments), *arguments.params):
-        given.update(scene_file.read_scene(path))
-    given.update((name, value) for name, value in map(scene_file.parse_assignment, arguments.param)
-                 if not scene_file.is_of_ros(name))
+    given = scene_file.given(arguments)
     given.update((name, value) for name, value in vars(arguments).items()
                  if name in ('seed', 'duration') and value is not None)
     values = parameters.checked(given)
@@ -208,42 +192,6 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
         finally:
             file.finish()
     return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
-
-
-class Table(Stream):
-    """The true states as rows of numbers: a stream whose messages are the rows of a table."""
-
-    size = 8 * len(UNITS)
-
-    def __init__(self, period_ns: int) -> None:
-        self.period_ns = period_ns
-
-    def encode(self, samples: Samples) -> Encoded:
-        states = samples.states
-        columns = np.broadcast_arrays(
-            samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
-            states.psi, states.psi_dot, *states.quaternion.T, *states.angular_velocity.T,
-            states.energy, states.l3, states.lz)
-        return samples.t_ns, np.stack(columns, axis=-1)
-
-
-def _write_csv(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
-    with open(path, 'x', encoding='utf-8') as file:
-        file.write(','.join(f'{name} [{unit}]' for name, unit in UNITS.items()) + '\n')
-        for rows in blocks:
-            # csv.writer looks for what to quote in every number, and takes a third longer.
-            file.writelines(','.join(map(repr, row)) + '\n' for row in rows.tolist())
-
-
-def _write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]]) -> None:
-    """Write a Parquet file.  Raises ImportError, and makes no file, without pyarrow."""
-    with needed('a Parquet file', 'parquet'):
-        import pyarrow as pa  # noqa: PLC0415
-        from pyarrow import parquet  # noqa: PLC0415
-    schema = pa.schema([(name, pa.float64()) for name in UNITS])
-    with open(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
-        for rows in blocks:
-            writer.write_table(pa.table(list(rows.T), schema=schema))
 
 
 if __name__ == '__main__':

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Names what is wrong with a simulator's equations of motion and steps.
+
+The change of its rates in each step is compared with what gravity and the gyroscopic term, both of
+its own attitudes and rates, would cause.  Errors do not add up there, so that the method works on
+every motion, and for every size of the error.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from spinning_top_sim.exam.measures import rms
+from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
+from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, least_squares
+from spinning_top_sim.grade.report import Fault
+from spinning_top_sim.grade.scenes import Body, Reals
+
+# Mean over the interval in the middle of six samples, for polynomials of degree 5.
+_MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
+LATE = 0.75         # steps
+STRANGE = 0.02      # of the rates, or of what changes in them in a step: they are not these
+UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
+EXPLAINED = 0.25    # of the discrepancy is left at most
+
+
+def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
+    """
+    Compare the rates that a simulator tells with its attitudes.
+
+    Returns body rates (n - 6, 3) of each motion: those told where they are right, or else those of
+    the attitudes; and the faults of those told.
+    """
+    derived = [motion.rates for motion in motions]
+    if any(motion.trajectory.rates is None for motion in motions):
+        return derived, []
+    told = [motion.trajectory.rates[MARGIN:-MARGIN]     # type: ignore[index]
+            for motion in motions]
+    sizes = [1.0 / (rms(rates) or 1.0) for rates in derived]
+
+    def pooled(parts: Sequence[Reals]) -> Reals:
+        return np.concatenate([size * part[MARGIN:-MARGIN]
+                               for size, part in zip(sizes, parts, strict=True)])
+
+    target = pooled(derived) - pooled(told)
+    if not rms(target):
+        return told, []
+    step = np.concatenate([size * derivative(rates, 1.0)
+                           for size, rates in zip(sizes, told, strict=True)])
+    (lead,), left = least_squares(target, [step])
+    if abs(lead) <= LATE and rms(left) <= STRANGE:
+        return told, []
+    if rms(left) < 0.5 * rms(target):
+        return derived, [Fault('imu_one_step_late', f'rates belong to the attitudes of {lead:.3g} '
+                               'steps before', float(lead))]
+    turned = [motion.trajectory.rotation[MARGIN:-MARGIN].inv().apply(rates)
+              for motion, rates in zip(motions, told, strict=True)]
+
+    def scale(found: Reals) -> Fault:
+        factor = 1.0 / (1.0 + found[0])
+        units = any(abs(factor / unit - 1.0) < 0.01 for unit in (180.0 / math.pi, math.pi / 180.0))
+        return Fault('units' if units else 'rates_scale',
+                     f'rates are {factor:.4g} times those at which the attitude turns', factor)
+
+    world = instead('rates_in_world', 'rates turned from axes of the world to those of the body '
+                    'are those of the attitude')
+    faults = explain(target, [Cause([pooled(told)], scale),
+                              Cause([pooled(told), pooled(turned)], world)]).faults
+    if not faults:
+        faults = [Fault('rates_scale', f'the attitude turns at other rates: they differ by '
+                        f'{100.0 * rms(target):.3g} %', math.nan)]
+    right = {'rates_in_world': turned, 'rates_scale': told}.get(faults[0].name, derived)
+    return right, faults
+
+
+def faults_of(motions: Sequence[Motion], rates: Sequence[Reals], dt: float) -> list[Fault]:
+    """Return the causes of the error of motions; rates as `rates_of` returns them."""
+    blocks = [_terms(motion, w, dt) for motion, w in zip(motions, rates, strict=True)]
+    # Motions count the same, unless what is not explained is small there.
+    sizes = [rms(target) for target, _ in blocks]
+    weights = [1.0 / max(size, 0.1 * max(sizes), UNIMPORTANT) for size in sizes]
+    target, columns = (np.concatenate([weight * part for weight, part in zip(
+        weights, parts, strict=True)]) for parts in zip(*blocks, strict=True))
+    # Columns as `_terms` has them.
+    gyroscopic, gyroscopic_step, gravity_step, in_world, damping, axis_damping, *others = (
+        columns.transpose(1, 0, 2))
+    arms, euler = others[:3], others[3:]
+    body = motions[0].body
+    if max(sizes) < UNIMPORTANT:
+        return []
+    found = explain(target, [
+        Cause([gyroscopic], _gyroscopic), Cause([gyroscopic_step, gravity_step], _step),
+        Cause([gyroscopic, in_world], instead('inertia_frame', 'the gyroscopic term is that of '
+                                              'moments of inertia about axes of the world')),
+        Cause([damping, axis_damping], _damping), Cause(arms, lambda found: _com(body, found)),
+        Cause(euler, lambda found: _inertia(body, found))])
+    return found.faults if found.left < EXPLAINED else []
+
+
+def _terms(motion: Motion, w: Reals, dt: float) -> tuple[Reals, Reals]:
+    """Return the angular acceleration that is not explained (N, 3), and its causes (N, k, 3)."""
+    body, step = motion.body, motion.trajectory.step
+    rotation = motion.trajectory.rotation[MARGIN:-MARGIN]
+    z = rotation.inv().apply((0.0, 0.0, 1.0))
+    inertia = np.array(body.inertia)
+    zero = np.zeros(len(w))
+    weight = body.mass * body.gravity
+    gyroscopic = -np.cross(w, inertia * w) / inertia
+    arms = [-weight * np.cross(e, z) / inertia for e in np.eye(3)]
+    gravity = body.com_distance * arms[2]
+    world = rotation.apply(w)
+    in_world = rotation.inv().apply(-np.cross(world, inertia * world) / inertia)
+    across = w * (1.0, 1.0, 0.0)
+    euler = [np.stack(rows, axis=1) for rows in (
+        (gravity[:, 0], zero, zero), (zero, gravity[:, 1], zero), (w[:, 1] * w[:, 2], zero, zero),
+        (zero, w[:, 2] * w[:, 0], zero), (zero, zero, w[:, 0] * w[:, 1]))]
+    nodes = np.stack([gyroscopic, in_world, -across, across - w, *arms, *euler], axis=1)
+    means = sum(weight * nodes[at:len(nodes) - 5 + at] for at, weight in enumerate(_MEAN))
+    steps = (dt / step) * np.stack([np.diff(part, axis=0)[2:-2]
+                                    for part in (gyroscopic, gravity)], axis=1)
+    columns = np.concatenate((means[:, :1], steps, means[:, 1:]), axis=1)
+    change = np.diff(w, axis=0)[2:-2] / step
+    target = change - means[:, 0] - body.com_distance * means[:, 6]
+    size = 1.0 / (rms(change) or 1.0)
+    return size * target, size * columns
+
+
+def _gyroscopic(found: Reals) -> Fault:
+    share = 1.0 + float(found[0])
+    text = f'the gyroscopic term w x I w has {share:.3g} times its size'
+    return Fault('no_gyroscopic_term' if abs(share) < NEAR else
+                 'coriolis_sign' if share < 0.0 else 'inertia', text, share)
+
+
+def _step(found: Reals) -> Fault:
+    at, gravity_at = (0.5 + found).tolist()
+    name, means = (('first_order', f'gravity at {gravity_at:.3g}') if abs(at - 0.5) < NEAR else
+                   ('implicit_damping', 'it removes energy') if at > 0.5 else
+                   ('explicit_gyroscopic_term', 'it adds energy') if at > -0.5 else
+                   ('coriolis_sign', 'its derivative in an implicit step has the wrong sign'))
+    return Fault(name, f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right '
+                 f'is 0.5: {means}', at)
+
+
+def _damping(found: Reals) -> Fault:
+    across, along = found.tolist()
+    return Fault('damping', f'a torque against the rates, {across:.3g} 1/s of them across the '
+                 f'axis and {along:.3g} 1/s about it', across)
+
+
+def _com(body: Body, found: Reals) -> Fault:
+    com = found + body.com
+    text = f'the torque of gravity is that of a centre of mass at ({_listed(com)}) m, not at ' \
+        f'({_listed(body.com)}) m'
+    if np.linalg.norm(com + body.com) < 0.1 * abs(body.com_distance):
+        return Fault('gravity_sign', f'{text}: gravity points upwards', -1.0)
+    return Fault('com_offset', text, float(np.linalg.norm(found)))
+
+
+def _inertia(body: Body, found: Reals) -> Fault | None:
+    shares = 1.0 + found[:2]
+    if np.any(shares <= 0.0):
+        return None
+    first, second = body.lambda1 / shares
+    # (I2 - I3)/I1, (I3 - I1)/I2 are told by the first two.
+    right = (body.lambda1 - body.lambda3) / body.lambda1
+    third = 0.5 * (second - first * (right + found[2]) + first + second * (found[3] - right))
+    return Fault('inertia', 'the motion is that of moments of inertia '
+                 f'{_listed((first, second, third))} kg m^2, not {_listed(body.inertia)}',
+                 float(first))
+
+
+def _listed(values: Sequence[float] | Reals) -> str:
+    return ', '.join(f'{float(value):.4g}' for value in values)

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Explains a discrepancy by as few causes as possible: small least-squares fits."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from spinning_top_sim.exam.measures import rms
+from spinning_top_sim.grade.report import Fault
+from spinning_top_sim.grade.scenes import Reals
+
+MOST_CAUSES = 3
+ENOUGH = 0.2            # of the discrepancy may remain: further causes are not looked for
+WORTHWHILE = 0.8        # of what remains is left at most by another cause
+NEAR = 0.25             # of a coefficient to the value that it has for a fault
+AS_GOOD = 2.0           # a cause with fewer columns may leave so many times more
+
+# From the coefficients of a cause to the fault; None for what is no fault.
+Judge = Callable[[Reals], Fault | None]
+
+
+class Cause(NamedTuple):
+    """
+    A possible cause of a discrepancy.
+
+    columns : (k, N, 3), the change of what is compared by each of k effects of size 1
+    judge : names the fault
+    """
+
+    columns: Sequence[Reals]
+    judge: Judge
+
+
+def instead(name: str, evidence: str) -> Judge:
+    """Return a judge of two columns: the second effect is there instead of the first."""
+    def judge(found: Reals) -> Fault | None:
+        return Fault(name, evidence) if np.allclose(found, (-1.0, 1.0), atol=NEAR) else None
+    return judge
+
+
+class Explained(NamedTuple):
+    """Faults that explain a discrepancy, what is left of it (N, 3), and its share of the rms."""
+
+    faults: list[Fault]
+    residual: Reals
+    left: float
+
+
+def explain(target: Reals, causes: Sequence[Cause], floor: float = 0.0) -> Explained:
+    """
+    Explain a discrepancy (N, 3) by causes, the best one first.
+
+    floor : rms of the noise in the target
+    """
+    chosen: list[Cause] = []
+    residual, fitted = target, np.empty(0)
+    enough = max(ENOUGH * _excess(target, floor), 0.1 * floor)
+    while len(chosen) < MOST_CAUSES and (before := _excess(residual, floor)) > enough:
+        tried = [(one, _fit(target, [*chosen, one])) for one in causes
+                 if not any(one is other for other in chosen)]
+        after = [_excess(left, floor) for _, (_, left) in tried]
+        good = max(AS_GOOD * min(after), 0.02 * before)
+        size, left, number = min((len(one.columns), left, number)
+                                 for number, ((one, _), left) in enumerate(
+                                     zip(tried, after, strict=True)) if left <= good)
+        if left > WORTHWHILE * before:
+            break
+        one, (fitted, residual) = tried[number]
+        chosen.append(one)
+    faults, at = [], 0
+    for one in chosen:
+        fault = one.judge(fitted[at:at + len(one.columns)])
+        at += len(one.columns)
+        if fault is not None:
+            faults.append(fault)
+    return Explained(faults, residual, _excess(residual, floor) / (_excess(target, floor) or 1.0))
+
+
+def least_squares(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
+    """Return the coefficients (k,) of columns (N, 3) by least squares, and the residual."""
+    matrix = np.stack([column.ravel() for column in columns], axis=1)
+    size = np.sqrt(np.sum(matrix * matrix, axis=0))
+    size[size == 0.0] = 1.0
+    found = np.linalg.lstsq(matrix / size, target.ravel(), rcond=1e-9)[0] / size
+    return found, target - (matrix @ found).reshape(target.shape)
+
+
+def _fit(target: Reals, causes: Sequence[Cause]) -> tuple[Reals, Reals]:
+    return least_squares(target, [column for one in causes for column in one.columns])
+
+
+def _excess(values: Reals, floor: float) -> float:
+    """Return the rms beyond that of noise."""
+    return float(np.sqrt(max(rms(values) ** 2 - floor ** 2, 0.0)))

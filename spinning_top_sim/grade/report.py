@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The result of grading a simulator, as text and JSON."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+# docs/grade.md defines them.
+FAULTS = (
+    'invalid_output', 'not_deterministic', 'first_order', 'explicit_gyroscopic_term',
+    'implicit_damping', 'coriolis_sign', 'no_gyroscopic_term', 'inertia_frame', 'inertia',
+    'com_offset', 'gravity_sign', 'damping', 'inaccurate', 'rates_in_world', 'rates_scale',
+    'imu_one_step_late', 'mounting', 'rotation_reversed', 'reading_sign', 'units',
+    'reading_in_world', 'reading_scale', 'no_lever_arm', 'no_tangential_term',
+    'no_centripetal_term', 'acceleration_scale', 'no_gravity', 'gravity_frame',
+    'finite_differences', 'inconsistent_reading', 'energy', 'noise_scale', 'uniform_noise',
+    'covariance_zero')
+
+
+class Fault(NamedTuple):
+    """
+    A fault of a simulator.
+
+    Parameters
+    ----------
+    name : str
+        One of FAULTS.
+    evidence : str
+        Why it is reported.
+    number : float
+        What was measured, such as a lag or a coefficient; NaN where there is none.
+    """
+
+    name: str
+    evidence: str
+    number: float = math.nan
+
+
+@dataclass(frozen=True)
+class Report:
+    """
+    The result of grading a simulator; `str(report)` is readable.
+
+    Parameters
+    ----------
+    subject : str
+        Name of the simulator.
+    faults : sequence of Fault
+        The faults with their evidence.
+    marks : mapping
+        Measures by name, as docs/grade.md defines them; NaN: could not be measured.
+    """
+
+    subject: str
+    faults: Sequence[Fault]
+    marks: Mapping[str, float]
+
+    @property
+    def passed(self) -> bool:
+        """Whether no fault was found."""
+        return not self.faults
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the faults, each once."""
+        return list(dict.fromkeys(fault.name for fault in self.faults))
+
+    def __str__(self) -> str:
+        lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.names)}']
+        lines += [f'  {fault.name}: {fault.evidence}' for fault in self.faults]
+        lines += [f'  {name:<40}{value:>12.4g}' for name, value in self.marks.items()
+                  if not math.isnan(value)]
+        return '\n'.join(lines)
+
+    def as_json(self) -> str:
+        """Return JSON with subject, passed, faults (name, evidence, number) and marks."""
+        def number(value: float) -> float | None:
+            return value if math.isfinite(value) else None
+        return json.dumps({
+            'subject': self.subject, 'passed': self.passed,
+            'faults': [{**fault._asdict(), 'number': number(fault.number)}
+                       for fault in self.faults],
+            'marks': {name: number(value) for name, value in self.marks.items()}}, indent=2)

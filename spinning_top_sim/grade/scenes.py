@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a simulator is given: a top with an IMU on it and its start; and the motions graded."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.exact import ExactSolution
+
+Reals = NDArray[np.float64]
+# What is no field of `Top`: numbers, and vectors with their length.
+_LENGTHS = {'lever_arm': 3, 'mounting': 4, 'field': 3}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body(Top):
+    """
+    A top with an IMU on it.  The pivot is the origin of the body frame, e3 the axis.
+
+    Parameters
+    ----------
+    lever_arm : (3,) float
+        Position of the IMU in the body frame [m].
+    mounting : (4,) float
+        q(body <- IMU) as w, x, y, z.
+    field : (3,) float
+        Magnetic field in the world [T].
+    gyroscope_noise_density, accelerometer_noise_density : float
+        Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
+        sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
+    """
+
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mounting: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    field: tuple[float, float, float] = (0.0, 20e-6, -43e-6)
+    gyroscope_noise_density: float | None = None
+    accelerometer_noise_density: float | None = None
+
+    def __post_init__(self) -> None:
+        Top(**{one.name: getattr(self, one.name) for one in fields(Top)})
+        for name, length in _LENGTHS.items():
+            value = np.asarray(getattr(self, name), dtype=float)
+            if value.shape != (length,) or not np.all(np.isfinite(value)):
+                raise ValueError(f'{name} = {getattr(self, name)!r}: must be {length} finite '
+                                 'numbers')
+            object.__setattr__(self, name, tuple(value.tolist()))
+        if abs(math.hypot(*self.mounting) - 1.0) > 1e-6:
+            raise ValueError(f'mounting = {self.mounting!r}: its norm must be 1')
+        for name in ('gyroscope_noise_density', 'accelerometer_noise_density'):
+            if not 0.0 <= (getattr(self, name) or 0.0) < math.inf:
+                raise ValueError(f'{name} = {getattr(self, name)!r}: must be >= 0, or None')
+
+    @classmethod
+    def of(cls, top: Top, **imu: object) -> Self:
+        """Return the body of a top; `imu` are the other parameters, by default those above."""
+        if isinstance(top, cls) and not imu:
+            return top
+        given = {one.name: getattr(top, one.name) for one in fields(top)}
+        return cls(**{**given, **imu})
+
+    @property
+    def inertia(self) -> tuple[float, float, float]:
+        """Principal moments of inertia about the pivot [kg m^2]."""
+        return self.lambda1, self.lambda1, self.lambda3
+
+    @property
+    def inertia_at_com(self) -> tuple[float, float, float]:
+        """Principal moments of inertia about the centre of mass [kg m^2]."""
+        return self.lambda1_at_com, self.lambda1_at_com, self.lambda3
+
+    @property
+    def com(self) -> tuple[float, float, float]:
+        """Position of the centre of mass in the body frame [m]."""
+        return 0.0, 0.0, self.com_distance
+
+
+@dataclass(frozen=True)
+class Start:
+    """
+    How the top starts.
+
+    Parameters
+    ----------
+    attitude : (4,) float
+        q(world <- body) as w, x, y, z; z of the world points up.
+    rates : (3,) float
+        Angular velocity in the body frame [rad/s].
+    state : State, optional
+        The same in Euler angles and momenta; `of` and `state_of` convert.
+    """
+
+    attitude: tuple[float, float, float, float]
+    rates: tuple[float, float, float]
+    state: State | None = field(default=None, repr=False)
+
+    @classmethod
+    def of(cls, top: Top, state: State) -> Self:
+        """Return the start of a state."""
+        first = ExactSolution(top, state).states_at_seconds(np.zeros(1))
+        x, y, z, w = first.quaternion[0].tolist()
+        return cls((w, x, y, z), tuple(first.angular_velocity[0].tolist()), state)
+
+    def state_of(self, top: Top) -> State:
+        """Return the start as a state of `top`.  Raises ValueError for what is no attitude."""
+        if self.state is not None:
+            return self.state
+        (w, x, y, z), = unit_quaternions([self.attitude]).tolist()
+        w1, w2, w3 = self.rates
+        low, high = math.hypot(x, y), math.hypot(z, w)
+        theta, l3 = 2.0 * math.atan2(low, high), top.lambda3 * w3
+        half_sum, half_difference = math.atan2(z, w), math.atan2(-x, y)
+        if low and high:
+            psi = half_sum - half_difference
+            up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x))
+            lz = top.lambda1 * (w1 * up[0] + w2 * up[1]) + l3 * (high * high - low * low)
+        else:       # at a pole one angle is free
+            psi = math.atan2(w1, w2)
+            theta, lz = (0.0, l3) if high else (math.pi, -l3)
+        phi = 2.0 * half_sum - psi if high else 2.0 * half_difference + psi
+        return State(theta=theta, phi=phi, psi=psi, l3=l3, lz=lz,
+                     theta_dot=w1 * math.sin(psi) + w2 * math.cos(psi))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """
+    A motion that is graded.
+
+    name : of the motion
+    start : l3, lz, theta and theta_dot of the start
+    duration : [s]
+    divided : numbers by which dt is divided, 1 first; more than one give the order of convergence
+    """
+
+    name: str
+    start: Mapping[str, float]
+    duration: float
+    divided: tuple[int, ...] = (1,)
+
+    def start_of(self, top: Top, seed: int) -> Start:
+        """Return the start; the seed determines phi and psi."""
+        phi, psi = np.random.default_rng(seed).uniform(-np.pi, np.pi, 2).tolist()
+        return Start.of(top, State(phi=phi, psi=psi, **self.start))
+
+
+# The bicycle wheel of config/cusp.yaml, with an IMU off its axis.
+WHEEL = Body(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665,
+             lever_arm=(0.12, -0.05, 0.2), mounting=(0.8, 0.4, -0.2, 0.4),
+             gyroscope_noise_density=0.0, accelerometer_noise_density=0.0)
+TILT = math.radians(30.0)
+# As in config/, but for the last two: one passes the upward vertical, one spins at 60 rad/s.
+SCENES = (
+    Scene('cusps', {'theta': TILT, 'l3': 1.6, 'lz': 1.6 * math.cos(TILT)}, 10.0, (1, 2, 4)),
+    Scene('waves', {'theta': TILT, 'l3': 1.6, 'lz': 1.42}, 4.0),
+    Scene('loops', {'theta': TILT, 'l3': 1.6, 'lz': 1.3}, 4.0),
+    Scene('near the separatrix', {'theta': 1.179087, 'l3': 1.0, 'lz': 1.0}, 4.0),
+    Scene('pole', {'theta': 0.6, 'theta_dot': -4.0, 'l3': 1.0, 'lz': 1.0}, 4.0),
+    Scene('fast spin', {'theta': TILT, 'l3': 9.0, 'lz': 9.0 * math.cos(TILT)}, 2.0, (1, 2, 4)))
+
+
+def unit_quaternions(rows: ArrayLike) -> Reals:
+    """Return quaternions (n, 4) with norm 1.  Raises ValueError where a norm is not near 1."""
+    quaternions = np.array(rows, dtype=float)
+    if quaternions.ndim != 2 or quaternions.shape[1:] != (4,):
+        raise ValueError(f'attitudes have shape {quaternions.shape}: must be (n, 4), w x y z')
+    norms = np.linalg.norm(quaternions, axis=1)
+    for at in np.flatnonzero(~(np.abs(norms - 1.0) < 1e-2)):
+        raise ValueError(f'attitudes[{at}] = {quaternions[at].tolist()}: the norm must be 1')
+    unit: Reals = quaternions / norms[:, np.newaxis]
+    return unit

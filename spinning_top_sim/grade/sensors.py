@@ -1,0 +1,316 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Compares readings of an IMU with the motion that the same simulator tells.
+
+A reading is fitted with its physical terms: for the accelerometer gravity, a x r and w x (w x r).
+The error of the motion does not matter.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam.measures import rms
+from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
+from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, least_squares
+from spinning_top_sim.grade.report import Fault
+from spinning_top_sim.grade.scenes import Body, Reals
+
+LAGS = range(-3, 31)        # samples that are tried
+LATE = 0.75                 # steps
+STRANGE = 2e-3              # of the reading, beside its noise: it is not what it should be
+CONSISTENT = 1e-3           # of the reading: the lag is not looked for
+MEANS_STRANGE = 2e-2        # of means over a step that are those of its ends
+UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
+NOISY = 1e-4                # of the reading: smaller noise is rounding
+NOISE_BAND = 0.05           # of the noise, to either side of what is declared, beside its doubt
+FOUR_SIGMA = 4.0            # that doubt
+LEAST_KURTOSIS = 2.4        # normal 3, uniform 1.8
+KINDS = ('gyroscope', 'accelerations', 'magnetometer', 'rotations', 'velocities')
+UNITS = {'gyroscope': (180.0 / math.pi, math.pi / 180.0), 'accelerations': (1.0 / 9.80665,),
+         'magnetometer': (1e4, 1e6, 1e9)}
+UNITS.update(rotations=UNITS['gyroscope'], velocities=UNITS['accelerations'])
+FORCES = ('accelerations', 'velocities')
+_rate = partial(np.gradient, axis=0)        # change per step of values (m, 3)
+
+
+@dataclass
+class Readings:
+    """
+    What a sensor reads in one motion, and what it should read.
+
+    reading : (n, 3)
+    first : index of the reading that `terms` begin with
+    terms : terms of the right reading by name, (m, k) x 3
+    step : time between samples [s]
+    rotation, mounting : world <- IMU (m), body <- IMU
+    arms : of an accelerometer, the acceleration (m, 3) at 1 m along each axis of the body
+    size, total : rms of the reading, and the sum of the terms (m, 3)
+    """
+
+    reading: Reals
+    first: int
+    terms: Mapping[str, Reals]
+    step: float
+    rotation: Rotation
+    mounting: Rotation
+    arms: Sequence[Reals] = ()
+
+    def __post_init__(self) -> None:
+        self.size, self.total = rms(self.reading) or 1.0, np.sum([*self.terms.values()], axis=0)
+
+    def late(self, lag: int) -> tuple[Reals, slice]:
+        """Return the readings `lag` samples after the terms, and the rows of the terms."""
+        m = len(self.total)
+        begin, end = self.first + lag, min(self.first + lag + m, len(self.reading))
+        skip = max(0, -begin)
+        return self.reading[begin + skip:end], slice(skip, end - begin)
+
+
+def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
+    """
+    Return the readings of a sensor, None if there are none.
+
+    kind : one of KINDS
+    w : rates (n - 6, 3), as `dynamics.rates_of` returns them
+    """
+    said, body, inner = motion.trajectory, motion.body, slice(MARGIN, -MARGIN)
+    reading: Reals | None = getattr(said, 'increments' if kind in ('rotations', 'velocities')
+                                    else kind)
+    if reading is None:
+        return None
+    rotation, first, arms = said.rotation[inner], MARGIN, np.empty((0, len(w), 3))
+    if kind == 'gyroscope':
+        terms = {'rates': w}
+    elif kind == 'magnetometer':
+        terms = {'field': rotation.inv().apply(body.field)}
+    elif kind == 'rotations':
+        reading, first = reading[:, :3] / said.step, first + 1
+        terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
+    else:
+        first, a, w = 2 * MARGIN, derivative(w, said.step), w[inner]
+        axes = np.eye(3)[:, np.newaxis]
+        tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
+        arms = tangential + centripetal
+        terms = {'gravity': body.gravity * rotation[inner].inv().apply((0.0, 0.0, 1.0)),
+                 'tangential': np.tensordot(body.lever_arm, tangential, 1),
+                 'centripetal': np.tensordot(body.lever_arm, centripetal, 1)}
+        if kind == 'velocities':
+            reading, first = reading[:, 3:] / said.step, first + 1
+            arms = 0.5 * (arms[:, :-1] + arms[:, 1:])
+            terms = {name: 0.5 * (term[:-1] + term[1:]) for name, term in terms.items()}
+    mounting = Rotation.from_quat((*body.mounting[1:], body.mounting[0]))
+    to_imu, m = mounting.inv().apply, len(next(iter(terms.values())))
+    return Readings(reading, first, {name: to_imu(term) for name, term in terms.items()},
+                    said.step, said.rotation[first:first + m] * mounting, mounting,
+                    [to_imu(arm) for arm in arms])
+
+
+def judge(kind: str, runs: Sequence[Readings], motion: Motion,
+          derived: bool) -> tuple[list[Fault], dict[str, float]]:
+    """
+    Compare the readings of a sensor in several motions with what they should be.
+
+    kind : one of KINDS
+    motion : one of the motions
+    derived : whether the rates are those of the attitudes, which may be half a step apart from
+        those of the simulator
+
+    Returns the faults and the measures.
+    """
+    lag = _lag(runs)
+    noise = [_noise(run, lag) for run in runs]
+    parts = [_discrepancy(kind, run, lag) for run in runs]
+    target = np.concatenate([one for one, _ in parts])
+    effects = {name: np.concatenate([columns[name] for _, columns in parts])
+               for name in parts[0][1]}
+    floor = math.sqrt(float(np.mean([(one / run.size) ** 2
+                                     for one, run in zip(noise, runs, strict=True)])))
+    doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
+    most = floor * math.sqrt(1.05 + 2.0 * doubt)
+    before = math.sqrt(max(rms(target) ** 2 - most ** 2, 0.0))
+    # The acceleration of a step may be that of its begin, without a lag of the reading.
+    fractions, left = least_squares(target, [effects[name] for name in (
+        'step', 'tangential step') if name in effects])
+    late = lag - float(fractions[0]) if rms(left) < UNEXPLAINED * rms(target) else float(lag)
+    marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(noise)),
+             f'{kind}_discrepancy': before}
+    faults, residual = [], target
+    if abs(late) > LATE:
+        faults.append(Fault('imu_one_step_late', f'{kind}: readings belong to the motion of '
+                            f'{late:.3g} steps ({1e3 * late * runs[0].step:.3g} ms) before', late))
+    strange = MEANS_STRANGE if kind == 'velocities' else STRANGE
+    if derived:
+        strange += 0.25 * max((run.rotation[0].inv() * run.rotation[1]).magnitude() ** 2
+                              for run in runs)
+    if before > strange:
+        causes = _causes(kind, effects, motion.body)
+        found, residual, _ = explain(target, causes, floor)
+        faults += found
+        rest = math.sqrt(max(rms(residual) ** 2 - most ** 2, 0.0))
+        if rest > max(UNEXPLAINED * before, strange):
+            faults.append(Fault('inconsistent_reading', f'{kind}: {100.0 * rest:.3g} % of the '
+                                'reading is not that of the motion', rest))
+            return faults, marks
+    if kind in ('gyroscope', 'accelerations') and not any(
+            fault.name in ('units', 'reading_scale') for fault in faults):
+        ends = np.cumsum([len(one) for one, _ in parts])[:-1]
+        noises = np.concatenate([run.size * one for run, one in zip(
+            runs, np.split(residual, ends), strict=True)])
+        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), noises, motion,
+                                NOISE_BAND + doubt)
+    return faults, marks
+
+
+def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motion: Motion,
+                  band: float) -> Iterator[Fault]:
+    """Compare the noise with what is declared; `band`: of the ratio, to either side of 1."""
+    density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
+               motion.body.accelerometer_noise_density)
+    covariance = (motion.trajectory.covariance or {}).get(kind)
+    exists, root = noise > NOISY * run.size, math.sqrt(run.step)
+    declared = None if density is None else density / root
+    text = f'{kind}: the noise has a standard deviation of {noise:.4g}'
+    if covariance is not None and not np.any(covariance):
+        if exists:
+            yield Fault('covariance_zero', f'{text}, its covariance is told as 0', noise)
+    elif covariance is not None and declared is None:
+        declared = math.sqrt(float(np.trace(covariance)) / 3.0)
+    if declared == 0.0 and exists:
+        yield Fault('noise_scale', f'{text}, it is declared as 0', math.inf)
+    elif declared and abs((ratio := noise / declared) - 1.0) > band:
+        as_if = [f' ({name})' for name, factor in (
+            ('sqrt(2)', math.sqrt(2.0)), ('1/sqrt(2)', math.sqrt(0.5)), ('sqrt(dt)', root),
+            ('1/sqrt(dt)', 1.0 / root)) if abs(ratio / factor - 1.0) < band]
+        yield Fault('noise_scale', f'{text}, {ratio:.4g}{"".join(as_if)} times what is declared',
+                    ratio)
+    if exists and rms(residual) < 1.05 * noise:
+        kurtosis = float(np.mean(residual ** 4) / np.mean(residual ** 2) ** 2)
+        if kurtosis < LEAST_KURTOSIS:
+            yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; '
+                        'normal noise has 3, uniform noise 1.8', kurtosis)
+
+
+def _lag(runs: Sequence[Readings]) -> int:
+    """Return the number of samples by which readings are late, with any size of their terms."""
+    def left(lag: int) -> float:
+        rows, columns = [], []
+        for run in runs:
+            reading, part = run.late(lag)
+            rows.append(reading / run.size)
+            columns.append(np.stack([values[part] / run.size for values in
+                                     (*run.terms.values(), _rate(run.total))]))
+        target = np.concatenate(rows)
+        return rms(least_squares(target, list(np.concatenate(columns, axis=1)))[1])
+
+    floor = rms(np.array([_noise(run, 0) / run.size for run in runs]))
+    now = left(0)
+    if now ** 2 < 1.1 * floor ** 2 + CONSISTENT ** 2:
+        return 0
+    found = {0: now} | {lag: left(lag) for lag in LAGS if lag < len(runs[0].total) // 4}
+    best = min(found, key=lambda lag: found[lag])
+    return best if found[best] < 0.5 * now else 0
+
+
+def _noise(run: Readings, lag: int) -> float:
+    """Return the standard deviation of white noise, by differences in which motions vanish."""
+    reading, part = run.late(lag)
+    return rms(np.diff(reading - run.total[part], 6, axis=0)) / math.sqrt(924.0)
+
+
+def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, Reals]]:
+    """Return reading minus right reading (m, 3) and effects of causes, relative to the reading."""
+    reading, part = run.late(lag)
+    total = run.total
+    effects = {**run.terms, 'total': total, 'step': _rate(total),
+               'mounted': run.mounting.apply(total),
+               'world': (world := run.rotation.apply(total)),
+               'reversed': run.rotation.apply(world)}
+    if kind in FORCES:
+        kinematic = total - run.terms['gravity']
+        back, forth = run.rotation.inv().apply, run.rotation.apply
+        effects |= {'kinematic': kinematic, 'difference': back(_rate(forth(kinematic))),
+                    'turned': back(_rate(forth(total))) - _rate(total),
+                    'tangential step': _rate(run.terms['tangential']),
+                    **{f'fixed {k}': 0.0 * total + axis for k, axis in enumerate(np.eye(3))},
+                    **{f'arm {k}': arm for k, arm in enumerate(run.arms)}}
+    return (reading - total[part]) / run.size, {
+        name: values[part] / run.size for name, values in effects.items()}
+
+
+def _causes(kind: str, effects: Mapping[str, Reals], body: Body) -> list[Cause]:
+    """Return what may be wrong with the readings of a sensor."""
+    def only(judge: object, *names: str) -> Cause:
+        return Cause([effects[name] for name in names], judge)      # type: ignore[arg-type]
+
+    in_world = 'rates_in_world' if kind == 'gyroscope' else 'reading_in_world'
+    text = f'{kind}: the readings are in axes of '
+    causes = [only(partial(_scale, kind), 'total'), only(lambda found: None, 'step'),
+              only(instead('mounting', f'{text}the body, not of the IMU'), 'total', 'mounted'),
+              only(instead(in_world, f'{text}the world, not of the IMU'), 'total', 'world'),
+              only(instead('rotation_reversed', f'{text}a sensor that turns against the IMU'),
+                   'total', 'reversed')]
+    if kind in FORCES:
+        causes += [only(partial(_term, kind, name), name) for name in _TERMS]
+        causes += [only(partial(_gravity_frame, kind, body), 'gravity', *(
+            f'fixed {k}' for k in range(3))), only(partial(_difference, kind), 'difference'),
+            only(lambda found: None, 'tangential step'), only(lambda found: None, 'turned'),
+            only(partial(_arm, kind, body), 'arm 0', 'arm 1', 'arm 2')]
+    return causes
+
+
+def _scale(kind: str, found: Reals) -> Fault:
+    factor = 1.0 + float(found[0])
+    text = f'{kind}: the readings are {factor:.4g} times what they should be'
+    if any(abs(abs(factor) / unit - 1.0) < 0.01 for unit in UNITS[kind]):
+        return Fault('units', text, factor)
+    return Fault('reading_sign' if factor < 0.0 else 'acceleration_scale' if
+                 kind == 'accelerations' else 'reading_scale', text, factor)
+
+
+# Terms of a specific force: what each is, and the fault where it is missing.
+_TERMS = {'gravity': ('gravity', 'no_gravity'), 'tangential': ('a x r', 'no_tangential_term'),
+          'centripetal': ('w x (w x r)', 'no_centripetal_term'),
+          'kinematic': ('motion', 'no_lever_arm')}
+
+
+def _term(kind: str, term: str, found: Reals) -> Fault:
+    share = 1.0 + float(found[0])
+    what, missing = _TERMS[term]
+    text = f'{kind}: the term of {what} has {share:.3g} times its size'
+    if abs(share) < NEAR:
+        return Fault(missing, text, share)
+    if share < 0.0:
+        return Fault('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
+    return Fault('acceleration_scale', text, share)
+
+
+def _gravity_frame(kind: str, body: Body, found: Reals) -> Fault | None:
+    fixed = float(np.linalg.norm(found[1:]))
+    other = abs(found[0] + 1.0) > NEAR or abs(fixed / body.gravity - 1.0) > NEAR
+    return None if other else Fault('gravity_frame', f'{kind}: gravity, {fixed:.4g} m/s^2, does '
+                                    'not turn with the IMU', fixed)
+
+
+def _difference(kind: str, found: Reals) -> Fault | None:
+    delay = -float(found[0])
+    return None if not 0.25 < delay < 0.8 else Fault(
+        'finite_differences', f'{kind}: the acceleration, without gravity, is that of {delay:.3g} '
+        'steps before, as a difference of two velocities', delay)
+
+
+def _arm(kind: str, body: Body, found: Reals) -> Fault:
+    arm, point = np.array(body.lever_arm), found + body.lever_arm
+    size = float(np.linalg.norm(arm))
+    share = float(point @ arm) / (size * size or 1.0)
+    if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * share * size:
+        return _term(kind, 'kinematic', np.array([share - 1.0]))
+    of = ', the centre of mass' if np.linalg.norm(point - body.com) < 0.1 * max(
+        size, abs(body.com_distance)) else ''
+    shown = [', '.join(f'{x:.3g}' for x in one) for one in (point, arm)]
+    return Fault('no_lever_arm', f'{kind}: the readings are those at ({shown[0]}) m{of}, not at '
+                 f'({shown[1]}) m', float(np.linalg.norm(found)))

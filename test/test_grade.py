@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The grade of simulators: measures, faults by name, right simulators, bad answers."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.faulty_simulators import (
+    NOISY,
+    OTHER,
+    PUBLISHED,
+    RIGHT,
+    STEPPED,
+    Imu,
+    Stepped,
+    exact,
+)
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim import State, Top
+from spinning_top_sim.grade import Body, Start, grade, grade_trajectory
+from spinning_top_sim.grade.motion import errors_of
+from spinning_top_sim.grade.pytest_plugin import pass_grade  # noqa: F401, a fixture
+from spinning_top_sim.grade.report import FAULTS
+from spinning_top_sim.grade.scenes import SCENES, WHEEL
+from spinning_top_sim.grade.trajectory import InvalidTrajectoryError, Trajectory
+
+QUIET = WHEEL
+SENSOR = replace(WHEEL, gyroscope_noise_density=1.7e-4, accelerometer_noise_density=1.2e-3)
+# Parts of the scenes, to be fast; steps of 4 ms make the error of a method as large.
+SHORT = tuple(replace(scene, duration=0.2 * scene.duration, divided=scene.divided[:2])
+              for scene in SCENES if scene.name in ('cusps', 'waves', 'pole', 'fast spin'))
+
+
+@cache
+def short(simulator, body=QUIET, dt=0.004):
+    return grade(simulator, body=body, scenes=SHORT, dt=dt)
+
+
+def trajectory_of(simulator, scene=SCENES[0], seconds=2.0, dt=0.002):
+    start, times = scene.start_of(WHEEL, 0), dt * np.arange(round(seconds / dt) + 1)
+    return {'t': times, **simulator(WHEEL, start, times, dt)}, start
+
+
+def test_errors_are_split_into_precession_nutation_and_spin():
+    phi, theta, psi = 0.3, 0.8, -0.4
+    truth = Rotation.from_euler('ZYZ', [(phi, theta, psi)])
+    for name, angles, size in (('precession', (phi + 1e-3, theta, psi), math.sin(theta)),
+                               ('nutation', (phi, theta + 1e-3, psi), 1.0),
+                               ('spin', (phi, theta, psi + 1e-3), 1.0)):
+        errors = errors_of(Rotation.from_euler('ZYZ', [angles]), truth)
+        assert errors[name] == pytest.approx(1e-3 * size, rel=1e-3)
+        others = {'precession', 'nutation'} - {name}
+        assert all(abs(errors[other]) < 1e-9 for other in others)
+    turned = errors_of(Rotation.from_euler('ZYZ', [(phi + 1e-3, theta, psi)]), truth)
+    assert turned['spin'] == pytest.approx(1e-3 * math.cos(theta), rel=1e-3)
+
+
+@pytest.mark.parametrize('scene', SCENES, ids=lambda scene: scene.name)
+def test_a_start_is_the_same_in_attitude_and_rates_as_in_angles_and_momenta(scene):
+    start = scene.start_of(WHEEL, 3)
+    state, again = start.state, Start(start.attitude, start.rates).state_of(WHEEL)
+    for name in ('theta', 'theta_dot', 'phi', 'psi', 'l3', 'lz'):
+        assert getattr(again, name) == pytest.approx(getattr(state, name), abs=1e-12)
+    motion = exact(WHEEL, start, [0.0], 0.0)
+    assert motion[0][0, [3, 0, 1, 2]] == pytest.approx(start.attitude, abs=1e-14)
+    assert motion[1][0] == pytest.approx(start.rates, abs=1e-12)
+
+
+@pytest.mark.parametrize('theta', [0.0, math.pi])
+def test_a_start_at_a_pole_has_a_state(theta):
+    state = State(theta=theta, theta_dot=0.5, phi=0.3, psi=0.2, l3=1.0, lz=math.cos(theta))
+    start = Start.of(WHEEL, state)
+    again = Start(start.attitude, start.rates).state_of(WHEEL)
+    assert (again.theta, again.lz) == (theta, state.lz)
+    motions = [exact(WHEEL, Start.of(WHEEL, one), [0.0, 0.3], 0.0)[0] for one in (state, again)]
+    assert abs(np.sum(motions[0] * motions[1], axis=1)) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize('name', RIGHT)
+def test_a_right_simulator_passes_with_noise_as_declared(name):
+    report = short(Imu(RIGHT[name], parts=('accelerations', 'gyroscope', 'covariance')), SENSOR)
+    assert report.passed, report
+    assert report.marks['total_error_deg: cusps'] < 1e-3
+    assert report.marks['gyroscope_noise'] == pytest.approx(1.7e-4 / math.sqrt(0.004), rel=0.05)
+
+
+def test_marks_of_the_exact_solution_are_those_of_the_motion():
+    marks = grade(Imu()).marks
+    assert marks['total_error_deg: cusps'] < 1e-12
+    assert max(value for name, value in marks.items() if '_drift' in name) < 1e-9
+    assert abs(marks['nutation_period_error: cusps']) < 1e-12
+    assert abs(marks['mean_precession_rate_error: waves']) < 1e-12
+
+
+@pytest.mark.parametrize('name', [*PUBLISHED, *OTHER])
+def test_a_defect_of_the_readings_is_named(name):
+    report = short(Imu(defect=name, seed=1), SENSOR if name in NOISY else QUIET)
+    assert report.names == list({**PUBLISHED, **OTHER}[name]), report
+
+
+@pytest.mark.parametrize('name', STEPPED)
+def test_a_defect_of_the_motion_is_named(name):
+    simulator, faults = STEPPED[name]
+    report = short(Imu(simulator))
+    assert report.names == list(faults), report
+
+
+def test_numbers_of_the_faults_are_those_of_the_defects():
+    def number(defect, **options):
+        return short(Imu(defect=defect), **options).faults[0].number
+
+    assert number('late') == pytest.approx(1.0, abs=0.02)
+    assert number('late_by_seven') == pytest.approx(7.0, abs=0.02)
+    assert number('wrong_dt') == pytest.approx(4.0, abs=0.1)
+    assert number('times_root_two', body=SENSOR) == pytest.approx(math.sqrt(2.0), rel=0.05)
+    offset = short(Imu(STEPPED['offset'][0])).faults[0]
+    assert offset.number == pytest.approx(math.sqrt(29e-6), rel=1e-3)
+    assert '(0.003, -0.002, 0.154)' in offset.evidence
+
+
+def test_with_the_step_of_a_game_the_fast_spin_is_left_out():
+    report = grade(Imu(), scenes=SCENES[1:], dt=1.0 / 60.0)
+    assert report.passed, report
+    assert 'total_error_deg: waves' in report.marks
+    assert 'total_error_deg: fast spin' not in report.marks
+    semi = grade(Imu(Stepped(method='semi-implicit')), dt=1.0 / 60.0)
+    assert semi.names == ['first_order', 'explicit_gyroscopic_term'], semi
+
+
+def test_without_rates_those_of_the_attitudes_serve():
+    parts = ('accelerations', 'gyroscope')
+    assert short(Imu(Stepped(method='implicit'), parts=parts)).names == [
+        'first_order', 'implicit_damping']
+    assert short(Imu(defect='late', parts=parts)).names == ['imu_one_step_late']
+    assert short(Imu(STEPPED['offset'][0], parts=())).names == ['com_offset']
+
+
+def test_an_error_without_a_cause_is_inaccurate():
+    def drifting(top, start, times, dt):
+        q, w, a = exact(top, start, times, dt)
+        turn = Rotation.from_rotvec(0.01 * times[:, np.newaxis] ** 2 * (0.0, 0.0, 1.0))
+        return (Rotation.from_quat(q) * turn).as_quat(), w, a
+
+    report = short(Imu(drifting, parts=()))
+    assert report.names == ['inaccurate'], report
+
+
+def test_readings_without_a_cause_are_inconsistent():
+    class Odd(Imu):
+        def none(self, said):
+            said['accelerations'][:, 0] += np.sin(np.arange(len(self.w)) / 3.0)
+
+    assert short(Odd()).names == ['inconsistent_reading']
+
+
+def test_a_motion_that_exists_is_graded():
+    right, start = trajectory_of(Imu(defect='increments', parts=('increments', 'gyroscope')))
+    assert grade_trajectory(right, WHEEL, start).passed
+    late, _ = trajectory_of(Imu(defect='late'))
+    top = Top(**{name: getattr(WHEEL, name) for name in Top.__dataclass_fields__})
+    imu = {'lever_arm': WHEEL.lever_arm, 'mounting': WHEEL.mounting}
+    report = grade_trajectory(late, top, start.state, **imu)
+    assert report.names == ['imu_one_step_late'], report
+    damped, _ = trajectory_of(Imu(Stepped(method='implicit')))
+    assert 'implicit_damping' in grade_trajectory(damped, WHEEL, start).names
+    first, _ = trajectory_of(Imu(Stepped(method='midpoint')))
+    assert grade_trajectory(first, WHEEL, start).names == ['first_order']
+    noisy, _ = trajectory_of(lambda *given: Imu(defect='residuals')(SENSOR, *given[1:]))
+    assert grade_trajectory(noisy, top, start, **imu).passed, 'no noise is declared'
+
+
+def test_a_report_is_readable_and_json():
+    report = short(Imu(defect='late'))
+    assert 'late: imu_one_step_late' in str(report) and report.faults[0].evidence in str(report)
+    said = json.loads(report.as_json())
+    assert said['passed'] is False
+    assert said['faults'][0]['name'] == 'imu_one_step_late'
+    assert said['marks']['nutation_period_error: pole'] is None
+    assert all(fault.name in FAULTS for fault in report.faults)
+
+
+def test_the_fixture_for_pytest_fails_a_test_of_a_simulator_with_faults(pass_grade):  # noqa: F811
+    assert pass_grade(Imu(), scenes=SHORT[:1]).passed
+    with pytest.raises(pytest.fail.Exception, match='readings belong to the motion of 1 steps'):
+        pass_grade(Imu(defect='late'), scenes=SHORT[:1])
+    pass_grade(Imu(defect='late'), scenes=SHORT[:1], known=['imu_one_step_late'])
+
+
+def test_another_motion_in_the_same_run_is_told():
+    class Random(Imu):
+        def none(self, said):
+            said['attitudes'][5:] = -said['attitudes'][5:]      # the same attitude
+            said['attitudes'] += 1e-9 * self._random.standard_normal(said['attitudes'].shape)
+
+    assert short(Random(parts=())).names == ['not_deterministic']
+
+
+@pytest.mark.parametrize(('said', 'says'), [
+    (lambda t: 1 / 0, 'cusps: run raises ZeroDivisionError'),
+    (lambda t: np.ones((3, 4)), 'the norm must be 1'),
+    (lambda t: np.eye(4)[:1], 'there are 1 attitudes: must be one for each of the'),
+    (lambda t: {'poses': 1}, "has ['poses']: must have attitudes"),
+    (lambda t: np.zeros((len(t), 3)), 'must be (n, 4)'),
+    (lambda t: {'attitudes': np.tile(np.eye(4)[0], (len(t), 1)), 'rates': np.full(
+        (len(t), 3), np.nan)}, 'rates[0, 0] = nan: must be finite'),
+    (lambda t: {'attitudes': np.tile(np.eye(4)[0], (len(t), 1)), 'energy': 'no'}, 'energy: ')])
+def test_what_is_no_motion_is_told(said, says):
+    report = grade(lambda top, start, times, dt: said(times), scenes=SHORT[:1])
+    assert report.names == ['invalid_output'] and not report.marks
+    assert says in str(report)
+
+
+@pytest.mark.parametrize(('options', 'says'), [
+    ({'dt': 0.0}, 'dt = 0.0 s: must be in (0, 1]'), ({'dt': 1.0}, 'turns by more than 0.7 rad')])
+def test_wrong_arguments_are_refused(options, says):
+    with pytest.raises(ValueError, match=re.escape(says)):
+        grade(Imu(), **options)
+    with pytest.raises(TypeError, match=r'run = 3: must be run\(top, start, times, dt\)'):
+        grade(3)
+
+
+def test_wrong_parameters_and_trajectories_are_refused():
+    right, start = trajectory_of(Imu())
+    for imu, says in (({'mounting': (1.0, 1.0, 0.0, 0.0)}, 'norm must be 1'),
+                      ({'lever_arm': (1.0, 2.0)}, 'must be 3 finite numbers'),
+                      ({'gyroscope_noise_density': -1.0}, 'must be >= 0')):
+        with pytest.raises(ValueError, match=says):
+            grade_trajectory(right, WHEEL, start, **imu)
+    with pytest.raises(ValueError, match='times = None'):
+        grade_trajectory(right['attitudes'], WHEEL, start)
+    times = right['t'].copy()
+    times[7] += 1e-3
+    with pytest.raises(InvalidTrajectoryError, match='must be equally spaced'):
+        grade_trajectory(right, WHEEL, start, times=times)
+
+
+def test_a_body_is_a_top():
+    assert Body.of(WHEEL) is WHEEL and WHEEL.com == (0.0, 0.0, 0.15)
+    assert WHEEL.inertia_at_com == pytest.approx((0.078, 0.078, 0.15))
+
+
+def test_attitudes_keep_their_sign_from_sample_to_sample():
+    right, _ = trajectory_of(Imu())
+    right['attitudes'][100:] *= -1.0
+    said = Trajectory.of(right, right['t'])
+    assert np.min(np.sum(said.attitudes[1:] * said.attitudes[:-1], axis=1)) > 0.99
+
+
+@pytest.fixture(scope='module')
+def mujoco_top():
+    pytest.importorskip('mujoco')
+    from helpers.mujoco_top import MujocoTop
+    return MujocoTop
+
+
+def test_mujoco_by_default_is_of_first_order_and_its_readings_are_one_step_late(mujoco_top):
+    report = grade(mujoco_top(), scenes=SCENES[:1])
+    assert report.names == ['first_order', 'explicit_gyroscopic_term', 'imu_one_step_late'], report
+    assert 10.0 < report.marks['total_error_deg: cusps'] < 11.0
+    assert report.marks['order: cusps'] == pytest.approx(1.0, abs=0.05)
+    late = [fault.number for fault in report.faults if fault.name == 'imu_one_step_late']
+    assert late == pytest.approx([1.0] * 3, abs=0.05)
+
+
+def test_mujoco_with_runge_kutta_passes_when_its_sensors_are_evaluated(mujoco_top):
+    report = grade(mujoco_top('RK4', forward=True))
+    assert report.passed, report
+    assert grade(mujoco_top('RK4'), scenes=SCENES[1:2]).names == ['imu_one_step_late']
