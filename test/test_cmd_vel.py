@@ -23,7 +23,7 @@ SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.speed': 1.5
            'pivot.acceleration': 2.0, 'pivot.repeat': True}
 METHODS = ('exact', 'rk45')
 DRIVES = ((S // 2, (1.0, 0.0, 0.0)), (3 * S // 4, (1.0, 0.0, 0.0)), (S, (0.0, -0.5, 0.2)),
-          (4 * S, (0.3, 0.0, 0.0)))
+          (4 * S, (0.3, 0.0, 0.0)), (9 * S // 2 - S // 500, (0.3, 0.0, 0.0)))
 
 
 def simulation_of(kind=Simulation, **values):
@@ -148,6 +148,14 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops(method):
     # Half a ramp of 0.4 s at each end, and 1.1 s of cruise.
     assert np.ravel(found.position) == pytest.approx((0.0, 0.8 * 1.5, 0.0), abs=1e-12)
     assert simulation.history == [(S, 0.0, 0.8, 0.0, 5 * S // 2)]
+
+
+def test_a_velocity_of_zero_brakes_a_pivot_that_moves():
+    simulation = simulation_of(**{'pivot.cmd_timeout': 0.0})
+    for t_ns, velocity, found in ((S, 0.8, 0.0), (2 * S, 0.0, 0.8), (3 * S, 0.0, 0.0)):
+        list(simulation.play((), t_ns))
+        assert simulation.segment.pivot(np.array([t_ns])).velocity[1] == pytest.approx(found)
+        assert simulation.drive((0.0, velocity, 0.0))
 
 
 def test_a_storm_of_velocities_costs_the_same_from_first_to_last(monkeypatch):
