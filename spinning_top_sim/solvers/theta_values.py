@@ -51,6 +51,7 @@ class ThetaFunctions:
     real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
     zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
     u_dot, u_dot_coefficients : of u'
+    momentum, swing : of (Lz - L3 u)/lambda1
     bounds : the least and the greatest theta in [0, pi] [rad]
     planar_rotation : (i, j) if both poles are passed: theta/2 is then within a quarter turn of
         (pi/2) (i + j N)
@@ -75,6 +76,8 @@ class ThetaFunctions:
         _check_amplitudes(motion)
         self.u_dot = np.array([in_range("cos(theta)'", x) for x in motion.u_dot])
         self.u_dot_coefficients = _coefficients([[motion.u_dot_series]], motion.size)[:, 0]
+        self.momentum, self.swing = (
+            np.array([*map(float, pair)]) for pair in (motion.momentum, motion.swing))
         # The rows where y = 0, at N = 0 and N = 1.
         alpha, beta, alpha_imag, beta_imag = np.where(
             np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
@@ -145,7 +148,7 @@ class ThetaValues:
         for k, (one, other) in enumerate(constants.prefactors):
             rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
         self._real, self._imag = rows[:2], rows[2:]
-        self._sin_cos, self._cos_y = bases[3], cos
+        self._sin_cos, self._cos_y, self._sin_y = bases[3], cos, sin
 
     @cached_property
     def moduli(self) -> Matrix:
@@ -225,6 +228,16 @@ class ThetaValues:
         theta_dot: Column = -constants.u_dot.take(self._parity) * (series / size) / (
             without[0] * without[1])
         return theta_dot
+
+    @cached_property
+    def across(self) -> Matrix:
+        """The two terms of phi' sin(theta) [rad/s] if no pole is passed exactly, (2, n)."""
+        constants, (alpha, beta) = self._constants, self.moduli
+        series = self._sin_y * _horner(constants.u_dot_coefficients, self._xi)
+        twice: Column = 2.0 * alpha * beta
+        return np.stack((
+            constants.momentum.take(self._parity) * (alpha * alpha + beta * beta) / twice,
+            constants.swing.take(self._parity) * (series * series) / twice))
 
     @cached_property
     def rates(self) -> Matrix:
