@@ -22,6 +22,7 @@ from spinning_top_sim.exam import measures, scenarios
 from spinning_top_sim.exam.course import (
     ANSWER_S,
     EARLY,
+    HEADING,
     LATEST,
     TILT,
     WHOLE,
@@ -155,8 +156,8 @@ class Responses:
         if not self.clean(self.outcome).wrong and not self._turns_wrong(self.outcome, GAIN):
             return None
         limit = EXPLAINED * self._whole(self.outcome)
-        for stage in (self._of_attitudes, self._of_gyroscope, self._of_steps,
-                      self._of_accelerometer, self._of_axes, self._of_field, self._of_delays):
+        for stage in (self._of_attitudes, self._of_delays, self._of_gyroscope,
+                      self._of_accelerometer, self._of_axes, self._of_field, self._of_inputs):
             gross = stage == self._of_gyroscope and self._turns_wrong(self.outcome, GROSS_GAIN)
             tried = []
             for one, outcome in stage():
@@ -202,15 +203,19 @@ class Responses:
         fit = whole if whole.scatter < SCATTER else early
         scale = float(np.trace(fit.matrix)) / 3.0
         uniform = bool(np.max(np.abs(fit.matrix - scale * np.eye(3))) < GAIN < scale)
-        tried = [Hypothesis(
-            ('gyroscope_wiring',), f'with {axes(one)} of the gyroscope for its x, y, z',
-            given=mapped('gyroscope', one.T)) for one in sorted(
-                SIGNED, key=lambda one: float(np.sum((one - fit.matrix) ** 2)))[:3]]
-        tried += [Hypothesis(('gyroscope_units',), f'with the gyroscope multiplied by {text}',
-                             given=mapped('gyroscope', by * np.eye(3)))
-                  for text, by in (('pi/180', math.radians(1.0)), ('180/pi', math.degrees(1.0)))]
-        tried.append(Hypothesis(('gyroscope_wiring',), 'with rates about axes of the world (a '
-                                'product on the wrong side)', given=of_world))
+        tried = []
+        if min(whole.off, early.off) > GROSS_GAIN:
+            tried = [Hypothesis(
+                ('gyroscope_wiring',), f'with {axes(one)} of the gyroscope for its x, y, z',
+                given=mapped('gyroscope', one.T)) for one in sorted(
+                    SIGNED, key=lambda one: float(np.sum((one - fit.matrix) ** 2)))[:3]]
+            tried += [Hypothesis(
+                ('gyroscope_units',), f'with the gyroscope multiplied by {text}',
+                given=mapped('gyroscope', by * np.eye(3))) for text, by in (
+                    ('pi/180', math.radians(1.0)), ('180/pi', math.degrees(1.0)))]
+            tried.append(Hypothesis(
+                ('gyroscope_wiring',), 'with rates about axes of the world (a product on the '
+                'wrong side)', given=of_world))
         if np.linalg.cond(fit.matrix) < WORST:
             tried.append(Hypothesis(
                 ('gyroscope_wiring', 'time_step') if uniform else ('gyroscope_wiring',),
@@ -218,9 +223,6 @@ class Responses:
                 + ' (a scale of the rates and one of the step cannot be told apart)' * uniform,
                 given=mapped('gyroscope', np.linalg.inv(fit.matrix))))
         return self._tried(tried)
-
-    def _of_steps(self) -> Iterator[Tried]:
-        return self._tried(ONE_STEP)
 
     def _of_accelerometer(self) -> Iterator[Tried]:
         """Try signs, axes and scales of the accelerometer that fit the verticals at rest."""
@@ -259,7 +261,7 @@ class Responses:
     def _of_axes(self) -> Iterator[Tried]:
         """Try signs and axes of the magnetometer that fit the headings at rest best."""
         before, name = self.clean(self.outcome), 'magnetometer'
-        if not self._absolute or max(before.tilt, before.heading) < TILT:
+        if not self._absolute or max(before.tilt, before.heading) < HEADING:
             return iter(())
         said, rows = self._at_rest()
         field = self.course.run.magnetometer[rows]
@@ -277,7 +279,7 @@ class Responses:
     def _of_field(self) -> Iterator[Tried]:
         """Try a hard iron, scales and units of the magnetometer."""
         before, name = self.clean(self.outcome), 'magnetometer'
-        if not self._absolute or max(before.tilt, before.heading) < TILT:
+        if not self._absolute or max(before.tilt, before.heading) < HEADING:
             return
         iron = self._fitted([partial(with_iron, one) for one in np.eye(3)])
         scale = 1.0 + 0.02 * self._fitted([mapped(name, np.eye(3) + 0.02 * np.diag(one))
@@ -290,18 +292,23 @@ class Responses:
                        given=mapped(name, np.diag((*scale, 1.0))))))
 
     def _of_delays(self) -> Iterator[Tried]:
-        """Try delays of each sensor, and of the attitudes."""
+        """Try delays of the attitudes and the gyroscope, and what is no fault."""
         late = self.gyroscope(self.outcome)[0].late
         part = self.outcome.since(self.course.motion.start)
         offset = measures.time_offset(part.estimates, part.run.truth, part.run.rates,
                                       self._absolute).seconds * scenarios.SLOW.rate
-        found = [Hypothesis(('lag',), f'with the gyroscope {late} samples earlier',
-                            given=shifted(('gyroscope',), late))] if late > 0 else []
+        tried = [*ONE_STEP]
         if not AHEAD <= offset <= DELAYED:
-            found.append(Hypothesis(
+            tried.append(Hypothesis(
                 ('stamp_offset',), f'with the attitude {round(offset)} samples earlier',
                 read=lambda q: moved(q, round(offset))))
-        yield from self._tried(found)
+        if late > 0:
+            tried.append(Hypothesis(('lag',), f'with the gyroscope {late} samples earlier',
+                                    given=shifted(('gyroscope',), late)))
+        return self._tried(tried)
+
+    def _of_inputs(self) -> Iterator[Tried]:
+        """Try delays of the other sensors."""
         for names in (('accelerometer',), ('magnetometer',), ('accelerometer', 'magnetometer')):
             by = 2.0 * float(self._fitted([shifted(names, 2)])[0])
             if by > 0.5:

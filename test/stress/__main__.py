@@ -7,6 +7,7 @@ Stress tests: random inputs and faults, for so long or so many.
     python test/stress nodes --seconds 600      extreme parameters and commands at a real node
     python test/stress disk --seconds 600       recordings on a disk that fails
     python test/stress exam --count 20          the exam of a node, beside busy processes
+    python test/stress wrong --count 95         the exam of filters that are wrong, or right
 
 A failure is told with its seed and the command that repeats it; the exit code says whether.
 """
