@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Filters of three kinds, right or wrong by their parameters."""
 
+import math
 from collections import deque
 from functools import partial
 
@@ -33,7 +34,10 @@ class Part:
         self.bias = np.zeros(3)
         self.start(**settings)
 
-    def _delay(self, line, value, n):
+    @staticmethod
+    def _delay(line, value, n):
+        if not n:
+            return value
         line.append(value)
         return line.popleft() if len(line) > n else line[0]
 
@@ -50,6 +54,11 @@ class Part:
                         in enumerate((gyroscope, accelerometer, magnetometer))), self._step(dt))
         self.bias = self._report(self._bias)
         return self._said(self._delay(self._lines[3], q, self._late[3]))
+
+
+def cross(one, other):
+    (a, b, c), (x, y, z) = one.tolist(), other.tolist()
+    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
 
 
 def body(q, turn):
@@ -80,15 +89,15 @@ class Mahony(Part):
         up, north, learns = self._gains
         self._q = self._advance(self._q, (w - self._bias) * dt)
         r = matrix_of(self._q)
-        e = up * np.cross(a / np.linalg.norm(a), r[2])
+        e = up * cross(a, r[2]) / math.sqrt(a @ a)
         if m is not None:
             h = r @ m
             if not self._level:
                 yaw = Rotation.from_quat(self._q).as_euler('ZYX')[0]
                 h = Rotation.from_euler('z', yaw).apply(m)
-            angle = np.arctan2(h[0], h[1]) + self._declination
+            angle = math.atan2(h[0], h[1]) + self._declination
             e = e + north * angle * r[2]
-        self._bias = np.clip(self._bias - learns * e * dt, -self._most, self._most)
+        self._bias = np.minimum(np.maximum(self._bias - learns * e * dt, -self._most), self._most)
         self._q = body(self._q, e * dt)
         return self._q.copy()
 
@@ -106,11 +115,11 @@ class Complementary(Part):
         self._q = self._advance(self._q, (w - self._bias) * dt)
         if m is None:
             r = matrix_of(self._q)
-            e = np.cross(a / np.linalg.norm(a), r[2])
+            e = cross(a, r[2]) / math.sqrt(a @ a)
         else:
             e = product(self._q * (-1.0, -1.0, -1.0, 1.0), from_two_vectors(a, m))
             e = 2.0 * e[:3] * np.sign(e[3])
-        self._bias = np.clip(self._bias - self._learns * e, -self._most, self._most)
+        self._bias = np.minimum(np.maximum(self._bias - self._learns * e, -self._most), self._most)
         self._q = body(self._q, self._share * e)
         return self._q.copy()
 
