@@ -208,7 +208,8 @@ class _Exam:
         self._do_extra(extra)
         if not self.faults:
             self._add(diagnosis.inaccuracy(noisy[0], self._absolute))
-        self._sort_out()
+        if any(fault.name not in SHOW_ELSEWHERE for fault in self.faults):
+            self.faults = [fault for fault in self.faults if fault.name != 'inaccurate']
         consistency = diagnosis.consistency(noisy, self._absolute)
         self.measures |= diagnosis.nees_marks(consistency)
         if self.judges_covariance and not self.faults:  # faults are another reason for errors
@@ -337,14 +338,9 @@ class _Exam:
     def _judge_bias(self) -> None:
         """Compare two runs with and without a gyroscope bias."""
         if self._responses is not None:
-            before = len(self._responses.faults)
-            self.measures |= self._responses.bias()
-            self.faults += self._responses.faults[before:]
-
-    def _sort_out(self) -> None:
-        """Drop `inaccurate` where a cause is named that shows in these runs."""
-        if any(fault.name not in SHOW_ELSEWHERE for fault in self.faults):
-            self.faults = [fault for fault in self.faults if fault.name != 'inaccurate']
+            measured, fault = self._responses.bias()
+            self.measures |= measured
+            self._add(fault)
 
     def _do_extra(self, extra: Sequence[Scenario]) -> None:
         for scenario in extra:

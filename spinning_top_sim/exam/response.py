@@ -202,7 +202,7 @@ class Responses:
             return iter(())
         fit = whole if whole.scatter < SCATTER else early
         scale = float(np.trace(fit.matrix)) / 3.0
-        uniform = bool(np.max(np.abs(fit.matrix - scale * np.eye(3))) < GAIN < scale)
+        uniform = bool(np.max(np.abs(fit.matrix - scale * np.eye(3))) < 0.3 * abs(scale - 1.0))
         tried = []
         if min(whole.off, early.off) > GROSS_GAIN:
             tried = [Hypothesis(
@@ -362,28 +362,26 @@ class Responses:
                     name, f'{left:.0%} of an error of the {what} are left after {ANSWER_S:g} s: '
                     f'the {sensor} does not correct it'))
 
-    def bias(self) -> dict[str, float]:
-        """Judge the effect of a gyroscope bias; return measures."""
+    def bias(self) -> tuple[dict[str, float], Fault | None]:
+        """Judge the effect of a gyroscope bias; return measures and the fault."""
         late, learned, found = self._with_bias(BIAS)
-        size = float(np.linalg.norm(BIAS))
+        size, known = float(np.linalg.norm(BIAS)), bool(np.isfinite(found[0]))
         measured = {'bias_error_s': late, 'bias_found': float(found @ BIAS) / size ** 2}
-        known = bool(np.isfinite(found[0]))
-        if late > BIAS_LEFT_S and not learned:
-            text = (f'with a gyroscope bias of 1 deg/s the '
-                    f'{"attitude" if self._absolute else "tilt"} is {late:.3g} deg off in the end:'
-                    ' the bias is not learned')
-            if known:
-                text += f', and the estimate has {measured["bias_found"]:.1%} of the bias'
-                small = self._with_bias(0.05 * BIAS)
-                if small[0] <= BIAS_LEFT_S or small[1]:
-                    text += '; one twenty times as small is learned, so the estimate is limited'
-            self.faults.append(Fault('no_bias_estimate', text))
-        elif known and late <= BIAS_LEFT_S and np.linalg.norm(found - BIAS) > BIAS_OFF * size:
-            self.faults.append(Fault(
+        if late <= BIAS_LEFT_S or learned:
+            if not known or late > BIAS_LEFT_S or np.linalg.norm(found - BIAS) < BIAS_OFF * size:
+                return measured, None
+            return measured, Fault(
                 'bias_report', 'the effect of a gyroscope bias of '
                 f'{np.degrees(BIAS).round(2).tolist()} deg/s disappears, but the estimate is '
-                f'{np.degrees(found).round(2).tolist()} deg/s'))
-        return measured
+                f'{np.degrees(found).round(2).tolist()} deg/s')
+        text = (f'with a gyroscope bias of 1 deg/s the {"attitude" if self._absolute else "tilt"} '
+                f'is {late:.3g} deg off in the end: the bias is not learned')
+        if known:
+            text += f', and the estimate has {measured["bias_found"]:.1%} of the bias'
+            small = self._with_bias(0.05 * BIAS)
+            if small[0] <= BIAS_LEFT_S or small[1]:
+                text += '; one twenty times as small is learned, so the estimate is limited'
+        return measured, Fault('no_bias_estimate', text)
 
     def _with_bias(self, bias: Reals) -> tuple[float, bool, Reals]:
         """Return the effect in the end [s], whether it is being learned, and the estimate."""
