@@ -83,6 +83,17 @@ ONE_STEP = (        # no fault: the filter corrects before it takes the step
 Tried = tuple[Hypothesis, Outcome]
 
 
+def wired(sensor: str, text: str, matrix: Any) -> Hypothesis:
+    """Return the hypothesis that the readings of a sensor need this matrix."""
+    return Hypothesis((f'{sensor}_wiring',), text, given=mapped(sensor, matrix))
+
+
+def permuted(sensor: str, likely: Sequence[Reals], count: int) -> list[Hypothesis]:
+    """Return the hypotheses that the filter has these signed permutations of a sensor."""
+    return [wired(sensor, f'with {axes(one.T)} of the {sensor} for its x, y, z', one.T)
+            for one in likely[:count]]
+
+
 class Responses:
     """
     The answers of one filter.
@@ -106,6 +117,8 @@ class Responses:
         self.faults: list[Fault] = []
         self.undone: list[Hypothesis] = []
         self._harmless: list[Hypothesis] = []
+        # Whether an error is left that would be taken for that by a lever arm or a bias.
+        self.unclear = False
         self.outcome = self._answer(())
 
     def identify(self) -> None:
@@ -121,7 +134,13 @@ class Responses:
                                   'after this correction') for name in one.faults]
             kept = self.undone if set(one.faults) - {'stamp_offset'} else self._harmless
             kept.insert(0, one)
+            self.unclear |= one.given is of_world
+        before = len(self.faults)
         self._name_the_rest()
+        self.unclear |= len(self.faults) > before
+        if self.unclear:
+            self.faults[-1] = self.faults[-1]._replace(evidence=f'{self.faults[-1].evidence}; '
+                                                       'no lever arm and no bias is judged')
 
     def clean(self, outcome: Outcome) -> Clean:
         """Return the errors on the course."""
@@ -183,7 +202,8 @@ class Responses:
         square = group[int(np.argmin((group.inv() * in_sensor).magnitude()))]
         vectors, last = (np.array([np.linalg.norm(one.as_quat()[:, :3], axis=1),
                                    np.abs(one.as_quat()[:, 3])]) for one in (said, true))
-        scale = float(np.median(vectors[0] * last[1] / np.maximum(vectors[1] * last[0], 1e-9)))
+        scale = max(float(np.median(
+            vectors[0] * last[1] / np.maximum(vectors[1] * last[0], 1e-9))), 1e-3)
         return self._tried((
             *READINGS,
             Hypothesis(('frame_ned',), 'read as attitude of axes '
@@ -205,10 +225,8 @@ class Responses:
         uniform = bool(np.max(np.abs(fit.matrix - scale * np.eye(3))) < 0.3 * abs(scale - 1.0))
         tried = []
         if min(whole.off, early.off) > GROSS_GAIN:
-            tried = [Hypothesis(
-                ('gyroscope_wiring',), f'with {axes(one)} of the gyroscope for its x, y, z',
-                given=mapped('gyroscope', one.T)) for one in sorted(
-                    SIGNED, key=lambda one: float(np.sum((one - fit.matrix) ** 2)))[:3]]
+            tried = permuted('gyroscope', sorted(
+                SIGNED, key=lambda one: float(np.sum((one - fit.matrix) ** 2))), 3)
             tried += [Hypothesis(
                 ('gyroscope_units',), f'with the gyroscope multiplied by {text}',
                 given=mapped('gyroscope', by * np.eye(3))) for text, by in (
@@ -232,22 +250,19 @@ class Responses:
         said, true = (turns.inv().apply((0.0, 0.0, 1.0)) for turns in (
             attitudes, Rotation.from_quat(self.course.run.truth[rows])))
         name = 'accelerometer'
-        likely = sorted(SIGNED, key=lambda one: -float(np.sum(said * (true @ one.T))))[:LIKELY]
-        # said x (matrix true) = 0
-        products = np.einsum('ijk,nj,nl->nikl', LEVI_CIVITA, said, true).reshape(-1, 9)
-        matrix = np.linalg.svd(products)[2][-1].reshape(3, 3)
-        matrix *= 3.0 ** 0.5 * np.sign(np.sum(said * (true @ matrix.T)))
-        tried = [GRAVITY_SIGN, *(Hypothesis(
-            (f'{name}_wiring',), f'with {axes(one)} of the {name} for its x, y, z',
-            given=mapped(name, one.T)) for one in likely if np.any(one != -np.eye(3)))]
-        if np.linalg.cond(matrix) < WORST:
-            tried.append(Hypothesis(
-                (f'{name}_wiring',), f'gravity is taken as {_rows(matrix)} times itself: with the '
-                'inverse of that', given=mapped(name, np.linalg.inv(matrix))))
-        tried += [Hypothesis((f'{name}_wiring',), f'with the {name} multiplied by {by:.4g}',
-                             given=mapped(name, by * np.eye(3)))
-                  for by in (scenarios.GRAVITY, 1.0 / scenarios.GRAVITY)]
-        return self._tried(tried)
+        likely = sorted(SIGNED, key=lambda one: -float(np.sum(said * (true @ one.T))))
+        tried = [GRAVITY_SIGN, *permuted(name, likely, LIKELY)]
+        for part in np.array_split(np.arange(len(rows)), 2 if self._restarts else 1)[::-1]:
+            # said x (matrix true) = 0
+            products = np.einsum('ijk,nj,nl->nikl', LEVI_CIVITA, said[part], true[part])
+            matrix = np.linalg.svd(products.reshape(-1, 9))[2][-1].reshape(3, 3)
+            matrix *= 3.0 ** 0.5 * np.sign(np.sum(said * (true @ matrix.T)))
+            if np.linalg.cond(matrix) < WORST:
+                tried.append(wired(name, f'gravity is taken as {_rows(matrix)} times itself: with '
+                                   'the inverse of that', np.linalg.inv(matrix)))
+        return self._tried((*tried, *(
+            wired(name, f'with the {name} multiplied by {by:.4g}', by * np.eye(3))
+            for by in (scenarios.GRAVITY, 1.0 / scenarios.GRAVITY))))
 
     def _at_rest(self) -> tuple[Rotation, NDArray[np.intp]]:
         """Return attitudes at rest, at the end and of filters that start there, and the rows."""
@@ -272,9 +287,7 @@ class Responses:
 
         return self._tried((
             Hypothesis((f'{name}_wiring',), 'with the field of a level sensor', given=untilted),
-            *(Hypothesis((f'{name}_wiring',), f'with {axes(one)} of the {name} for its x, y, z',
-                         given=mapped(name, one.T))
-              for one in sorted(SIGNED, key=north, reverse=True)[:LIKELY])))
+            *permuted(name, sorted(SIGNED, key=north, reverse=True), LIKELY)))
 
     def _of_field(self) -> Iterator[Tried]:
         """Try a hard iron, scales and units of the magnetometer."""
@@ -287,9 +300,8 @@ class Responses:
         yield from self._tried((
             Hypothesis(('hard_iron',), f'with {", ".join(f"{value:.3g}" for value in iron)} uT '
                        f'added to the {name}', given=partial(with_iron, iron)),
-            Hypothesis((f'{name}_wiring',), f'with x, y of the {name} multiplied by '
-                       f'{", ".join(f"{value:.3g}" for value in scale)}',
-                       given=mapped(name, np.diag((*scale, 1.0))))))
+            wired(name, f'with x, y of the {name} multiplied by '
+                  f'{", ".join(f"{value:.3g}" for value in scale)}', np.diag((*scale, 1.0)))))
 
     def _of_delays(self) -> Iterator[Tried]:
         """Try delays of the attitudes and the gyroscope, and what is no fault."""
