@@ -2,8 +2,8 @@
 """
 Fits the exact motion of a top to attitudes, and the place of an IMU to its readings.
 
-A fit begins with a short part of the attitudes and goes on to longer ones, each twice as long, so
-that no phase is ever off by half a turn.
+A fit begins with a short part of the attitudes and goes on to longer ones, each three times as
+long, so that no phase is ever off by half a turn.
 """
 
 from __future__ import annotations
@@ -52,7 +52,6 @@ LARGEST = 0.3               # noise [rad]
 ONCE_IN = 1000.0            # noise that is called a residue of the motion
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
-TRIALS = 8
 INTERVAL = 1.96             # standard deviations: 95 %
 OFF = 0.1                   # rad, or share of the rates: another start
 
@@ -163,7 +162,7 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     if best is None:
         raise ValueError('no motion of a top comes near the attitudes')
     best.problem.readings = [replace(one, sigma=max(best.residual, 1e-15))]
-    best = _settled(best)
+    best = _settled(best) if best.reached else best
     if imu:
         best = _with_imu(best, parts, begin)
     return _conclude(best, begin, lambda1, gravity)
@@ -190,9 +189,8 @@ def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
     axis = np.stack(attitude.axis_in_world(tuple(q)))
     spin, sure = guess.spin_rate(times, q, _hint(parts))
     weak, small = guess.weak(times, axis), list(guess.small_nutation(times, axis))
-    seeds = [*weak[:1], *((0, *pair) for pair in small[:2]), *weak[1:3],
-             *((0, *pair) for pair in small[2:])]
-    for size, l3, p in seeds[:TRIALS]:
+    seeds = [*weak[:1], *((0, *pair) for pair in small[:4]), *weak[1:2]]
+    for size, l3, p in seeds:
         x = np.zeros(UNKNOWNS)
         x[RATES] = (*guess.transverse_rates(times, q, axis)[:2], spin)
         x[L3], x[P] = l3, p
@@ -213,7 +211,7 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
         chosen = slice(0, count, math.ceil(count / ENOUGH))
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
         x = descend(problem, x, MOTION if size and count > 2 * size else MOTION[:6], 8, 1e-3)
-        count *= 2
+        count *= 3
     problem.readings = [one]
     x = descend(problem, x, MOTION)
     rest = problem.residuals(x).reshape(3, -1)
@@ -223,7 +221,7 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
                   residual <= EXACT or (white and residual < LARGEST))
 
 
-def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
+def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 20,
             tolerance: float = 1e-10) -> Reals:
     """Return the unknowns at the least sum of squares."""
     chosen = [*free]
@@ -398,11 +396,12 @@ def _slopes(problem: Problem, x: Reals, free: Sequence[int], sizes: Reals) -> Re
 
 def _scaled(problem: Problem, x: Reals, lambda1: float, gravity: float) -> tuple[Top, State]:
     """Return top and start with this lambda1."""
-    (_, state), p, gravity = problem.start(x), float(x[P]), gravity or 9.80665
+    (_, state), p = problem.start(x), float(x[P]) if gravity else 0.0
     ratio = state.l3 / float(x[SPIN]) if x[SPIN] else 1.0
-    distance = math.copysign(min(0.1, gravity / (4.0 * max(abs(p), 1e-9))), p)
+    distance = math.copysign(min(0.1, gravity / (4.0 * max(abs(p), 1e-9))), p) or 0.1
+    mass = abs(p) * lambda1 / abs(gravity * distance) if gravity else 1.0
     top = Top(lambda1=lambda1, lambda3=(ratio if ratio > 0.0 else 1.0) * lambda1, gravity=gravity,
-              com_distance=distance, mass=abs(p) * lambda1 / abs(gravity * distance))
+              com_distance=distance, mass=mass)
     return top, replace(state, l3=state.l3 * lambda1, lz=state.lz * lambda1)
 
 
