@@ -28,7 +28,7 @@ from spinning_top_sim.grade import grade
 from spinning_top_sim.grade.scenes import SCENES
 
 PACKAGES = ('numpy', 'mujoco', 'mujoco-mjx', 'drake', 'pin', 'pybullet', 'dartpy', 'newton',
-            'mujoco-warp', 'scipy', 'heyoka', 'diffrax', 'jax')
+            'scipy', 'heyoka', 'diffrax', 'jax')
 FINER = 4           # times as many steps
 LIMIT = 1800        # seconds that a row may take
 TOGETHER = 2        # rows
@@ -84,24 +84,23 @@ FINE = {'rtol': 1e-10, 'atol': 1e-12}
 ENTRIES = (
     *(entry for integrator in ('Euler', 'implicit', 'implicitfast', 'RK4') for entry in stepped(
         f'MuJoCo {integrator}', 'mujoco_engine:run', 0.002, integrator=integrator)),
-    *(entry for integrator in ('Euler', 'RK4') for entry in stepped(
-        f'MJX {integrator}', 'mujoco_engine:Mjx', 0.002, {}, integrator=integrator)),
-    *stepped('Drake discrete', 'drake_engine:run', 0.001),
-    Entry('Drake RK3', 'drake_engine:run', 0.002, 'accuracy 1e-4', options={'accuracy': 1e-4}),
-    Entry('Drake RK3', 'drake_engine:run', 0.002, 'accuracy 1e-10', options={'accuracy': 1e-10},
-          whole=False),
     *stepped('Pinocchio', 'pinocchio_engine:run', 0.001),
     *stepped('Bullet', 'bullet_engine:run', 1.0 / 240.0),
-    *stepped('DART', 'dart_engine:run', 0.001),
-    *(entry for solver in ('MuJoCo', 'Featherstone', 'SemiImplicit', 'XPBD') for entry in stepped(
-        f'Newton {solver}', 'newton_engine:run', 1.0 / 600.0, solver=solver)),
     *(entry for method in ('RK45', 'DOP853', 'LSODA') for entry in tolerant(
         f'SciPy {method}', 'integrators:scipy', FINE, method=method)),
     *tolerant('heyoka', 'integrators:heyoka', {}),
     *stepped('diffrax Tsit5, single precision', 'integrators:Diffrax', 0.002,
              {'method': 'Tsit5', 'double': False}),
     *stepped('diffrax Tsit5, double precision', 'integrators:Diffrax', 0.002,
-             {'method': 'Tsit5'}))
+             {'method': 'Tsit5'}),
+    *stepped('DART', 'dart_engine:run', 0.001),
+    *stepped('Drake discrete', 'drake_engine:run', 0.001),
+    Entry('Drake RK3', 'drake_engine:run', 0.002, 'accuracy 1e-4', options={'accuracy': 1e-4}),
+    Entry('Drake RK3', 'drake_engine:run', 0.002, 'accuracy 1e-10', options={'accuracy': 1e-10},
+          whole=False),
+    *stepped('MJX Euler', 'mujoco_engine:Mjx', 0.002, integrator='Euler'),
+    *(entry for solver in ('Featherstone', 'SemiImplicit', 'XPBD') for entry in stepped(
+        f'Newton {solver}', 'newton_engine:run', 1.0 / 600.0, solver=solver)))
 
 
 class Timed:
@@ -187,12 +186,12 @@ Tolerances hold for one step of an integrator, so that the error after 10 s is l
 NOTES = """\
 - MJX tells accelerations only in models that have a constraint (google-deepmind/mujoco#3440).
 - Drake's ball joint has roll, pitch and yaw as coordinates. A discrete step adds their rates,
-  which are large near pitch 90 degrees; the error control of RK3 takes shorter steps there.
-- Bullet and Newton are graded without an IMU: Bullet has none, and that of Newton needs a solver
-  that tells accelerations.
+  which are large near a pitch of 90 degrees; the error control of RK3 takes shorter steps there.
+- Bullet has no IMU, and that of Newton needs a solver that tells accelerations: both are graded
+  without one.
 - The first call of JAX and Warp compiles; `ms` leaves it out.
-- Genesis and Brax are left out: Genesis has no set of versions that pip can install beside these,
-  and the engine of Brax is MJX.
+- Newton's solver MuJoCo is left out: it asks for MuJoCo 3.17, whose RK4 is of second order here.
+- Genesis cannot be installed beside these versions, and the engine of Brax is MJX.
 """
 
 

@@ -19,6 +19,7 @@ from helpers.faulty_simulators import (
     Stepped,
     exact,
 )
+from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top
@@ -52,12 +53,12 @@ def test_errors_are_split_into_precession_nutation_and_spin():
     for name, angles, size in (('precession', (phi + 1e-3, theta, psi), math.sin(theta)),
                                ('nutation', (phi, theta + 1e-3, psi), 1.0),
                                ('spin', (phi, theta, psi + 1e-3), 1.0)):
-        errors = vars(errors_of(Rotation.from_euler('ZYZ', [angles]), truth))
+        errors = errors_of(Rotation.from_euler('ZYZ', [angles]), truth)
         assert errors[name] == pytest.approx(1e-3 * size, rel=1e-3)
         others = {'precession', 'nutation'} - {name}
         assert all(abs(errors[other]) < 1e-9 for other in others)
     turned = errors_of(Rotation.from_euler('ZYZ', [(phi + 1e-3, theta, psi)]), truth)
-    assert turned.spin == pytest.approx(1e-3 * math.cos(theta), rel=1e-3)
+    assert turned['spin'] == pytest.approx(1e-3 * math.cos(theta), rel=1e-3)
 
 
 @pytest.mark.parametrize('scene', SCENES, ids=lambda scene: scene.name)
@@ -123,6 +124,15 @@ def test_numbers_of_the_faults_are_those_of_the_defects():
     assert '(0.003, -0.002, 0.154)' in offset.evidence
 
 
+def test_with_the_step_of_a_game_the_fast_spin_is_left_out():
+    report = grade(Imu(), scenes=SCENES[1:], dt=1.0 / 60.0)
+    assert report.passed, report
+    assert 'total_error_deg: waves' in report.marks
+    assert 'total_error_deg: fast spin' not in report.marks
+    semi = grade(Imu(Stepped(method='semi-implicit')), dt=1.0 / 60.0)
+    assert semi.names == ['first_order', 'explicit_gyroscopic_term'], semi
+
+
 def test_without_rates_those_of_the_attitudes_serve():
     parts = ('accelerations', 'gyroscope')
     assert short(Imu(Stepped(method='implicit'), parts=parts)).names == [
@@ -159,8 +169,46 @@ def test_a_motion_that_exists_is_graded():
     assert report.names == ['imu_one_step_late'], report
     damped, _ = trajectory_of(Imu(Stepped(method='implicit')))
     assert 'implicit_damping' in grade_trajectory(damped, WHEEL, start).names
+    first, _ = trajectory_of(Imu(Stepped(method='midpoint')))
+    assert grade_trajectory(first, WHEEL, start).names == ['first_order']
     noisy, _ = trajectory_of(lambda *given: Imu(defect='residuals')(SENSOR, *given[1:]))
     assert grade_trajectory(noisy, top, start, **imu).passed, 'no noise is declared'
+
+
+@pytest.mark.parametrize('scene', [SCENES[1], SCENES[3]], ids=['waves', 'near the separatrix'])
+def test_a_log_with_fewer_samples_than_steps_shows_their_kind(scene):
+    for method, fault in (('semi-implicit', 'explicit_gyroscopic_term'),
+                          ('implicit', 'implicit_damping'), ('rk4', None)):
+        start, times = scene.start_of(WHEEL, 0), 0.01 * np.arange(400)
+        attitudes, rates, _ = Stepped(method=method)(WHEEL, start, times, 0.002)
+        said = {'attitudes': attitudes[:, [3, 0, 1, 2]], 'rates': rates}
+        report = grade_trajectory(said, WHEEL, start, times=times)
+        assert report.names == [fault] * bool(fault), report
+
+
+@pytest.mark.parametrize('theta', [0.0, math.pi])
+@pytest.mark.parametrize('gravity', [0.0, 9.8, -9.8])
+def test_a_top_that_only_spins_shows_no_faults_that_cannot_be_seen(theta, gravity):
+    body = replace(WHEEL, gravity=gravity)
+    start = Start.of(body, State(theta=theta, l3=2.0, lz=2.0 * math.cos(theta)))
+    times = 0.01 * np.arange(50)
+    said = Imu(defect='increments', parts=(
+        'rates', 'gyroscope', 'accelerations', 'magnetometer', 'increments'))(
+            body, start, times, 0.01)
+    assert grade_trajectory(said, body, start, times=times).passed
+
+
+def test_all_faults_are_in_the_page_and_no_other():
+    page = (ROOT / 'docs/grade.md').read_text(encoding='utf-8')
+    _, table = page.split('| fault | signature |')
+    names = [name for line in table.splitlines() if line.startswith('| `')
+             for name in re.findall(r'`(\w+)`', line.split('|')[1])]
+    assert sorted(names) == sorted(FAULTS)
+    named = {name for faults in (*PUBLISHED.values(), *OTHER.values(),
+                                 *(faults for _, faults in STEPPED.values())) for name in faults}
+    # Those without a simulator there have a test of their own here.
+    assert set(FAULTS) - named == {
+        'invalid_output', 'not_deterministic', 'inaccurate', 'inconsistent_reading'}
 
 
 def test_a_report_is_readable_and_json():
@@ -205,7 +253,7 @@ def test_what_is_no_motion_is_told(said, says):
 
 
 @pytest.mark.parametrize(('options', 'says'), [
-    ({'dt': 0.0}, 'dt = 0.0 s: must be in'), ({'dt': 1.0}, 'dt = 1.0 s')])
+    ({'dt': 0.0}, 'dt = 0.0 s: must be in (0, 1]'), ({'dt': 1.0}, 'turns by more than 0.7 rad')])
 def test_wrong_arguments_are_refused(options, says):
     with pytest.raises(ValueError, match=re.escape(says)):
         grade(Imu(), **options)

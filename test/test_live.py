@@ -248,6 +248,8 @@ def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
             simulation.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)
         if ahead:
             simulation.prepare(30 * MILLISECOND)
+            if change == 'command':         # blocks begin small again
+                assert simulation.computed_ns == 30 * MILLISECOND
         for until in (30, 60):
             simulation.advance(until * MILLISECOND)
         return taken, pose.sent, pose.skipped

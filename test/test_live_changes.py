@@ -44,14 +44,14 @@ def test_late_samples_are_recorded_and_counted_but_not_published(ahead):
     simulation.advance(0)
     if ahead:
         simulation.prepare(SECOND)
-    assert simulation.advance(10 * SECOND, publish_from_ns=9 * SECOND + 1)
+    assert simulation.advance(10 * SECOND, publish_from_ns=9 * SECOND)
     assert times(recorded, 'pose') == list(range(0, 10 * SECOND + 1, PERIOD_NS))
     for topic in ('pose', 'joint_states'):
-        assert [name for name, _ in published].count(topic) == 101
-        assert (output(simulation, topic).sent, output(simulation, topic).skipped) == (101, 900)
+        assert [name for name, _ in published].count(topic) == 102
+        assert (output(simulation, topic).sent, output(simulation, topic).skipped) == (102, 899)
     assert encoded['pose'].count == 1001
     if not ahead:       # nobody takes the samples that are left out
-        assert encoded['joint_states'].count == 101
+        assert encoded['joint_states'].count == 102
 
 
 @pytest.mark.parametrize(('before', 'after'), [(100.0, 33.0), (10000.0, 10.0)])
@@ -75,6 +75,7 @@ def test_a_change_of_rates_reaches_every_stream():
     assert at_once == {name for name in parameters.BY_NAME if name.endswith('.rate')
                        and not name.startswith('imu.vibration')}
     assert all(parameters.BY_NAME[name].effect is parameters.Effect.NOW for name in at_once)
+    simulation.apply({'imu.rate': 100.0})
     simulation.advance(SECOND)
     simulation.apply({**dict.fromkeys(at_once, 50.0), 'tick_rate': 100.0})
     taken = record(simulation)
@@ -82,7 +83,7 @@ def test_a_change_of_rates_reaches_every_stream():
     for one in simulation.streams:
         assert times(taken, one.topic) == list(range(SECOND + 20 * MILLISECOND, 2 * SECOND + 1,
                                                      20 * MILLISECOND)), one.topic
-    assert simulation.history == [(SECOND, 50.0)], 'the rate of the IMU'
+    assert simulation.history == [(0, 100.0), (SECOND, 50.0)], 'the rates of the IMU'
 
 
 @pytest.mark.parametrize(('l3', 'lz', 'named'), [

@@ -32,7 +32,7 @@ def run(top, start, times, dt, integrator):
 class Mjx:
     """MJX on the CPU, in single precision as JAX has it by default; one program for all runs."""
 
-    MOST = 20_000       # samples of a run
+    MOST = 50_000       # samples of a run
 
     def __init__(self) -> None:
         import jax

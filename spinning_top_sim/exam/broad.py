@@ -6,7 +6,7 @@ Examines filters with trials of BROAD: readings of a real IMU beside an optical 
 Estimation", Data 2021, 6, 72)
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,21 +70,27 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     ValueError
         If there is no folder, no trial in it, or a file is none.
     """
-    paths = trials_in(folder)
-    found, outcomes, failed = {}, [], []
-    for number, path in enumerate(paths, start=1):
-        trial = read_trial(path)
+    return judge(make_filter, map(read_trial, trials_in(folder)), 'data', subject, show=show)
+
+
+def judge(make_filter: MakeFilter, trials: Iterable[Trial], kind: str, subject: str | None,
+          feed: Feed = feed_apart, show: Callable[[float], object] = lambda done: None) -> Report:
+    """Return the report on a filter in trials; the names of its measures begin with `kind`."""
+    found: dict[str, list[measures.Rmse]] = {}
+    outcomes, failed = [], []
+    for number, trial in enumerate(trials, start=1):
         try:
-            outcome = trial.follow(make_filter)
+            outcome = trial.follow(make_filter, feed)
         except InvalidOutputError as error:
             failed.append(f'{trial.run.name}: {error}')
         else:
             outcomes.append(outcome)
-            found[trial.run.name] = measures.rmse(outcome.estimates, outcome.run.truth)
+            found.setdefault(trial.run.name, []).append(
+                measures.rmse(outcome.estimates, outcome.run.truth))
         show(number)
     return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
                   [Fault('invalid_output', '; '.join(failed))] if failed else [],
-                  measures.means('data', found), outcomes)
+                  measures.means(kind, found), outcomes)
 
 
 def trials_in(folder: str | Path) -> list[Path]:

@@ -62,7 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f'(FILE.py:CLASS), or a published filter: {", ".join(FILTERS)}')
     add('--data', type=Path, metavar='FOLDER', help='examine --filter with the trials of BROAD in '
         'this folder: readings of a real IMU beside an optical truth (.mat; .hdf5 needs h5py)')
-    add('--level', choices=SEEDS, help='level of the exam of a filter or node; default: quick')
+    add('--level', choices=SEEDS, help='level of the exam of a filter or node; default: quick; '
+        'field: scenes of a sensor in a hand')
     scene_file.add_arguments(parser, 'imu')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')
     add('--json', action='store_true', help='print everything as JSON')

@@ -60,14 +60,16 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
     return Rmse(*(math.degrees(rms(one)) for one in (total, errors.turned(True), errors.tilt)))
 
 
-def means(kind: str, found: Mapping[str, Rmse]) -> dict[str, float]:
-    """Return the means over trials, and the whole error of each, by the names of measures."""
+def means(kind: str, found: Mapping[str, Sequence[Rmse]]) -> dict[str, float]:
+    """Return the means over all trials, and the whole error of each, by the names of measures."""
     if not found:
         return {}
-    total, heading, tilt = np.mean(list(found.values()), axis=0).tolist()
+    total, heading, tilt = np.mean([one for trials in found.values() for one in trials],
+                                   axis=0).tolist()
     return {f'{kind}_rms_deg': total, f'{kind}_heading_rms_deg': heading,
             f'{kind}_tilt_rms_deg': tilt,
-            **{f'{kind}_rms_{name}_deg': one.total for name, one in found.items()}}
+            **{f'{kind}_rms_{name}_deg': float(np.mean([one.total for one in trials]))
+               for name, trials in found.items()}}
 
 
 def rms(values: Reals) -> float:

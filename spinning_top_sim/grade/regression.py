@@ -13,6 +13,8 @@ from spinning_top_sim.grade.scenes import Reals
 MOST_CAUSES = 3
 ENOUGH = 0.2            # of the discrepancy may remain: further causes are not looked for
 WORTHWHILE = 0.8        # of what remains is left at most by another cause
+TINY = 1e-6             # rms of an effect that cannot be seen
+NEAR = 0.25             # of a coefficient to the value that it has for a fault
 AS_GOOD = 2.0           # a cause with fewer columns may leave so many times more
 
 # From the coefficients of a cause to the fault; None for what is no fault.
@@ -29,6 +31,13 @@ class Cause(NamedTuple):
 
     columns: Sequence[Reals]
     judge: Judge
+
+
+def instead(name: str, evidence: str) -> Judge:
+    """Return a judge of two columns: the second effect is there instead of the first."""
+    def judge(found: Reals) -> Fault | None:
+        return Fault(name, evidence) if np.allclose(found, (-1.0, 1.0), atol=NEAR) else None
+    return judge
 
 
 class Explained(NamedTuple):
@@ -70,10 +79,14 @@ def explain(target: Reals, causes: Sequence[Cause], floor: float = 0.0) -> Expla
 
 
 def least_squares(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
-    """Return the coefficients (k,) of columns (N, 3) by least squares, and the residual."""
+    """
+    Return the coefficients (k,) of columns (N, 3) by least squares, and the residual.
+
+    The coefficient of a column that is TINY is 0.
+    """
     matrix = np.stack([column.ravel() for column in columns], axis=1)
     size = np.sqrt(np.sum(matrix * matrix, axis=0))
-    size[size == 0.0] = 1.0
+    size[size <= TINY * np.sqrt(len(matrix))] = np.inf
     found = np.linalg.lstsq(matrix / size, target.ravel(), rcond=1e-9)[0] / size
     return found, target - (matrix @ found).reshape(target.shape)
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import mmap
 import struct
 import zlib
 from array import array
@@ -128,8 +127,7 @@ class PlainChunk:
         return lz4.frame.compress(self.data) if self._compression == 'lz4' else bytes(self.data)
 
     def _enlarge(self, size: int) -> None:
-        # Private: a process that forks would share it with its children.
-        larger = memoryview(mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))
+        larger = memoryview(bytearray(size))
         larger[:self.size] = self.data
         self._memory = larger
 

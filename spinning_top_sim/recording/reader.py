@@ -9,6 +9,7 @@ that overlap in time: one in a log that was written in order.
 import contextlib
 import functools
 import heapq
+import itertools
 import os
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -30,6 +31,7 @@ from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scan import Part, Scan
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
+BLOCK = 16384               # messages that are read together
 _FIRST_DATE = 10 ** 17      # [ns], in 1973
 _STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, about
 
@@ -200,6 +202,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         for message in heapq.merge(*streams, key=attrgetter('log_time')):
             if message.channel_id >= 0 and message.log_time in times:
                 yield message
+
+    def groups(self, topics: Iterable[str] | None = None,
+               ) -> Iterator[tuple[str, list[LogMessage]]]:
+        """Yield some messages of a topic at a time, each topic's in the order of `messages`."""
+        messages = self.messages(topics)
+        while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
+            for topic, group in itertools.groupby(block, attrgetter('topic')):
+                yield topic, list(group)
 
     def scan(self, progress: Callable[[int], object] = lambda offset: None) -> Scan:
         """Return what a scan of the whole file finds, done at the first use."""

@@ -7,19 +7,15 @@ E. T. Whittaker, *Analytical Dynamics*, 4th ed., sect. 71 and 72; theta function
 Watson, *Modern Analysis*, ch. XXI; D. F. Lawden, *Elliptic Functions and Applications*; DLMF,
 https://dlmf.nist.gov, ch. 19, 20 and 22.
 
-1. *Nutation.*  u = cos(theta) obeys u'^2 = (2P/lambda1) (u - u1) (u2 - u) (u3 - u), P = M g R.
-   So u = u1 + (u2 - u1) sn^2(chi) [DLMF 22.13(i)], where chi grows at the constant rate w,
-   w^2 = P (u3 - u1)/(2 lambda1), with the parameter m = (u2 - u1)/(u3 - u1); m1 = 1 - m.
-   K = K(m) and K' = K(m1) are the quarter periods.
+docs/theta_functions.md derives the first two steps.
 
-2. *Attitude.*  The Cayley-Klein parameters
+1. *Nutation.*  u = cos(theta) = u1 + (u2 - u1) sn^2(chi) [DLMF 22.13(i)], where chi grows at the
+   constant rate w, w^2 = P (u3 - u1)/(2 lambda1), P = M g R, with the parameter
+   m = (u2 - u1)/(u3 - u1); m1 = 1 - m.  K = K(m) and K' = K(m1) are the quarter periods.
 
-       alpha = cos(theta/2) exp(i(phi+psi)/2),   beta = sin(theta/2) exp(i(phi-psi)/2)
-
-   have |alpha|^2 = (1 + u)/2 and |beta|^2 = (1 - u)/2.  alpha vanishes where u = -1, at
-   chi = ia; beta where u = 1, at chi = K + ib.  Here a and b are real [DLMF 22.6(iv)].  A quotient
-   of theta functions with these zeros and the poles of u differs from alpha or beta by a factor
-   exp(constant + constant * t).
+2. *Attitude.*  alpha vanishes where u = -1, at chi = ia; beta where u = 1, at chi = K + ib, with
+   real a and b [DLMF 22.6(iv)].  A quotient of theta functions with these zeros and the poles of u
+   differs from alpha or beta by a factor exp(constant + constant * t).
 
 3. *Phase.*  Z = chi/K counts quarter periods.  N is the nearest integer and y = (pi/2) (Z - N), so
    |y| <= pi/4.  By step 2, with the signs s of Lz + L3 for alpha and of Lz - L3 for beta,

@@ -2,16 +2,9 @@
 """
 A simulation that sends its samples in time.
 
-Of the times, two move on; both count from the start [ns]:
-
-    0 -------- now_ns -------------- computed_ns -----> t
-       sent             in the queue
-
-    now_ns       samples up to here are sent
-    computed_ns  samples up to here are sent, or computed ahead and in the queue
-
-`advance` moves `now_ns` to the time that is due, `prepare` moves `computed_ns` ahead of it.  All
-that changes samples after `now_ns` empties the queue.
+Samples up to `now_ns` are sent, those up to `computed_ns` are sent or in the queue.  `advance`
+moves the one to the time that is due, `prepare` the other ahead of it.  All that changes samples
+after `now_ns` empties the queue.
 """
 
 import contextlib

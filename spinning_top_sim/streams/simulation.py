@@ -94,9 +94,8 @@ class Simulation:
         # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
         self.pivot, self._lz = pivot, start.lz
-        late_ns = round(values['gnss.latency'] * NANOSECONDS)
         self.path = Path(segment, self._follow, self.imu.carry,
-                         keep_ns=max(trace_ns, LONGEST_NS + late_ns, self.imu.keep_ns),
+                         keep_ns=max(trace_ns, LONGEST_NS, self.imu.keep_ns),
                          keep_steps_ns=self.imu.keep_ns)
         self.version += 1
 

@@ -185,18 +185,14 @@ class Markers(Stream):
 
     def _traces(self, samples: Samples) -> NDArray[np.float64]:
         """Return the points of the traces that end at these samples, (n, 3 (count + 1))."""
-        n, steps = len(samples.times), np.arange(1 - self._count, 1)
         newest = (samples.t_ns[:, np.newaxis] - 1) // self._spacing_ns
-        numbers = newest + steps
-        # The points that a trace shares with the one before it are computed once.
-        is_new = numbers > np.vstack((numbers[0, 0] - 1, newest[:-1]))
-        points = samples.path.exact_points(
-            np.maximum(numbers[is_new], 0) * self._spacing_ns, self._shape.tip)
-        ends = np.cumsum(np.count_nonzero(is_new, axis=1))[:, np.newaxis]
-        last = self._point(samples, self._shape.tip)
-        traces = np.concatenate((points[ends - 1 + steps], np.stack(last, axis=-1)[:, np.newaxis]),
-                                axis=1)
-        return traces.reshape(n, -1)
+        # Traces share points, which are computed once.
+        numbers, places = np.unique(np.maximum(newest + np.arange(1 - self._count, 1), 0),
+                                    return_inverse=True)
+        points = samples.path.exact_points(numbers * self._spacing_ns, self._shape.tip)
+        traces = points[places.reshape(len(newest), -1)]
+        last = np.stack(self._point(samples, self._shape.tip), axis=-1)[:, np.newaxis]
+        return np.concatenate((traces, last), axis=1).reshape(len(newest), -1)
 
     @staticmethod
     def _point(samples: Samples, along: float) -> Vector:

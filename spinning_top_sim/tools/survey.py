@@ -11,7 +11,6 @@ import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,6 @@ from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured
 from spinning_top_sim.tools.recorded_run import LATEST_NS, ODD, RunDescription, reason_of
 
-BLOCK = 16384               # messages of all topics that are analysed together
 MOST_GAPS = 10              # that are listed
 MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
 # Streams that a motion can be measured from, the most accurate first.
@@ -182,15 +180,12 @@ def _read_messages(found: Survey, reader: LogReader) -> dict[str, Stamps]:
     """Compare all messages with their motions; return the log times of each topic [ns]."""
     ends_ns = [motion.end_ns for motion in found.motions[:-1]]
     blocks_ns = {topic: [np.empty(0, np.int64)] for topic in found.topics}
-    messages = reader.messages()
-    while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
-        for topic, group in itertools.groupby(block, attrgetter('topic')):
-            samples = list(group)
-            blocks_ns[topic].append(_stamps(samples))
-            if found.motions and found.topics[topic].stream is not None:
-                for number, part in itertools.groupby(
-                        samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
-                    _analyse(found, found.motions[number], topic, list(part))
+    for topic, samples in reader.groups():
+        blocks_ns[topic].append(_stamps(samples))
+        if found.motions and found.topics[topic].stream is not None:
+            for number, part in itertools.groupby(
+                    samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
+                _analyse(found, found.motions[number], topic, list(part))
     return {topic: np.concatenate(parts) for topic, parts in blocks_ns.items()}
 
 

@@ -221,11 +221,10 @@ class LiveView(Node):
         client: Client = self._services_of_sim[name]
         if not client.service_is_ready():
             raise RefusedError(f'there is no {self._sim}')
-        answered = threading.Event()
         future = client.call_async(request)
-        future.add_done_callback(lambda _: answered.set())
         end = time.monotonic() + ANSWER_S
-        while not answered.wait(0.1):
+        while not future.done():
+            time.sleep(0.01)
             if time.monotonic() > end or self._stopped:
                 client.remove_pending_request(future)
                 raise RefusedError(f'{self._sim}/{name} has not answered')

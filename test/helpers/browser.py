@@ -66,6 +66,10 @@ class Visit:
         w, *xyz = self.scene.evaluate(f'window.__viserMutable.nodePoseData[{name!r}].wxyz')
         return [*xyz, w]
 
+    def place(self, name):
+        """Return the position of a node of the scene."""
+        return self.scene.evaluate(f'window.__viserMutable.nodePoseData[{name!r}].position')
+
     def read(self, pattern):
         """Wait for a text; return its groups."""
         self.page.wait_for_function('text => RegExp(text).test(document.body.innerText)',
