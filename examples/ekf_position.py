@@ -27,7 +27,7 @@ START = np.repeat((10.0, 1.0, 0.05, 0.01, 0.1), 3)      # m, m/s, rad, rad/s, m/
 
 
 def main(argv=None):
-    """Run the filter; print and return the errors (n, 3) [m] of the estimated positions."""
+    """Run the filter; return errors of the positions and their deviations (n, 3) [m]."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
     parser.add_argument('log')
     parser.add_argument('--plot', metavar='FILE', help='write a picture (PNG)')
@@ -45,7 +45,7 @@ def main(argv=None):
           f'{rms(settled):.3f} m, of the fixes alone {rms(raw):.3f} m')
     if arguments.plot:
         plot(arguments.plot, t, errors, deviations)
-    return errors
+    return errors, deviations
 
 
 def read(path):

@@ -23,6 +23,7 @@ COMMANDS = {
     'export': ('tools.top_files', 'write models for physics engines, or reference trajectories'),
     'ensemble': ('tools.ensemble', 'simulate many tops with sampled parameters'),
     'examine': ('exam.command', 'examine an attitude filter'),
+    'grade': ('grade.command', 'grade the trajectory of a simulator'),
     'view': ('view.command', 'show a running node or a log in the browser'),
 }
 INTERRUPTED = 130

@@ -16,7 +16,6 @@ from helpers.reference import scene_parameters
 from helpers.simulations import MILLISECOND, play, record, simulate
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.solvers.exact import ExactSolution
 
 # ---------------------------------------------------------------------------------- scenarios
 
@@ -171,24 +170,6 @@ def some_times(seed, earliest, latest):
 
 def assert_same_bits(found, expected, name):
     assert found.tobytes() == expected.tobytes(), name
-
-
-@motions
-def test_exact_states_are_the_same_bits_in_any_blocks_and_any_order(name):
-    """Blocks of 1 to 300 times, many of them so small that no vector instruction is used."""
-    solution = ExactSolution(*MOTIONS[name])
-    rng = np.random.default_rng(1)
-    t = some_times(1, -20.0, 40.0)
-    whole = solve(*MOTIONS[name], t)
-    sizes = rng.permutation(np.concatenate((rng.integers(1, 4, 30), rng.integers(1, 301, 15))))
-    edges = np.cumsum(sizes)
-    parts = [solution.states_at_seconds(part) for part in np.split(t, edges[edges < INSTANTS])]
-    order = rng.permutation(INSTANTS)
-    shuffled = solve(*MOTIONS[name], t[order])
-    for each in COLUMNS:
-        expected = getattr(whole, each)
-        assert_same_bits(np.concatenate([getattr(part, each) for part in parts]), expected, each)
-        assert_same_bits(getattr(shuffled, each), expected[order], each)
 
 
 @motions

@@ -15,7 +15,6 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 from helpers.reference import ROOT
 
-from spinning_top_sim import tools
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import ensemble_part, ensemble_spec
@@ -405,14 +404,3 @@ def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, sai
     assert main([str(path), *arguments]) == 2
     assert said in capsys.readouterr().err
     assert [entry.name for entry in tmp_path.iterdir()] == ['spec.yaml']
-
-
-@pytest.mark.parametrize('name', ['distributed', 'pyarrow'])
-def test_what_is_not_installed_is_named(tmp_path, monkeypatch, capsys, name):
-    monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, 'spinning_top_sim.tools.ensemble_cluster', raising=False)
-    monkeypatch.delattr(tools, 'ensemble_cluster', raising=False)
-    assert main([str(written(tmp_path)), '-o', str(tmp_path / 'out')]) == 1
-    error = capsys.readouterr().err
-    assert f'an ensemble needs {name}, which' in error and "-m pip install 'ahrs" in error
-    assert not (tmp_path / 'out').exists()

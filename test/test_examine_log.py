@@ -106,7 +106,7 @@ def test_attitudes_of_every_type_are_read(beside, type_name):
     ('component_order', lambda q: np.roll(q, 1, axis=1), {}),
     ('stamp_offset', disturbed, {'delay_ns': 20_000_000}),
     ('covariance_small', disturbed, {'variance': 0.5e-4}),
-    ('diverges', lambda q: np.roll(q, 100, axis=0), {}),
+    ('inaccurate', lambda q: np.roll(q, 100, axis=0), {}),
     ('invalid_output', lambda q: q * np.where(np.arange(len(q)) == 777, np.nan, 1.0)[:, None],
      {}),
     ('invalid_output', disturbed, {'variance': -1e-4})])

@@ -4,13 +4,12 @@
 import math
 import random
 import re
-import time
 import warnings
 
 import numpy as np
 import pytest
 from helpers.examples import TIMES, examples
-from helpers.extremes import DOUBLES, actions, number, parameter_set
+from helpers.extremes import DOUBLES, number, parameter_set
 from helpers.simulations import SECOND, play, simulate
 from hypothesis import given
 from hypothesis import strategies as st
@@ -200,54 +199,3 @@ def short_life(rng):
 def test_every_combination_that_the_ranges_allow_runs_or_is_refused():
     found = [short_life(random.Random(seed)) for seed in range(6 * TIMES)]
     assert found.count('ran') >= 3 * TIMES
-
-
-def without_end(values):
-    return {name: value for name, value in values.items()
-            if name not in ('duration', 'start_paused')}
-
-
-# ------------------------------------------------------------------------------------- real nodes
-
-@pytest.fixture(scope='module')
-def peer():
-    pytest.importorskip('rclpy')
-    from helpers.node_harness import Peer
-
-    with Peer() as peer:
-        yield peer
-
-
-def test_a_node_survives_extreme_parameters_commands_and_resets(peer, tmp_path):
-    from geometry_msgs.msg import PoseStamped
-    from helpers.node_harness import Diagnostics, SimNode
-    from rclpy.parameter import Parameter
-
-    defaults = {name: list(value) if isinstance(value, tuple) else value
-                for name, value in parameters.checked({}).items()
-                if parameters.BY_NAME[name].effect is not parameters.Effect.START
-                and not name.startswith('spin.')}
-    with SimNode(tmp_path, {'status_period': 0.5}) as node:
-        peer.introduce(node, Diagnostics(peer))
-        for seed in range(4):
-            for kind, data in actions(random.Random(seed)):
-                if kind == 'set':
-                    for name, value in without_end(data).items():
-                        peer.set_each(node, **{name: Parameter(name, value=value)
-                                               .to_parameter_msg()})
-                elif kind == 'command':
-                    peer.send_command(node, *data)
-                elif kind == 'pause':
-                    peer.switch(node, 'set_pause', data)
-                elif kind == 'wait':
-                    time.sleep(data)
-                else:
-                    peer.trigger(node, kind)
-            assert node.alive, (seed, node.err)
-        assert all(result.successful for result in peer.set_each(node, **defaults))
-        assert peer.trigger(node, 'reset').success
-        assert peer.switch(node, 'set_pause', False).success
-        pose = peer.listen(node.topic('pose'), PoseStamped)
-        pose.wait_more(50)
-        assert node.end() == 0, node.err
-        peer.stop_listening(pose)

@@ -8,15 +8,11 @@ import pytest
 from helpers.logs import (
     ALL_KEPT,
     FAILED,
-    JAZZY,
-    NUMBER,
     SOME_LOST,
     STRANGERS,
-    metadata_of,
     records_of,
     run,
     seen_by_mcap,
-    seen_by_rosbags,
     seen_by_us,
     small_log,
     without_sync,
@@ -27,8 +23,6 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message
 from mcap.writer import MCAP0_MAGIC
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as BagWriter
 
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
@@ -111,22 +105,6 @@ def first_message(chunk: bytes, messages) -> int:
     """Return the number of the message that a chunk of `write_stranger` begins with."""
     start_time, = struct.unpack_from('<Q', chunk, 9)
     return start_time - messages[0][1]
-
-
-def test_a_bag_of_rosbags_is_recovered(tmp_path):
-    with BagWriter(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection('/number', NUMBER, typestore=JAZZY)
-        for number in range(200):
-            writer.write(connection, number, bytes(JAZZY.serialize_cdr(
-                JAZZY.types[NUMBER](float(number)), NUMBER)))
-    (path,) = (tmp_path / 'bag').glob('*.mcap')
-    expected = seen_by_rosbags(path)
-    assert len(expected) == 200
-    code, out, err = run(path, '-o', tmp_path / 'whole.mcap')
-    assert code == ALL_KEPT, (out, err)
-    output = tmp_path / 'whole.mcap'
-    assert seen_by_rosbags(output) == seen_by_mcap(output) == seen_by_us(output) == expected
-    assert 'name: /number\n' in metadata_of(output)['rosbag2']['serialized_metadata']
 
 
 def test_messages_in_and_out_of_chunks_keep_their_order(tmp_path):

@@ -6,7 +6,6 @@ import struct
 import subprocess
 import sys
 import textwrap
-import tracemalloc
 
 import pytest
 import zstandard
@@ -26,7 +25,7 @@ from helpers.logs import SOME_LOST, seen_by_us
 from helpers.reference import ROOT
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
-from mcap.records import Channel, Chunk, Header, Metadata, Schema
+from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import scan
@@ -64,32 +63,6 @@ def test_a_chunk_with_wrong_declarations_is_not_copied(tmp_path, wrong):
     assert read == [('thing', '/a', b'1'), ('thing', '/a', b'2')]
     with LogReader(output) as reader:
         assert reader.damage.lines() == []
-
-
-@pytest.mark.parametrize(('stated_size', 'report'), [
-    (100, 'lost: chunk at byte 34'),
-    (1 << 62, f'lost: chunk at byte 34 ({{}} bytes): its {1 << 62} bytes are more than the '
-              f'{256 << 20} that are read')])
-def test_a_chunk_that_would_fill_the_memory_does_not(tmp_path, stated_size, report):
-    bomb = record_bytes(Chunk(
-        compression='zstd', data=zstandard.ZstdCompressor().compress(bytes(300_000_000)),
-        uncompressed_size=stated_size, uncompressed_crc=1, message_start_time=1,
-        message_end_time=2))
-    path = tmp_path / 'bomb.mcap'
-    header = record_bytes(Header(profile='', library=''))
-    path.write_bytes(closed(header, bomb))
-    tracemalloc.start()
-    try:
-        with LogReader(path) as reader:
-            assert not list(reader.messages())
-            assert [loss.what for loss in reader.damage.losses] == ['chunk']
-            lines = reader.damage.lines()
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert peak < 10_000_000
-    report = report.format(len(bomb)).replace('byte 34', f'byte {8 + len(header)}')
-    assert any(line.startswith(report) for line in lines), lines
 
 
 @pytest.mark.parametrize('kind', ['chunk', 'metadata'])
@@ -138,7 +111,8 @@ def test_the_search_behind_damage_takes_linear_time(tmp_path, monkeypatch):
     assert seen_by_us(path) == [('/a', 5, b'x')]
 
 
-CEILING_MB = 1000       # of the process: about three times max_bytes, and the interpreter
+# Of what is read into memory, and of the process.
+MAX_BYTES, CEILING_MB = 32 << 20, 400
 
 
 def tiny_messages() -> bytes:
@@ -161,7 +135,7 @@ def many_keys() -> bytes:
 
 
 def overlapping() -> bytes:
-    return zstd_chunk(message(5, b'') + message(6, bytes(200_000_000)) + message(9, b''), 9) * 3
+    return zstd_chunk(message(5, b'') + message(6, bytes(25_000_000)) + message(9, b''), 9) * 3
 
 
 @pytest.mark.parametrize(('bomb', 'report'), [
@@ -175,6 +149,8 @@ def test_memory_has_a_ceiling(tmp_path, bomb, report):
     done = subprocess.run(
         [sys.executable, '-c', textwrap.dedent(f"""
             import resource
+            from spinning_top_sim.recording import records
+            records.MAX_BYTES = {MAX_BYTES}
             from spinning_top_sim.recording.reader import LogReader
             from spinning_top_sim.recording.errors import LogError
             from spinning_top_sim.tools.recover import main

@@ -111,21 +111,6 @@ def test_increments_connect_the_samples_of_the_lever_arms_end(method):
     assert velocity == pytest.approx(np.cross(rates, arm), abs=1e-13)
 
 
-def test_a_strapdown_of_the_increments_stays_with_the_truth():
-    """60 s here; benchmark/increments.py has 1000 s, and the bounds for that."""
-    _, found = run({**MOUNTED, 'solver.method': 'exact', 'imu.rate': 50.0,
-                    'ground_truth_imu_odom.rate': 0.1}, 60 * SECOND, *TOPICS)
-    (_, _, dq), (_, _, dv), (_, _, _, orientation, velocity, _) = found.values()
-    turned, total = Rotation.from_quat(orientation), np.zeros(3)
-    attitude, world = turned[0], turned.apply(velocity)
-    for rotation, change in zip(Rotation.from_quat(dq[1:]), dv[1:], strict=True):
-        total += attitude.apply(change)
-        attitude = attitude * rotation
-    total[2] -= GRAVITY * 60.0
-    assert (turned[-1].inv() * attitude).magnitude() <= 2e-13
-    assert np.abs(world[0] + total - world[-1]).max() <= 1e-11
-
-
 # ---------------------------------------------------------------------------------- errors
 
 def test_the_noise_of_increments_is_that_of_the_readings():

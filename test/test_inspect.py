@@ -19,7 +19,6 @@ from helpers.inspected import as_json, log_of, rewritten, short_log, stepped_log
 from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.writer import Writer
 
-from spinning_top_sim import tools
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect, recover, simulate
@@ -212,15 +211,6 @@ def test_a_strangers_log_is_listed_and_its_names_do_not_act_on_the_terminal(tmp_
     assert code == 1 and 'nothing to draw' in err and not (tmp_path / 'no.png').exists()
 
 
-@pytest.mark.parametrize('content', [None, b'', b'no log at all'])
-def test_what_cannot_be_read_says_so(tmp_path, capsys, content):
-    path = tmp_path / 'bad.mcap'
-    if content is not None:
-        path.write_bytes(content)
-    code, out, err = told(capsys, path)
-    assert code == 1 and not out and str(path) in err
-
-
 def test_a_reader_that_leaves_is_no_error(short, monkeypatch, capsys):
     left, output = os.pipe()
     os.close(left)
@@ -278,17 +268,6 @@ def test_pictures_overwrite_nothing_and_an_interrupted_one_leaves_no_file(
                         interrupted)
     assert told(capsys, short, option, path)[0] == 130
     assert not any(tmp_path.iterdir())
-
-
-def test_without_matplotlib_there_is_a_hint(short, tmp_path, capsys, monkeypatch):
-    for name in ('matplotlib', 'matplotlib.animation', 'matplotlib.figure'):
-        monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, 'spinning_top_sim.tools.plots', raising=False)
-    monkeypatch.delattr(tools, 'plots', raising=False)
-    code, out, err = told(capsys, short, '--plot', tmp_path / 'page.png')
-    assert code == 1 and "pip install 'matplotlib" in err
-    assert len(err.splitlines()) == 1
-    assert 'motion 2' in out                            # the rest is told all the same
 
 
 def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path):

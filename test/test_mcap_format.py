@@ -160,32 +160,6 @@ def test_a_chunk_index_that_lies_costs_nothing(tmp_path, place, wrong):
     assert seen_by_mcap(recover(path)) == messages
 
 
-@pytest.mark.parametrize('bit', [0, 3, 7])
-def test_a_record_of_another_kind_costs_no_other_chunk(tmp_path, bit):
-    """In a truncated file of a stranger: no kind may pass for the end of the data."""
-    path = tmp_path / 'a.mcap'
-    messages = write_stranger(path, {})
-    content = path.read_bytes()
-    records = records_of(content)
-    last = max(end for opcode, _, end in records if opcode == Opcode.MESSAGE_INDEX)
-    chunks = [start for opcode, start, _ in records if opcode == Opcode.CHUNK]
-    first = [struct.unpack_from('<Q', content, start + 9)[0] for start in chunks]
-    first.append(messages[-1][1] + 1)
-    for opcode, start, _ in records:
-        if start >= last or start == chunks[0]:     # that chunk has the channels
-            continue
-        changed = bytearray(content[:last])
-        changed[start] ^= 1 << bit
-        path.write_bytes(changed)
-        lost = range(0)
-        if opcode == Opcode.CHUNK:
-            number = chunks.index(start)
-            lost = range(first[number], first[number + 1])
-        read = seen_by_us(path)
-        assert [message for message in read if message[1] not in lost] == [
-            message for message in messages if message[1] not in lost], (opcode, start)
-
-
 @pytest.mark.parametrize('truncated', [False, True])
 def test_a_summary_behind_a_damaged_end_of_the_data_is_no_data(tmp_path, truncated):
     """Nothing else tells where it begins if the file is truncated, or it is damaged itself."""

@@ -2,12 +2,9 @@
 """Pictures of a motion for notebooks."""
 
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
-from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
@@ -63,15 +60,3 @@ def test_what_makes_no_picture_is_refused(times, argument, says):
     motion = solve(TOP, CUSP, np.array(times))
     with pytest.raises(ValueError, match=re.escape(says)):
         motion.animate(**argument) if argument else motion.plot()
-
-
-def test_without_matplotlib_the_error_names_the_extra():
-    program = ('import sys; sys.modules["matplotlib"] = None\n'
-               'from spinning_top_sim import State, Top, solve\n'
-               f'motion = solve({TOP!r}, {CUSP!r}, [0.0, 1.0])\n'
-               'for draw in (motion.plot, motion.animate):\n'
-               '    try:\n        draw()\n'
-               '    except ImportError as error:\n        print(error)\n')
-    said = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
-                          timeout=60, check=True, cwd=ROOT).stdout
-    assert said.count("-m pip install 'matplotlib") == 2

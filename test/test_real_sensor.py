@@ -122,6 +122,7 @@ def test_any_division_of_a_run_gives_the_same_bytes(method):
               'mag.disturbance.world': (0.1, 0.3, 1e-5, 0.0, 0.0)}
     topics = ('imu/data_raw', 'imu/data', 'imu/mag', 'imu/dq', 'imu/dv')
     events = ((125 * MILLISECOND, command(1.1, 1.1)), (225_000_001, rate(320.0)),
+              (300_000_000, lambda simulation: simulation.drive((0.5, 0.0, 0.0))),
               (350_000_003, command(0.9, 0.85)), (350_000_003, command(1.2, 1.2)))
 
     def go(splits, live):

@@ -17,6 +17,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
+from helpers.definitions import FILE, TYPES, definition
 from helpers.recordings import (
     EPOCH_NS,
     JAZZY,
@@ -38,14 +39,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
 
-from spinning_top_sim.recording import definitions
 from spinning_top_sim.recording.chunks import CHUNK_BYTES, PlainChunk, time_span
-from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
 from spinning_top_sim.recording.writer import McapRecorder, create_file
-from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.topics import all_streams
 
 COMPRESSIONS = ('zstd', 'lz4', 'none')
 SUMMARY_OPCODES = (
@@ -227,34 +224,8 @@ def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
         assert times['duration']['nanoseconds'] == 30
 
 
-def test_a_schema_holds_constants_then_fields_and_what_they_need(tmp_path, monkeypatch):
-    """Depth first, each once, without comments and default values."""
-    share = tmp_path / 'share' / 'nested_msgs' / 'msg'
-    share.mkdir(parents=True)
-    (share / 'Root.msg').write_bytes(
-        b'# Zebra in a comment\r\nnested_msgs/Zebra[<=3] z\nApe  a\nstring<=5 s "x"\nuint8 N = 1')
-    (share / 'Ape.msg').write_bytes(b'Zebra[2] z # no newline at the end')
-    (share / 'Zebra.msg').write_bytes('float32 c 0.5  # [°]\n'.encode())
-    (share / 'Root.json').write_text(json.dumps({'type_hashes': [
-        {'type_name': 'nested_msgs/msg/Zebra', 'hash_string': 'RIHS01_0'},
-        {'type_name': 'nested_msgs/msg/Root', 'hash_string': 'RIHS01_1'}]}))
-    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{tmp_path / "nothing"}{os.pathsep}{tmp_path}')
-    text, type_hash = find_definition('nested_msgs/msg/Root')
-    line = '=' * 80
-    assert text == (
-        'uint8 N=1\nnested_msgs/Zebra[<=3] z\nnested_msgs/Ape a\nstring<=5 s\n'
-        f'{line}\nMSG: nested_msgs/Zebra\nfloat32 c\n'
-        f'{line}\nMSG: nested_msgs/Ape\nnested_msgs/Zebra[2] z\n')
-    assert type_hash == 'RIHS01_1'
-
-
-RECORDED = sorted({stream.type_name for stream in all_streams(parameters.checked({}))}
-                  | {type_name for _, type_name in journal.TOPICS})
-
-
-@pytest.mark.parametrize('type_name', RECORDED)
-def test_definitions_are_the_same_with_and_without_ros(type_name):
-    assert find_definition(type_name) == definitions._of_rosbags(type_name)
+def test_the_definitions_of_all_streams_are_those_of_jazzy():
+    assert json.loads(FILE.read_text('utf-8')) == {name: definition(name) for name in TYPES}
 
 
 @pytest.mark.parametrize('type_name', [

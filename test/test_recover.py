@@ -15,9 +15,7 @@ from helpers.logs import (
     ALL_KEPT,
     CHUNKS,
     FAILED,
-    JAZZY,
     MESSAGES_PER_CHUNK,
-    NUMBER,
     POINT,
     SOME_LOST,
     TOPICS,
@@ -39,9 +37,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.recording.writer import create_file
 
 
@@ -271,19 +267,6 @@ def test_recovering_a_whole_file_changes_nothing(tmp_path, compression):
         assert reader.whole
         assert reader.damage.lossless
         assert not reader.damage.lines()
-
-
-def test_a_topic_tells_all_that_its_channel_says(log, tmp_path):
-    (tmp_path / 'run.mcap').write_bytes(log.content)
-    with LogReader(tmp_path / 'run.mcap') as reader:
-        topic = reader.topics[1]
-        assert reader.profile == 'ros2'
-        assert reader.library.startswith('spinning_top_sim ')
-        assert reader.size == len(log.content)
-    assert (topic.name, topic.type_name, topic.encoding) == ('/top/number', NUMBER, 'cdr')
-    assert (topic.schema_encoding, topic.schema) == ('ros2msg', find_definition(NUMBER)[0])
-    assert topic.qos == (dict(DEFAULT_QOS) | TOPICS[1].qos,)
-    assert topic.metadata['topic_type_hash'] == JAZZY.hash_rihs01(NUMBER)
 
 
 @pytest.mark.parametrize('torn', [False, True])

@@ -3,7 +3,6 @@
 
 import os
 import random
-import resource
 import signal
 import subprocess
 import sys
@@ -116,20 +115,6 @@ def test_nothing_is_overwritten(tmp_path, log):
     assert path.read_bytes() == log.content
     assert other.read_text() == 'precious'
     assert len(list(tmp_path.iterdir())) == 3
-
-
-def test_a_full_disk_leaves_nothing_behind(monkeypatch, tmp_path, log):
-    # What is measured for `make coverage` could not be written either.
-    monkeypatch.delenv('COVERAGE_PROCESS_CONFIG', raising=False)
-    path = tmp_path / 'run.mcap'
-    path.write_bytes(log.content)
-    limit = len(log.content) - 1000
-    done = run_process(path, preexec_fn=lambda: resource.setrlimit(
-        resource.RLIMIT_FSIZE, (limit, limit)))
-    assert done.returncode == FAILED
-    assert done.stderr == (
-        f'spinning-top recover: cannot write {tmp_path / "run_recovered.mcap"}: File too large\n')
-    assert [item.name for item in tmp_path.iterdir()] == ['run.mcap']
 
 
 def test_an_output_that_cannot_be_made_is_named(tmp_path, log):

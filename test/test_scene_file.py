@@ -95,16 +95,6 @@ def test_a_file_may_have_parameters_of_ros_only(tmp_path, section):
                  '-p', 'use_sim_time:=true', '-p', 'qos_overrides./a.b:=1', '--quiet']) == 0
 
 
-@pytest.mark.parametrize('text', ['!!bool maybe', '[!!int 1]'])
-def test_a_tag_that_rcl_ignores_is_refused_in_one_line(tmp_path, capsys, text):
-    path = scene(tmp_path / 'p.yaml', **{'spin.l3': text})
-    assert main(['-o', str(tmp_path / 'run.mcap'), '--duration', '1', '--params', str(path)]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith('spinning-top simulate: '
-                            f'{path} is not YAML: the tag ') and error.count('\n') == 1
-    assert error.endswith(': must be !!str, as rcl ignores all others\n')
-
-
 @pytest.mark.parametrize('name', ['1', '[a]', '<<'])
 def test_a_name_that_is_no_text_is_refused(tmp_path, name):
     path = scene(tmp_path / 'p.yaml', **{name: '1.5'})

@@ -159,16 +159,6 @@ def test_a_jump_of_three_years_draws_few_numbers(monkeypatch):
     assert np.std(there - later, axis=0).min() > 0.0
 
 
-def test_errors_add_up():
-    """The noise of all is the sum of what each alone adds."""
-    times, errors = range(0, 3 * SECOND, MILLISECOND), {
-        **ALL_BIASES, 'imu.gyroscope_noise_density': 0.01, 'imu.accelerometer_noise_density': 0.1}
-    alone = [read({name: value for name, value in errors.items() if name.endswith(end)}, times)[0]
-             for end in ('_walk', '_stddev', '_turn_on_bias', '_instability', '_density')]
-    assert all(np.all(np.std(one, axis=0) + np.abs(one[0]) > 0.0) for one in alone)
-    assert read(errors, times)[0] == pytest.approx(sum(alone), rel=3e-16, abs=1e-15)
-
-
 def test_a_change_of_the_rate_leaves_the_bias_on_its_path():
     values = {**ALL_BIASES, 'solver.method': 'exact', 'imu.rate': 200.0}
     _, found = run(values, 2 * SECOND, 'ground_truth/imu_bias', events=[

@@ -109,34 +109,3 @@ def test_stamps_stay_within_what_a_message_holds():
     later = Timing(parameters.checked({'imu.stamp_offset': 1.0}))
     assert later.stamps_ns(2 ** 31 * SECOND - 1, np.zeros(1, np.int64), PERIOD_NS) == (
         2 ** 31 * SECOND - 1)
-
-
-# -------------------------------------------------------------------------------------------- live
-
-def test_a_node_with_all_errors_records_a_log_that_is_verified(peer, tmp_path):
-    """Rates change while it runs; what is not allowed is refused with the reason."""
-    pytest.importorskip('rclpy')
-    from helpers.node_harness import SimNode
-    from sensor_msgs.msg import Imu, MagneticField
-
-    from spinning_top_sim.tools.inspect import main as inspect
-
-    errors = {**FAULTS, 'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-2,
-              'imu.gyroscope_bias_instability': 1e-3, 'imu.accelerometer_turn_on_bias': 0.2,
-              'imu.accelerometer_bias_stddev': 0.1, 'imu.orientation_stddev': [0.1] * 3,
-              'imu.gyroscope_A': [1e-3] * 9, 'mag.noise_density': 1e-7, 'mag.random_walk': 1e-8,
-              'mag.hard_iron': [1e-5, 0.0, 0.0]}
-    with SimNode(tmp_path, {**errors, 'imu_timing.enabled': True, 'imu_data.enabled': True,
-                            'mag.enabled': True, 'record.enabled': True}) as node:
-        peer.listen(node.topic('imu/mag'), MagneticField).wait(20)
-        raw = peer.listen(node.topic('imu/data_raw'), Imu).wait(20)
-        refused, = peer.set_each(node, imu__bias_instability_band=[5.0, 1.0])
-        assert not refused.successful
-        assert 'imu.bias_instability_band = [5.0, 1.0]: the second number' in refused.reason
-        for rate in (333.0, 50.0):
-            changed = peer.set_each(node, imu__rate=rate, mag__rate=0.5 * rate)
-            assert all(one.successful for one in changed)
-            raw.wait_more(10)
-        assert node.end() == 0
-    log, = node.folder.glob('*.mcap')
-    assert inspect([str(log), '--verify']) == 0

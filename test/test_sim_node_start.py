@@ -28,7 +28,7 @@ def main(capfd):
 
 
 @pytest.mark.parametrize('given', [
-    ['config/wavy.yaml'], ['-p', 'seed:=7'], ['--ros-args', '--', '--params-file', 'a.yaml']])
+    ['config/wavy.yaml'], ['-s', 'seed:=7'], ['--ros-args', '--', '--params-file', 'a.yaml']])
 def test_arguments_that_ros_does_not_take_are_refused(main, given):
     run = main(*given)
     assert run.code == 2
@@ -138,6 +138,13 @@ def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(tmp_path):
     found = start_values(*options, '--params-file', file)
     assert [found[name] for name in names] == [3.0, 1.0, 250.0, 1.0, 2.0, (1.0, 2.0, 3.0)]
     assert start_values('-p', 'spin.l3:=2', '-p', 'spin.l3:=1.5')['spin.l3'] == 1.5
+
+
+def test_parameters_are_given_as_to_simulate():
+    argv = ['--scene', 'wavy', '-p', 'spin.l3:=1.5', '-p', 'imu.enabled:=true']
+    sim_node._prepare(argv)
+    assert argv[:2] == ['--ros-args', '--params-file'] and argv[2].endswith('/wavy.yaml')
+    assert argv[3:] == ['-p', 'spin.l3:=1.5', '-p', 'imu.enabled:=true', '--']
 
 
 def test_of_several_files_the_last_that_is_for_the_node_wins(tmp_path):

@@ -3,7 +3,7 @@
 What a node does for simulation_interfaces: states, steps, resets, features.
 
 The handlers are called as the executor calls them, with stand-ins for the messages, and with the
-installed ones where there are some.  test_simulation_interfaces_dds.py calls services.
+installed ones where there are some.
 """
 
 import json

@@ -11,16 +11,10 @@ import os
 
 import numpy as np
 import pytest
-import test_extremes as extremes
 from helpers.reference import scene_parameters
-from stress.tops import EXACT, blocks, check_block, natural_rate, report
-from test_extremes import METHODS, START, TOP
+from stress.tops import blocks, check_block, report
 
-from spinning_top_sim import Top
-from spinning_top_sim.physics.attitude import quaternion_of_angles
-from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.propagator import propagate
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 
@@ -34,103 +28,6 @@ def test_random_tops(seeds):
     # The judges must have judged: most tops all the way.
     assert found.counts['integrated'] > 0.85 * len(seeds)
     assert found.counts['rk45: q'] > 0.8 * len(seeds)
-
-
-# ------------------------------------------------------------------------------ edge inputs
-
-def answer(top, start, t, **method):
-    return extremes.answer({**top, **start}, {'method': 'exact', **method}, t)
-
-
-def assert_same_attitude(one, other, bound):
-    assert np.abs(one.quaternion - other.quaternion).max() <= bound
-
-
-@pytest.mark.parametrize('method', METHODS[:2], ids=('exact', 'transport'))
-@pytest.mark.parametrize('power', [-500, 100, 480])
-def test_the_motion_is_the_same_at_every_scale_of_mass_and_of_time(power, method):
-    base = answer(TOP, START, [0.5, 1.0], **method)
-    by = 2.0 ** power
-    heavier = {**TOP, 'lambda1': by * 0.123, 'lambda3': by * 0.15, 'mass': by * 2.0}
-    motion = answer(heavier, {**START, 'l3': by * 1.6, 'lz': by * 1.1}, [0.5, 1.0], **method)
-    if motion is not None:
-        assert_same_attitude(motion, base, 2.0 * EXACT)
-    assert motion is not None or abs(power) > 400
-    by = 2.0 ** (power // 4)
-    quick = {**START, 'theta_dot': by * 0.4, 'l3': by * 1.6, 'lz': by * 1.1}
-    motion = answer({**TOP, 'gravity': by * by * 9.8}, quick, np.array([0.5, 1.0]) / by, **method)
-    assert motion is not None
-    assert_same_attitude(motion, base, 2.0 * EXACT)
-
-
-@pytest.mark.parametrize('theta', [0.0, 1e-160, 1e-20, math.pi, math.nextafter(math.pi, 0)])
-@pytest.mark.parametrize('theta_dot', [0.0, 1e-160, 0.3])
-@pytest.mark.parametrize('l3', [0.0, 5.0])
-def test_starts_at_the_poles_and_next_to_them_are_right_or_refused(theta, theta_dot, l3):
-    """
-    With Lz = L3 (-L3 below) the start is regular however near the pole is.
-
-    An exponent k = sqrt(P/lambda1) = 4.9/s carries a start of 1e-16 to 1e-11 within 2 s, and
-    what is beneath it may as well be 0.
-    """
-    start = {'theta': theta, 'theta_dot': theta_dot, 'phi': 0.3, 'psi': -1.2, 'l3': l3,
-             'lz': l3 if theta < 1.0 else -l3}
-    t = np.array([0.0, 0.7, 2.0])
-    exact = answer(TOP, start, t)
-    stepped = answer(TOP, start, t, method='rk45', rtol=1e-9)
-    assert stepped is not None
-    if theta < 1e-19 and theta_dot < 1e-19:
-        rest = answer(TOP, {**start, 'theta': 0.0, 'theta_dot': 0.0}, t)
-        assert_same_attitude(stepped, rest, 1e-7)       # some 100 steps of 1e-9
-        if exact is not None:
-            assert_same_attitude(exact, rest, 1e-14)    # 1e-20 exp(2 k), and rounding
-    elif exact is not None:
-        assert_same_attitude(stepped, exact, 1e-6)
-        for name in ('theta', 'phi', 'psi'):
-            if theta_dot > 1e-3 or theta >= 1e-12:
-                sine = np.sin(exact.theta_folded)
-                told = sine > 1e-4
-                assert getattr(stepped, name)[told] == pytest.approx(
-                    getattr(exact, name)[told], abs=1e-2)
-    # m1, the distance to the separatrix, goes with the squares: refused below 1e-290.
-    assert exact is not None or 0.0 < theta < 1e-145 or 0.0 < theta_dot < 1e-144
-
-
-# ------------------------------------------------------------------------ continued branches
-
-CONTINUED = [-0.3, -1.5, math.pi + 0.4, 2.0 * math.pi - 0.1, 2.0 * math.pi + 0.2, -7.0, 9.5,
-             -math.pi - 0.1, 100.3, -40.0]
-
-
-MOMENTA = (0.0, 0.0), (1.6, 1.6), (1.6, -1.6), (0.0, 0.9), (1.6, 1.1)
-# Every pair of gravity and momenta, with branches in turn.
-BRANCHES = [(CONTINUED[(3 * i + k) % 10], momenta, gravity)
-            for i, momenta in enumerate(MOMENTA) for k, gravity in enumerate((9.8, -9.8, 0.0))]
-
-
-@pytest.mark.parametrize(('theta', 'momenta', 'gravity'), BRANCHES)
-def test_both_methods_go_on_from_any_branch(theta, momenta, gravity):
-    """A motion that was commanded after its axis went over the top, any number of times."""
-    l3, lz = momenta
-    top = Top(**{**TOP, 'gravity': gravity})
-    start = ContinuedState(theta=theta, theta_dot=5.5, phi=3.3, psi=-11.2, l3=l3, lz=lz)
-    step = min(0.02, 0.3 / natural_rate(top, start))
-    t = np.arange(0.0, 2.0, step)
-    exact, stepped = (propagate(top, start, method=method, rtol=1e-11).states_at_seconds(t)
-                      for method in ('exact', 'rk45'))
-    for states in (exact, stepped):
-        assert math.dist(states.quaternion[0], quaternion_of_angles(
-            start.phi, start.theta, start.psi)) < 1e-13
-        assert states.theta_dot[0] == pytest.approx(start.theta_dot,
-                                                    abs=1e-13 * natural_rate(top, start))
-        for name in ('theta', 'phi', 'psi'):
-            assert getattr(states, name)[0] == pytest.approx(getattr(start, name), abs=1e-12)
-    # A turn of 0.3 and what the body adds, far from the 2 of a change of sign.
-    assert np.linalg.norm(np.diff(exact.quaternion, axis=0), axis=1).max() < 0.5
-    assert np.linalg.norm(exact.quaternion - stepped.quaternion, axis=1).max() < 1e-7
-    away = np.abs(np.sin(exact.theta)) > 1e-3
-    for name in ('theta', 'phi', 'psi'):
-        assert getattr(exact, name)[away] == pytest.approx(getattr(stepped, name)[away], abs=1e-4)
 
 
 @pytest.mark.parametrize('method', ['rk45', 'exact'])

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal
-from spinning_top_sim.tools import recorded_run, recover
+from spinning_top_sim.tools import recorded_run
 
 
 @pytest.fixture(scope='module')
@@ -179,26 +179,6 @@ def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys
     assert code == 1 and not content['whole'] and content['damage']['torn']
     assert content['damage']['lost_bytes'] > 0
     assert content['motions'][0]['measured']['nutations'] > 3
-
-
-def test_an_incomplete_log_is_told_in_the_same_words_before_and_after_recover(
-        columns, tmp_path, capsys):
-    torn, whole = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap'
-    data = bytearray(columns.read_bytes())
-    chunk = chunks_of(columns)[1]
-    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
-    data[middle:middle + 99] = bytes(99)
-    torn.write_bytes(data)
-    assert recover.main([str(torn), '-o', str(whole)]) == 3
-    capsys.readouterr()
-    texts = []
-    for path in (torn, whole):
-        code, out, _ = told(capsys, path, '--verify')
-        assert code == 1
-        texts.append([line for line in out.splitlines() if line.startswith('verify: ')])
-    assert texts[0] == texts[1]
-    assert re.match(r'verify: incomplete, \d+ messages missing; the other \d+ are identical',
-                    texts[0][0])
 
 
 @pytest.mark.parametrize('event', [

@@ -111,7 +111,8 @@ def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     track = Track('', parameters.checked({}))
     half = math.sqrt(0.5)
     track.add('pose', Samples(np.arange(4), np.array(
-        [(0, 0, 0, 1), (0, 0.01, 0, 1), (0, half, 0, half), (0, half, 0.01, half)], float)))
+        [(0, 0, 0, 1, 0, 0, 0), (0, 0.01, 0, 1, 0, 0, 0), (0, half, 0, half, 0, 0, 0),
+         (0, half, 0.01, half, 0, 0, 0)], float)))
     assert len(model.trace(track, 3)) == 2
 
 
@@ -238,6 +239,26 @@ def test_each_of_two_logs_has_its_own_time(page, tmp_path):
     assert page._plots.content.count('stroke-dasharray="5 3"') >= 4       # of the second log
 
 
+def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
+    path = tmp_path / 'shuttle.mcap'
+    assert simulate.main(['--scene', 'shuttle', '--duration', '3', '-o', str(path)]) == 0
+    track, = logs.read_logs([path])
+    player = logs.Player(page, [track])
+    for t, x in ((1.0, 1.0), (2.2, 4.0 + 0.2 * 4.0)):       # 2 m/s^2, then 4 m/s
+        player.draw(t)
+        reach = abs(model.reach(track))
+        assert page._ground.position == pytest.approx((-(x % reach), 0.0, -0.8 * reach), abs=1e-9)
+        assert 'The pivot moves' in page._words.content
+        stamp_ns = track.origin_ns + round(t * NANOSECONDS)
+        assert track.places(np.array([stamp_ns])) == pytest.approx(np.array([[x, 0.0, 0.0]]))
+        # The trace has stayed where the tip was: at the start at x = 0.
+        begin, end = (model.reach(track) * model.axis_of(track.attitudes.at(at_ns)[1])[0]
+                      for at_ns in (track.origin_ns, stamp_ns))
+        lines = model.trace(track, stamp_ns)
+        assert lines[0, 0] == pytest.approx(begin - (x, 0.0, 0.0), abs=1e-6)
+        assert lines[-1, 1] == pytest.approx(end, abs=1e-6)
+
+
 def test_a_truncated_log_is_shown_as_far_as_it_goes(log, shown, tmp_path):
     path = tmp_path / 'torn.mcap'
     path.write_bytes(log.read_bytes()[:-60_000])
@@ -288,21 +309,6 @@ def test_a_page_as_a_file_is_never_overwritten(log, tmp_path, capsys):
     assert capsys.readouterr().err == (
         f'spinning-top view: cannot write {path}: it exists, and nothing is overwritten\n')
     assert path.read_text() == 'mine'
-
-
-def test_the_body_stands_on_its_pivot_and_has_marks(shown):
-    shape, length = shown.shape, model.reach(shown)
-    parts = {part.name: part.mesh for part in body.wheel(shape, length)}
-    rim, axle = parts['rim'], parts['axle']
-    assert np.hypot(*rim.vertices.T[:2]).max() == pytest.approx(shape.radius)
-    assert np.hypot(*rim.vertices.T[:2]).min() > 0.8 * shape.radius        # it hides nothing
-    assert rim.vertices[:, 2].mean() == pytest.approx(shape.centre)
-    assert sorted(axle.bounds[:, 2]) == pytest.approx([0.0, length])
-    turned = parts['mark'].vertices @ Rotation.from_euler('z', 45.0, degrees=True).as_matrix()
-    assert abs(np.sort(turned[:, 0]) - np.sort(parts['mark'].vertices[:, 0])).max() > 0.01
-    peg = body.stand(1.0)
-    assert peg.bounds[:, 2] == pytest.approx([-1.0, 0.0])
-    assert np.hypot(*peg.vertices[peg.vertices[:, 2] > -0.5].T[:2]).max() < 0.05
 
 
 def test_a_player_follows_its_buttons_and_the_slider(shown, page):

@@ -45,10 +45,8 @@ def apart(shown, orientation):
     return float(angle_between(*(tuple(np.array([x]) for x in q) for q in (shown, published)))[0])
 
 
-@pytest.fixture(scope='module')
-def log(tmp_path_factory):
-    path = tmp_path_factory.mktemp('view') / 'cusp.mcap'
-    assert simulate.main(['--params', str(ROOT / 'config/cusp.yaml'), '--duration', '6', '-o',
+def write_log(path, duration):
+    assert simulate.main(['--params', str(ROOT / 'config/cusp.yaml'), '--duration', duration, '-o',
                           str(path), '--command', '2.5:2.0:1.5']) == 0
     return path
 
@@ -98,6 +96,14 @@ def test_live(browser, peer, tmp_path):
             visit.wait("[...document.querySelectorAll('.top-legend')].some("
                        "e => e.textContent.includes('torque'))")
 
+            # The pad pushes the pivot: the ground moves under it.
+            visit.press('+x')
+            visit.read(r'pivot: 0\.5, 0 m/s')
+            visit.read('The pivot moves')
+            visit.read(r'Pivot\s+0\.\d+, 0, 0')
+            assert visit.place('/ground')[0] < 0.0 == visit.place('/ground')[1]
+            assert visit.place('/top0') == [0, 0, 0]
+
             # A chosen scene is another top, from its start.
             visit.choose('scene', 'wavy')
             visit.read('wavy, reset: at t = 0')
@@ -128,11 +134,13 @@ def stamp_of(poses):
     return str(seconds), f'{nanoseconds:09d}'
 
 
-def test_log(browser, log, tmp_path):
+def test_log(browser, tmp_path):
+    log = write_log(tmp_path / 'cusp.mcap', '120')      # longer than a slow browser takes to pause
     poses = poses_of(log)
     view = SimNode(tmp_path, program=(*VIEW, str(log)))
     with view, Visit(browser, address_of(view)) as visit:
-        visit.press('Pause')
+        if visit.page.get_by_role('button', name='Pause').count():      # it is not at its end
+            visit.press('Pause')
         visit.page.get_by_role('button', name='Play').wait_for()
         visit.put('time [s]', 1.25)
         visit.read(r't = 1\.250')
@@ -146,7 +154,8 @@ def test_log(browser, log, tmp_path):
         assert visit.hosts <= {'127.0.0.1', None}
 
 
-def test_file_without_a_network(browser, log, tmp_path):
+def test_file_without_a_network(browser, tmp_path):
+    log = write_log(tmp_path / 'cusp.mcap', '6')
     page = tmp_path / 'page.html'
     assert command.main([str(log), '--html', str(page)]) == 0
     assert page.stat().st_size < 2.5e6      # for 6 s
@@ -173,3 +182,14 @@ def test_file_without_a_network(browser, log, tmp_path):
             " !== 'translate(46 0)'")
         assert visit.errors == []
         assert visit.hosts <= {'', None}
+
+
+def test_a_file_of_a_ride_moves_the_ground(browser, tmp_path):
+    page, ride = tmp_path / 'ride.html', tmp_path / 'ride.mcap'
+    assert simulate.main(['--scene', 'shuttle', '--duration', '2', '-o', str(ride)]) == 0
+    assert command.main([str(ride), '--html', str(page)]) == 0
+    with Visit(browser, str(page), offline=True, framed=True) as visit:
+        visit.read('The pivot moves')
+        visit.wait("window.__viserMutable.nodePoseData['/ground'].position[0] < -0.1")
+        assert visit.place('/top0') == [0, 0, 0]
+        assert visit.errors == []

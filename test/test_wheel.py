@@ -111,7 +111,7 @@ def test_without_ros_a_scene_is_simulated_and_verified_with_the_same_bytes(empty
 
 
 @pytest.mark.parametrize('name', ['', 'node', 'replay', 'simulate', 'inspect', 'recover',
-                                  'ensemble', 'examine', 'view'])
+                                  'ensemble', 'examine', 'grade', 'view'])
 def test_help_needs_nothing(empty, tmp_path, name):
     code, out, err = run(empty / 'bin/spinning-top', *name.split(), '--help', cwd=tmp_path)
     assert (code, err) == (0, '')

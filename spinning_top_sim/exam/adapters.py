@@ -2,8 +2,8 @@
 """
 Adapters of published attitude filters; the extra `exam` installs them.
 
-Each filter has the default settings of its package, and starts from the attitude of its first
-readings.  With `magnetic=False` it does not use the magnetometer.
+Each filter has the default settings of its package, but for the options that are given, and starts
+from the attitude of its first readings.  With `magnetic=False` it does not use the magnetometer.
 """
 
 from collections.abc import Callable
@@ -25,10 +25,10 @@ FROM_NWU = Rotation.from_euler('z', 90.0, degrees=True)
 class Vqf:
     """VQF (Laidig and Seel 2023), package vqf.  Its period is fixed: it repeats lost samples."""
 
-    def __init__(self, magnetic: bool = True) -> None:
+    def __init__(self, magnetic: bool = True, **options: float) -> None:
         from vqf import VQF  # noqa: PLC0415
 
-        self._make, self._magnetic, self._period = VQF, magnetic, 0.0
+        self._make, self._magnetic, self._period = partial(VQF, **options), magnetic, 0.0
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
@@ -56,14 +56,14 @@ class Ahrs:
     accelerometer reads +g along z there, which is up here.
     """
 
-    def __init__(self, name: str, magnetic: bool = True) -> None:
+    def __init__(self, name: str, magnetic: bool = True, **options: Any) -> None:
         from ahrs import filters  # noqa: PLC0415
 
         self._name, self._magnetic = name, magnetic
         if name == 'EKF':
-            self._filter = filters.EKF(magnetic_ref=list(FIELD))
+            self._filter = filters.EKF(magnetic_ref=list(FIELD), **options)
         else:
-            self._filter = getattr(filters, name)()
+            self._filter = getattr(filters, name)(**options)
         if name == 'Madgwick' and magnetic:
             self._filter.gain = self._filter.gain_marg
         self._turn = FROM_NWU if name == 'Madgwick' and magnetic else Rotation.identity()
@@ -93,13 +93,15 @@ class Ahrs:
 class Imufusion:
     """Madgwick's later filter (thesis of 2014, ch. 7), package imufusion; it takes deg/s and g."""
 
-    def __init__(self, magnetic: bool = True) -> None:
+    def __init__(self, magnetic: bool = True, **options: float) -> None:
         import imufusion  # noqa: PLC0415
 
         self._magnetic = magnetic
         self._filter: Any = imufusion.Ahrs()
         settings = imufusion.AhrsSettings()
         settings.convention = imufusion.CONVENTION_ENU
+        for name, value in options.items():
+            setattr(settings, name, value)
         self._filter.set_settings(settings)
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Examine an attitude filter: its attitudes in a log beside the truth, a ROS node,
-or a published filter by name.
+a class of yours, or a published filter by name.
 
   spinning-top examine run.mcap --topic /imu/data
   spinning-top examine --node "python examples/attitude_node.py" --topic imu/data
   spinning-top examine --topic imu/data                      # of a node that runs already
   spinning-top examine --filter vqf --level full --page vqf.png
+  spinning-top examine --filter mine.py:MyFilter
+  spinning-top examine --filter vqf --data broad/data_mat    # with real readings
 
 exit codes:
   0    no fault was found
@@ -18,24 +20,26 @@ The faults and the measures are defined in docs/exam.md.
 """
 
 import argparse
+import runpy
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from spinning_top_sim.exam.adapters import FILTERS
+from spinning_top_sim.exam.broad import examine_data, trials_in
 from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.log import NORTHS, examine_log
 from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
+from spinning_top_sim.exam.trial import INTERRUPTED, Filter, NodeError
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli, scene_file
 
 # Options for each kind of subject.
 OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 'imu', 'seeds'),
-           '--filter': ('level', 'imu', 'seeds')}
+           '--filter': ('level', 'imu', 'seeds'), '--data': ('data',)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,11 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'magnetic north; default: it must be steady')
     add('--node', metavar='COMMAND', help='command that starts a ROS node that reads imu/data_raw '
         'and imu/mag; each run starts it anew, and waits for its answer to each sample')
-    add('--filter', choices=FILTERS, metavar='NAME',
-        help=f'examine a published filter: {", ".join(FILTERS)}')
-    add('--level', choices=SEEDS, help='level of the exam of a filter or node; default: quick')
-    add('--imu', metavar='NAME', help='errors of an IMU: name of an installed one, or path of '
-        'a parameter file; "help" lists the names')
+    add('--filter', metavar='NAME', help='examine the class with a method `update` in a file '
+        f'(FILE.py:CLASS), or a published filter: {", ".join(FILTERS)}')
+    add('--data', type=Path, metavar='FOLDER', help='examine --filter with the trials of BROAD in '
+        'this folder: readings of a real IMU beside an optical truth (.mat; .hdf5 needs h5py)')
+    add('--level', choices=SEEDS, help='level of the exam of a filter or node; default: quick; '
+        'field: scenes of a sensor in a hand')
+    scene_file.add_arguments(parser, 'imu')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')
     add('--json', action='store_true', help='print everything as JSON')
     add('--junit', type=Path, metavar='FILE', help='write JUnit XML; an existing file is replaced')
@@ -87,6 +93,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the given options by name.  Raises ValueError for those of another subject."""
     subject = ('a log' if arguments.log is not None else
+               '--data' if arguments.data is not None else
                '--filter' if arguments.filter is not None else 'a node')
     options = {name: value for names in OPTIONS.values() for name in names
                if (value := getattr(arguments, name)) is not None}
@@ -99,18 +106,25 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _report(arguments: argparse.Namespace) -> Report:
     if ([arguments.log, arguments.node, arguments.filter].count(None) < 2
-            or arguments.filter is arguments.topic is None):
-        raise ValueError('give either a log and --topic, --node and --topic, --topic alone, or '
-                         '--filter')
+            or arguments.filter is arguments.topic is None
+            or arguments.filter is None is not arguments.data):
+        raise ValueError('give either a log and --topic, --node and --topic, --topic alone, '
+                         '--filter, or --filter and --data')
     options = _options(arguments)
     if arguments.log is not None:
         options['north'] = options.pop('heading', None)
         return examine_log(arguments.log, **options)
     if arguments.filter is not None:
-        make_filter = FILTERS[arguments.filter]
-        with needed(f'the filter {arguments.filter}'):
-            make_filter()       # imports its package once, before the runs fork
-        return examine(make_filter, subject=arguments.filter, **options)
+        make_filter, subject = FILTERS.get(arguments.filter), arguments.filter
+        if make_filter is None:
+            make_filter, subject = _own_filter(arguments.filter), None
+        else:
+            with needed(f'the filter {arguments.filter}'):
+                make_filter()       # imports its package once, before the runs fork
+        if arguments.data is None:
+            return examine(make_filter, subject=subject, **options)
+        with cli.progress('examined', len(trials_in(arguments.data)), 'trials') as show:
+            return examine_data(make_filter, arguments.data, subject=subject, show=show)
     before = signal.signal(signal.SIGINT, lambda *_: INTERRUPTED.set())
     try:
         from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS
@@ -118,6 +132,20 @@ def _report(arguments: argparse.Namespace) -> Report:
         return examine_node(command=arguments.node, **options)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _own_filter(given: str) -> Callable[[], Filter]:
+    """Return the class FILE.py:CLASS.  Raises ValueError, with the reason."""
+    path, _, name = given.rpartition(':')
+    if not path.endswith('.py'):
+        raise ValueError(f'--filter {given}: must be FILE.py:CLASS, or one of '
+                         f'{", ".join(FILTERS)}')
+    sys.path.insert(0, str(Path(path).resolve().parent))    # for what the file imports
+    try:
+        made: Callable[[], Filter] = runpy.run_path(path)[name]
+    except KeyError:
+        raise ValueError(f'--filter {given}: there is no {name} in {path}') from None
+    return made
 
 
 if __name__ == '__main__':

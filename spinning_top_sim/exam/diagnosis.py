@@ -6,8 +6,9 @@ A constant misinterpretation of readings or attitudes is identified by inverting
 disappears, it was the cause.
 """
 
+import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,24 +17,24 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import measures
 from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.exam.scenarios import Reals
+from spinning_top_sim.exam.scenarios import Run
 from spinning_top_sim.exam.trial import ChangeAttitudes, ChangeReadings, Outcome, same
 
 FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component_order',
-          'frame_ned', 'gravity_sign', 'lever_arm', 'stamp_offset', 'no_bias_estimate',
-          'covariance_small', 'covariance_large', 'diverges', 'invalid_output')
+          'frame_ned', 'gravity_sign', 'gyroscope_wiring', 'accelerometer_wiring',
+          'magnetometer_wiring', 'time_step', 'heading_offset', 'hard_iron', 'lag', 'lever_arm',
+          'stamp_offset', 'no_bias_estimate', 'bias_report', 'covariance_small',
+          'covariance_large', 'inaccurate', 'diverges', 'invalid_output')
 
 # Thresholds; docs/exam.md compares them with the values of filters.  Errors are in rad.
 GROSS = np.radians(3.0)         # a smaller error is no misreading
-DIVERGED = np.radians(10.0)
+DIVERGED, GROWS = np.radians(10.0), 1.2     # from one quarter to the next
 EXPLAINED = 0.25                # of the error is left at most when its cause is undone
 FIRST_ORDER = np.radians(0.2)   # on the fast motion
 FIRST_ORDER_LEFT = 0.5          # of that error, with rates for which first-order steps are right
 LEVER_ARM = np.radians(1.0)     # between the attitudes with and without the lever arm
 AHEAD, DELAYED = -1.5, 0.75     # steps; a filter that corrects before its step is ahead by one
 BIAS_LEFT_S = 0.05              # error relative to the bias that causes it [rad/(rad/s)]
-BIAS_REMAINS = 0.9              # of that error, from the second to the last quarter
-BIAS_FOUND = 0.05               # of the bias, by the filter's estimate
 CONSISTENT = 0.9999             # probability of the NEES band
 
 
@@ -69,11 +70,12 @@ def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
                               * Rotation.from_quat(right)).as_quat()
 
 
-def for_first_order(gyroscope: Reals, accelerometer: Reals, dt: Reals) -> tuple[Reals, Reals]:
+def for_first_order(run: Run) -> Run:
     """Return the rates for which the normalised first-order step q + q w dt/2 is exact."""
-    half = 0.5 * dt * np.linalg.norm(gyroscope, axis=1)
+    half = 0.5 * run.dt * np.linalg.norm(run.gyroscope, axis=1)
     longer = np.tan(np.minimum(half, 1.5)) / np.where(half > 0.0, half, 1.0)
-    return gyroscope * np.where(half > 0.0, longer, 1.0)[:, np.newaxis], accelerometer
+    return replace(run, gyroscope=run.gyroscope * np.where(
+        half > 0.0, longer, 1.0)[:, np.newaxis])
 
 
 _HALF = 0.5 ** 0.5
@@ -82,7 +84,7 @@ NED_WORLD = Hypothesis(('frame_ned',), 'read as attitude in a world north-east-d
                        read=_turned((_HALF, _HALF, 0.0, 0.0)))
 GRAVITY_SIGN = Hypothesis(
     ('gravity_sign',), 'with the sign of the accelerometer changed',
-    given=lambda gyroscope, accelerometer, dt: (gyroscope, -accelerometer))
+    given=lambda run: replace(run, accelerometer=-run.accelerometer))
 # These need the attitudes only.
 READINGS = (
     Hypothesis(('component_order',), 'read as w, x, y, z', read=lambda q: q[:, _W_LAST]),
@@ -94,15 +96,6 @@ READINGS = (
                read=_turned((0.0, 0.0, _HALF, _HALF))),
     Hypothesis(('conjugated', 'component_order'), 'read as w, x, y, z and conjugated',
                read=lambda q: q[:, _W_LAST] * _CONJUGATE))
-# These need another run.  The order is that of the harm to a right filter, least first.
-REPEATED = (
-    GRAVITY_SIGN,
-    Hypothesis(('gyroscope_units',), 'with the gyroscope multiplied by pi/180',
-               given=lambda gyroscope, accelerometer, dt: (np.radians(gyroscope), accelerometer)),
-    Hypothesis(('gyroscope_units',), 'with the gyroscope in deg/s',
-               given=lambda gyroscope, accelerometer, dt: (np.degrees(gyroscope), accelerometer)))
-
-
 def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
     """Return the measures of the errors in several runs, as defined in docs/exam.md."""
     settled = [outcome.last() for outcome in outcomes]
@@ -124,31 +117,25 @@ def error_of(outcome: Outcome, absolute: bool) -> float:
     return rms(outcome.errors.attitude(absolute))
 
 
-def explain(outcome: Outcome, absolute: bool,
-            again: Callable[[Hypothesis], Outcome] | None = None) -> Hypothesis | None:
-    """
-    Return the misreading whose inversion removes the error of a settled filter, or None.
-
-    again : repeats the run for a hypothesis; None if that is not possible
-    """
+def explain(outcome: Outcome, absolute: bool) -> Hypothesis | None:
+    """Return the misreading of attitudes that explains the error of a settled filter, or None."""
     before = error_of(outcome, absolute)
-    if before < GROSS:
+    after, best = min((
+        (error_of(replace(outcome, estimates=one.read(outcome.estimates)), absolute), one)
+        for one in READINGS), key=lambda pair: pair[0])
+    if before < GROSS or after > EXPLAINED * before:
         return None
-    tried = [(error_of(replace(outcome, estimates=one.read(outcome.estimates)), absolute), one)
-             for one in READINGS]
-    for one in REPEATED:
-        if again is None or min(error for error, _ in tried) <= EXPLAINED * before:
-            break
-        tried.append((error_of(again(one), absolute), one))
-    after, best = min(tried, key=lambda pair: pair[0])
-    if after > EXPLAINED * before:
-        return None
-    text = (f'{best.text}, the error falls from {_degrees(before)} to {_degrees(after)}; all '
+    text = (f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
             'measures are those after this correction')
-    if not absolute and best in (NED_WORLD, GRAVITY_SIGN):
-        best = best._replace(faults=('frame_ned', 'gravity_sign'))
-        text += '; the two cannot be told apart without a heading'
-    return best._replace(text=text)
+    return told(best._replace(text=text), absolute)
+
+
+def told(one: Hypothesis, absolute: bool) -> Hypothesis:
+    """Return a hypothesis that has both names where two cannot be told apart."""
+    if absolute or one.faults not in (('gravity_sign',), NED_WORLD.faults):
+        return one
+    return one._replace(faults=('frame_ned', 'gravity_sign'),
+                        text=f'{one.text}; the two cannot be told apart without a heading')
 
 
 def stamp_fault(outcome: Outcome, absolute: bool) -> tuple[measures.Offset, Fault | None]:
@@ -161,8 +148,8 @@ def stamp_fault(outcome: Outcome, absolute: bool) -> tuple[measures.Offset, Faul
     side = 'behind' if steps > 0.0 else 'ahead of'
     return offset, Fault(
         'stamp_offset', f'the attitude is {abs(1e3 * offset.seconds):.3g} ms {side} its stamp: '
-        f'shifted by that, the error falls from {_degrees(offset.before)} to '
-        f'{_degrees(offset.after)}')
+        f'shifted by that, the error falls from {degrees(offset.before)} to '
+        f'{degrees(offset.after)}')
 
 
 def first_order_fault(before: float, after: float, rate: float) -> Fault | None:
@@ -171,48 +158,15 @@ def first_order_fault(before: float, after: float, rate: float) -> Fault | None:
         return None
     return Fault('first_order_integration',
                  f'integration is first order: correcting it reduces the error at {rate:g} Hz '
-                 f'from {_degrees(before)} to {_degrees(after)}')
+                 f'from {degrees(before)} to {degrees(after)}')
 
 
 def lever_arm_fault(effect: float, arm: float) -> Fault | None:
     """Judge the tilt [rad] that a lever arm [m] causes."""
     if effect < LEVER_ARM:
         return None
-    return Fault('lever_arm', f'{100.0 * arm:g} cm off the axis adds {_degrees(effect)}: motion '
+    return Fault('lever_arm', f'{100.0 * arm:g} cm off the axis adds {degrees(effect)}: motion '
                  'is mistaken for gravity')
-
-
-def judge_bias(plus: Outcome, minus: Outcome, bias: Reals,
-               absolute: bool) -> tuple[dict[str, float], Fault | None]:
-    """
-    Return measures of the effect of a gyroscope bias, and the fault if there is one.
-
-    plus, minus : runs with this bias [rad/s] and its opposite; errors of other causes cancel
-    absolute : False judges the tilt only
-    """
-    size = float(np.linalg.norm(bias))
-    one, other = (Rotation.from_quat(outcome.estimates) for outcome in (plus, minus))
-    if absolute:
-        apart = (one * other.inv()).magnitude()
-    else:
-        verticals = [turn.inv().apply((0.0, 0.0, 1.0)) for turn in (one, other)]
-        apart = np.linalg.norm(verticals[0] - verticals[1], axis=1)
-    quarter = len(apart) // 4
-    early, late = (rms(apart[part]) / (2.0 * size)
-                   for part in (slice(quarter, 2 * quarter), slice(-quarter, None)))
-    estimates = [known[-1] for outcome in (plus, minus)
-                 if len(known := outcome.biases[~np.isnan(outcome.biases[:, 0])])]
-    found = (float(0.5 * (estimates[0] - estimates[1]) @ bias / size ** 2)
-             if len(estimates) == 2 else math.nan)
-    measured = {'bias_error_s': late, 'bias_found': found}
-    estimated = late < BIAS_REMAINS * early if math.isnan(found) else found > BIAS_FOUND
-    if estimated or late < BIAS_LEFT_S:
-        return measured, None
-    text = (f'with a gyroscope bias of 1 deg/s the {"attitude" if absolute else "tilt"} is '
-            f'{early:.3g} deg off, and {late:.3g} deg in the end: the bias is not learned')
-    if not math.isnan(found):
-        text += f', and the estimate has {found:.1%} of the bias'
-    return measured, Fault('no_bias_estimate', text)
 
 
 def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measures.Nees]:
@@ -247,13 +201,24 @@ def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
 
 
 def divergence(outcome: Outcome, absolute: bool) -> Fault | None:
-    """Judge the error in the last quarter."""
+    """Judge whether the error grows from quarter to quarter."""
+    error = outcome.errors.attitude(True) if absolute else outcome.errors.tilt
+    quarters = [rms(part) for part in np.array_split(error, 4)]
+    if quarters[-1] < DIVERGED or any(
+            later < GROWS * earlier for earlier, later in itertools.pairwise(quarters[1:])):
+        return None
+    return Fault('diverges', f'{outcome.run.name}: the error grows from quarter to quarter: '
+                 f'{", ".join(map(degrees, quarters))}')
+
+
+def inaccuracy(outcome: Outcome, absolute: bool) -> Fault | None:
+    """Judge the error in the last quarter, for which there is no other reason."""
     last = outcome.last(0.25)
     error = error_of(last, True) if absolute else rms(last.errors.tilt)
     if error < DIVERGED:
         return None
-    return Fault('diverges', f'{last.run.name}: the error in the last quarter is '
-                 f'{_degrees(error)}, for no reason that is known')
+    return Fault('inaccurate', f'{last.run.name}: the error in the last quarter is '
+                 f'{degrees(error)}, for no reason that is known')
 
 
 def one_of_each(faults: Sequence[Fault]) -> Iterator[Fault]:
@@ -262,5 +227,6 @@ def one_of_each(faults: Sequence[Fault]) -> Iterator[Fault]:
     yield from (fault for k, fault in enumerate(faults) if fault.name not in names[:k])
 
 
-def _degrees(angle: float) -> str:
+def degrees(angle: float) -> str:
+    """Return an angle [rad] in words."""
     return f'{np.degrees(angle):.3g} deg'

@@ -14,10 +14,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import diagnosis, measures, scenarios
+from spinning_top_sim.exam.course import increments
 from spinning_top_sim.exam.diagnosis import Fault, Hypothesis
+from spinning_top_sim.exam.field import examine_field
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.report import Report
+from spinning_top_sim.exam.response import Responses
 from spinning_top_sim.exam.scenarios import Reals, Run, Scenario
 from spinning_top_sim.exam.trial import (
     ChangeReadings,
@@ -33,21 +36,20 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
 
 # Seeds of the noisy runs.
-SEEDS = {'quick': range(3), 'full': range(10)}
-# Gyroscope bias [rad/s]; its norm is 1.4 deg/s.
-BIAS = np.array((0.01, -0.01, 0.02))
-BIASED = replace(scenarios.PIVOT, name='bias', duration=120.0, rate=25.0)
+SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
 # Sampling rates for the order of convergence, as multiples of the rate of the fast motion.
-FINER = (1.0, 2.0, 4.0)
-FIELD_ASKED = 200           # updates after which a filter has shown whether it uses the field
+FINER = (1.0, 2.0)
+FIELD_ASKED = 200, 1000     # updates after which a filter has shown whether it uses the field
 EXTRA = (scenarios.POLE, scenarios.SATURATION, scenarios.DROPS, scenarios.COMMAND)
 # A filter that is not restarted is first turned to the attitude at which the run begins [s].
 TURN_S = 30.0
 # A filter uses the field if its heading follows at least a tenth of this alternating turn of the
 # field [rad].  A larger turn would disturb a filter that assumes low noise.
 DECLINATION = np.radians(2.0)
-
-NOTHING_MISREAD = Hypothesis((), '')
+# These faults do not show in runs without noise, bias and lever arm.
+SHOW_ELSEWHERE = ('inaccurate', 'lever_arm', 'no_bias_estimate', 'bias_report', 'invalid_output')
+ARM_S = 1.0, 6.0                # after the lever arm came, its effect is measured
+STEP = 0.05                     # by which the response to a rate depends on the step, relative
 
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
@@ -69,8 +71,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     make_filter : callable
         Returns a new filter: its class, a function, or one of `adapters.FILTERS`.  It is called
         for every run.
-    level : {'quick', 'full'}
-        'full' has more seeds and motions.
+    level : {'quick', 'full', 'field'}
+        'full' has more seeds and motions, and a seed of the scenes of 'field'.
     imu : mapping or path, optional
         Parameters imu.* and mag.* by name, or the path of a parameter file such as those in
         config/imu.  The default, `scenarios.CALIBRATED`, is the noise of a calibrated device.
@@ -104,9 +106,18 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     values = _imu_parameters(imu)
     numbers = list(SEEDS[level]) if seeds is None else _seed_numbers(seeds)
+    in_field = partial(examine_field, make_filter, subject=subject,
+                       imu=None if imu is None else values,
+                       feed=feed_apart if isolated else feed)
+    if level == 'field':
+        if not restart:
+            raise ValueError("level = 'field': the filter must be made anew for each scene")
+        return in_field(numbers)
     exam = (_Exam(_NewFilter(make_filter, feed_apart if isolated else feed, values), numbers)
             if restart else _OneFilterExam(_OneFilter(cache(make_filter), feed, values), numbers))
     exam.sit(EXTRA if level == 'full' else ())
+    if level == 'full' and restart and exam.outcomes:
+        exam.measures |= in_field(numbers[:1]).measures
     return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
                   tuple(diagnosis.one_of_each(exam.faults)), exam.measures, exam.outcomes)
 
@@ -135,20 +146,24 @@ def _seed_numbers(seeds: int | Iterable[int]) -> list[int]:
 
 @dataclass
 class _NewFilter:
-    """Feeds each run to a new filter, and undoes the misreading that was already found."""
+    """Feeds each run to a new filter, and undoes the misreadings that were already found."""
 
     make_filter: MakeFilter
     feed: Feed
     imu: Mapping[str, Any]
-    correction: Hypothesis = NOTHING_MISREAD
 
-    def follow(self, run: Run, change: ChangeReadings | None = None,
-               magnetometer: bool = True) -> Outcome:
+    def follow(self, run: Run, undone: Sequence[Hypothesis] = (),
+               change: ChangeReadings | None = None, magnetometer: bool = True) -> Outcome:
         """Return the outcome of a run whose readings are first changed by `change`."""
-        changes = [one for one in (change, self.correction.given) if one is not None]
+        changes = [one for one in (change, *(one.given for one in undone)) if one is not None]
+
+        def read(estimates: Reals) -> Reals:
+            for one in reversed(undone):
+                estimates = one.read(estimates)
+            return estimates
+
         try:
-            return follow(self.make_filter, run, changes, self.correction.read, magnetometer,
-                          self.feed)
+            return follow(self.make_filter, run, changes, read, magnetometer, self.feed)
         except InvalidOutputError as error:
             raise InvalidOutputError(f'{run.name}: {error}') from error
 
@@ -159,11 +174,11 @@ class _OneFilter(_NewFilter):
 
     attitude: Reals = field(default_factory=lambda: np.array((0.0, 0.0, 0.0, 1.0)))
 
-    def follow(self, run: Run, change: ChangeReadings | None = None,
-               magnetometer: bool = True) -> Outcome:
+    def follow(self, run: Run, undone: Sequence[Hypothesis] = (),
+               change: ChangeReadings | None = None, magnetometer: bool = True) -> Outcome:
         """Return the outcome of a run whose readings are first changed by `change`."""
         lead = scenarios.turning(self.imu, self.attitude, run.truth[0], TURN_S)
-        outcome = super().follow(run.after(lead), change, magnetometer).since(len(lead.t))
+        outcome = super().follow(run.after(lead), undone, change, magnetometer).since(len(lead.t))
         self.attitude = run.truth[-1]       # not reached if the filter fails in its first step
         return outcome
 
@@ -172,12 +187,12 @@ class _Exam:
     """The runs of one exam, and what they show."""
 
     finer: Sequence[float] = FINER
-    biased = BIASED
-    judges_covariance = True
+    judges_covariance = restarts = True
 
     def __init__(self, subject: _NewFilter, seeds: Sequence[int]) -> None:
         self._subject, self._seeds, self._imu = subject, seeds, subject.imu
         self._absolute = False
+        self._responses: Responses | None = None
         self.faults: list[Fault] = []
         self.measures: dict[str, float] = {}
         self.outcomes: list[Outcome] = []
@@ -186,6 +201,8 @@ class _Exam:
         """Do all runs, those of the `extra` scenarios included."""
         with self._guarded():
             self._ask_for_field()
+        with self._guarded():
+            self._identify()
         noisy = self._noisy_runs()
         if not noisy:
             return
@@ -193,17 +210,15 @@ class _Exam:
         offset, fault = diagnosis.stamp_fault(noisy[0].last(), self._absolute)
         self.measures['stamp_offset_s'] = offset.seconds
         self._add(fault)
-        if not self.faults:
+        self._add(diagnosis.divergence(noisy[0], self._absolute))
+        for part in (self._judge_integration, partial(self._judge_lever_arm, noisy[0]),
+                     self._judge_bias):
             with self._guarded():
-                self._add(diagnosis.divergence(self._pivot, self._absolute))
-        if all(fault.name != 'diverges' for fault in self.faults):  # else they show nothing more
-            for part in (self._judge_integration, partial(self._judge_lever_arm, noisy[0]),
-                         self._judge_bias):
-                with self._guarded():
-                    part()
+                part()
         self._do_extra(extra)
         if not self.faults:
-            self._add(diagnosis.divergence(noisy[0], self._absolute))
+            self._add(diagnosis.inaccuracy(noisy[0], self._absolute))
+        self._sort_out()
         consistency = diagnosis.consistency(noisy, self._absolute)
         self.measures |= diagnosis.nees_marks(consistency)
         if self.judges_covariance and not self.faults:  # faults are another reason for errors
@@ -224,45 +239,48 @@ class _Exam:
     def _run(self, scenario: Scenario, change: ChangeReadings | None = None,
              magnetometer: bool = True, seed: int | None = None) -> Outcome:
         """Return the outcome of a scenario, by default with the first seed."""
-        return self._subject.follow(self._record(scenario, seed), change, magnetometer)
+        return self._follow(self._record(scenario, seed), change, magnetometer)
+
+    def _follow(self, run: Run, change: ChangeReadings | None = None,
+                magnetometer: bool = True) -> Outcome:
+        undone = self._responses.undone if self._responses is not None else ()
+        return self._subject.follow(run, undone, change, magnetometer)
 
     def _record(self, scenario: Scenario, seed: int | None = None) -> Run:
         return scenarios.record(scenario, self._imu, self._seeds[0] if seed is None else seed)
 
     def _ask_for_field(self) -> None:
         """Find out whether the filter uses the field: only then its heading can be judged."""
-        run = self._record(scenarios.SLOW).part(slice(FIELD_ASKED))
-        other = replace(run, magnetometer=run.magnetometer[:, [1, 2, 0]])
-        one, two = (self._subject.follow(fed).estimates for fed in (run, other))
-        self._absolute = bool(np.max(np.abs(one - two)) > 1e-9)
+        for updates in FIELD_ASKED:
+            run = self._record(scenarios.SLOW).part(slice(updates))
+            other = replace(run, magnetometer=run.magnetometer[:, [1, 2, 0]])
+            one, two = (self._subject.follow(fed).estimates for fed in (run, other))
+            self._absolute = bool(np.max(np.abs(one - two)) > 1e-9)
+            if self._absolute:
+                break
+
+    def _identify(self) -> None:
+        """Name the causes that show in the answers to single inputs; they are undone from now."""
+        self._responses = found = Responses(
+            self._subject.follow, self._imu, self._absolute, self.restarts)
+        try:
+            found.identify()
+        finally:
+            self.faults += found.faults
+        clean = found.clean(found.outcome)
+        self.measures |= {'tilt_clean_deg': math.degrees(max(clean.tilt, clean.tilt_moving)),
+                          'heading_clean_deg': math.degrees(max(
+                              clean.heading, clean.heading_moving))}
 
     def _noisy_runs(self) -> list[Outcome]:
-        """Return the outcomes of all seeds, after undoing a misreading that explains errors."""
-        noisy = self._runs_of_seeds()
-        found = self._misreading(noisy[0].last()) if noisy else None
-        if found is not None:
-            self.faults += [Fault(name, found.text) for name in found.faults]
-            self._subject.correction = found
-            noisy = self._runs_of_seeds() if found.given is not None else [
-                replace(outcome, estimates=found.read(outcome.estimates)) for outcome in noisy]
-        self.outcomes += noisy
-        return noisy
-
-    def _runs_of_seeds(self) -> list[Outcome]:
         """Return the outcomes on the slow motion; drop the seeds for which the filter failed."""
         done = {}
         for seed in self._seeds:
             with self._guarded():
                 done[seed] = self._run(scenarios.SLOW, seed=seed)
         self._seeds = list(done)
+        self.outcomes += done.values()
         return list(done.values())
-
-    def _misreading(self, settled: Outcome) -> Hypothesis | None:
-        if diagnosis.stamp_fault(settled, self._absolute)[1] is None:
-            with contextlib.suppress(InvalidOutputError):   # the filter rejects other readings
-                return diagnosis.explain(settled, self._absolute, lambda hypothesis: self._run(
-                    scenarios.SLOW, hypothesis.given).last())
-        return diagnosis.explain(settled, self._absolute)
 
     @cached_property
     def _pivot(self) -> Outcome:
@@ -283,6 +301,7 @@ class _Exam:
                  for outcome in outcomes]
         self.measures['order'] = measures.convergence_order(self.finer, moved)
         self.measures['integration_error_deg'] = math.degrees(moved[0])
+        self._judge_step(outcomes)
         corrected = self._run(finer[0], diagnosis.for_first_order, magnetometer).last()
         before, after = (diagnosis.error_of(outcome, self._absolute and magnetometer)
                          for outcome in (outcomes[0], corrected))
@@ -292,29 +311,50 @@ class _Exam:
         """Compare the attitudes with and without a lever arm, and with and without noise."""
         still, moving = map(self._record, (scenarios.PIVOT, scenarios.LEVER_ARM))
         # The lever arm comes when the filter has settled, so that its start does not matter.
-        begin = len(still.t) // 3
-        arm = self._subject.follow(replace(moving, accelerometer=np.concatenate(
-            (still.accelerometer[:begin], moving.accelerometer[begin:])))).last()
-        pivot = self._pivot.last()
-        effect = rms(measures.errors_of(arm.estimates, pivot.estimates).tilt)
+        begin = 2 * len(still.t) // 3
+        arm = self._follow(replace(moving, accelerometer=np.concatenate(
+            (still.accelerometer[:begin], moving.accelerometer[begin:]))))
+        # Later the estimate of a bias would have adapted to the force.
+        rows = slice(*(begin + round(t * scenarios.SLOW.rate) for t in ARM_S))
+        effect = rms(measures.errors_of(
+            arm.estimates[rows], self._pivot.estimates[rows]).tilt)
         self.measures['lever_arm_deg'] = math.degrees(effect)
         self._add(diagnosis.lever_arm_fault(
             effect, math.hypot(*scenarios.LEVER_ARM.values['imu.lever_arm'])))
         density = self._imu.get('imu.accelerometer_noise_density', 0.0)
         if density:
-            quiet = pivot if not any(self._imu.get('imu.lever_arm', ())) else self._run(
-                replace(scenarios.SLOW, noisy=False)).last()
-            tilt = rms(measures.errors_of(noisy.last().estimates, quiet.estimates).tilt)
+            quiet = self._pivot if not any(self._imu.get('imu.lever_arm', ())) else self._run(
+                replace(scenarios.PIVOT, values=scenarios.SLOW.values))
+            rows = slice(len(still.t) // 2, len(still.t))
+            tilt = rms(measures.errors_of(noisy.estimates[rows], quiet.estimates[rows]).tilt)
             sample = density * math.sqrt(scenarios.SLOW.rate) / scenarios.GRAVITY
             self.measures['noise_gain'] = tilt / (math.sqrt(2.0) * sample)
 
+    def _judge_step(self, outcomes: Sequence[Outcome]) -> None:
+        """Compare the answers to the same rates in steps of different lengths."""
+        answers = []
+        for outcome in outcomes:
+            said, true = map(increments, (outcome.estimates, outcome.run.truth))
+            answers.append(float(np.sum(said * true) / np.sum(true * true)))
+        if abs(answers[-1] - answers[0]) <= STEP * abs(answers[0]):
+            return
+        # A wrong step turns up as a wrong scale at one rate.
+        self.faults = [fault for fault in self.faults if not (
+            fault.name == 'gyroscope_wiring' and 'time_step' in dict(self.faults))]
+        self._add(Fault('time_step', f'at {self.finer[-1]:g} times the rate the same turn moves '
+                        f'it {answers[-1] / answers[0]:.3g} times as far: the step is not used'))
+
     def _judge_bias(self) -> None:
-        """Compare two runs with opposite gyroscope biases."""
-        plus, minus = (self._run(replace(self.biased, bias=tuple(sign * BIAS)))
-                       for sign in (1.0, -1.0))
-        measured, fault = diagnosis.judge_bias(plus, minus, BIAS, self._absolute)
-        self.measures |= measured
-        self._add(fault)
+        """Compare two runs with and without a gyroscope bias."""
+        if self._responses is not None:
+            before = len(self._responses.faults)
+            self.measures |= self._responses.bias()
+            self.faults += self._responses.faults[before:]
+
+    def _sort_out(self) -> None:
+        """Drop `inaccurate` where a cause is named that shows in these runs."""
+        if any(fault.name not in SHOW_ELSEWHERE for fault in self.faults):
+            self.faults = [fault for fault in self.faults if fault.name != 'inaccurate']
 
     def _do_extra(self, extra: Sequence[Scenario]) -> None:
         for scenario in extra:
@@ -329,9 +369,8 @@ class _OneFilterExam(_Exam):
     """The runs of an exam of one filter that is never restarted, at the one rate of its IMU."""
 
     finer = FINER[:1]
-    biased = replace(BIASED, rate=scenarios.SLOW.rate)
     # After minutes of learning the bias the filter is too sure of it when the motion changes.
-    judges_covariance = False
+    judges_covariance = restarts = False
 
     def sit(self, extra: Sequence[Scenario]) -> None:
         """Do all runs."""

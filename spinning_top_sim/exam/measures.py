@@ -2,7 +2,7 @@
 """Error measures of an attitude filter; docs/exam.md has the definitions and their sources."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +43,33 @@ def errors_of(estimates: Reals, truth: Reals) -> Errors:
     # Remove whole turns, so that the last heading is in [-pi, pi].
     heading -= 2.0 * np.pi * np.rint(heading[-1] / (2.0 * np.pi))
     return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), heading)
+
+
+class Rmse(NamedTuple):
+    """Root mean squares of the whole attitude error, of heading and of tilt [deg]."""
+
+    total: float
+    heading: float
+    tilt: float
+
+
+def rmse(estimates: Reals, truth: Reals) -> Rmse:
+    """Return what BROAD's evaluation says of attitudes (n, 4); the heading is absolute."""
+    total = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).magnitude()
+    errors = errors_of(estimates, truth)
+    return Rmse(*(math.degrees(rms(one)) for one in (total, errors.turned(True), errors.tilt)))
+
+
+def means(kind: str, found: Mapping[str, Sequence[Rmse]]) -> dict[str, float]:
+    """Return the means over all trials, and the whole error of each, by the names of measures."""
+    if not found:
+        return {}
+    total, heading, tilt = np.mean([one for trials in found.values() for one in trials],
+                                   axis=0).tolist()
+    return {f'{kind}_rms_deg': total, f'{kind}_heading_rms_deg': heading,
+            f'{kind}_tilt_rms_deg': tilt,
+            **{f'{kind}_rms_{name}_deg': float(np.mean([one.total for one in trials]))
+               for name, trials in found.items()}}
 
 
 def rms(values: Reals) -> float:

@@ -15,6 +15,7 @@ from spinning_top_sim.exam.trial import Outcome
 # Of each measure that needs a word: what it is, and from where on it is a fault.
 MEANINGS = {
     'tilt_rms_deg': 'settled', 'tilt_max_deg': 'settled', 'heading_rms_deg': 'settled',
+    'tilt_clean_deg': 'without noise, at rest and in motion', 'heading_clean_deg': 'the same',
     'convergence_s': f'until the tilt error stays below {CONVERGED_DEG:g} deg',
     'heading_drift_deg_per_s': 'slope of the heading error',
     'noise_gain': 'noise of the tilt over that of the accelerometer alone',
@@ -24,9 +25,13 @@ MEANINGS = {
     'lever_arm_deg': f'tilt by motion 10 cm off the axis; fault from '
                      f'{math.degrees(diagnosis.LEVER_ARM):g}',
     'bias_error_s': f'deg left by 1 deg/s; fault from {diagnosis.BIAS_LEFT_S:g} unless learned',
-    'bias_found': f'share of the bias in the estimate; learned from {diagnosis.BIAS_FOUND:g}',
+    'bias_found': 'share of the bias in the estimate',
     'nees': 'error^2 of the tilt over its covariance; right from nees_low to nees_high',
-    'nees_attitude': 'the same of the whole attitude'}
+    'nees_attitude': 'the same of the whole attitude',
+    'field_rms_deg': 'in scenes of the field, in motion: mean over the scenes',
+    'field_heading_rms_deg': 'heading alone', 'field_tilt_rms_deg': 'tilt alone',
+    'data_rms_deg': 'of real readings in motion, mean over the trials',
+    'data_heading_rms_deg': 'heading alone', 'data_tilt_rms_deg': 'tilt alone'}
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,8 @@ class Report:
 
     def measure_lines(self) -> list[str]:
         """Return the measures, with what they mean, except those that could not be measured."""
-        return [f'{name:<26}{value:>12.4g}  {MEANINGS.get(name, "")}'.rstrip()
+        width = max(map(len, self.measures), default=0)
+        return [f'{name:<{width}}{value:>12.4g}  {MEANINGS.get(name, "")}'.rstrip()
                 for name, value in self.measures.items() if not math.isnan(value)]
 
     def as_json(self) -> str:

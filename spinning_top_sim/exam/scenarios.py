@@ -66,7 +66,7 @@ SLOW = Scenario('slow', {'top.com_distance': 0.02, 'spin.l3': 0.6, 'initial.thet
 # The wheel 15 cm from the pivot with 10.7 rad/s of spin: waves.
 WAVES = Scenario('waves', {'spin.l3': 1.6, 'spin.lz': 1.42, 'initial.theta': 0.5236})
 # 10 cm off the axis, where the centripetal acceleration of the slow wheel is a sixth of gravity.
-LEVER_ARM = replace(SLOW, name='lever_arm', noisy=False, values={
+LEVER_ARM = replace(SLOW, name='lever_arm', duration=20.0, noisy=False, values={
     **SLOW.values, 'imu.lever_arm': (0.1, 0.0, 0.0)})
 PIVOT = replace(LEVER_ARM, name='pivot', values={
     **SLOW.values, 'imu.lever_arm': (0.0, 0.0, 0.0)})
@@ -137,18 +137,29 @@ def turning(imu: Mapping[str, Any], first: Reals, last: Reals, seconds: float,
     first, last : attitudes q(world <- sensor) as x, y, z, w (4,)
     declination : by which the field is turned to the west [rad], one or for each sample
     """
-    period = 1.0 / SLOW.rate
     n = round(seconds * SLOW.rate)
     part = np.arange(n + 1) / n
-    t: Reals = np.arange(1 - n, 1) / SLOW.rate
     turns = (Slerp((0.0, 1.0), Rotation.from_quat((first, last)))(part)
              * Rotation.from_euler('zx', np.stack((
                  12.0 * np.pi * part, 0.7 * np.sin(6.0 * np.pi * part)), axis=1)))
-    rates = (turns[:-1].inv() * turns[1:]).as_rotvec() / period
+    return along('', turns, imu, SLOW.rate, declination)
+
+
+def along(name: str, turns: Rotation, imu: Mapping[str, Any], rate: float,
+          declination: float | Reals = 0.0) -> Run:
+    """
+    Return the readings along attitudes q(world <- sensor), without noise and acceleration; t <= 0.
+
+    turns : n + 1 attitudes, between which the rate is constant
+    declination : by which the field is turned to the west [rad], one or for each of n samples
+    """
+    n = len(turns) - 1
+    t: Reals = np.arange(1 - n, 1) / rate
+    rates = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate
     to_sensor = turns[1:].inv()
     field = Rotation.from_euler('z', np.broadcast_to(declination, n)[:, np.newaxis]).apply(
         without_declination(imu.get('mag.field', FIELD)))
-    return Run('', t, np.full(n, period), turns[1:].as_quat(), rates, rates.copy(),
+    return Run(name, t, np.full(n, 1.0 / rate), turns[1:].as_quat(), rates, rates.copy(),
                to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(field))
 
 

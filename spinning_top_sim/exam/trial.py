@@ -53,8 +53,8 @@ class Filter(Protocol):
 
 
 MakeFilter = Callable[[], Filter]
-# From gyroscope and accelerometer (n, 3) and the steps (n,) to the readings that are fed instead.
-ChangeReadings = Callable[[Reals, Reals, Reals], tuple[Reals, Reals]]
+# From a run to that whose readings are fed instead.
+ChangeReadings = Callable[[Run], Run]
 ChangeAttitudes = Callable[[Reals], Reals]
 
 
@@ -154,16 +154,15 @@ def follow(make_filter: MakeFilter, run: Run, changes: Iterable[ChangeReadings] 
     """
     Return the outcome of a run that is fed to a new filter.  Raises InvalidOutputError.
 
-    changes : are applied in turn to the readings before the filter gets them
+    changes : are applied in turn to the run before the filter gets its readings
     read : is applied to the attitudes that the filter returns
     magnetometer : False feeds None instead of the field
     """
-    gyroscope, accelerometer = run.gyroscope, run.accelerometer
+    fed = run
     for change in changes:
-        gyroscope, accelerometer = change(gyroscope, accelerometer, run.dt)
-    field = run.magnetometer if magnetometer else None
-    estimates, covariances, biases = feed(
-        make_filter, Readings(gyroscope, accelerometer, field, run.dt))
+        fed = change(fed)
+    estimates, covariances, biases = feed(make_filter, Readings(
+        fed.gyroscope, fed.accelerometer, fed.magnetometer if magnetometer else None, fed.dt))
     return Outcome(run, read(estimates), covariances, biases)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
-from spinning_top_sim.grade.regression import Cause, explain, least_squares
+from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, least_squares
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
@@ -24,7 +24,6 @@ LATE = 0.75         # steps
 STRANGE = 0.02      # of the rates, or of what changes in them in a step: they are not these
 UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
 EXPLAINED = 0.25    # of the discrepancy is left at most
-NEAR = 0.25         # of a coefficient to the value it has for a fault
 
 
 def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
@@ -65,12 +64,8 @@ def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
         return Fault('units' if units else 'rates_scale',
                      f'rates are {factor:.4g} times those at which the attitude turns', factor)
 
-    def world(found: Reals) -> Fault | None:
-        if not np.allclose(found, (-1.0, 1.0), atol=NEAR):
-            return None
-        return Fault('rates_in_world', 'rates turned from axes of the world to those of the body '
-                     'are those of the attitude')
-
+    world = instead('rates_in_world', 'rates turned from axes of the world to those of the body '
+                    'are those of the attitude')
     faults = explain(target, [Cause([pooled(told)], scale),
                               Cause([pooled(told), pooled(turned)], world)]).faults
     if not faults:
@@ -97,7 +92,8 @@ def faults_of(motions: Sequence[Motion], rates: Sequence[Reals], dt: float) -> l
         return []
     found = explain(target, [
         Cause([gyroscopic], _gyroscopic), Cause([gyroscopic_step, gravity_step], _step),
-        Cause([gyroscopic, in_world], _in_world),
+        Cause([gyroscopic, in_world], instead('inertia_frame', 'the gyroscopic term is that of '
+                                              'moments of inertia about axes of the world')),
         Cause([damping, axis_damping], _damping), Cause(arms, lambda found: _com(body, found)),
         Cause(euler, lambda found: _inertia(body, found))])
     return found.faults if found.left < EXPLAINED else []
@@ -138,24 +134,14 @@ def _gyroscopic(found: Reals) -> Fault:
                  'coriolis_sign' if share < 0.0 else 'inertia', text, share)
 
 
-def _step(found: Reals) -> Fault | None:
-    at = 0.5 + float(found[0])
-    if abs(found[0]) < NEAR:
-        return None
-    text = f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right is 0.5'
-    if at > 0.5:
-        return Fault('implicit_damping', f'{text}: it removes energy', at)
-    if at > -0.5:
-        return Fault('explicit_gyroscopic_term', f'{text}: it adds energy', at)
-    return Fault('coriolis_sign', f'{text}: as in an implicit step with the derivative of the '
-                 'gyroscopic term of the wrong sign', at)
-
-
-def _in_world(found: Reals) -> Fault | None:
-    if not np.allclose(found, (-1.0, 1.0), atol=NEAR):
-        return None
-    return Fault('inertia_frame', 'the gyroscopic term is that of moments of inertia about axes '
-                 'of the world')
+def _step(found: Reals) -> Fault:
+    at, gravity_at = (0.5 + found).tolist()
+    name, means = (('first_order', f'gravity at {gravity_at:.3g}') if abs(at - 0.5) < NEAR else
+                   ('implicit_damping', 'it removes energy') if at > 0.5 else
+                   ('explicit_gyroscopic_term', 'it adds energy') if at > -0.5 else
+                   ('coriolis_sign', 'its derivative in an implicit step has the wrong sign'))
+    return Fault(name, f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right '
+                 f'is 0.5: {means}', at)
 
 
 def _damping(found: Reals) -> Fault:

@@ -19,24 +19,14 @@ _WEIGHTS = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
 MARGIN = 3
 
 
-@dataclass(frozen=True)
-class Errors:
+def errors_of(rotation: Rotation, truth: Rotation) -> dict[str, Reals]:
     """
-    Errors of an attitude, simulated minus exact (n,) [rad].
+    Split the rotation between two attitudes world <- body, simulated and exact (n,) [rad].
 
-    A small rotation is split in three directions that are regular at the poles: precession is
-    turned about the vertical, times sin(theta); nutation changes the tilt; spin turns about the
-    axis.  `total` is the angle of the whole rotation.
+    A small rotation is split in directions that are regular at the poles: `precession` turns about
+    the vertical, times sin(theta); `nutation` is that of theta; `spin` turns about the axis.
+    `total` is the angle of the whole rotation.
     """
-
-    total: Reals
-    precession: Reals
-    nutation: Reals
-    spin: Reals
-
-
-def errors_of(rotation: Rotation, truth: Rotation) -> Errors:
-    """Split the rotation between two attitudes world <- body at n times."""
     tips, tilts = [], []
     for one in (rotation, truth):
         x, y, z = one.apply((0.0, 0.0, 1.0)).T
@@ -44,25 +34,15 @@ def errors_of(rotation: Rotation, truth: Rotation) -> Errors:
         tilts.append(np.arctan2(np.hypot(x, y), z))
     between = truth.inv() * rotation
     _, _, z, w = between.as_quat().T
-    return Errors(
-        total=between.magnitude(), nutation=tilts[0] - tilts[1],
-        precession=np.unwrap(np.angle(tips[0] * np.conj(tips[1]))) * np.abs(tips[1]),
-        spin=np.unwrap(2.0 * np.arctan2(z, w)))
+    return {'total': between.magnitude(), 'precession': np.unwrap(np.angle(
+                tips[0] * np.conj(tips[1]))) * np.abs(tips[1]),
+            'nutation': tilts[0] - tilts[1], 'spin': np.unwrap(2.0 * np.arctan2(z, w))}
 
 
 def derivative(values: Reals, step: float) -> Reals:
     """Return the derivative of rows (n, k) at all samples but `MARGIN` at each end."""
     n = len(values) - 2 * MARGIN
     total: Reals = sum(weight * values[at:at + n] for at, weight in enumerate(_WEIGHTS) if weight)
-    return total / step
-
-
-def rates_of_attitudes(rotation: Rotation, step: float) -> Reals:
-    """Return body rates [rad/s] at all samples but `MARGIN` at each end, by differences."""
-    n = len(rotation) - 2 * MARGIN
-    here = rotation[MARGIN:MARGIN + n].inv()
-    total: Reals = sum(weight * (here * rotation[at:at + n]).as_rotvec()
-                       for at, weight in enumerate(_WEIGHTS) if weight)
     return total / step
 
 
@@ -80,34 +60,27 @@ class Motion:
         return ExactSolution(self.body, self.start.state_of(self.body))
 
     @cached_property
-    def errors(self) -> Errors:
-        """Errors of the attitude."""
+    def errors(self) -> dict[str, Reals]:
+        """Errors of the attitude, as `errors_of` has them."""
         truth = self.solution.states_at_seconds(self.trajectory.t).quaternion
         return errors_of(self.trajectory.rotation, Rotation.from_quat(truth))
 
     @property
     def worst(self) -> float:
         """Largest error of the attitude [rad]."""
-        return float(np.max(self.errors.total))
+        return float(np.max(self.errors['total']))
 
     @cached_property
     def rates(self) -> Reals:
         """Body rates at all samples but `MARGIN` at each end, from the attitudes (n - 6, 3)."""
-        return rates_of_attitudes(self.trajectory.rotation, self.trajectory.step)
+        rotation, n = self.trajectory.rotation, len(self.trajectory.t) - 2 * MARGIN
+        here = rotation[MARGIN:-MARGIN].inv()
+        total: Reals = sum(weight * (here * rotation[at:at + n]).as_rotvec()
+                           for at, weight in enumerate(_WEIGHTS) if weight)
+        return total / self.trajectory.step
 
-    @cached_property
-    def height(self) -> Reals:
-        """cos(theta) at all samples but `MARGIN` at each end (n - 6,)."""
-        height: Reals = self.trajectory.rotation[MARGIN:-MARGIN].apply((0.0, 0.0, 1.0))[:, 2]
-        return height
-
-    def constants(self, rates: Reals) -> tuple[Reals, Reals, Reals]:
-        """Return E [J], L3 and Lz [kg m^2/s] (n - 6,), given rates as `rates` has them."""
-        constants = self._data(rates).constants(self.body)
-        assert constants is not None
-        return constants
-
-    def _data(self, rates: Reals) -> Attitudes:
+    def data(self, rates: Reals) -> Attitudes:
+        """Return attitudes and rates, given rates as `rates` has them."""
         part = self.trajectory.attitudes[MARGIN:-MARGIN, [1, 2, 3, 0]]
         stamps = np.rint(1e9 * self.trajectory.t[MARGIN:-MARGIN]).astype(np.int64)
         return Attitudes(stamps, np.vstack((part.T, rates.T)))
@@ -115,13 +88,14 @@ class Motion:
     def marks(self, rates: Reals) -> dict[str, float]:
         """Return the measures, given rates as `rates` has them; docs/grade.md defines them."""
         marks = {f'{name}_error_deg': math.degrees(float(np.max(np.abs(values))))
-                 for name, values in vars(self.errors).items()}
-        first = self.solution.states_at_seconds(np.zeros(1))
-        for name, values in zip(('energy', 'l3', 'lz'), self.constants(rates), strict=True):
+                 for name, values in self.errors.items()}
+        first, data = self.solution.states_at_seconds(np.zeros(1)), self.data(rates)
+        for name, values in zip(('energy', 'l3', 'lz'), data.constants(self.body) or (),
+                                strict=True):
             marks[f'{name}_drift'] = float(np.max(np.abs(relative_drift(
                 values, float(getattr(first, name)[0])))))
         exact = self.solution.describe()
-        found = measure(self._data(rates), exact.nutation_period)
+        found = measure(data, exact.nutation_period)
         for name in ('nutation_period', 'mean_precession_rate'):
             value, right = getattr(found, name), getattr(exact, name)
             marks[f'{name}_error'] = value / right - 1.0 if value and right else math.nan

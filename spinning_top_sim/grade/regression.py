@@ -13,6 +13,7 @@ from spinning_top_sim.grade.scenes import Reals
 MOST_CAUSES = 3
 ENOUGH = 0.2            # of the discrepancy may remain: further causes are not looked for
 WORTHWHILE = 0.8        # of what remains is left at most by another cause
+NEAR = 0.25             # of a coefficient to the value that it has for a fault
 AS_GOOD = 2.0           # a cause with fewer columns may leave so many times more
 
 # From the coefficients of a cause to the fault; None for what is no fault.
@@ -29,6 +30,13 @@ class Cause(NamedTuple):
 
     columns: Sequence[Reals]
     judge: Judge
+
+
+def instead(name: str, evidence: str) -> Judge:
+    """Return a judge of two columns: the second effect is there instead of the first."""
+    def judge(found: Reals) -> Fault | None:
+        return Fault(name, evidence) if np.allclose(found, (-1.0, 1.0), atol=NEAR) else None
+    return judge
 
 
 class Explained(NamedTuple):

@@ -7,43 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-# Of each fault: what is wrong.  docs/grade.md says how it is found.
-FAULTS: Mapping[str, str] = {
-    'invalid_output': 'the simulator raises, or returns no motion',
-    'not_deterministic': 'the same run twice differs',
-    'first_order': 'the error is proportional to the step',
-    'explicit_gyroscopic_term': 'the gyroscopic term is that of the begin of a step',
-    'implicit_damping': 'the gyroscopic term is that of the end of a step',
-    'coriolis_sign': 'the gyroscopic term, or its derivative in a step, has a wrong sign',
-    'no_gyroscopic_term': 'w x I w is missing',
-    'inertia_frame': 'the inertia is used in axes of the world',
-    'inertia': 'the motion is that of other moments of inertia',
-    'com_offset': 'the motion is that of another centre of mass',
-    'gravity_sign': 'gravity, or its reading, has a wrong sign',
-    'damping': 'a torque is proportional to the rates',
-    'inaccurate': 'an error that no cause explains',
-    'rates_in_world': 'rates are in axes of the world',
-    'rates_scale': 'the attitude does not turn at the rates',
-    'imu_one_step_late': 'readings belong to another time',
-    'mounting': 'readings are in axes of the body, not of the IMU',
-    'rotation_reversed': 'readings turn against the IMU',
-    'reading_sign': 'a reading has the opposite sign',
-    'units': 'readings are in degrees, g, gauss or microtesla',
-    'reading_in_world': 'readings of accelerometer or magnetometer are in axes of the world',
-    'reading_scale': 'a reading is a factor off',
-    'no_lever_arm': 'accelerations are those of another point',
-    'no_tangential_term': 'a x r is missing',
-    'no_centripetal_term': 'w x (w x r) is missing',
-    'acceleration_scale': 'accelerations, without gravity, are a factor off',
-    'no_gravity': 'the reading lacks gravity',
-    'gravity_frame': 'gravity is added in axes of the IMU',
-    'finite_differences': 'accelerations are differences of velocities over a step',
-    'inconsistent_reading': 'a reading that no cause explains',
-    'energy': 'the energy told is not that of the motion',
-    'noise_scale': 'the noise is not as declared',
-    'uniform_noise': 'the noise is not normal',
-    'covariance_zero': 'the covariance is zero, the noise is not',
-}
+# docs/grade.md defines them.
+FAULTS = (
+    'invalid_output', 'not_deterministic', 'first_order', 'explicit_gyroscopic_term',
+    'implicit_damping', 'coriolis_sign', 'no_gyroscopic_term', 'inertia_frame', 'inertia',
+    'com_offset', 'gravity_sign', 'damping', 'inaccurate', 'rates_in_world', 'rates_scale',
+    'imu_one_step_late', 'mounting', 'rotation_reversed', 'reading_sign', 'units',
+    'reading_in_world', 'reading_scale', 'no_lever_arm', 'no_tangential_term',
+    'no_centripetal_term', 'acceleration_scale', 'no_gravity', 'gravity_frame',
+    'finite_differences', 'inconsistent_reading', 'energy', 'noise_scale', 'uniform_noise',
+    'covariance_zero')
 
 
 class Fault(NamedTuple):

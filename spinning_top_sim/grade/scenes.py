@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.exact import ExactSolution
 
 Reals = NDArray[np.float64]
 # What is no field of `Top`: numbers, and vectors with their length.
@@ -52,9 +52,8 @@ class Body(Top):
         if abs(math.hypot(*self.mounting) - 1.0) > 1e-6:
             raise ValueError(f'mounting = {self.mounting!r}: its norm must be 1')
         for name in ('gyroscope_noise_density', 'accelerometer_noise_density'):
-            value = getattr(self, name)
-            if not (value is None or 0.0 <= value < math.inf):
-                raise ValueError(f'{name} = {value!r}: must be >= 0, or None')
+            if not 0.0 <= (getattr(self, name) or 0.0) < math.inf:
+                raise ValueError(f'{name} = {getattr(self, name)!r}: must be >= 0, or None')
 
     @classmethod
     def of(cls, top: Top, **imu: object) -> Self:
@@ -102,22 +101,15 @@ class Start:
     @classmethod
     def of(cls, top: Top, state: State) -> Self:
         """Return the start of a state."""
-        angles = (np.array([angle]) for angle in (state.phi, state.theta, state.psi))
-        x, y, z, w = (float(part[0]) for part in attitude.quaternion_of_angles(*angles))
-        cos2, sin2 = math.cos(0.5 * state.theta) ** 2, math.sin(0.5 * state.theta) ** 2
-        across = attitude.precession_rate(top, state.l3, state.lz, cos2, sin2) * math.sin(
-            state.theta) if sin2 and cos2 else 0.0
-        sine, cosine = math.sin(state.psi), math.cos(state.psi)
-        return cls((w, x, y, z), (state.theta_dot * sine - across * cosine,
-                                  state.theta_dot * cosine + across * sine,
-                                  state.l3 / top.lambda3), state)
+        first = ExactSolution(top, state).states_at_seconds(np.zeros(1))
+        x, y, z, w = first.quaternion[0].tolist()
+        return cls((w, x, y, z), tuple(first.angular_velocity[0].tolist()), state)
 
     def state_of(self, top: Top) -> State:
         """Return the start as a state of `top`.  Raises ValueError for what is no attitude."""
         if self.state is not None:
             return self.state
-        unit = unit_quaternions(np.asarray(self.attitude)[np.newaxis])[0]
-        w, x, y, z = unit.tolist()
+        (w, x, y, z), = unit_quaternions([self.attitude]).tolist()
         w1, w2, w3 = self.rates
         low, high = math.hypot(x, y), math.hypot(z, w)
         theta, l3 = 2.0 * math.atan2(low, high), top.lambda3 * w3

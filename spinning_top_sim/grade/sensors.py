@@ -16,27 +16,29 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
-from spinning_top_sim.grade.regression import Cause, explain, least_squares
+from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, least_squares
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
 LAGS = range(-3, 31)        # samples that are tried
 LATE = 0.75                 # steps
-NEAR = 0.25                 # of a coefficient to the value it has for a fault
 STRANGE = 2e-3              # of the reading, beside its noise: it is not what it should be
 CONSISTENT = 1e-3           # of the reading: the lag is not looked for
 MEANS_STRANGE = 2e-2        # of means over a step that are those of its ends
 UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
 NOISY = 1e-4                # of the reading: smaller noise is rounding
-NOISE_BAND = 0.07           # of the noise, to either side of what is declared
+NOISE_BAND = 0.05           # of the noise, to either side of what is declared, beside its doubt
+FOUR_SIGMA = 4.0            # that doubt
 LEAST_KURTOSIS = 2.4        # normal 3, uniform 1.8
+KINDS = ('gyroscope', 'accelerations', 'magnetometer', 'rotations', 'velocities')
 UNITS = {'gyroscope': (180.0 / math.pi, math.pi / 180.0), 'accelerations': (1.0 / 9.80665,),
          'magnetometer': (1e4, 1e6, 1e9)}
 UNITS.update(rotations=UNITS['gyroscope'], velocities=UNITS['accelerations'])
 FORCES = ('accelerations', 'velocities')
+_rate = partial(np.gradient, axis=0)        # change per step of values (m, 3)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Readings:
     """
     What a sensor reads in one motion, and what it should read.
@@ -47,6 +49,7 @@ class Readings:
     step : time between samples [s]
     rotation, mounting : world <- IMU (m), body <- IMU
     arms : of an accelerometer, the acceleration (m, 3) at 1 m along each axis of the body
+    size, total : rms of the reading, and the sum of the terms (m, 3)
     """
 
     reading: Reals
@@ -57,20 +60,8 @@ class Readings:
     mounting: Rotation
     arms: Sequence[Reals] = ()
 
-    @property
-    def size(self) -> float:
-        return rms(self.reading) or 1.0
-
-    @property
-    def total(self) -> Reals:
-        """The right reading (m, 3)."""
-        whole: Reals = sum(self.terms.values())     # type: ignore[assignment]
-        return whole
-
-    def rate(self, values: Reals) -> Reals:
-        """Return the change of values (m, 3) per step."""
-        change: Reals = np.gradient(values, axis=0)
-        return change
+    def __post_init__(self) -> None:
+        self.size, self.total = rms(self.reading) or 1.0, np.sum([*self.terms.values()], axis=0)
 
     def late(self, lag: int) -> tuple[Reals, slice]:
         """Return the readings `lag` samples after the terms, and the rows of the terms."""
@@ -80,76 +71,43 @@ class Readings:
         return self.reading[begin + skip:end], slice(skip, end - begin)
 
 
-def gyroscope_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what a gyroscope reads; w (n - 6, 3) as `dynamics.rates_of` returns it."""
-    return _readings(motion, motion.trajectory.gyroscope, {'rates': w}, MARGIN)
+def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
+    """
+    Return the readings of a sensor, None if there are none.
 
-
-def magnetometer_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what a magnetometer reads."""
-    field = motion.trajectory.rotation[MARGIN:-MARGIN].inv().apply(motion.body.field)
-    return _readings(motion, motion.trajectory.magnetometer, {'field': field}, MARGIN)
-
-
-def accelerometer_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what an accelerometer reads."""
-    return _readings(motion, motion.trajectory.accelerations, _forces(motion, w), 2 * MARGIN,
-                     [np.add(*_accelerations(motion, w, axis)) for axis in np.eye(3)])
-
-
-def rotations_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what rotation increments are, per second."""
-    told, rotation = motion.trajectory.increments, motion.trajectory.rotation
-    turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec() / motion.trajectory.step
-    return _readings(motion, None if told is None else told[:, :3] / motion.trajectory.step,
-                     {'rates': turned[MARGIN:-MARGIN]}, MARGIN + 1)
-
-
-def velocities_of(motion: Motion, w: Reals) -> Readings | None:
-    """Return what velocity increments are, per second."""
-    told = motion.trajectory.increments
-    arms = [np.add(*_accelerations(motion, w, axis)) for axis in np.eye(3)]
-    return _readings(motion, None if told is None else told[:, 3:] / motion.trajectory.step,
-                     {name: _means(values) for name, values in _forces(motion, w).items()},
-                     2 * MARGIN + 1, [_means(arm) for arm in arms])
-
-
-def _means(values: Reals) -> Reals:
-    means: Reals = 0.5 * (values[:-1] + values[1:])
-    return means
-
-
-# What makes `Readings` of a motion and its rates (n - 6, 3), as `dynamics.rates_of` returns them.
-KINDS = {'gyroscope': gyroscope_of, 'accelerations': accelerometer_of,
-         'magnetometer': magnetometer_of, 'rotations': rotations_of, 'velocities': velocities_of}
-
-
-def _forces(motion: Motion, w: Reals) -> dict[str, Reals]:
-    """Return the terms of the specific force at the IMU in the body frame (n - 12, 3)."""
-    z = motion.trajectory.rotation[2 * MARGIN:-2 * MARGIN].inv().apply((0.0, 0.0, 1.0))
-    tangential, centripetal = _accelerations(motion, w, np.array(motion.body.lever_arm))
-    return {'gravity': motion.body.gravity * z, 'tangential': tangential,
-            'centripetal': centripetal}
-
-
-def _accelerations(motion: Motion, w: Reals, arm: Reals) -> tuple[Reals, Reals]:
-    """Return a x r and w x (w x r) in the body frame (n - 12, 3)."""
-    inner = w[MARGIN:-MARGIN]
-    return (np.cross(derivative(w, motion.trajectory.step), arm),
-            np.cross(inner, np.cross(inner, arm)))
-
-
-def _readings(motion: Motion, reading: Reals | None, terms: Mapping[str, Reals],
-              first: int, arms: Sequence[Reals] = ()) -> Readings | None:
+    kind : one of KINDS
+    w : rates (n - 6, 3), as `dynamics.rates_of` returns them
+    """
+    said, body, inner = motion.trajectory, motion.body, slice(MARGIN, -MARGIN)
+    reading: Reals | None = getattr(said, 'increments' if kind in ('rotations', 'velocities')
+                                    else kind)
     if reading is None:
         return None
-    w, x, y, z = motion.body.mounting
-    mounting = Rotation.from_quat((x, y, z, w))
-    m = len(next(iter(terms.values())))
-    return Readings(reading, first, {name: mounting.inv().apply(values)
-                                     for name, values in terms.items()}, motion.trajectory.step,
-                    motion.trajectory.rotation[first:first + m] * mounting, mounting,
-                    [mounting.inv().apply(arm) for arm in arms])
+    rotation, first, arms = said.rotation[inner], MARGIN, np.empty((0, len(w), 3))
+    if kind == 'gyroscope':
+        terms = {'rates': w}
+    elif kind == 'magnetometer':
+        terms = {'field': rotation.inv().apply(body.field)}
+    elif kind == 'rotations':
+        reading, first = reading[:, :3] / said.step, first + 1
+        terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
+    else:
+        first, a, w = 2 * MARGIN, derivative(w, said.step), w[inner]
+        axes = np.eye(3)[:, np.newaxis]
+        tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
+        arms = tangential + centripetal
+        terms = {'gravity': body.gravity * rotation[inner].inv().apply((0.0, 0.0, 1.0)),
+                 'tangential': np.tensordot(body.lever_arm, tangential, 1),
+                 'centripetal': np.tensordot(body.lever_arm, centripetal, 1)}
+        if kind == 'velocities':
+            reading, first = reading[:, 3:] / said.step, first + 1
+            arms = 0.5 * (arms[:, :-1] + arms[:, 1:])
+            terms = {name: 0.5 * (term[:-1] + term[1:]) for name, term in terms.items()}
+    mounting = Rotation.from_quat((*body.mounting[1:], body.mounting[0]))
+    to_imu, m = mounting.inv().apply, len(next(iter(terms.values())))
+    return Readings(reading, first, {name: to_imu(term) for name, term in terms.items()},
+                    said.step, said.rotation[first:first + m] * mounting, mounting,
+                    [to_imu(arm) for arm in arms])
 
 
 def judge(kind: str, runs: Sequence[Readings], motion: Motion,
@@ -172,7 +130,9 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
                for name in parts[0][1]}
     floor = math.sqrt(float(np.mean([(one / run.size) ** 2
                                      for one, run in zip(noise, runs, strict=True)])))
-    before = math.sqrt(max(rms(target) ** 2 - 1.05 * floor ** 2, 0.0))
+    doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
+    most = floor * math.sqrt(1.05 + 2.0 * doubt)
+    before = math.sqrt(max(rms(target) ** 2 - most ** 2, 0.0))
     # The acceleration of a step may be that of its begin, without a lag of the reading.
     fractions, left = least_squares(target, [effects[name] for name in (
         'step', 'tangential step') if name in effects])
@@ -191,7 +151,7 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
         causes = _causes(kind, effects, motion.body)
         found, residual, _ = explain(target, causes, floor)
         faults += found
-        rest = math.sqrt(max(rms(residual) ** 2 - floor ** 2, 0.0))
+        rest = math.sqrt(max(rms(residual) ** 2 - most ** 2, 0.0))
         if rest > max(UNEXPLAINED * before, strange):
             faults.append(Fault('inconsistent_reading', f'{kind}: {100.0 * rest:.3g} % of the '
                                 'reading is not that of the motion', rest))
@@ -201,18 +161,19 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
         ends = np.cumsum([len(one) for one, _ in parts])[:-1]
         noises = np.concatenate([run.size * one for run, one in zip(
             runs, np.split(residual, ends), strict=True)])
-        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), noises, motion)
+        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), noises, motion,
+                                NOISE_BAND + doubt)
     return faults, marks
 
 
-def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals,
-                  motion: Motion) -> Iterator[Fault]:
-    """Compare the noise with what is declared."""
+def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motion: Motion,
+                  band: float) -> Iterator[Fault]:
+    """Compare the noise with what is declared; `band`: of the ratio, to either side of 1."""
     density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
                motion.body.accelerometer_noise_density)
     covariance = (motion.trajectory.covariance or {}).get(kind)
-    exists = noise > NOISY * run.size
-    declared = None if density is None else density / math.sqrt(run.step)
+    exists, root = noise > NOISY * run.size, math.sqrt(run.step)
+    declared = None if density is None else density / root
     text = f'{kind}: the noise has a standard deviation of {noise:.4g}'
     if covariance is not None and not np.any(covariance):
         if exists:
@@ -221,15 +182,13 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals,
         declared = math.sqrt(float(np.trace(covariance)) / 3.0)
     if declared == 0.0 and exists:
         yield Fault('noise_scale', f'{text}, it is declared as 0', math.inf)
-    elif declared and abs(noise / declared - 1.0) > NOISE_BAND:
-        ratio = noise / declared
-        root = math.sqrt(run.step)
-        known = {'sqrt(2)': math.sqrt(2.0), '1/sqrt(2)': math.sqrt(0.5), 'sqrt(dt)': root,
-                 '1/sqrt(dt)': 1.0 / root, 'dt': root * root, '1/dt': 1.0 / root ** 2}
-        as_if = ''.join(f' ({name})' for name, factor in known.items()
-                        if abs(ratio / factor - 1.0) < NOISE_BAND)
-        yield Fault('noise_scale', f'{text}, {ratio:.4g}{as_if} times what is declared', ratio)
-    if exists:
+    elif declared and abs((ratio := noise / declared) - 1.0) > band:
+        as_if = [f' ({name})' for name, factor in (
+            ('sqrt(2)', math.sqrt(2.0)), ('1/sqrt(2)', math.sqrt(0.5)), ('sqrt(dt)', root),
+            ('1/sqrt(dt)', 1.0 / root)) if abs(ratio / factor - 1.0) < band]
+        yield Fault('noise_scale', f'{text}, {ratio:.4g}{"".join(as_if)} times what is declared',
+                    ratio)
+    if exists and rms(residual) < 1.05 * noise:
         kurtosis = float(np.mean(residual ** 4) / np.mean(residual ** 2) ** 2)
         if kurtosis < LEAST_KURTOSIS:
             yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; '
@@ -244,13 +203,13 @@ def _lag(runs: Sequence[Readings]) -> int:
             reading, part = run.late(lag)
             rows.append(reading / run.size)
             columns.append(np.stack([values[part] / run.size for values in
-                                     (*run.terms.values(), run.rate(run.total))]))
+                                     (*run.terms.values(), _rate(run.total))]))
         target = np.concatenate(rows)
         return rms(least_squares(target, list(np.concatenate(columns, axis=1)))[1])
 
     floor = rms(np.array([_noise(run, 0) / run.size for run in runs]))
     now = left(0)
-    if now ** 2 < 1.05 * floor ** 2 + CONSISTENT ** 2:
+    if now ** 2 < 1.1 * floor ** 2 + CONSISTENT ** 2:
         return 0
     found = {0: now} | {lag: left(lag) for lag in LAGS if lag < len(runs[0].total) // 4}
     best = min(found, key=lambda lag: found[lag])
@@ -260,29 +219,25 @@ def _lag(runs: Sequence[Readings]) -> int:
 def _noise(run: Readings, lag: int) -> float:
     """Return the standard deviation of white noise, by differences in which motions vanish."""
     reading, part = run.late(lag)
-    differences = np.diff(reading - run.total[part], 6, axis=0)
-    return rms(differences) / math.sqrt(924.0)
+    return rms(np.diff(reading - run.total[part], 6, axis=0)) / math.sqrt(924.0)
 
 
 def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, Reals]]:
     """Return reading minus right reading (m, 3) and effects of causes, relative to the reading."""
     reading, part = run.late(lag)
     total = run.total
-    effects = {**run.terms, 'total': total, 'step': run.rate(total),
+    effects = {**run.terms, 'total': total, 'step': _rate(total),
                'mounted': run.mounting.apply(total),
                'world': (world := run.rotation.apply(total)),
                'reversed': run.rotation.apply(world)}
     if kind in FORCES:
         kinematic = total - run.terms['gravity']
-        effects['kinematic'] = kinematic
-        effects['difference'] = run.rotation.inv().apply(run.rate(run.rotation.apply(kinematic)))
-        effects['turned'] = run.rotation.inv().apply(run.rate(run.rotation.apply(total))) \
-            - run.rate(total)
-        effects['tangential step'] = run.rate(run.terms['tangential'])
-        for k in range(3):
-            effects[f'fixed {k}'] = np.tile(np.eye(3)[k], (len(total), 1))
-        for k, arm in enumerate(run.arms):
-            effects[f'arm {k}'] = arm
+        back, forth = run.rotation.inv().apply, run.rotation.apply
+        effects |= {'kinematic': kinematic, 'difference': back(_rate(forth(kinematic))),
+                    'turned': back(_rate(forth(total))) - _rate(total),
+                    'tangential step': _rate(run.terms['tangential']),
+                    **{f'fixed {k}': 0.0 * total + axis for k, axis in enumerate(np.eye(3))},
+                    **{f'arm {k}': arm for k, arm in enumerate(run.arms)}}
     return (reading - total[part]) / run.size, {
         name: values[part] / run.size for name, values in effects.items()}
 
@@ -292,11 +247,12 @@ def _causes(kind: str, effects: Mapping[str, Reals], body: Body) -> list[Cause]:
     def only(judge: object, *names: str) -> Cause:
         return Cause([effects[name] for name in names], judge)      # type: ignore[arg-type]
 
+    in_world = 'rates_in_world' if kind == 'gyroscope' else 'reading_in_world'
+    text = f'{kind}: the readings are in axes of '
     causes = [only(partial(_scale, kind), 'total'), only(lambda found: None, 'step'),
-              only(partial(_frame, kind, 'mounting', 'the body'), 'total', 'mounted'),
-              only(partial(_frame, kind, 'rates_in_world' if kind == 'gyroscope' else
-                           'reading_in_world', 'the world'), 'total', 'world'),
-              only(partial(_frame, kind, 'rotation_reversed', 'a sensor that turns backwards'),
+              only(instead('mounting', f'{text}the body, not of the IMU'), 'total', 'mounted'),
+              only(instead(in_world, f'{text}the world, not of the IMU'), 'total', 'world'),
+              only(instead('rotation_reversed', f'{text}a sensor that turns against the IMU'),
                    'total', 'reversed')]
     if kind in FORCES:
         causes += [only(partial(_term, kind, name), name) for name in _TERMS]
@@ -314,12 +270,6 @@ def _scale(kind: str, found: Reals) -> Fault:
         return Fault('units', text, factor)
     return Fault('reading_sign' if factor < 0.0 else 'acceleration_scale' if
                  kind == 'accelerations' else 'reading_scale', text, factor)
-
-
-def _frame(kind: str, name: str, of: str, found: Reals) -> Fault | None:
-    if not np.allclose(found, (-1.0, 1.0), atol=NEAR):
-        return None
-    return Fault(name, f'{kind}: the readings are in axes of {of}, not of the IMU')
 
 
 # Terms of a specific force: what each is, and the fault where it is missing.
@@ -341,24 +291,26 @@ def _term(kind: str, term: str, found: Reals) -> Fault:
 
 def _gravity_frame(kind: str, body: Body, found: Reals) -> Fault | None:
     fixed = float(np.linalg.norm(found[1:]))
-    if abs(found[0] + 1.0) > NEAR or abs(fixed / body.gravity - 1.0) > NEAR:
-        return None
-    return Fault('gravity_frame', f'{kind}: gravity, {fixed:.4g} m/s^2, does not turn with the '
-                 'IMU', fixed)
+    other = abs(found[0] + 1.0) > NEAR or abs(fixed / body.gravity - 1.0) > NEAR
+    return None if other else Fault('gravity_frame', f'{kind}: gravity, {fixed:.4g} m/s^2, does '
+                                    'not turn with the IMU', fixed)
 
 
 def _difference(kind: str, found: Reals) -> Fault | None:
     delay = -float(found[0])
-    if not 0.25 < delay < 0.8:
-        return None
-    return Fault('finite_differences', f'{kind}: the acceleration, without gravity, is that of '
-                 f'{delay:.3g} steps before, as a difference of two velocities', delay)
+    return None if not 0.25 < delay < 0.8 else Fault(
+        'finite_differences', f'{kind}: the acceleration, without gravity, is that of {delay:.3g} '
+        'steps before, as a difference of two velocities', delay)
 
 
 def _arm(kind: str, body: Body, found: Reals) -> Fault:
-    point, sizes = found + body.lever_arm, [np.linalg.norm(body.com),
-                                            np.linalg.norm(body.lever_arm)]
-    of = ', the centre of mass' if np.linalg.norm(point - body.com) < 0.1 * max(sizes) else ''
-    shown = [', '.join(f'{x:.3g}' for x in one) for one in (point, body.lever_arm)]
+    arm, point = np.array(body.lever_arm), found + body.lever_arm
+    size = float(np.linalg.norm(arm))
+    share = float(point @ arm) / (size * size or 1.0)
+    if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * share * size:
+        return _term(kind, 'kinematic', np.array([share - 1.0]))
+    of = ', the centre of mass' if np.linalg.norm(point - body.com) < 0.1 * max(
+        size, abs(body.com_distance)) else ''
+    shown = [', '.join(f'{x:.3g}' for x in one) for one in (point, arm)]
     return Fault('no_lever_arm', f'{kind}: the readings are those at ({shown[0]}) m{of}, not at '
                  f'({shown[1]}) m', float(np.linalg.norm(found)))

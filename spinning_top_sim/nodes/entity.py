@@ -17,8 +17,8 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 
 Message = Any           # message packages have no types
 TAGS = ('spinning_top', 'heavy_symmetric_top', 'imu')
-# Tolerances for the rounding of a client: distance of the pivot from the origin [m], its velocity
-# [m/s], and the difference of a quaternion's length from 1.
+# Tolerances for the rounding of a client: of the pivot's place [m] and its velocity [m/s], and
+# of a quaternion's length.
 SMALLEST_LENGTH, SMALLEST_SPEED, LENGTH_ERROR = 1e-6, 1e-6, 1e-3
 UNSUPPORTED, INVALID_POSE = 0, 101      # of Result and SetEntityState
 
@@ -43,11 +43,13 @@ def fill_state(message: Message, states: States, pivot: Kinematics, stamp_ns: in
             setattr(target, name, float(column[0]))
 
 
-def asked_state(request: Message, top: Top, frame: str, now: States) -> State:
+def asked_state(request: Message, top: Top, frame: str, now: States,
+                pivot: Kinematics) -> State:
     """
     Return the state that a SetEntityState request asks for.
 
     now : the present state (n = 1), which holds for what the request does not set
+    pivot : what the pivot does at present, which cannot be set
 
     Raises RefusedError or ValueError, which name the value and what is allowed.
     """
@@ -64,22 +66,24 @@ def asked_state(request: Message, top: Top, frame: str, now: States) -> State:
     rates = np.concatenate(attitude.in_world(now.rows_quaternion, now.rows_angular_velocity))
     if sets_pose:
         rotation = _numbers(wanted.pose.orientation, 'xyzw')
-        _check_pose(_numbers(wanted.pose.position, 'xyz'), rotation)
+        _check_pose(_numbers(wanted.pose.position, 'xyz'), rotation, pivot.position[:, 0])
     if sets_twist:
         rates = _numbers(wanted.twist.angular, 'xyz')
         velocity = _numbers(wanted.twist.linear, 'xyz')
-        if not np.all(np.abs(velocity) <= SMALLEST_SPEED):
-            raise ValueError(f'twist.linear = {velocity.tolist()} m/s: must be 0, as the pivot '
-                             f'is fixed (within {SMALLEST_SPEED:g})')
+        moves = pivot.velocity[:, 0]
+        if not np.all(np.abs(velocity - moves) <= SMALLEST_SPEED):
+            raise ValueError(f'twist.linear = {velocity.tolist()} m/s: must be that of the pivot, '
+                             f'{moves.tolist()} (within {SMALLEST_SPEED:g})')
         if not np.all(np.isfinite(rates)):
             raise ValueError(f'twist.angular = {rates.tolist()} rad/s: must be finite')
     return state_of(top, rotation, rates)
 
 
-def _check_pose(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> None:
-    if not np.all(np.abs(position) <= SMALLEST_LENGTH):
+def _check_pose(position: NDArray[np.float64], rotation: NDArray[np.float64],
+                pivot: NDArray[np.float64]) -> None:
+    if not np.all(np.abs(position - pivot) <= SMALLEST_LENGTH):
         raise RefusedError(INVALID_POSE, f'pose.position = {position.tolist()} m: must be the '
-                           f'pivot, [0, 0, 0] (within {SMALLEST_LENGTH:g})')
+                           f'pivot, {pivot.tolist()} (within {SMALLEST_LENGTH:g})')
     length = float(np.linalg.norm(rotation))
     if not abs(length - 1.0) <= LENGTH_ERROR:
         raise RefusedError(INVALID_POSE, f'pose.orientation = {rotation.tolist()} has length '

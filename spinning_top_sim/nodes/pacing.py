@@ -26,7 +26,6 @@ class SimulatedClock:
         self._from_simulated = 0
 
     def set(self, simulated_ns: int, running: bool) -> None:
-        """Run from this simulated time on, or stand there."""
         self._from_source = self._source() if running else None
         self._from_simulated = simulated_ns
 

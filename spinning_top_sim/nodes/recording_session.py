@@ -109,7 +109,6 @@ class RecordingSession:
         return reason
 
     def write_command(self, l3: float, lz: float) -> None:
-        """Record a command that is applied now, as a message and as an event."""
         self.write_event('command', l3=l3, lz=lz)
         self._write_now(journal.COMMANDS, journal.command(l3, lz))
 
@@ -141,7 +140,6 @@ class RecordingSession:
         return recorder.warning if recorder else None
 
     def numbers(self) -> dict[str, object]:
-        """Return the values for /diagnostics."""
         recorder = self._recorder
         if recorder is None:
             return {'recorder': 'failed' if self.error else 'off'}

@@ -121,12 +121,10 @@ class Terminal:
         self._open = True
 
     def tell(self, line: str) -> None:
-        """Show a line that stays."""
         self.end()
         self._write(f'{line}\n')
 
     def end(self) -> None:
-        """Move the cursor to a new line."""
         if self._open:
             self._open = False
             self._write('\n')

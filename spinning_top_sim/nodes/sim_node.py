@@ -13,7 +13,7 @@ DESCRIPTION = """\
 Simulate the heavy symmetric top in real time as a ROS 2 node.
 
   spinning-top node --scene looping --imu bmi088
-  spinning-top node --ros-args -p spin.l3:=2.0 --params-file mine.yaml
+  spinning-top node -p spin.l3:=2.0 --ros-args --params-file mine.yaml
 
 Of several values for a parameter, the last one on the command line holds; those
 of --scene and --imu come first.
@@ -39,12 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     from spinning_top_sim.tools import scene_file  # noqa: PLC0415 - YAML takes 10 ms
     scene_file.add_arguments(parser)
+    parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
+                        help='one parameter; may be repeated')
     parser.add_argument('--ros-args', metavar='...', nargs='*',
                         help='arguments of ROS 2, such as -p NAME:=VALUE and --params-file FILE')
 
 
 def _interface() -> Iterator[str]:
-    """Yield the lines about topics, services and parameters."""
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
     yield INTERFACE
     for *_, text in parameters.STREAM_DEFAULTS:
@@ -64,8 +65,9 @@ def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
         from spinning_top_sim.tools.scene_file import chosen_files  # noqa: PLC0415
         parser = cli.Parser('node', DESCRIPTION, '\n'.join(_interface()))
         add_arguments(parser)
-        files = chosen_files(parser.parse_args(words))
-        given = [word for path in files for word in ('--params-file', str(path))]
+        arguments = parser.parse_args(words)
+        given = [word for path in chosen_files(arguments) for word in ('--params-file', str(path))]
+        given += [word for parameter in arguments.param for word in ('-p', parameter)]
         argv[:] = ['--ros-args', *given, '--', *argv[len(words):]]
     from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
 

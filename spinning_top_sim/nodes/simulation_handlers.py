@@ -20,6 +20,7 @@ from spinning_top_sim.nodes import entity
 from spinning_top_sim.nodes.simulation_standard import FEATURES, RefusedError, service_name
 from spinning_top_sim.nodes.simulator import Simulator
 from spinning_top_sim.nodes.tick_loop import LoopState
+from spinning_top_sim.physics.pivot import Kinematics
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
@@ -68,7 +69,6 @@ class SimulationHandlers:
         return response
 
     def _outcome(self, act: Callable[[], str | None]) -> tuple[int, str]:
-        """Return the result code and the text of an action."""
         error, text = self._node.outcome(act)
         if error is None:
             return self._results.RESULT_OK, text
@@ -252,10 +252,12 @@ class SimulationHandlers:
     def _fill_state(self, message: Any) -> None:
         simulation = self._simulation
         with self._lock:
-            pivot = simulation.segment.pivot(np.array([self._loop.now_ns]))
-            entity.fill_state(message, simulation.state(), pivot,
+            entity.fill_state(message, simulation.state(), self._pivot(),
                               simulation.epoch_ns + self._loop.now_ns,
                               self._node.values['world_frame'])
+
+    def _pivot(self) -> Kinematics:
+        return self._simulation.segment.pivot(np.array([self._loop.now_ns]))
 
     def _get_entities(self, request: Any, response: Any) -> None:
         filters = request.filters
@@ -278,7 +280,8 @@ class SimulationHandlers:
         self._check_runs()
         top, frame = self._simulation.top, self._node.values['world_frame']
         with self._lock:
-            self._loop.set_state(lambda now: entity.asked_state(request, top, frame, now))
+            self._loop.set_state(
+                lambda now: entity.asked_state(request, top, frame, now, self._pivot()))
         self._node.show_spin()
 
     def _get_entity_info(self, request: Any, response: Any) -> None:

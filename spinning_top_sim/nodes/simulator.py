@@ -89,7 +89,6 @@ class Simulator(Node):
         self._begin()
 
     def _begin(self) -> None:
-        """Start the motion once there is a date."""
         if self._date.now_ns() == 0:
             return
         if self.values['max_error'] > 0.0:
@@ -220,7 +219,6 @@ class Simulator(Node):
         self.values, self._start_spin = values, start_spin
 
     def _check_surroundings(self, values: Mapping[str, Any], *, restarted: bool) -> None:
-        """Raise ValueError for parameters that contradict what is in use already."""
         if self._date.follows and journal.is_enabled('clock', values):
             raise ValueError('clock.enabled, publish_clock: must be false while this node follows '
                              'another /clock (use_sim_time)')
@@ -257,7 +255,6 @@ class Simulator(Node):
             return error, f'{type(error).__name__}: {error}'
 
     def check_started(self) -> None:
-        """Raise RuntimeError before the motion begins."""
         if not self._pacer.is_alive():
             raise RuntimeError(self.loop.failure or 'waiting for /clock (use_sim_time is set)')
 
@@ -303,7 +300,6 @@ class Simulator(Node):
         self.show_spin()
 
     def show_spin(self) -> None:
-        """Set the parameters spin.l3 and spin.lz to the present spin."""
         self.values |= {'spin.l3': self.simulation.l3, 'spin.lz': self.simulation.lz}
         self._show(SPIN)
 
@@ -343,7 +339,6 @@ class Simulator(Node):
         return self.create_timer(period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish_diagnostics(self) -> None:
-        """Check /clock and the recording; publish /diagnostics."""
         self._check_clock()
         self._check_recording()
         if self._session.warning:

@@ -54,7 +54,7 @@ class Piece(NamedTuple):
         """Return what the pivot does at times (n,) [ns]."""
         t, a = (times_ns - self.start_ns) * 1e-9, _doubles([self.acceleration]).T
         return Kinematics(self.position + t * (self.velocity + 0.5 * t * a),
-                          self.velocity + t * a, np.repeat(a, len(t), axis=1))
+                          self.velocity + t * a, np.broadcast_to(a, (3, len(t))))
 
 
 class PivotPath:

@@ -89,7 +89,6 @@ class States:
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
-        """phi, theta and psi."""
         raise NotImplementedError
 
     @cached_property
@@ -107,7 +106,6 @@ class States:
 
     @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
-        """cos^2 and sin^2 of theta/2."""
         x, y, z, w = self.rows_quaternion
         return w * w + z * z, x * x + y * y
 

@@ -41,7 +41,9 @@ class WorldStates(States):
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
-        return attitude.product(self._rotation, self._moved.rows_quaternion)
+        moved = self._moved.rows_quaternion
+        is_identity = self._rotation[3][0] == 1.0
+        return moved if is_identity else attitude.product(self._rotation, moved)
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:

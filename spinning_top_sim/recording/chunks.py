@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import mmap
 import struct
 import zlib
 from array import array
@@ -68,7 +67,6 @@ class PlainChunk:
         return self._memory[:self.size]
 
     def record(self) -> Chunk:
-        """Return the chunk, compressed."""
         start_ns, end_ns = time_span(self.entries)
         return Chunk(
             compression='' if self._compression == 'none' else self._compression,
@@ -78,7 +76,6 @@ class PlainChunk:
 
     def add(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
             data: bytes | bytearray | memoryview) -> None:
-        """Add a message."""
         offset = self.size
         start = offset + MESSAGE.size
         end = start + len(data)
@@ -130,8 +127,7 @@ class PlainChunk:
         return lz4.frame.compress(self.data) if self._compression == 'lz4' else bytes(self.data)
 
     def _enlarge(self, size: int) -> None:
-        # Private: a process that forks would share it with its children.
-        larger = memoryview(mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))
+        larger = memoryview(bytearray(size))
         larger[:self.size] = self.data
         self._memory = larger
 

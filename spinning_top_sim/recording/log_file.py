@@ -63,7 +63,6 @@ class LogFile:
             return self._file.read(length)
 
     def crc(self, end: int) -> int:
-        """Return the checksum of the file up to an offset."""
         crc = 0
         for offset in range(0, end, _BLOCK):
             crc = zlib.crc32(self.read(offset, min(_BLOCK, end - offset)), crc)
@@ -79,12 +78,10 @@ class LogFile:
         raise DamagedError('no record ends in the file that begins there')
 
     def raw(self, offset: int, end: int) -> bytes:
-        """Return the bytes of a record; raises DamagedError if it is too large."""
         check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
     def record(self, offset: int, limit: int) -> McapRecord:
-        """Return the record of a known kind there; raises DamagedError."""
         _, end = self.head(offset, limit)
         return parse(self.raw(offset, end))
 
@@ -155,7 +152,6 @@ def read_summary(file: LogFile) -> Summary:
 
 
 def _read_section(section: bytes, footer: Footer, summary: Summary) -> None:
-    """Take over the records of a summary section up to the end; raises DamagedError."""
     if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
         raise DamagedError('its checksum is wrong')
     try:

@@ -71,12 +71,10 @@ class McapWriter:
 
     @property
     def size(self) -> int:
-        """Size of the file, all of it whole records [bytes]."""
         return self._end[0]
 
     @property
     def messages(self) -> int:
-        """Number of messages in the file."""
         return sum(self.message_counts.values())
 
     @contextlib.contextmanager
@@ -157,7 +155,6 @@ class McapWriter:
             self._chunk.clear()
 
     def copy_chunk(self, chunk: records.Chunk, entries: chunks.Entries) -> None:
-        """Write a compressed chunk and its message indexes."""
         raw = record_bytes(chunk)
         indexes = chunks.message_indexes(entries)
         offsets = list(itertools.accumulate(
@@ -178,7 +175,6 @@ class McapWriter:
                 self.message_counts[channel_id] += len(entries[channel_id]) // 2
 
     def sync(self) -> None:
-        """Wait until everything written is on the disk."""
         os.fsync(self._file.fileno())
 
     def check_disk(self, min_free_bytes: int) -> None:
@@ -233,7 +229,6 @@ class McapWriter:
             self._spare_chunks.put(chunk)
 
     def _summary(self) -> bytes:
-        """Return the summary section, the footer and the closing magic."""
         groups = self._summary_records
         groups[Opcode.STATISTICS] = [record_bytes(records.Statistics(
             message_count=self.messages,

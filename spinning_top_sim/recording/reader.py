@@ -9,6 +9,7 @@ that overlap in time: one in a log that was written in order.
 import contextlib
 import functools
 import heapq
+import itertools
 import os
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -30,6 +31,7 @@ from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scan import Part, Scan
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
+BLOCK = 16384               # messages that are read together
 _FIRST_DATE = 10 ** 17      # [ns], in 1973
 _STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, about
 
@@ -122,7 +124,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.profile, self.library = header.profile, header.library
 
     def close(self) -> None:
-        """Close the file."""
         self.file.close()
 
     def __exit__(self, *exception: object) -> None:
@@ -202,6 +203,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             if message.channel_id >= 0 and message.log_time in times:
                 yield message
 
+    def groups(self, topics: Iterable[str] | None = None,
+               ) -> Iterator[tuple[str, list[LogMessage]]]:
+        """Yield some messages of a topic at a time, each topic's in the order of `messages`."""
+        messages = self.messages(topics)
+        while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
+            for topic, group in itertools.groupby(block, attrgetter('topic')):
+                yield topic, list(group)
+
     def scan(self, progress: Callable[[int], object] = lambda offset: None) -> Scan:
         """Return what a scan of the whole file finds, done at the first use."""
         if self._scanned is None:
@@ -258,7 +267,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     @property
     def _messages(self) -> list[Part]:
-        """The parts of the file that hold messages."""
         return [part for part in self._index.parts if part.channel_ids]
 
     def _leads_to_chunk(self, index: ChunkIndex) -> bool:

@@ -114,7 +114,6 @@ class Scan:
         self._check_end(offset)
 
     def _take(self, opcode: int, offset: int, end: int) -> None:
-        """Note what a record holds; raises DamagedError."""
         record, messages = self._decode(opcode, offset, end)
         self._check_length(record, offset, end)
         if isinstance(record, int):

@@ -124,7 +124,6 @@ class McapRecorder:
 
     @property
     def counters(self) -> RecordingSummary:
-        """Where the recording stands now."""
         running = self.state == 'recording'     # read first: nothing is written after it
         counts = dict(zip(self._names, self._file.message_counts.values(), strict=True))
         missing = self._offered - sum(counts.values())
@@ -134,7 +133,6 @@ class McapRecorder:
             longest_flush=self._longest_flush, error=self.error)
 
     def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
-        """Hand over one message; see `write_all`."""
         self.write_all([(topic_index, log_time_ns, data)], len(data))
 
     def write_all(self, entries: Sequence[Entry], size: int) -> None:
@@ -197,7 +195,6 @@ class McapRecorder:
                 self._file.finish()
 
     def _record(self) -> None:
-        """Write what is queued, flush in time, finish when asked to."""
         interval = self._max_loss / 2.0
         next_flush = time.monotonic() + interval
         while True:
@@ -243,7 +240,6 @@ class McapRecorder:
             self._longest_flush = max(self._longest_flush, time.monotonic() - start)
 
     def _write_queued(self) -> None:
-        """Take what is in the queue now and put it into chunks."""
         for _ in range(len(self._queue)):
             entries, size = self._queue.popleft()
             for topic_index, log_time_ns, data in entries:

@@ -9,11 +9,13 @@ for small arguments; `sin_cos` loses the digits that cancel next to other multip
 import math
 from contextlib import AbstractContextManager
 from decimal import Context, Decimal, getcontext, localcontext
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 ZERO, ONE = Decimal(0), Decimal(1)
-HALVINGS = 5
+DIGITS = 40             # that are left of long decimals once nothing cancels any more
 SMALL = Decimal('1e-9')
+# Parts of a quarter turn whose sines and cosines are tabulated.
+PARTS = 64
 
 
 def precision(digits: int) -> AbstractContextManager[Context]:
@@ -36,22 +38,43 @@ def _pi(digits: int) -> Decimal:
         return (a + b) ** 2 / (4 * t)
 
 
+@lru_cache
+def _tables(digits: int) -> tuple[Decimal, list[tuple[Decimal, Decimal]], list[Decimal]]:
+    """
+    Return what `sin_cos` adds angles from.
+
+    The angle of a part, sine and cosine of the multiples below a quarter turn, and the series of
+    sin(x)/x in x^2, which is short up to the angle, the last term first.
+    """
+    with precision(digits + 10):
+        angle, series, term, size = pi() / (2 * PARTS), [ONE], ONE, ONE
+        while size.adjusted() > -digits - 5:
+            n = 2 * len(series)
+            term, size = -term / (n * (n + 1)), size * angle * angle / (n * (n + 1))
+            series.insert(0, term)
+        s = angle * reduce(lambda total, one: total * angle * angle + one, series)
+        c, values = (1 - s * s).sqrt(), [(ZERO, ONE)]
+        while len(values) < PARTS:
+            a, b = values[-1]
+            values.append((a * c + b * s, b * c - a * s))
+    return angle, values, series
+
+
 def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
-    """Return sin x and cos x: the power series of a part of x, then angles are doubled."""
-    quarter_turn = pi() / 2
-    quarters = (x / quarter_turn).to_integral_value()
-    part = (x - quarters * quarter_turn) / 2 ** HALVINGS
-    square = part * part
-    s = term = part
-    n = 1
-    while term and term.adjusted() >= s.adjusted() - getcontext().prec:
-        n += 2
-        term = -term * square / (n * (n - 1))
-        s += term
+    """Return sin x and cos x."""
+    angle, values, series = _tables(getcontext().prec)
+    count = int((x / angle).to_integral_value())
+    rest = x - count * angle
+    square, total = rest * rest, ZERO
+    for coefficient in series:
+        total = total * square + coefficient
+    s = rest * total
     c = (1 - s * s).sqrt()
-    for _ in range(HALVINGS):
-        s, c = 2 * s * c, 1 - 2 * s * s
-    return [(s, c), (c, -s), (-s, -c), (-c, s)][int(quarters) % 4]
+    quarters, part = divmod(count, PARTS)
+    if part:
+        a, b = values[part]
+        s, c = a * c + b * s, b * c - a * s
+    return [(s, c), (c, -s), (-s, -c), (-c, s)][quarters % 4]
 
 
 def atan2(y: Decimal, x: Decimal) -> Decimal:

@@ -16,9 +16,9 @@ from decimal import Decimal, getcontext
 
 from spinning_top_sim.solvers.decimal_math import ZERO
 
-# Coefficients of lambda, lambda^5, lambda^9 ... in the nome [DLMF 19.5.6].  The first one that is
-# left out contributes less than 1e-23 for k^2 <= 1/2.
-NOME_COEFFICIENTS = 1, 2, 15, 150, 1707
+# Coefficients of lambda, lambda^5, lambda^9 ... in the nome [DLMF 19.5.6; A002103 of oeis.org].
+# The first one that is left out contributes less than 1e-44 for k^2 <= 1/2.
+NOME_COEFFICIENTS = 1, 2, 15, 150, 1707, 20910, 268616, 3567400, 48555069, 673458874
 
 
 class GaussMean:
@@ -46,7 +46,7 @@ class GaussMean:
         return self._means[0][0] / self.mean
 
     def nome(self) -> Decimal:
-        """Return q = exp(-pi K'/K) to 23 digits, for k^2 <= 1/2."""
+        """Return q = exp(-pi K'/K) to 40 digits, for k^2 <= 1/2."""
         (a, _), (_, g), c = self._means[0], self._means[1], self._c[1]
         small = a * c / (a + g) ** 2                # (1 - sqrt(k'))/(1 + sqrt(k'))/2
         power, total = small ** 4, ZERO

@@ -52,17 +52,15 @@ class TransportEquations(Equations):
     sample (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
 
     rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
-    carried_share : c/L3
     spin_rate : chi [rad/s]
     uniform_rates : rate of the uniform part of alpha's phase (see `unwrap`), in the frame that is
         stepped and in the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
     """
 
-    def __init__(self, top: Top, start: State, rtol: float, atol: float,
-                 carried_share: float = 0.5) -> None:
+    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
         lambda1, l3, lz, torque = top.lambda1, start.l3, start.lz, top.gravity_torque
         self.top, self.l3, self.lz = top, l3, lz
-        carried = carried_share * l3                                    # c
+        carried = 0.5 * l3                                              # c
         self.spin_rate = l3 / top.lambda3 - (l3 - carried) / lambda1
         self.uniform_rates = -0.5 * carried / lambda1, 0.5 * (l3 / top.lambda3 - l3 / lambda1)
         self._turn_alpha = 0.5j * (lz - carried) / lambda1
@@ -95,7 +93,6 @@ class TransportEquations(Equations):
                 0.5j * momentum / lambda1)
 
     def derivative(self, alpha: complex, beta: complex, m: complex) -> Vector:
-        """Return (alpha', beta', m')."""
         return (self._turn_alpha * alpha + m * beta.conjugate(),
                 self._turn_beta * beta - m * alpha.conjugate(),
                 self._fall * (alpha * beta))

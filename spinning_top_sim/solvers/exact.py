@@ -18,8 +18,8 @@ from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.decimal_math import pi, precision
-from spinning_top_sim.solvers.theta_setup import DIGITS, ThetaMotion, set_up
+from spinning_top_sim.solvers.decimal_math import DIGITS, pi, precision
+from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import MOST, ThetaFunctions, ThetaValues, in_range
 from spinning_top_sim.solvers.times import LARGEST_NS, Times
 
@@ -76,18 +76,18 @@ class ExactSolution:
             theta=min(abs(theta), math.pi), theta_dot=self._sign * start.theta_dot,
             phi=start.phi + self._half_turn, psi=start.psi - self._half_turn,
             l3=start.l3, lz=start.lz)
-        motion = set_up(top, self.start)
+        motion = set_up(top, Decimal(top.gravity), self.start)
         with precision(DIGITS):
-            self._take_constants(motion)
+            self._take_constants(motion, Decimal(start.l3), Decimal(start.lz))
         self._check_start()
 
-    def _take_constants(self, motion: ThetaMotion) -> None:
+    def _take_constants(self, motion: ThetaMotion, l3: Decimal, lz: Decimal) -> None:
         top, start = self.top, self.start
         self.m, self.m1 = float(motion.m), float(motion.m1)
         # 2 K/w, two quarter periods
         self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
         alpha, beta = motion.alpha, motion.beta
-        l3, lz, two_lambda1 = Decimal(start.l3), Decimal(start.lz), 2 * Decimal(top.lambda1)
+        two_lambda1 = 2 * Decimal(top.lambda1)
         bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
         in_range('the fastest rate', max(map(abs, (
             motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
@@ -109,7 +109,8 @@ class ExactSolution:
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""
-        start, first = self.start, ThetaValues(self._theta, Times.from_ns(range(1)))
+        start, self._at_start = self.start, ThetaValues(self._theta, Times.from_ns(range(1)))
+        first = self._at_start
         alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
@@ -137,7 +138,6 @@ class ExactSolution:
         return across
 
     def describe(self) -> Description:
-        """Return the motion in the numbers that a physicist asks for."""
         top, start = self.top, self.start
         rests = axis_rests(top, start)
         low, high = 2 * (start.theta,) if rests else (self.theta_min, self.theta_max)
@@ -187,6 +187,8 @@ class _ExactStates(States):
 
     @cached_property
     def _block(self) -> ThetaValues:
+        if len(self) == 1 and not self._times.latest:
+            return self._solution._at_start
         return ThetaValues(self._solution._theta, self._times)
 
     def _rows(self, name: str) -> NDArray[np.float64]:

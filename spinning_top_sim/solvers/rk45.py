@@ -52,12 +52,10 @@ class SteppedMotion(ABC):
 
     @property
     def steps(self) -> int:
-        """Integration steps taken so far."""
         return self._integrator.steps
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the right-hand side so far."""
         return self._integrator.evaluations
 
     @property
@@ -151,8 +149,6 @@ class EulerMotion(SteppedMotion):
 
 
 class _EulerStates(States):
-    """States known by their Euler angles."""
-
     def __init__(self, top: Top, start: State, t: Column, unknowns: Rows) -> None:
         super().__init__(top, start, len(t))
         theta, theta_dot, phi, psi = unknowns

@@ -5,11 +5,13 @@ Jacobi's theta functions as short polynomials, in long decimals.
 theta1 .. theta4 of y are used in the real form, with the nome q = exp(-pi K'/K) [DLMF 20.2(i)], or
 in the imaginary form, after Jacobi's transformation: with the nome q' = exp(-pi K/K') and
 hyperbolic functions of x = y K/K' [DLMF 20.7(viii)].  The smaller nome is at most exp(-pi), so
-four terms reach 1e-19.  Positive constants that all series of a form share are left out.
+four terms reach 1e-19 and six 1e-39.  Positive constants that all series of a form share are left
+out.
 """
 
 from collections.abc import Sequence
 from decimal import Decimal
+from itertools import count, zip_longest
 from typing import NamedTuple
 
 from spinning_top_sim.solvers.decimal_math import ONE, ZERO
@@ -17,14 +19,25 @@ from spinning_top_sim.solvers.elliptic import GaussMean
 
 # What the terms of a series have in common: one of the four prefactors 1, cos y, sin y and
 # sin y cos y.  The rest of cos(n y) or sin(n y) is a polynomial in xi = sin^2 y [DLMF 4.21(iii)],
-# of which these are the coefficients, for n = 0, 2, 4, 6 or n = 1, 3, 5, 7.
+# of which these are the first two, for n = 0 and 2 or n = 1 and 3; f(n + 2) = (2 - 4 xi) f(n) -
+# f(n - 2).
 COS_EVEN, COS_ODD, SIN_ODD, SIN_EVEN = range(4)
-MULTIPLE_ANGLES = (
-    ((1,), (1, -2), (1, -8, 8), (1, -18, 48, -32)),
-    ((1,), (1, -4), (1, -12, 16), (1, -24, 80, -64)),
-    ((1,), (3, -4), (5, -20, 16), (7, -56, 112, -64)),
-    ((0,), (2,), (4, -8), (6, -32, 32)))
-MOST_TERMS = 4
+FIRST_POLYNOMIALS = ([1], [1, -2]), ([1], [1, -4]), ([1], [3, -4]), ([0], [2])
+MOST_TERMS = 6
+# That doubles need, and that states need which are handed over: motions between changes of the
+# vertical can be chaotic, and every error grows.
+DIGITS_OF_DOUBLES, DIGITS_HANDED_OVER = 19, 39
+
+
+def _polynomials(first: Sequence[int], second: Sequence[int]) -> list[Sequence[int]]:
+    rows = [first, second]
+    while len(rows) < MOST_TERMS:
+        rows.append([2 * a - 4 * b - c for a, b, c in zip_longest(
+            rows[-1], [0, *rows[-1]], rows[-2], fillvalue=0)])
+    return rows
+
+
+MULTIPLE_ANGLES = [_polynomials(*pair) for pair in FIRST_POLYNOMIALS]
 
 
 class Series(NamedTuple):
@@ -70,19 +83,22 @@ class ThetaForm:
     """
     The theta functions in the real or in the imaginary form.
 
+    digits : that the terms of the series reach
     mean : of which k is the modulus of the form: k^2 is m in the real and 1 - m in the imaginary
         form, and at most 1/2
+    size : coefficients of a polynomial that doubles need
     theta1 .. theta4 : the functions of y, or what the transformation makes of them
     odd_over_even : the factor that the transforms of theta1 and theta4 have lost, squared; those
         of theta2 and theta3 have not
     """
 
-    def __init__(self, mean: GaussMean, imaginary: bool) -> None:
+    def __init__(self, mean: GaussMean, imaginary: bool, digits: int) -> None:
         self.mean, self.imaginary = mean, imaginary
         q = mean.nome()
-        # Terms k, of size q^(k^2 - k/2) or less beside the first one, while they are above 1e-19.
-        terms = next((k for k in range(2, MOST_TERMS)
-                      if q ** (2 * k * k - k) < Decimal('1e-38')), MOST_TERMS)
+        # Terms k are of size q^(k^2 - k/2) or less beside the first one.
+        self.size, terms = (
+            next(k for k in count(2) if q ** (2 * k * k - k) < Decimal(10) ** (-2 * wanted))
+            for wanted in (DIGITS_OF_DOUBLES, digits))
         self._even = [ONE, *(2 * q ** (k * k) for k in range(1, terms))]
         self._odd = [q ** (k * (k + 1)) for k in range(terms)]
         self.theta1 = Series.of(SIN_ODD, _alternating(self._odd))

@@ -7,19 +7,15 @@ E. T. Whittaker, *Analytical Dynamics*, 4th ed., sect. 71 and 72; theta function
 Watson, *Modern Analysis*, ch. XXI; D. F. Lawden, *Elliptic Functions and Applications*; DLMF,
 https://dlmf.nist.gov, ch. 19, 20 and 22.
 
-1. *Nutation.*  u = cos(theta) obeys u'^2 = (2P/lambda1) (u - u1) (u2 - u) (u3 - u), P = M g R.
-   So u = u1 + (u2 - u1) sn^2(chi) [DLMF 22.13(i)], where chi grows at the constant rate w,
-   w^2 = P (u3 - u1)/(2 lambda1), with the parameter m = (u2 - u1)/(u3 - u1); m1 = 1 - m.
-   K = K(m) and K' = K(m1) are the quarter periods.
+docs/theta_functions.md derives the first two steps.
 
-2. *Attitude.*  The Cayley-Klein parameters
+1. *Nutation.*  u = cos(theta) = u1 + (u2 - u1) sn^2(chi) [DLMF 22.13(i)], where chi grows at the
+   constant rate w, w^2 = P (u3 - u1)/(2 lambda1), P = M g R, with the parameter
+   m = (u2 - u1)/(u3 - u1); m1 = 1 - m.  K = K(m) and K' = K(m1) are the quarter periods.
 
-       alpha = cos(theta/2) exp(i(phi+psi)/2),   beta = sin(theta/2) exp(i(phi-psi)/2)
-
-   have |alpha|^2 = (1 + u)/2 and |beta|^2 = (1 - u)/2.  alpha vanishes where u = -1, at
-   chi = ia; beta where u = 1, at chi = K + ib.  Here a and b are real [DLMF 22.6(iv)].  A quotient
-   of theta functions with these zeros and the poles of u differs from alpha or beta by a factor
-   exp(constant + constant * t).
+2. *Attitude.*  alpha vanishes where u = -1, at chi = ia; beta where u = 1, at chi = K + ib, with
+   real a and b [DLMF 22.6(iv)].  A quotient of theta functions with these zeros and the poles of u
+   differs from alpha or beta by a factor exp(constant + constant * t).
 
 3. *Phase.*  Z = chi/K counts quarter periods.  N is the nearest integer and y = (pi/2) (Z - N), so
    |y| <= pi/4.  By step 2, with the signs s of Lz + L3 for alpha and of Lz - L3 for beta,
@@ -53,6 +49,7 @@ from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.cubic import Roots, RootsTooCloseError, cubic_roots
 from spinning_top_sim.solvers.decimal_math import (
+    DIGITS,
     ONE,
     ZERO,
     asinh,
@@ -63,10 +60,17 @@ from spinning_top_sim.solvers.decimal_math import (
     sin_cos,
 )
 from spinning_top_sim.solvers.elliptic import GaussMean
-from spinning_top_sim.solvers.theta_series import COS_EVEN, NOTHING, Parts, Series, ThetaForm
+from spinning_top_sim.solvers.theta_series import (
+    COS_EVEN,
+    DIGITS_OF_DOUBLES,
+    MOST_TERMS,
+    NOTHING,
+    Parts,
+    Series,
+    ThetaForm,
+)
 
 DIGITS_TO_TRY = 60, 120, 240, 480
-DIGITS = 40             # that are left once nothing cancels any more
 NO_GRAVITY = Decimal('1e-1000')     # so small that u3 is infinite to all digits
 
 
@@ -100,6 +104,7 @@ class ThetaMotion:
     stretch : K/K', if the series are in the imaginary form, of x = stretch y
     quarter_rate : quarter periods per second, w/K
     quarter0, offset0 : N and 2y/pi at t = 0, offset0 accurate relative to itself
+    size : coefficients of each polynomial that doubles need
     u_dot, u_dot_series : c at even and at odd N, and theta1, of u' = c theta1(2y)/D^4
     """
 
@@ -113,22 +118,42 @@ class ThetaMotion:
     u_dot_series: Series = NOTHING
     m: Decimal = ZERO
     m1: Decimal = ONE
+    size: int = MOST_TERMS
 
 
-def set_up(top: Top, start: State, form: type[ThetaForm] = ThetaForm) -> ThetaMotion:
+class HalfAngles(NamedTuple):
     """
-    Return alpha and beta of the motion through `start` at t = 0, for the doubles as they are.
+    A state in long decimals; theta is in [0, pi/2].
 
-    form : of the series, which decides how many terms they have; the constants may be decimals
+    sin_half, theta_dot : of theta/2; [rad/s]
+    alpha_turns, beta_turns : (phi + psi)/2 and (phi - psi)/2 [turns]
+    l3, lz : [kg m^2/s]
+    """
+
+    sin_half: Decimal
+    theta_dot: Decimal
+    alpha_turns: Decimal
+    beta_turns: Decimal
+    l3: Decimal
+    lz: Decimal
+
+
+def set_up(top: Top, gravity: Decimal, start: State | HalfAngles,
+           digits: int = DIGITS_OF_DOUBLES) -> ThetaMotion:
+    """
+    Return alpha and beta of the motion through `start` at t = 0, for the numbers as they are.
+
+    gravity : instead of that of the top
+    digits : of the values of the series
 
     Raises ValueError if none of DIGITS_TO_TRY tell the roots of the cubic apart.  They are never
     equal: on the separatrix, or in steady precession with theta' != 0, cos(theta0) would be
     algebraic, and no double but 0 has an algebraic cosine.
     """
-    for digits in DIGITS_TO_TRY:
-        with precision(digits):
+    for tried in DIGITS_TO_TRY:
+        with precision(tried):
             try:
-                return _set_up(top, start, form)
+                return _set_up(top, gravity, start, digits)
             except RootsTooCloseError:
                 continue
             except (DecimalException, OverflowError) as error:
@@ -155,17 +180,22 @@ class _Side(NamedTuple):
     slope: Decimal
 
 
-def _set_up(top: Top, start: State, form_type: type[ThetaForm]) -> ThetaMotion:
-    torque = Decimal(top.mass) * Decimal(top.gravity) * Decimal(top.com_distance)
+def _set_up(top: Top, gravity: Decimal, start: State | HalfAngles, digits: int) -> ThetaMotion:
+    torque = Decimal(top.mass) * gravity * Decimal(top.com_distance)
     lambda1, lambda3 = Decimal(top.lambda1), Decimal(top.lambda3)
-    # Rounded now (+): a sum rounds its result, and -L3 must cancel Lz = L3 to the last digit.
-    theta, theta_dot, l3, lz = (
-        +Decimal(x) for x in (start.theta, start.theta_dot, start.l3, start.lz))
-    phi, psi = half_turns(start.phi), half_turns(start.psi)
-    sin_half, cos_half = sin_cos(theta / 2)
+    if isinstance(start, HalfAngles):
+        sin_half, theta_dot, alpha_turns, beta_turns, l3, lz = start
+        cos_half = (1 - sin_half * sin_half).sqrt()
+    else:
+        # Rounded now (+): a sum rounds its result, and -L3 must cancel Lz = L3 to the last digit.
+        theta, theta_dot, l3, lz = (
+            +Decimal(x) for x in (start.theta, start.theta_dot, start.l3, start.lz))
+        phi, psi = half_turns(start.phi), half_turns(start.psi)
+        alpha_turns, beta_turns = phi + psi, phi - psi
+        sin_half, cos_half = sin_cos(theta / 2)
     spin = l3 * (1 / lambda3 - 1 / lambda1)
-    sides = (_Side(lz + l3, spin, phi + psi, cos_half, -sin_half * theta_dot),
-             _Side(lz - l3, -spin, phi - psi, sin_half, cos_half * theta_dot))
+    sides = (_Side(lz + l3, spin, alpha_turns, cos_half, -sin_half * theta_dot),
+             _Side(lz - l3, -spin, beta_turns, sin_half, cos_half * theta_dot))
     f0, f1, f2, f3 = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     if not f0 and not f1:
         return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
@@ -173,7 +203,7 @@ def _set_up(top: Top, start: State, form_type: type[ThetaForm]) -> ThetaMotion:
     sense = -1 if torque < 0 else 1
     return _nutating(sides[::sense], lambda1, sense, (
         f0, sense * f1, f2, sense * f3 or NO_GRAVITY * abs(f2)),
-        falling=sense * theta_dot > 0, form_type=form_type)
+        falling=sense * theta_dot > 0, digits=digits)
 
 
 def _resting(side: _Side, lambda1: Decimal) -> Factor:
@@ -187,7 +217,7 @@ def _resting(side: _Side, lambda1: Decimal) -> Factor:
 
 def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int,
               cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool,
-              form_type: type[ThetaForm]) -> ThetaMotion:
+              digits: int) -> ThetaMotion:
     """Return a motion with P >= 0; with sense -1 that of which this is the mirror image."""
     roots, f3 = cubic_roots(*cubic), cubic[3]
     imaginary = roots.gap21 > roots.gap32
@@ -195,7 +225,7 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int,
     with precision(DIGITS):
         a, g, c = roots.gap31.sqrt(), roots.gap32.sqrt(), roots.gap21.sqrt()
         mean = GaussMean(a, g, c)
-        form = form_type(GaussMean(a, c, g) if imaginary else mean, imaginary)
+        form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary, digits)
         quarter0, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
         stretch = form.mean.mean / mean.mean if imaginary else None
         sin = form.mean.amplitude(square, 1 if imaginary else -1)
@@ -217,7 +247,7 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int,
             # w/K, where w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
             quarter_rate=f3.sqrt() * mean.mean / pi(), quarter0=quarter0, offset0=y0 * 2 / pi(),
             u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
-            m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31)
+            m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31, size=form.size)
 
 
 class _Pole(NamedTuple):

@@ -66,13 +66,13 @@ class ThetaFunctions:
         self.stretch = QUARTER * float(motion.stretch) if motion.stretch else None
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
-        self.coefficients = _coefficients(rows)
+        self.coefficients = _coefficients(rows, motion.size)
         self.real = [k for k, factor in enumerate(factors) if not factor.sense]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
                       if SIN_ODD in pair}
         _check_amplitudes(motion)
         self.u_dot = np.array([in_range("cos(theta)'", x) for x in motion.u_dot])
-        self.u_dot_coefficients = _coefficients([[motion.u_dot_series]])[:, 0]
+        self.u_dot_coefficients = _coefficients([[motion.u_dot_series]], motion.size)[:, 0]
         # The rows where y = 0, at N = 0 and N = 1.
         alpha, beta, alpha_imag, beta_imag = np.where(
             np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
@@ -156,7 +156,6 @@ class ThetaValues:
 
     @cached_property
     def half_theta(self) -> Matrix:
-        """Cosine and sine of theta/2, (2, n)."""
         alpha, beta = self.moduli
         scale: Column = 1.0 / np.sqrt(alpha * alpha + beta * beta)
         return self.moduli * scale
@@ -175,7 +174,6 @@ class ThetaValues:
 
     @cached_property
     def quaternion(self) -> Matrix:
-        """x, y, z, w (4, n)."""
         real, imag = self._alpha_beta
         squares = self._real * self._real + self._imag * self._imag
         scale = 1.0 / np.sqrt(squares[0] + squares[1])
@@ -211,7 +209,6 @@ class ThetaValues:
 
     @cached_property
     def theta_dot(self) -> Column:
-        """[rad/s]."""
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.
         constants, xi, (alpha, beta) = self._constants, self._xi, self.moduli
         if not constants.u_dot.any():
@@ -259,11 +256,12 @@ def _check_amplitudes(motion: ThetaMotion) -> None:
                     f'to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
 
 
-def _coefficients(rows: Sequence[Sequence[Series]]) -> NDArray[np.float64]:
+def _coefficients(rows: Sequence[Sequence[Series]], most: int) -> NDArray[np.float64]:
     """Return the polynomials' coefficients in doubles, highest of at least 2 powers first."""
-    size = max(2, *(len(x.polynomial) for row in rows for x in row))
-    return np.array([[(size - len(x.polynomial)) * [0.0] + [*map(float, x.polynomial[::-1])]
-                      for x in row] for row in rows]).transpose(2, 0, 1)
+    size = max(2, *(len(x.polynomial[:most]) for row in rows for x in row))
+    doubles = [[[*map(float, x.polynomial[:most])] for x in row] for row in rows]
+    return np.array([[(size - len(x)) * [0.0] + x[::-1] for x in row] for row in doubles]
+                    ).transpose(2, 0, 1)
 
 
 def _column(values: Iterable[float]) -> Matrix:

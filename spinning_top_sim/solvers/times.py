@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number
-from spinning_top_sim.solvers.decimal_math import double_double
+from spinning_top_sim.solvers.decimal_math import DIGITS, double_double, precision
 
 NANOSECONDS = 1_000_000_000
 UNITS = {'s': Decimal(1), 'ns': Decimal('1e-9')}
@@ -67,12 +67,10 @@ class Times:
 
     @classmethod
     def from_seconds(cls, t: Column) -> Times:
-        """Return the times of doubles [s]."""
         return cls('s', t.copy(), 0.0, float(np.abs(t).max(initial=0.0)))
 
     @property
     def seconds(self) -> Column:
-        """(n,) [s]."""
         return self.high if self.unit == 's' else self.high / 1e9 + self.low / 1e9
 
     def __len__(self) -> int:
@@ -87,15 +85,21 @@ class Rates:
     """k rates [1/s] as two doubles each: their products with times have no error that grows."""
 
     def __init__(self, per_second: Sequence[Decimal]) -> None:
+        self._per_second = per_second
         # (k, 1) by unit: nearest doubles, their halves, and what they leave out
-        self._constants = {}
-        for unit, scale in UNITS.items():
-            high, low = np.array([double_double(rate * scale) for rate in per_second]).T
-            rates = high[:, np.newaxis]
-            self._constants[unit] = rates, *halves(rates), low[:, np.newaxis]
+        self._constants: dict[str, tuple[NDArray[np.float64], ...]] = {}
+
+    def _add(self, unit: str) -> None:
+        with precision(DIGITS):
+            high, low = np.array([
+                double_double(rate * UNITS[unit]) for rate in self._per_second]).T
+        rates = high[:, np.newaxis]
+        self._constants[unit] = rates, *halves(rates), low[:, np.newaxis]
 
     def products(self, times: Times) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return rate * t, (k, n), as nearest doubles and what they leave out."""
+        if times.unit not in self._constants:
+            self._add(times.unit)
         rate, r1, r2, rate_low = self._constants[times.unit]
         t1, t2 = halves(times.high)
         high = rate * times.high

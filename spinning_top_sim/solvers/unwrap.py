@@ -87,5 +87,4 @@ class PhaseUnwrapper:
             unwrap, phases, self.begins[:, -1], self.momenta)]), axis=1)
 
     def forget(self, count: int) -> None:
-        """Forget the oldest steps."""
         self.begins = self.begins[:, count:].copy()

@@ -10,10 +10,12 @@ rounding, and the phase would drift by that much times the angle that follows.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
-from typing import NamedTuple, cast
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,13 +23,26 @@ from spinning_top_sim.physics.attitude import Quaternion
 from spinning_top_sim.physics.pivot import Exact
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.decimal_math import ONE, ZERO, atan2, pi, precision, sin_cos
+from spinning_top_sim.solvers.decimal_math import (
+    DIGITS,
+    ONE,
+    ZERO,
+    atan2,
+    pi,
+    precision,
+    sin_cos,
+)
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.theta_long import LongForm, short
-from spinning_top_sim.solvers.theta_series import SIN_ODD
-from spinning_top_sim.solvers.theta_setup import DIGITS_TO_TRY, Factor, ThetaMotion, set_up
+from spinning_top_sim.solvers.theta_series import DIGITS_HANDED_OVER, SIN_ODD
+from spinning_top_sim.solvers.theta_setup import (
+    DIGITS_TO_TRY,
+    Factor,
+    HalfAngles,
+    ThetaMotion,
+    set_up,
+)
 
-DIGITS = DIGITS_TO_TRY[0]
+MOST_DIGITS = DIGITS_TO_TRY[0]
 # An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
 # as this has zeros.
 POLE = Decimal('1e-30')
@@ -51,34 +66,6 @@ class Posture(NamedTuple):
     beta: Complex
     across: Complex
     l3: float
-
-
-class LongTop(NamedTuple):
-    """The constants of `Top` in long decimals."""
-
-    lambda1: Decimal
-    lambda3: Decimal
-    mass: Decimal
-    com_distance: Decimal
-    gravity: Decimal
-
-
-class LongState(NamedTuple):
-    """The fields of `State` in long decimals; theta is in [0, pi/2]."""
-
-    theta: Decimal
-    theta_dot: Decimal
-    phi: Decimal
-    psi: Decimal
-    l3: Decimal
-    lz: Decimal
-
-    def rounded(self) -> State:
-        """Return the state in doubles."""
-        theta, lz = float(self.theta), float(self.lz)
-        return State(theta=theta, theta_dot=float(self.theta_dot), phi=float(self.phi),
-                     psi=float(self.psi), l3=float(self.l3),
-                     lz=lz if theta else float(self.l3))
 
 
 class Vertical:
@@ -119,38 +106,37 @@ class Vertical:
         qx, qy, qz, qw = (np.array([float(part)]) for part in parts)
         self.rows: Quaternion = qx, qy, qz, qw
 
-    def start(self, top: Top, posture: Posture) -> LongState:
+    def start(self, top: Top, posture: Posture) -> HalfAngles:
         """Return a posture as a state in this frame."""
         alpha, beta = _product(_inverse(self.alpha, self.beta), (posture.alpha, posture.beta))
         cosine2, sine2 = _square(alpha), _square(beta)
-        size = (cosine2 + sine2).sqrt()
-        cosine, sine = cosine2.sqrt() / size, sine2.sqrt() / size
-        l3, half_sum = Decimal(posture.l3), atan2(alpha[1], alpha[0])
+        size2 = cosine2 + sine2
+        cosine2, sine2 = cosine2 / size2, sine2 / size2
+        sine, l3, turn = sine2.sqrt(), Decimal(posture.l3), 2 * pi()
+        half_sum = atan2(alpha[1], alpha[0])
         o1, o2 = posture.across
         if 2 * sine < POLE:         # all the motion of the axis is nutation: psi from omega
             theta_dot = _square(posture.across).sqrt()
             psi = atan2(o1, o2) if theta_dot else ZERO
-            return LongState(ZERO, theta_dot, 2 * half_sum - psi, psi, +l3, +l3)
-        half_difference = atan2(beta[1], beta[0])
+            return HalfAngles(ZERO, theta_dot, half_sum / turn, (half_sum - psi) / turn, +l3, +l3)
         # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
         # + i theta') exp(-i psi)
-        turn = _times(alpha, (beta[0], -beta[1]))
-        minus_across, theta_dot = _times(posture.across, turn)
-        unit = (cosine2 * sine2).sqrt()
+        minus_across, theta_dot = _times(posture.across, _times(alpha, (beta[0], -beta[1])))
+        half_tilt = (cosine2 * sine2).sqrt()
+        tilt, unit = 2 * half_tilt, half_tilt * size2
         lambda1 = Decimal(top.lambda1)
-        tilt = 2 * sine * cosine
         lz = (1 - 2 * sine2) * l3 - lambda1 * minus_across / unit * tilt
         fastest = (_square(posture.across) + abs(self.gravity * Decimal(top.mass) * Decimal(
             top.com_distance)) / lambda1).sqrt()
         for pole in (l3, -l3):
             if abs(lz - pole) <= THROUGH * tilt * (abs(l3) * tilt + lambda1 * fastest):
                 lz = +pole
-        return LongState(2 * atan2(sine, cosine), theta_dot / unit, half_sum + half_difference,
-                         half_sum - half_difference, +l3, lz)
+        return HalfAngles(sine, theta_dot / unit, half_sum / turn,
+                          atan2(beta[1], beta[0]) / turn, +l3, lz)
 
     def top(self, top: Top) -> Top:
         """Return the top in the effective gravity."""
-        return replace(top, gravity=float(self.gravity))
+        return _in_gravity(top, float(self.gravity))
 
 
 class AcceleratedMotion(ExactSolution):
@@ -171,22 +157,13 @@ class AcceleratedMotion(ExactSolution):
     """
 
     def __init__(self, top: Top, posture: Posture, acceleration: Exact) -> None:
-        with precision(DIGITS):
-            self.vertical = Vertical(top.gravity, acceleration, posture)
-            long_start = self.vertical.start(top, posture)
-            long_top = LongTop(
-                Decimal(top.lambda1), Decimal(top.lambda3), Decimal(top.mass),
-                Decimal(top.com_distance), self.vertical.gravity)
-        self._posture = posture
+        self.vertical, start = about_vertical(top, posture, acceleration)
+        self.top, self.start = self.vertical.top(top), rounded(start)
+        self._posture, self._momenta = posture, (start.l3, start.lz)
         self._turns, self._sign, self._half_turn = 0, 1.0, 0.0
-        # All that follows turns these into decimals.
-        self.top, self.start = cast(Top, long_top), cast(State, long_start)
-        self._motion = set_up(self.top, self.start, LongForm)
-        self._long = long_top, long_start
+        self._motion = set_up(top, self.vertical.gravity, start, DIGITS_HANDED_OVER)
         with precision(DIGITS):
-            self._take_constants(short(self._motion))
-        self.top = self.vertical.top(top)
-        self.start = long_start.rounded()
+            self._take_constants(self._motion, *self._momenta)
         self._check_start()
 
     def posture(self, ns: int) -> Posture:
@@ -197,24 +174,40 @@ class AcceleratedMotion(ExactSolution):
         """
         if not ns:                  # perhaps at a pole, where the axis does not tell its rates
             return self._posture
-        with precision(DIGITS):
-            vertical, (top, start) = self.vertical, self._long
+        with precision(DIGITS + 2):
+            vertical = self.vertical
             alpha, beta, u_dot = _cayley_klein(self._motion, Decimal(ns).scaleb(-9))
-            across = _across(top, start, alpha, beta, u_dot)
+            across = _across(Decimal(self.top.lambda1), *self._momenta, alpha, beta, u_dot)
             alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
-            return Posture(alpha, beta, across, float(start.l3))
+            return Posture(alpha, beta, across, self.start.l3)
 
 
-def about_vertical(top: Top, posture: Posture, acceleration: Exact) -> tuple[Vertical, State]:
-    """Return the vertical while the pivot accelerates so, and the state there in doubles."""
-    with precision(DIGITS):
+@lru_cache(16)
+def _in_gravity(top: Top, gravity: float) -> Top:
+    return replace(top, gravity=gravity)
+
+
+def about_vertical(top: Top, posture: Posture, acceleration: Exact,
+                   ) -> tuple[Vertical, HalfAngles]:
+    """Return the vertical while the pivot accelerates so, and the state there."""
+    with precision(MOST_DIGITS):
         vertical = Vertical(top.gravity, acceleration, posture)
-        return vertical, vertical.start(top, posture).rounded()
+        return vertical, vertical.start(top, posture)
+
+
+def rounded(start: HalfAngles) -> State:
+    """Return a state in doubles."""
+    sine, alpha, beta, l3 = (
+        float(x) for x in (start.sin_half, start.alpha_turns, start.beta_turns, start.l3))
+    return State(
+        theta=min(2.0 * math.asin(sine), 0.5 * math.pi), theta_dot=float(start.theta_dot),
+        phi=math.tau * (alpha + beta), psi=math.tau * (alpha - beta), l3=l3,
+        lz=float(start.lz) if sine else l3)
 
 
 def posture_of(top: Top, state: State) -> Posture:
     """Return the posture of a state about the vertical of the world."""
-    with precision(DIGITS):
+    with precision(MOST_DIGITS):
         sine, cosine = sin_cos(Decimal(state.theta) / 2)
         phi, psi = +Decimal(state.phi), +Decimal(state.psi)
         (s_sum, c_sum), (s_difference, c_difference), (s_psi, c_psi) = (
@@ -239,7 +232,7 @@ def posture_at(states: States) -> Posture:
 
 def _reduced(angle: Decimal) -> Decimal:
     """Return an angle less whole turns [rad]."""
-    with precision(DIGITS + max(0, angle.adjusted())):
+    with precision(MOST_DIGITS + max(0, angle.adjusted())):
         return angle.remainder_near(2 * pi())
 
 
@@ -278,18 +271,18 @@ def _factor(factor: Factor, whole: int, y: Decimal, t: Decimal,
     return _times((real, imag), (cosine, sine))
 
 
-def _across(top: LongTop, start: LongState, alpha: Complex, beta: Complex,
+def _across(lambda1: Decimal, l3: Decimal, lz: Decimal, alpha: Complex, beta: Complex,
             u_dot: Decimal) -> Complex:
     """Return omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta))."""
     cosine2, sine2 = _square(alpha), _square(beta)
     if not (cosine2 and sine2):
         return ZERO, ZERO           # it rests at a pole
     # Lz - L3 u, without cancellation at either pole
-    momentum = ((start.lz - start.l3) + 2 * start.l3 * sine2 if sine2 < cosine2
-                else (start.lz + start.l3) - 2 * start.l3 * cosine2)
+    momentum = ((lz - l3) + 2 * l3 * sine2 if sine2 < cosine2
+                else (lz + l3) - 2 * l3 * cosine2)
     # 1/(alpha conj(beta)) = conj(alpha) beta/|alpha beta|^2
     inverse = _scaled(-1 / (2 * cosine2 * sine2), _times((alpha[0], -alpha[1]), beta))
-    return _times((momentum / top.lambda1, u_dot), inverse)
+    return _times((momentum / lambda1, u_dot), inverse)
 
 
 def _sinh(x: Decimal) -> Decimal:

@@ -3,8 +3,8 @@
 The bandwidth of a sensor: a low pass of the true signal, as data sheets state it.
 
 A reading is the convolution of the signal with the impulse response of the analog filter, by
-Gauss-Legendre panels over the time that the filter remembers.  It needs no state that is carried
-along, so it depends on its own time only.
+Gauss-Legendre panels over the time that the filter remembers.  Each segment of the motion begins
+with the state of the filter there, so a reading depends on its own time only.
 """
 
 import math
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.integrals import fastest_rate
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams.path import Path, Segment
+from spinning_top_sim.streams.path import Segment
 
 # The filter forgets what is older than so many time constants: e^-25 = 1e-11 is left.
 TIME_CONSTANTS = 25.0
@@ -43,6 +43,7 @@ class LowPass:
     def __init__(self, frequency: float, order: int) -> None:
         self._corner, self._order = math.tau * frequency, order
         self._decay = self._corner / (1.0 if order == 1 else math.sqrt(2.0))
+        self._gain = order * self._decay        # of the last part of the state
         self.memory_ns = math.ceil(1e9 * TIME_CONSTANTS / self._decay)
         nodes, weights = np.polynomial.legendre.leggauss(NODES)
         self._nodes, self._weights = 0.5 * (1.0 + nodes), 0.5 * weights
@@ -53,23 +54,19 @@ class LowPass:
         return np.asarray(1.0 / (
             1.0 + s if self._order == 1 else 1.0 + math.sqrt(2.0) * s + s * s), np.complex128)
 
-    def filtered(self, path: Path, times: range, signal: Signal) -> NDArray[np.float64]:
+    def filtered(self, segment: Segment, times: range, signal: Signal) -> NDArray[np.float64]:
         """Return the filtered signal at times [ns] within a segment, (columns, n)."""
         # Samples that see this segment alone have the same nodes.
-        start_ns = path.after(times.start).start_ns
-        mixed = len(range(times.start, start_ns + self.memory_ns, times.step))
-        parts = [self._sum(path, part, signal) for part in (times[:mixed], times[mixed:])
-                 if len(part)]
-        return np.concatenate(parts, axis=1)
-
-    def _sum(self, path: Path, times: range, signal: Signal) -> NDArray[np.float64]:
-        oldest_ns = max(times[0] - self.memory_ns, 0)
-        pieces = path.pieces(oldest_ns, times[-1] + 1)
-        together = max(1, MOST_TOGETHER // max(
-            NODES * len(self._edges(segment)) for segment, _, _ in pieces))
+        mixed = len(range(times.start, segment.start_ns + self.memory_ns, times.step))
+        together = max(1, MOST_TOGETHER // (NODES * len(self._edges(segment))))
         return np.concatenate([
-            sum(self._piece(np.array(times[begin:begin + together]), *piece, signal)
-                for piece in pieces) for begin in range(0, len(times), together)], axis=1)
+            self._state(segment, np.array(part[begin:begin + together]), signal, 1)[-1]
+            for part in (times[:mixed], times[mixed:])
+            for begin in range(0, len(part), together)], axis=1) * self._gain
+
+    def carried(self, segment: Segment, until_ns: int, signal: Signal) -> NDArray[np.float64]:
+        """Return the state of the filter where another segment follows (parts, columns, 1)."""
+        return self._state(segment, np.array([until_ns]), signal, self._order)
 
     def _edges(self, segment: Segment) -> NDArray[np.float64]:
         """Return how long before a sample the panels begin and end [ns], (panels + 1, 1)."""
@@ -79,40 +76,49 @@ class LowPass:
         panels = min(math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS)
         return np.linspace(0.0, self.memory_ns, panels + 1)[:, np.newaxis]
 
-    def _piece(self, t_ns: NDArray[np.int64], segment: Segment, from_ns: int, until_ns: int,
-               signal: Signal) -> NDArray[np.float64]:
-        """Return what the signal between two times contributes to each sample."""
-        memory_ns = np.minimum(t_ns, self.memory_ns)
-        newest = np.clip(t_ns - until_ns, 0, memory_ns)
-        oldest = np.clip(t_ns - from_ns, 0, memory_ns)
-        if newest.max() == 0 and oldest.min() == self.memory_ns:    # the same for all samples
-            memory_ns, newest, oldest = memory_ns[:1], newest[:1], oldest[:1]
-        edges = np.clip(self._edges(segment), newest, oldest)
+    def _state(self, segment: Segment, t_ns: NDArray[np.int64], signal: Signal,
+               parts: int) -> NDArray[np.float64]:
+        """
+        Return the last parts of the filter's state at times, (parts, columns, n).
+
+        The state is the integral of the signal times exp(p t), t ago, with the pole p of the
+        filter, as its real and, of second order, its imaginary part.
+
+        t_ns : within the segment, all less than `memory_ns` after its start, or none of them
+        """
+        back_ns = np.minimum(t_ns - segment.start_ns, self.memory_ns)
+        carried = segment.filtered if t_ns[0] < segment.start_ns + self.memory_ns else None
+        if back_ns.min() == self.memory_ns:     # the same for all samples
+            back_ns = back_ns[:1]
+        edges = self._edges(segment)
+        edges = np.minimum(edges[:1 + np.searchsorted(edges[:, 0], back_ns.max())], back_ns)
         lengths = np.diff(edges, axis=0)[:, np.newaxis]
         before = (edges[:-1, np.newaxis] + lengths * self._nodes[:, np.newaxis]).reshape(
-            -1, len(newest))
-        weights = (lengths * self._weights[:, np.newaxis]).reshape(before.shape)
-        weights = 1e-9 * weights * self._impulse_response(1e-9 * before)
-        # What is older than the memory, or than the start, is the value there.
-        first_ns = t_ns[:len(memory_ns)] - memory_ns
-        begins_here = (from_ns <= first_ns) & (first_ns < until_ns)
-        rest = np.where(begins_here, self._rest(1e-9 * memory_ns), 0.0)
-        before, weights = np.vstack((before, oldest)), np.vstack((weights, rest))
-        at_ns = t_ns - np.rint(before).astype(np.int64)
+            -1, len(back_ns))
+        weights = 1e-9 * (lengths * self._weights[:, np.newaxis]).reshape(before.shape)
+        kernels = [weights * part for part in self._kernel(1e-9 * before)[-parts:]]
+        at_ns = t_ns - np.rint(np.vstack((before, back_ns))).astype(np.int64)
         unique, places = np.unique(at_ns, return_inverse=True)
         values = signal(segment.own_states(unique))[:, places.reshape(at_ns.shape)]
-        total = np.zeros((len(values), len(t_ns)))
-        for node in range(len(weights)):        # in one order, however many samples there are
-            total += weights[node] * values[:, node]
-        return total
+        # Before that the signal has been what it is there, unless its history is known.
+        first = (np.stack(self._order * [values[:, -1] / (self._order * self._decay)])
+                 if carried is None else carried)
+        totals = self._later(first, 1e-9 * back_ns)[-parts:]
+        for node in range(len(before)):         # in one order, however many samples there are
+            totals = [total + kernel[node] * values[:, node]
+                      for total, kernel in zip(totals, kernels, strict=True)]
+        return np.stack(totals)
 
-    def _impulse_response(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _kernel(self, seconds: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Return real and, of second order, imaginary part of exp(p t)."""
         angle = self._decay * seconds
-        factor = 1.0 if self._order == 1 else 2.0 * np.sin(angle)
-        return self._decay * factor * np.exp(-angle)
+        fade = np.exp(-angle)
+        return [fade] if self._order == 1 else [fade * np.cos(angle), fade * np.sin(angle)]
 
-    def _rest(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the integral of the impulse response from a time on."""
-        angle = self._decay * seconds
-        factor = 1.0 if self._order == 1 else np.cos(angle) + np.sin(angle)
-        return factor * np.exp(-angle)
+    def _later(self, state: NDArray[np.float64], seconds: NDArray[np.float64],
+               ) -> list[NDArray[np.float64]]:
+        """Return what is left of a state after a time."""
+        real, *imag = self._kernel(seconds)
+        if not imag:
+            return [real * state[0]]
+        return [real * state[0] - imag[0] * state[1], real * state[1] + imag[0] * state[0]]

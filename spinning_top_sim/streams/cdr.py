@@ -39,7 +39,6 @@ class CdrWriter:
         self.fields: list[tuple[int, int]] = []
 
     def append(self, code: str, *values: float) -> Self:
-        """Append numbers of one type, a code of `struct`."""
         if values:
             size = struct.calcsize('<' + code)
             self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
@@ -47,7 +46,6 @@ class CdrWriter:
         return self
 
     def field(self, count: int) -> Self:
-        """Append a field of doubles."""
         self.append('d', *(count * (0.0,)))
         self.fields.append((len(self.buffer) - 8 * count, count))
         return self
@@ -59,7 +57,6 @@ class CdrWriter:
         return self
 
     def string(self, *texts: str) -> Self:
-        """Append strings."""
         for text in texts:
             data = text.encode() + b'\0'
             self.append('I', len(data))
@@ -67,7 +64,6 @@ class CdrWriter:
         return self
 
     def header(self, frame_id: str) -> Self:
-        """Append a std_msgs/Header."""
         return self.stamp().string(frame_id)
 
 
@@ -97,7 +93,6 @@ class Template:
                          'itemsize': len(self._buffer)})
 
     def __len__(self) -> int:
-        """Return the size of every message [bytes]."""
         return len(self._buffer)
 
     def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
@@ -118,7 +113,6 @@ class Template:
         return rows.view(np.uint8).reshape(count, len(self))
 
     def encode_one(self, stamp_ns: int, *values: Field) -> bytes:
-        """Return one message; see `encode`."""
         return self.encode(np.array([stamp_ns]), *values).tobytes()
 
     def decode(self, data: bytes | NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:

@@ -41,19 +41,18 @@ class Gnss(Stream):
         self._seed, self._is_exact = values['seed'], is_exact
         level, vertical = values[self._noise]
         self._deviation = np.array([[level], [level], [vertical]]) * (not is_exact)
-        self._latency_ns = 0 if is_exact else round(values['gnss.latency'] * NANOSECONDS)
+        self.late_ns = 0 if is_exact else round(values['gnss.latency'] * NANOSECONDS)
         # Begin and end of each outage, in turn; an odd number of them is past within an outage.
         self._edges_ns = np.rint(np.array(() if is_exact else values['gnss.outages'])
                                  * NANOSECONDS).astype(np.int64)
 
     def times(self, after_ns: int, until_ns: int) -> range:
         """Return the times after `after_ns` and up to `until_ns` at which messages are sent."""
-        late_ns = self._latency_ns
-        valid = super().times(max(after_ns - late_ns, -1), until_ns - late_ns)
-        return range(valid.start + late_ns, valid.stop + late_ns, valid.step)
+        valid = super().times(max(after_ns - self.late_ns, -1), until_ns - self.late_ns)
+        return range(valid.start + self.late_ns, valid.stop + self.late_ns, valid.step)
 
     def encode(self, samples: Samples) -> Encoded:
-        valid_ns = samples.t_ns - self._latency_ns
+        valid_ns = samples.t_ns - self.late_ns
         return self._sent(samples.t_ns, samples.epoch_ns + valid_ns, self._measured(
             samples, valid_ns), np.searchsorted(self._edges_ns, valid_ns, 'right') % 2 == 1)
 
@@ -114,6 +113,8 @@ class Velocity(Gnss):
         level, vertical = (0.0, 0.0) if is_exact else values[self._noise]
         super().__init__(values, topic, messages.twist_with_covariance(
             values['world_frame'], (level ** 2, level ** 2, vertical ** 2)), is_exact=is_exact)
+        edges_ns = self._edges_ns.tolist()
+        self.silences_ns = list(zip(edges_ns[::2], edges_ns[1::2], strict=True))
 
     def _sent(self, t_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64], measured: Vector,
               is_out: NDArray[np.bool_]) -> Encoded:

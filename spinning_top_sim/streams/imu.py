@@ -14,6 +14,7 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
@@ -23,6 +24,7 @@ from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.bandwidth import LowPass
 from spinning_top_sim.streams.intervals import Intervals
 from spinning_top_sim.streams.parameters import BY_NAME, IDENTITY
+from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Samples, period_ns
 from spinning_top_sim.streams.vibration import Vibration
 
@@ -62,7 +64,6 @@ class Imu:
 
     @property
     def present_sensor(self) -> 'Sensor':
-        """The sensor at the present rate."""
         return self.sensor(self.intervals.length_ns)
 
     def set_rate(self, rate: float, now_ns: int) -> bool:
@@ -119,9 +120,16 @@ class Imu:
     def _filtered(self, samples: Samples) -> tuple[Vector, Vector]:
         assert self._low_pass is not None
         w1, w2, w3, f1, f2, f3 = self._low_pass.filtered(
-            samples.path, samples.times, lambda states: np.stack(np.broadcast_arrays(
-                *itertools.chain(*self.true(states)))))
+            samples.segment, samples.times, self._signal)
         return (w1, w2, w3), (f1, f2, f3)
+
+    def _signal(self, states: States) -> NDArray[np.float64]:
+        return np.stack(np.broadcast_arrays(*itertools.chain(*self.true(states))))
+
+    def carry(self, before: Segment, after: Segment) -> None:
+        """Let a segment begin with the state of the filter at the end of the one before it."""
+        if self._low_pass is not None:
+            after.filtered = self._low_pass.carried(before, after.start_ns, self._signal)
 
     def measured_increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
         """Return `increments` with the errors of the sensor and its vibration."""
@@ -158,7 +166,6 @@ class Imu:
         return (x, y, z), self.orientation(states), self.from_body((v1, v2, v3))
 
     def from_body(self, vector: Vector) -> Vector:
-        """Return a vector in the frame of the IMU."""
         # The mounting is q(body <- IMU), and `in_body` applies the inverse of its argument.
         return attitude.in_body(self._mounting, vector) if self._is_rotated else vector
 
@@ -250,7 +257,6 @@ class Sensor:
                 (v1 + f1, v2 + f2, v3 + f3))
 
     def bias(self, times: range) -> tuple[Vector, Vector]:
-        """Return the bias [rad/s], [m/s^2] at these times [ns]."""
         _, (w1, w2, w3, f1, f2, f3) = self._noise.at(times)
         return (w1, w2, w3), (f1, f2, f3)
 

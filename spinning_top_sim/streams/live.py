@@ -2,16 +2,9 @@
 """
 A simulation that sends its samples in time.
 
-Of the times, two move on; both count from the start [ns]:
-
-    0 -------- now_ns -------------- computed_ns -----> t
-       sent             in the queue
-
-    now_ns       samples up to here are sent
-    computed_ns  samples up to here are sent, or computed ahead and in the queue
-
-`advance` moves `now_ns` to the time that is due, `prepare` moves `computed_ns` ahead of it.  All
-that changes samples after `now_ns` empties the queue.
+Samples up to `now_ns` are sent, those up to `computed_ns` are sent or in the queue.  `advance`
+moves the one to the time that is due, `prepare` the other ahead of it.  All that changes samples
+after `now_ns` empties the queue.
 """
 
 import contextlib
@@ -186,7 +179,6 @@ class LiveSimulation(Simulation):
             self._work, self.computed_ns, self._block = None, self.now_ns, SMALLEST_BLOCK
 
     def _send(self, t_ns: int, instant: Instant, publish_from_ns: int) -> None:
-        """Record the messages of a time, then publish them."""
         if instant.entries:
             self._write(instant.entries, instant.size)
         self.now_ns = t_ns
@@ -214,7 +206,6 @@ class LiveSimulation(Simulation):
         return min((count - 1) * shortest_ns, span_of(streams, MOST_BYTES, NEVER_NS))
 
     def _begin_block(self, used: Sequence[Output], until_ns: int) -> None:
-        """Begin a block up to a time, or the largest one."""
         until_ns = min(until_ns, self.computed_ns + self._span_ns(used, LARGEST_BLOCK))
         self.path.release(self.now_ns)
         self._work = blocks(self.path, [output.stream for output in used], self.epoch_ns,
@@ -237,7 +228,6 @@ class LiveSimulation(Simulation):
         return True
 
     def _append(self, block: Block) -> None:
-        """Put a block into the queue, in the order of time."""
         instants: defaultdict[int, Instant] = defaultdict(Instant)
         epoch_ns = self.epoch_ns
         for stream, times_ns, rows in block.parts:

@@ -63,7 +63,6 @@ class Parameter:
         return self.default is None or isinstance(self.default, float)
 
     def describe(self, range_too: bool = True) -> str:
-        """Return text, unit, range and effect in one line."""
         return '; '.join(filter(None, (
             self.text + (f' [{self.unit}]' if self.unit else ''),
             self.allowed if range_too and (self.choices or self._bounds()) else '',
@@ -76,7 +75,6 @@ class Parameter:
 
     @property
     def allowed(self) -> str:
-        """The allowed values, in words."""
         if self.choices:
             return f'must be one of {", ".join(self.choices)}'
         kind = {bool: 'true or false', int: 'an integer', str: 'a string', float: 'a number',

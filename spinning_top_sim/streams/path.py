@@ -53,12 +53,14 @@ class Segment:
     ride : what the pivot does; None while it rests at the origin
     reached_ns : time up to which the solver needs no further steps
     energy, l3, lz : constants of the motion, at its start
+    filtered : state of the low pass of the IMU at the start; None without one, or from t = 0 on
     """
 
     def __init__(self, solver: Propagator, start: State, start_ns: int,
                  ride: Ride | None = None) -> None:
         self.solver, self.start, self.start_ns, self.ride = solver, start, start_ns, ride
         self.reached_ns = start_ns + solver.reached_ns
+        self.filtered: NDArray[np.float64] | None = None
         self._first = solver.states(range(1))
         self.energy, self.l3, self.lz = float(self._first.energy[0]), start.l3, start.lz
 
@@ -145,13 +147,15 @@ class Path:
     The segments of a run, in order.
 
     follow : returns the segment behind the end of one; raises ValueError if there is none
+    carry : lets a segment begin with what the one before it leaves
     keep_ns : how long a segment is kept after its end [ns]
     keep_steps_ns : `release` keeps the integration steps of this time before its argument [ns]
     """
 
-    def __init__(self, first: Segment, follow: Callable[[Segment], Segment], *, keep_ns: int,
+    def __init__(self, first: Segment, follow: Callable[[Segment], Segment],
+                 carry: Callable[[Segment, Segment], None], *, keep_ns: int,
                  keep_steps_ns: int) -> None:
-        self._segments, self._follow = [first], follow
+        self._segments, self._follow, self._carry = [first], follow, carry
         self._gone_steps = self._gone_evaluations = 0       # of segments that are forgotten
         self._keep_ns, self.keep_steps_ns = keep_ns, keep_steps_ns
 
@@ -191,6 +195,7 @@ class Path:
         return bool(late)
 
     def _append(self, segment: Segment) -> None:
+        self._carry(self._segments[-1], segment)
         oldest_ns = segment.start_ns - max(self._keep_ns, self.keep_steps_ns)
         ends = [later.start_ns for later in self._segments[1:]] + [segment.start_ns]
         self._forget([one for one, end_ns in zip(self._segments, ends, strict=True)
@@ -210,25 +215,21 @@ class Path:
 
     def exact_points(self, times_ns: NDArray[np.int64], along: float) -> NDArray[np.float64]:
         """Return where a point of the axis is at ascending times (n,) [ns], (n, 3)."""
+        return np.concatenate([np.stack(segment.exact_point(times, along), axis=-1)
+                               for segment, times in self._shares(times_ns)])
+
+    def _shares(self, times_ns: NDArray[np.int64]) -> list[tuple[Segment, NDArray[np.int64]]]:
+        """Return the segments at ascending times (n,) [ns], with those of each."""
         # A segment ends with the command that begins the next one, that instant included.
         ends = np.searchsorted(times_ns, [one.start_ns for one in self._segments[1:]], 'right')
-        return np.concatenate([
-            np.stack(segment.exact_point(times, along), axis=-1) for segment, times in zip(
-                self._segments, np.split(times_ns, ends), strict=True) if len(times)])
-
-    def pieces(self, begin_ns: int, end_ns: int) -> list[tuple[Segment, int, int]]:
-        """Return the segments between two times [ns], and where each begins and ends there."""
-        ends = [*(later.start_ns for later in self._segments[1:]), end_ns]
-        return [(segment, max(begin_ns, segment.start_ns), min(until_ns, end_ns))
-                for segment, until_ns in zip(self._segments, ends, strict=True)
-                if begin_ns < until_ns and segment.start_ns < end_ns]
+        return [(segment, times) for segment, times in zip(
+            self._segments, np.split(times_ns, ends), strict=True) if len(times)]
 
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at ascending times (n,) [ns], those before now too."""
-        ends = np.searchsorted(times_ns, [one.start_ns for one in self._segments[1:]], 'right')
+        shares = self._shares(times_ns) or [(self._segments[-1], times_ns)]
         return Kinematics(*(np.concatenate(parts, axis=1) for parts in zip(*(
-            segment.pivot(times) for segment, times in zip(
-                self._segments, np.split(times_ns, ends), strict=True)), strict=True)))
+            segment.pivot(times) for segment, times in shares), strict=True)))
 
     def increments(self, begin_ns: int, end_ns: int, point: Point, count: int = 1,
                    step_ns: int = 1) -> Increments:

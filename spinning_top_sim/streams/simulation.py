@@ -20,6 +20,7 @@ from spinning_top_sim.solvers.vertical import (
     Posture,
     about_vertical,
     posture_of,
+    rounded,
 )
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
@@ -93,15 +94,13 @@ class Simulation:
         # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
         self.pivot, self._lz = pivot, start.lz
-        late_ns = round(values['gnss.latency'] * NANOSECONDS)
-        self.path = Path(segment, self._follow,
-                         keep_ns=max(trace_ns, LONGEST_NS + late_ns, self.imu.keep_ns),
+        self.path = Path(segment, self._follow, self.imu.carry,
+                         keep_ns=max(trace_ns, LONGEST_NS, self.imu.keep_ns),
                          keep_steps_ns=self.imu.keep_ns)
         self.version += 1
 
     @property
     def imu(self) -> Imu:
-        """The ideal IMU, which all streams of the IMU share."""
         return next(stream.imu for stream in self.streams if isinstance(stream, ImuStream))
 
     @property
@@ -121,12 +120,10 @@ class Simulation:
 
     @property
     def steps(self) -> int:
-        """Integration steps taken so far."""
         return self._steps_before + self.path.steps
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the right-hand side so far."""
         return self._evaluations_before + self.path.evaluations
 
     def state(self) -> States:
@@ -316,7 +313,6 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
 
 def _begun(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
            pivot: PivotPath | None) -> Segment:
-    """Return the motion from a start, unchecked."""
     step = partial(propagate, method=values['solver.method'],
                    equations=values['solver.equations'], rtol=values['solver.rtol'],
                    atol=values['solver.atol'])
@@ -331,6 +327,7 @@ def _begun(top: Top, start: State | Posture, start_ns: int, values: Mapping[str,
         solver = AcceleratedMotion(top, posture, piece.acceleration)
         vertical, state = solver.vertical, solver.start
     else:
-        vertical, state = about_vertical(top, posture, piece.acceleration)
+        vertical, halves = about_vertical(top, posture, piece.acceleration)
+        state = rounded(halves)
         solver = step(vertical.top(top), state)
     return Segment(solver, state, start_ns, Ride(top, vertical, piece))

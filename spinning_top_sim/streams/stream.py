@@ -37,17 +37,14 @@ class Samples:
 
     @cached_property
     def t_ns(self) -> NDArray[np.int64]:
-        """The times (n,) [ns]."""
         return np.arange(self.times.start, self.times.stop, self.times.step)
 
     @cached_property
     def segment(self) -> Segment:
-        """The segment in which they are."""
         return self.path.after(self.times.start - 1)
 
     @cached_property
     def states(self) -> States:
-        """The states in the world at these times."""
         return self.segment.states(self.times)
 
     @cached_property
@@ -71,7 +68,12 @@ class Stream:
     fields : returns the numbers that go into the fields of `template`
     timing : the timing faults of its messages
     rate_parameter : name of the parameter that is its rate
+    late_ns : time from a sample to its message [ns]
+    silences_ns : begin and end of the times without messages [ns]
     """
+
+    late_ns = 0
+    silences_ns: Sequence[tuple[int, int]] = ()
 
     def __init__(self, values: Mapping[str, Any], parameter: str, topic: str, type_name: str,
                  template: Template, fields: Callable[[Samples], Sequence[Field]] = lambda _: (),
@@ -84,11 +86,9 @@ class Stream:
 
     @property
     def size(self) -> int:
-        """Size of a message [bytes]."""
         return len(self.template)
 
     def apply(self, changes: Mapping[str, Any]) -> None:
-        """Take over a new rate, if it is among these parameters."""
         if self.rate_parameter in changes:
             self.period_ns = period_ns(changes[self.rate_parameter])
 

@@ -31,7 +31,6 @@ NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
 def _place(samples: Samples) -> Sequence[Any]:
-    """Return the position of the pivot in the world [m]."""
     return tuple(samples.pivot.position) if samples.segment.ride else messages.ORIGIN
 
 
@@ -40,13 +39,11 @@ def _pose(samples: Samples) -> Sequence[Field]:
 
 
 def _odometry(samples: Samples) -> Sequence[Field]:
-    """Return pose and twist of the body's frame; the twist is in that frame."""
     states = samples.states
     return (*_pose(samples), samples.once(_velocity), states.rows_angular_velocity)
 
 
 def _velocity(samples: Samples) -> Vector:
-    """Return the velocity of the pivot in the frame of the body [m/s]."""
     if not samples.segment.ride:
         return messages.ORIGIN
     x, y, z = samples.pivot.velocity
@@ -54,7 +51,6 @@ def _velocity(samples: Samples) -> Vector:
 
 
 def _joints(samples: Samples) -> Sequence[Field]:
-    """Return angles and rates of the joints of the URDF."""
     states = samples.states
     return ((states.phi, states.theta, states.psi),
             (states.phi_dot, states.theta_dot, states.psi_dot))
@@ -65,14 +61,12 @@ def _readings(imu: Imu, samples: Samples) -> Sequence[Field]:
 
 
 def _estimates(imu: Imu, samples: Samples) -> Sequence[Field]:
-    """Return the readings with the orientation that the sensor estimates."""
     _, *readings = _readings(imu, samples)
     exact = imu.orientation(samples.states)
     return (imu.present_sensor.orientation(exact, samples.times), *readings)
 
 
 def _increment(imu: Imu, place: int, samples: Samples) -> Sequence[Field]:
-    """Return the rotation (place 0) or velocity increment over the interval that ends there."""
     return (samples.once(imu.measured_increments)[place],)
 
 
@@ -191,22 +185,17 @@ class Markers(Stream):
 
     def _traces(self, samples: Samples) -> NDArray[np.float64]:
         """Return the points of the traces that end at these samples, (n, 3 (count + 1))."""
-        n, steps = len(samples.times), np.arange(1 - self._count, 1)
         newest = (samples.t_ns[:, np.newaxis] - 1) // self._spacing_ns
-        numbers = newest + steps
-        # The points that a trace shares with the one before it are computed once.
-        is_new = numbers > np.vstack((numbers[0, 0] - 1, newest[:-1]))
-        points = samples.path.exact_points(
-            np.maximum(numbers[is_new], 0) * self._spacing_ns, self._shape.tip)
-        ends = np.cumsum(np.count_nonzero(is_new, axis=1))[:, np.newaxis]
-        last = self._point(samples, self._shape.tip)
-        traces = np.concatenate((points[ends - 1 + steps], np.stack(last, axis=-1)[:, np.newaxis]),
-                                axis=1)
-        return traces.reshape(n, -1)
+        # Traces share points, which are computed once.
+        numbers, places = np.unique(np.maximum(newest + np.arange(1 - self._count, 1), 0),
+                                    return_inverse=True)
+        points = samples.path.exact_points(numbers * self._spacing_ns, self._shape.tip)
+        traces = points[places.reshape(len(newest), -1)]
+        last = np.stack(self._point(samples, self._shape.tip), axis=-1)[:, np.newaxis]
+        return np.concatenate((traces, last), axis=1).reshape(len(newest), -1)
 
     @staticmethod
     def _point(samples: Samples, along: float) -> Vector:
-        """Return where a point of the axis is in the world."""
         x, y, z = (along * part for part in samples.states.rows_axis)
         if samples.segment.ride:
             a, b, c = samples.pivot.position

@@ -61,7 +61,6 @@ class Attitudes:
             self.phi, self.psi = (np.unwrap(np.angle(tip)) for tip in (self.tip, self.body_tip))
 
     def first(self, count: int) -> Attitudes:
-        """Return the first samples."""
         return Attitudes(self.stamps_ns[:count], self.rows[:, :count])
 
     def constants(self, top: Top) -> tuple[Column, Column, Column] | None:

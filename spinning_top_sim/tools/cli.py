@@ -26,7 +26,6 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--version', action='version', version=f'%(prog)s {version()}')
 
     def error(self, message: str) -> NoReturn:
-        """Exit with one line."""
         self.exit(WRONG_USAGE, printable(f'{self.prog}: {message}; see --help') + '\n')
 
 

@@ -151,7 +151,6 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest, which is never there in part."""
     written = folder / f'{MANIFEST}.new'
     written.write_text(json.dumps(manifest, indent=1), encoding='utf-8')
     written.replace(folder / MANIFEST)

@@ -77,11 +77,9 @@ class Specification:
 
     @property
     def parts(self) -> int:
-        """Number of the parts."""
         return -(-self.runs // self.runs_per_part)
 
     def part(self, number: int) -> range:
-        """Return the runs of a part."""
         first = number * self.runs_per_part
         return range(first, min(first + self.runs_per_part, self.runs))
 
@@ -156,7 +154,6 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
 
 
 def _checked(given: Specification, folder: Path) -> Specification:
-    """Return the specification with files read, and lists and mappings of checked values."""
     sample = given.sample or {}
     if not isinstance(sample, Mapping):
         raise ValueError(f'sample = {shown(sample)}: must be a mapping of parameters')
@@ -178,7 +175,6 @@ def _list(value: object, what: str) -> Sequence[Any]:
 
 
 def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
-    """Return checked parameters from a file or a mapping."""
     if isinstance(given, str):
         beside = folder / given
         found = read_scene(beside if beside.exists() else given)
@@ -210,7 +206,6 @@ def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
 
 
 def _bounds(name: str, kind: str, items: Sequence[Any]) -> list[float]:
-    """Return the two numbers of a distribution, checked."""
     if name == PARAMS or not parameters.BY_NAME[name].is_double:
         raise ValueError(f'sample: {name}: {kind}: must be values, because the parameter is no '
                          'double')

@@ -9,7 +9,6 @@ formats").
 """
 
 import argparse
-import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.recorded_run import RunDescription
 
-BLOCK = 16384               # messages that are read together
 RAW, BIAS, ODOMETRY = 'imu/data_raw', 'ground_truth/imu_bias', 'ground_truth/imu_odom'
 KALIBR_NEEDS = tuple(f'imu.{kind}_{name}' for kind in ('accelerometer', 'gyroscope')
                      for name in ('noise_density', 'random_walk'))
@@ -125,9 +123,8 @@ def _blocks(reader: LogReader, run: RunDescription, topic: str,
     """Yield stamps (n,) [ns] and fields of the messages of a stream, block by block."""
     template = next(stream.template for stream in all_streams(run.values_in_effect)
                     if stream.topic == topic)
-    messages = reader.messages(topics=[run.topics[topic]])
-    while block := list(itertools.islice(messages, BLOCK)):
-        data = b''.join(message.data for message in block if len(message.data) == len(template))
+    for _, group in reader.groups([run.topics[topic]]):
+        data = b''.join(message.data for message in group if len(message.data) == len(template))
         yield template.stamps_ns(data), template.decode(data)
 
 

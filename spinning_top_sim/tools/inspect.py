@@ -188,7 +188,8 @@ def _journal(run: RunDescription) -> str:
     counts = Counter(event.name for event in run.events)
     return (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
             f'{counts["parameters"]} changes of parameters'
-            + (f', {counts["state"]} states set' if counts['state'] else ''))
+            + (f', {counts["state"]} states set' if counts['state'] else '')
+            + (f', {counts["drive"]} velocities of the pivot' if counts['drive'] else ''))
 
 
 def _topics(found: Survey) -> Iterator[str]:
@@ -219,6 +220,9 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
         yield from (f'not measured: {reason}' for reason in measured.missing)
     else:
         yield 'not measured: no topic with enough attitudes (joint_states, pose, ground_truth/...)'
+    if motion.segment.ride:
+        yield ('the pivot moves: no constants and no closed form of the whole motion to compare '
+               'with; --verify compares each message')
 
 
 def _verdict(verdict: Verdict) -> Iterator[str]:

@@ -161,7 +161,6 @@ def reason_of(error: Exception) -> str:
 
 
 def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, str]:
-    """Return the topic in the log of each stream and of the parts of the journal."""
     every = all_streams(values)
     recorded = [*((stream.topic, stream.type_name)
                   for stream in journal.recorded_streams(every, values)), *journal.TOPICS]
@@ -175,7 +174,6 @@ def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, 
 
 
 def _event(stamp_ns: int, data: bytes) -> Event:
-    """Return an event from its bytes.  Raises one of ODD where they are not as written."""
     details = json.loads(data[len(ENCAPSULATION) + 4:-1])      # 4 for the length of the text
     name, t_ns, sent_ns = (details.pop(key) for key in ('event', 't_ns', 'sent_ns'))
     if journal.event(name, t_ns, sent_ns, **details) != data:
@@ -263,7 +261,6 @@ class _Rerun:
 
 
 def _apply(simulation: Simulation, event: Event) -> None:
-    """Apply an event.  Raises one of ODD where that cannot be."""
     details = event.details
     if event.name in FIELDS_OF:
         if event.name == 'command':

@@ -4,9 +4,9 @@
 import argparse
 import difflib
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -18,7 +18,6 @@ from spinning_top_sim.streams import parameters
 NODES = ('/**', '/*', 'spinning_top', '/spinning_top', '/**/spinning_top')
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
-STRING_TAG = 'tag:yaml.org,2002:str'
 
 
 class _Loader(yaml.SafeLoader):
@@ -27,9 +26,6 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, *place: object) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError('rcl supports no aliases')
-        tag = getattr(self.peek_event(), 'tag', None)
-        if tag not in (None, STRING_TAG):
-            raise yaml.YAMLError(f'the tag {tag}: must be !!str, as rcl ignores all others')
         return super().compose_node(*place)
 
 
@@ -45,12 +41,28 @@ for _type, _pattern in (
     _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_type}', re.compile(f'({_pattern})$'), None)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options --scene and --imu."""
+class _Name(argparse.Action):
+    """The name of an installed file; "help" prints the names and exits, as --help does."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
+                 value: Any, option: str | None = None) -> None:
+        if value == 'help':
+            for stem, path in parameter_files(self.dest).items():
+                # The first sentence of the comment at the head, behind the licence.
+                text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
+                                if line.startswith('# '))
+                print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
+            parser.exit()
+        setattr(namespace, self.dest, value)
+
+
+def add_arguments(parser: argparse.ArgumentParser, *kinds: str) -> None:
+    """Add the options --scene and --imu, or one of them."""
     for kind, what in (('scene', 'top and start of a scene'), ('imu', 'errors of an IMU')):
-        parser.add_argument(
-            f'--{kind}', metavar='NAME', help=f'{what}: the name of one that is installed, or the '
-            'path of a parameter file; "help" lists the names')
+        if kind in (kinds or ('scene', 'imu')):
+            parser.add_argument(
+                f'--{kind}', metavar='NAME', action=_Name, help=f'{what}: the name of one that is '
+                'installed, or the path of a parameter file; "help" lists the names')
 
 
 def add_parameters(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +86,7 @@ def given(arguments: argparse.Namespace) -> dict[str, object]:
 
 def chosen_files(arguments: argparse.Namespace) -> list[Path]:
     """
-    Return the parameter files of --scene and --imu; exit after the list that "help" asks for.
+    Return the parameter files of --scene and --imu.
 
     Raises ValueError for a name that is not there.
     """
@@ -84,13 +96,6 @@ def chosen_files(arguments: argparse.Namespace) -> list[Path]:
         if name is None:
             continue
         files = parameter_files(kind)
-        if name == 'help':
-            for stem, path in files.items():
-                # The first sentence of the comment at the head, behind the licence.
-                text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
-                                if line.startswith('# '))
-                print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
-            sys.exit()
         if name not in files and '/' not in name and not name.endswith('.yaml'):
             raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
                              f'{", ".join(files)}')
@@ -147,7 +152,6 @@ def parse_yaml(text: str | bytes, source: str) -> object:
 
 
 def _flatten(section: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
-    """Yield the dotted names and the values of parameters."""
     for name, value in section.items():
         if isinstance(value, Mapping):
             yield from _flatten(value, f'{prefix}{name}.')

@@ -12,7 +12,7 @@ exit codes:
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream, period_ns
 from spinning_top_sim.tools import cli, export, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
-from spinning_top_sim.tools.table import UNITS, Table, write_csv, write_parquet
+from spinning_top_sim.tools.table import RideTable, Table, write_csv, write_parquet
 
 FORMATS = ('mcap', 'csv', 'parquet')
 
@@ -86,8 +86,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if file_format == 'mcap':
             summary = write_log(output, simulation, stops, show, arguments.namespace)
         else:
-            _write_table(output, file_format, simulation, stops, show)
-            summary = ', '.join(UNITS)
+            summary = ', '.join(_write_table(output, file_format, simulation, stops, show))
     lines = [f'{output}: {summary}']
     if arguments.export:
         with LogReader(output) as reader:
@@ -99,12 +98,14 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
-                 show: Callable[[float], object]) -> None:
-    table = Table(period_ns(simulation.values['pose.rate']))
+                 show: Callable[[float], object]) -> Mapping[str, str]:
+    """Write a table; return the units of its columns."""
+    table = (RideTable if simulation.pivot else Table)(period_ns(simulation.values['pose.rate']))
     write = write_csv if file_format == 'csv' else write_parquet
     # A command changes the rows after its time.
     write(path, (rows for done in _play(simulation, [table], stops, show)
-                 if isinstance(done, Block) for _, _, rows in done.parts))
+                 if isinstance(done, Block) for _, _, rows in done.parts), table.units)
+    return table.units
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -11,7 +11,6 @@ import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,6 @@ from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured
 from spinning_top_sim.tools.recorded_run import LATEST_NS, ODD, RunDescription, reason_of
 
-BLOCK = 16384               # messages of all topics that are analysed together
 MOST_GAPS = 10              # that are listed
 MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
 # Streams that a motion can be measured from, the most accurate first.
@@ -63,6 +61,7 @@ class Section:
     end_ns: int
     epoch_ns: int                         # stamp of t = 0 [ns]
     periods_ns: dict[str, int]            # of the streams, by topic of the log
+    streams: dict[str, Stream]            # with their delays and silences
 
 
 @dataclass
@@ -162,7 +161,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
                     simulation.segment, exact, _source(run, streams, exact), streams,
                     Imu(simulation.values)))
             motions[-1].sections.append(Section(begin_ns, begin_ns, simulation.epoch_ns, {
-                topic: stream.period_ns for topic, stream in streams.items()}))
+                topic: stream.period_ns for topic, stream in streams.items()}, streams))
     except ODD as error:
         found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
     if len(motions) > MOST_EXACT:
@@ -181,15 +180,12 @@ def _read_messages(found: Survey, reader: LogReader) -> dict[str, Stamps]:
     """Compare all messages with their motions; return the log times of each topic [ns]."""
     ends_ns = [motion.end_ns for motion in found.motions[:-1]]
     blocks_ns = {topic: [np.empty(0, np.int64)] for topic in found.topics}
-    messages = reader.messages()
-    while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
-        for topic, group in itertools.groupby(block, attrgetter('topic')):
-            samples = list(group)
-            blocks_ns[topic].append(_stamps(samples))
-            if found.motions and found.topics[topic].stream is not None:
-                for number, part in itertools.groupby(
-                        samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
-                    _analyse(found, found.motions[number], topic, list(part))
+    for topic, samples in reader.groups():
+        blocks_ns[topic].append(_stamps(samples))
+        if found.motions and found.topics[topic].stream is not None:
+            for number, part in itertools.groupby(
+                    samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
+                _analyse(found, found.motions[number], topic, list(part))
     return {topic: np.concatenate(parts) for topic, parts in blocks_ns.items()}
 
 
@@ -198,7 +194,6 @@ def _stamps(samples: Sequence[LogMessage]) -> Stamps:
 
 
 def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogMessage]) -> None:
-    """Compare samples of a stream with their motion."""
     stream, segment = motion.streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     stamps_ns = _stamps(fitting)
@@ -229,31 +224,39 @@ def _largest(values: Rows) -> float:
 
 
 def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topic: str) -> None:
-    """Count the messages of a topic; compare those of a stream with the grid of each section."""
     report.count = len(stamps_ns)
     if report.count > 1:
         duration_ns = int(stamps_ns[-1] - stamps_ns[0])
         report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
     for section in sections:
-        epoch_ns, period_ns = section.epoch_ns, section.periods_ns[topic]
+        stream, period_ns = section.streams[topic], section.periods_ns[topic]
+        zero_ns = section.epoch_ns + stream.late_ns         # log time of the sample at t = 0
         end = int(np.searchsorted(stamps_ns, section.end_ns, 'right'))
         here, stamps_ns = stamps_ns[:end], stamps_ns[end:]
-        first, last = ((at_ns - epoch_ns) // period_ns
+        first, last = (max(-1, (at_ns - zero_ns) // period_ns)
                        for at_ns in (section.begin_ns, section.end_ns))
-        is_on_grid = (here - epoch_ns) % period_ns == 0
+        is_on_grid = (here - zero_ns) % period_ns == 0
+        # First sample of each silence, and the first one after it
+        silences = [(-(-begin // period_ns), -(-end // period_ns))
+                    for begin, end in stream.silences_ns]
+        expected = last - first - sum(max(0, min(end - 1, last) - max(begin, first + 1) + 1)
+                                      for begin, end in silences)
         report.grid_rate = NANOSECONDS / period_ns
         # A sample that is there twice does not replace a missing one.
-        report.missing = (report.missing or 0) + last - first - len(np.unique(here[is_on_grid]))
-        edges_ns = np.array([first * period_ns + epoch_ns, *here,
-                             (last + 1) * period_ns + epoch_ns])
-        places = np.flatnonzero(np.diff(edges_ns) > period_ns)
-        for place in places[:MOST_GAPS - len(report.gaps_ns)]:
-            report.gaps_ns.append((int(edges_ns[place]) + period_ns,
-                                   int(edges_ns[place + 1]) - period_ns))
+        report.missing = (report.missing or 0) + expected - len(np.unique(here[is_on_grid]))
+        edges_ns = np.array([first * period_ns + zero_ns, *here,
+                             (last + 1) * period_ns + zero_ns])
+        for place in np.flatnonzero(np.diff(edges_ns) > period_ns):
+            if len(report.gaps_ns) == MOST_GAPS:
+                break
+            from_ns, to_ns = (int(edges_ns[place]) + period_ns,
+                              int(edges_ns[place + 1]) - period_ns)
+            if not any(begin * period_ns <= from_ns - zero_ns and to_ns - zero_ns < end * period_ns
+                       for begin, end in silences):
+                report.gaps_ns.append((from_ns, to_ns))
 
 
 def _measure(found: Survey, motion: MotionReport) -> None:
-    """Measure a motion from the samples of its source."""
     samples, motion.samples = motion.samples, []
     data = analysis.longest_run(samples) if samples else None
     if data is None or len(data.stamps_ns) < 2:

@@ -41,21 +41,17 @@ class Plot(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """The ends of both axes."""
-
     low: float
     high: float
     bottom: float
     top: float
 
     def place(self, x: Reals, y: Reals) -> list[list[float]]:
-        """Return places across and down [px] of points (n,)."""
         across = (x - self.low) * ((WIDTH - LEFT - RIGHT) / (self.high - self.low))
         down = (self.top - y) * ((HEIGHT - TOP - BOTTOM) / (self.top - self.bottom))
         return np.column_stack((LEFT + across, TOP + down)).round(1).tolist()
 
     def place_one(self, x: float, y: float) -> list[float]:
-        """Return the place of a point."""
         return self.place(np.array([x]), np.array([y]))[0]
 
 
@@ -120,7 +116,6 @@ def _mark(frame: _Frame, plot: Plot) -> str:
 
 
 def _range(parts: Sequence[Reals], margin: float) -> tuple[float, float]:
-    """Return the ends of an axis, apart from each other."""
     values = np.concatenate(parts)
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     least = max(FLAT * max(abs(low), abs(high)), 1e-12)

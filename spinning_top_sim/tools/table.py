@@ -17,11 +17,13 @@ UNITS = {
     'psi': 'rad', 'psi_dot': 'rad/s', 'qx': '1', 'qy': '1', 'qz': '1', 'qw': '1',
     'omega_1': 'rad/s', 'omega_2': 'rad/s', 'omega_3': 'rad/s', 'energy': 'J',
     'l3': 'kg m^2/s', 'lz': 'kg m^2/s'}
+RIDE_UNITS = {**UNITS, 'x': 'm', 'y': 'm', 'z': 'm', 'vx': 'm/s', 'vy': 'm/s', 'vz': 'm/s'}
 
 
 class Table(Stream):
     """The true states as rows of numbers: a stream whose messages are the rows of a table."""
 
+    units = UNITS
     size = 8 * len(UNITS)
 
     def __init__(self, period_ns: int) -> None:
@@ -34,6 +36,18 @@ class Table(Stream):
             states.psi, states.psi_dot, *states.quaternion.T, *states.angular_velocity.T,
             states.energy, states.l3, states.lz)
         return samples.t_ns, np.stack(columns, axis=-1)
+
+
+class RideTable(Table):
+    """The columns of `Table`, and place and velocity of the pivot in the world."""
+
+    units = RIDE_UNITS
+    size = 8 * len(RIDE_UNITS)
+
+    def encode(self, samples: Samples) -> Encoded:
+        t_ns, rows = super().encode(samples)
+        position, velocity, _ = samples.pivot
+        return t_ns, np.column_stack((rows, *position, *velocity))
 
 
 def write_csv(path: Path, blocks: Iterable[NDArray[np.float64]],

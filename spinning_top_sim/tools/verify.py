@@ -46,7 +46,6 @@ class Verdict:
         return not (self.different or self.missing or self.unexpected or self.stopped)
 
     def note(self, this: Difference) -> None:
-        """Keep a difference if it is the earliest so far."""
         self.first = min(self.first or this, this, key=operator.attrgetter('stamp_ns'))
 
 
@@ -123,7 +122,6 @@ class Comparison:
 
 def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
                 computed: bytes) -> Difference:
-    """Return the first difference of two messages."""
     sizes = len(logged), len(computed)
     if sizes[0] != sizes[1]:
         return Difference(*key, 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes))
@@ -143,6 +141,5 @@ def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
 
 
 def _warnings(run: RunDescription) -> list[str]:
-    """Return the differences of this machine from that of the recording."""
     return [f'{what} was {run.surroundings[what]}, is {here}'
             for what, here in provenance.surroundings().items() if run.surroundings[what] != here]

@@ -63,7 +63,6 @@ class Controls:
         self._scene.on_update(self._on_scene)
 
     def _act(self, action: Callable[[], str]) -> None:
-        """Act, and show the message or the reason of the refusal."""
         with self._lock:
             try:
                 self._page.message.content = action()
@@ -84,7 +83,6 @@ class Controls:
             self._act(self._send)
 
     def _send(self) -> str:
-        """Send the values of the sliders that somebody has moved."""
         values = [slider.value for slider in self._sliders]
         l3, lz = (value if abs(value - shown) > 0.5 * self._sliders[0].step else present
                   for value, shown, present in zip(values, self._shown, self._spin, strict=True))
@@ -134,7 +132,6 @@ class Controls:
                     self._shown[k] = slider.value
 
     def tell_status(self, message: str, numbers: Mapping[str, str]) -> None:
-        """Show the content of /diagnostics."""
         recorder, path = numbers['recorder'], numbers.get('recorded file', '')
         self._status.content = ' · '.join(filter(None, (
             message, f't = {float(numbers["simulated time [s]"]):.1f} s',

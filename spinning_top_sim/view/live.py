@@ -128,7 +128,8 @@ class LiveView(Node):
                 numbers = {pair.key: pair.value for pair in status.values}
                 self._controls.tell_status(status.message, numbers)
                 origin_ns = int(numbers['stamp of t = 0 [ns]'])
-                self._stale |= self._origin_ns not in (None, origin_ns)
+                if self._origin_ns not in (None, origin_ns):
+                    self._stale = True      # not `|=`: that could undo what `choose` writes
                 self._origin_ns = origin_ns
                 self._errors = float(numbers['energy drift']), float(
                     numbers['orientation error [rad]'])
@@ -220,11 +221,10 @@ class LiveView(Node):
         client: Client = self._services_of_sim[name]
         if not client.service_is_ready():
             raise RefusedError(f'there is no {self._sim}')
-        answered = threading.Event()
         future = client.call_async(request)
-        future.add_done_callback(lambda _: answered.set())
         end = time.monotonic() + ANSWER_S
-        while not answered.wait(0.1):
+        while not future.done():
+            time.sleep(0.01)
             if time.monotonic() > end or self._stopped:
                 client.remove_pending_request(future)
                 raise RefusedError(f'{self._sim}/{name} has not answered')

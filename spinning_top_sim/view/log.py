@@ -2,12 +2,10 @@
 """The page of one log or two: reads their tracks, and plays them."""
 
 import contextlib
-import itertools
 import time
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +22,6 @@ from spinning_top_sim.view import plots, text
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
 from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Samples, Track, joined
 
-BLOCK = 16384               # messages that are decoded together
 SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
 LONGEST_HTML_S = 60.0
 
@@ -61,12 +58,9 @@ def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) ->
     """Read the samples of a log of this package; `topics` as in RunDescription."""
     names = {topics[name]: name for name in WIDTHS if name in topics}
     parts = defaultdict(list)
-    messages = reader.messages(topics=names)
-    while block := list(itertools.islice(messages, BLOCK)):
-        block.sort(key=attrgetter('topic'))
-        for topic, group in itertools.groupby(block, attrgetter('topic')):
-            stamps_ns, data = zip(*((one.log_time, one.data) for one in group), strict=True)
-            parts[names[topic]].append(track.decode(names[topic], stamps_ns, data))
+    for topic, group in reader.groups(names):
+        stamps_ns, data = zip(*((one.log_time, one.data) for one in group), strict=True)
+        parts[names[topic]].append(track.decode(names[topic], stamps_ns, data))
     for name, samples in parts.items():
         track.samples[name] = joined(samples)
 
@@ -83,7 +77,8 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
                 if 0.5 < norm < 2.0:
                     found[stamp_ns] = quaternion / norm
         if found:
-            rows = Samples(np.array(list(found), np.int64), np.array(list(found.values())))
+            rows = Samples(np.array(list(found), np.int64), np.pad(
+                np.array(list(found.values())), ((0, 0), (0, 3))))
             track.add('pose', rows)
             track.origin_ns = track.span[0]
             break
@@ -91,13 +86,13 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
 
 
 def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> None:
-    """Compute the run again to find its motions and commands."""
     for simulation, event in recorded_run.rerun(run, end_ns):
         if isinstance(event, Block) or event.name == 'parameters':
             continue
         begin_ns = simulation.epoch_ns + max(simulation.now_ns, 0)
         track.motions.append(DescribedMotion.of(
-            begin_ns, track.top, simulation.segment.start, simulation.describe()))
+            begin_ns, track.top, simulation.segment.start, simulation.describe(),
+            rides=simulation.segment.ride is not None))
         if event.name == 'command':
             track.commands_ns.append(begin_ns)
 
@@ -143,16 +138,16 @@ class Player:
         self._button.label = 'Pause' if self._plays else 'Play'
 
     def _go_to_next(self) -> None:
-        """Go to the next command, from the last one to the first."""
         behind = bisect_right(self._commands, self._now + 1e-9)
         self._now = self._commands[behind % len(self._commands)]
 
     def play(self) -> None:
-        """Show pictures until KeyboardInterrupt."""
+        """Show pictures until KeyboardInterrupt; the log waits for somebody who looks at it."""
         due = time.monotonic()
         while True:
             due = max(due + 1.0 / RATE, time.monotonic() - CATCH_UP_S)
-            self.draw_next(float(self._speed.value) / RATE if self._plays else 0.0)
+            plays = self._plays and self._page.server.get_clients()
+            self.draw_next(float(self._speed.value) / RATE if plays else 0.0)
             time.sleep(max(due - time.monotonic(), 0.0))
 
     def draw_next(self, step: float) -> None:
@@ -170,7 +165,6 @@ class Player:
         self.draw(self._now)
 
     def draw(self, now: float) -> None:
-        """Draw the picture of a time [s]."""
         self._page.draw(self._begin_ns + round(now * NANOSECONDS), self._origin_ns)
 
     def write_html(self, path: Path) -> str:

@@ -42,9 +42,10 @@ def circle(radius: float, theta: float) -> Lines:
 
 
 def trace(track: Track, stamp_ns: int) -> Lines:
-    """Return the lines along which the tip has moved, up to a stamp."""
-    _, axis, joined = path(track, stamp_ns - TRACE_NS, stamp_ns)
-    return segments(reach(track) * axis)[joined]
+    """Return the lines along which the tip has moved, up to a stamp, from where the pivot is."""
+    stamps_ns, axis, joined = path(track, stamp_ns - TRACE_NS, stamp_ns)
+    moved = track.places(stamps_ns) - track.places(np.array([stamp_ns]))
+    return segments(reach(track) * axis + moved)[joined]
 
 
 def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDArray[np.bool_]]:
@@ -59,7 +60,7 @@ def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDA
     steps = np.diff(axis, axis=0)
     longest_ns = int(np.max(np.diff(stamps_ns), initial=0))
     count = min(-(-longest_ns // TRACE_STEP_NS), MOST_STEPS)
-    if count < 2 or rows.shape[1] < 7:          # close together, or without a velocity
+    if count < 2 or rows.shape[1] < 8:          # close together, or without a velocity
         return stamps_ns, axis, np.linalg.norm(steps, axis=1) < LONGEST_CHORD
     velocity = np.cross(in_world(rows[:, :4].T, rows[:, 4:7].T), axis, axisa=0)
     span = 1e-9 * np.diff(stamps_ns)[:, np.newaxis]

@@ -191,10 +191,10 @@ class Page:
             track.known for track in tracks)
         for arrow in self.arrows:
             arrow.visible = self._bounds.visible
-        scene.add_grid('/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
-                       cell_color=(238, 240, 244), section_color=(228, 231, 236),
-                       fade_distance=9 * size, fade_from='origin', shadow_opacity=0.1,
-                       position=(0.0, 0.0, -FOOT * size))
+        self._ground = scene.add_grid(
+            '/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
+            cell_color=(238, 240, 244), section_color=(228, 231, 236), fade_distance=9 * size,
+            fade_from='origin', shadow_opacity=0.1, position=(0.0, 0.0, -FOOT * size))
         camera = self.server.initial_camera
         away = size * (5.2 if len(tracks) == 1 else 10.5)
         camera.fov = VIEW_ANGLE
@@ -210,9 +210,15 @@ class Page:
         """
         arrows = [switch.value for switch in self.arrows]
         side = 0.0 if self._over.value else 1.3 * self._reach
+        places = [top.track.places(np.array([page_ns + top.shift_ns]))[0] for top in self._tops]
         with self.server.atomic():
-            for k, top in enumerate(self._tops):
-                top.root.position = (side * (2 * k - len(self._tops) + 1), 0.0, 0.0)
+            if places:          # the picture follows the first top: the ground moves
+                x, y, z = places[0]
+                self._ground.position = (-(x % self._reach), -(y % self._reach),
+                                         -FOOT * self._reach - z)
+            for k, (top, place) in enumerate(zip(self._tops, places, strict=True)):
+                top.root.position = place - places[0] + (
+                    side * (2 * k - len(self._tops) + 1), 0.0, 0.0)
                 top.draw(page_ns, trace=self._trace.value, bounds=self._bounds.value,
                          arrows=arrows)
         if self._number % PLOT_EVERY == 0:

@@ -36,11 +36,9 @@ class Shown(NamedTuple):
     origin_ns: int
 
     def seconds(self, stamps_ns: NDArray[np.int64]) -> Reals:
-        """Return times since t = 0 (n,) [s]."""
         return (stamps_ns - self.origin_ns) / NANOSECONDS
 
     def part(self, samples: Samples) -> tuple[Reals, Reals]:
-        """Return times (n,) [s] and rows (n, width) in the span."""
         stamps_ns, rows = samples.part(self.begin_ns, self.end_ns).thinned(POINTS)
         return self.seconds(stamps_ns), rows
 

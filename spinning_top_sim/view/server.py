@@ -37,7 +37,6 @@ class Server(viser.ViserServer):
         """Do nothing: viser would share the page by a public server."""
 
     def stop(self) -> None:
-        """Stop, and print nothing."""
         with contextlib.redirect_stdout(io.StringIO()):
             super().stop()
 

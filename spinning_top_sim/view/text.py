@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from string import Template
 
+import numpy as np
+
 from spinning_top_sim.physics.regimes import SENTENCES
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -15,6 +17,7 @@ from spinning_top_sim.view.track import DescribedMotion, Track
 HERE = Path(__file__).parent
 STYLE, LIVE_STYLE = ((HERE / name).read_text('utf-8') for name in ('page.css', 'live.css'))
 BEYOND = 'No closed form is in reach of its numbers; the samples are shown as they are.'
+RIDE = 'The pivot moves: where it accelerates, the top moves about another vertical.'
 NEUTRAL = ('The body is not in this log, only its attitude: a grey disc shows it, with its axes '
            'x (red), y (green) and z (blue).')
 VERTICAL = 1e-6                 # tilt from a vertical up to which there is no precession [rad]
@@ -32,9 +35,12 @@ def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns:
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     description = motion.description if motion else None
     title, sentence = ((description.name, SENTENCES[description.name]) if description else
-                       ('motion', BEYOND) if motion else
+                       ('motion', RIDE if motion.rides else BEYOND) if motion else
                        ('attitude', '' if track.known else NEUTRAL))
-    rows = _rows(track.top, motion) if motion else []
+    rows = [*_rows(track.top, motion)] if motion else []
+    place = track.places(np.array([stamp_ns]))[0]
+    if place.any():
+        rows.append(('Pivot', ', '.join(map(number, place)), 'x, y, z [m]'))
     return ''.join((
         '<div class="top-words">', f'<p>{html.escape(track.name)}</p>' if track.name else '',
         f'<h1>{title}</h1>', f'<p>{sentence}</p>' if sentence else '', '<table>',
@@ -45,7 +51,6 @@ def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns:
 
 
 def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
-    """Yield label, value and note of each number."""
     moves = motion.description
     if moves is not None:
         low, high = (number(math.degrees(theta)) for theta in (moves.theta_min, moves.theta_max))
@@ -57,9 +62,9 @@ def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
             yield 'Precession φ′', f'{number(moves.mean_precession_rate)} rad/s', (
                 f'mean; from {slow} to {fast}' if period else '')
             yield 'Spin ψ′', f'{number(moves.mean_spin_rate)} rad/s', 'mean' if period else ''
-    yield 'Angular mo&shy;mentum', (f'L₃ = {number(motion.l3)}, L<sub>z</sub> = '
-                                    f'{number(motion.lz)}'), (
-        'kg m²/s; axis, vertical')
+    yield 'Angular mo&shy;mentum', f'L₃ = {number(motion.l3)}' + (
+        '' if motion.rides else f', L<sub>z</sub> = {number(motion.lz)}'), (
+        'kg m²/s; axis' + ('' if motion.rides else ', vertical'))
     least = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))
     if least:
         yield 'Stable upright', f'if |L₃| &gt; {number(least)} kg m²/s', ''

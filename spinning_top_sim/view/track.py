@@ -20,11 +20,12 @@ from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools.analysis import attitudes_of
 
 # Number of columns of each topic.  First come the attitude x, y, z, w and the angular velocity in
-# the body; then phi', or for the IMU the specific force.
-WIDTHS = {'pose': 4, 'joint_states': 8, 'ground_truth/odom': 8, 'ground_truth/imu': 10,
+# the body; then phi', or for the IMU the specific force.  PLACES end with that of the pivot.
+WIDTHS = {'pose': 7, 'joint_states': 8, 'ground_truth/odom': 11, 'ground_truth/imu': 10,
           '~/invariants': 8}
 ATTITUDES = ('pose', 'joint_states', 'ground_truth/odom', 'ground_truth/imu')     # best first
 RATES = ('joint_states', 'ground_truth/odom')
+PLACES = ('pose', 'ground_truth/odom')
 PRECESSION = 7              # column of RATES
 ENERGY_DRIFT, ORIENTATION_ERROR = 3, 7     # columns of ~/invariants
 SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
@@ -75,6 +76,7 @@ class DescribedMotion:
 
     l3, lz, energy : constants [kg m^2/s], and the energy lambda1 theta'^2/2 + V(theta) [J]
     description : None if it has no closed form
+    rides : whether the pivot moves: then Lz and the energy are not constant
     """
 
     begin_ns: int
@@ -82,14 +84,15 @@ class DescribedMotion:
     lz: float
     energy: float
     description: Description | None
+    rides: bool = False
 
     @classmethod
     def of(cls, begin_ns: int, top: Top, state: State,
-           description: Description | None) -> 'DescribedMotion':
+           description: Description | None, *, rides: bool = False) -> 'DescribedMotion':
         """Return the motion that begins in a state."""
         height = effective_potential(top, state.l3, state.lz, np.array([state.theta]))
         return cls(begin_ns, state.l3, state.lz,
-                   0.5 * top.lambda1 * state.theta_dot ** 2 + float(height[0]), description)
+                   0.5 * top.lambda1 * state.theta_dot ** 2 + float(height[0]), description, rides)
 
 
 class Track:
@@ -135,6 +138,10 @@ class Track:
             (_, rates), (_, force) = (self._imu.in_body(tuple(fields[0].T), tuple(field.T))
                                       for field in fields[1:3])
             rows = np.column_stack((rows[:, :4], *rates, *force))
+        if topic in PLACES:
+            norm = np.linalg.norm(fields[1], axis=1)
+            place = np.nan_to_num(fields[0][np.isfinite(norm) & (norm > 0.0)])
+            rows = np.column_stack((rows[:, :4] if topic == 'pose' else rows, place))
         return Samples(found.stamps_ns, rows)
 
     def add(self, topic: str, samples: Samples) -> None:
@@ -155,6 +162,19 @@ class Track:
     def rates(self) -> Samples:
         """The samples that show attitude, angular velocity and phi'."""
         return self._best(RATES)
+
+    def places(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return where the pivot is at stamps (n,), (n, 3) [m]; the origin where not known."""
+        known_ns, rows = self._best(PLACES)
+        if not len(rows):
+            return np.zeros((len(stamps_ns), 3))
+        return np.stack([np.interp(stamps_ns - known_ns[0], known_ns - known_ns[0], column)
+                         for column in rows[:, -3:].T], axis=-1)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the pivot has moved between the last two samples."""
+        return bool(np.diff(self._best(PLACES).rows[-2:, -3:], axis=0).any())
 
     def _best(self, topics: Sequence[str]) -> Samples:
         return next((self.samples[topic] for topic in topics
@@ -177,15 +197,17 @@ class Track:
         if not len(rows):
             return
         constants, state = state_of(self.top, rows[-1])
+        if rides := self.moves:     # L3 alone is constant
+            constants = 0.0, constants[1], 0.0
         if self._constants is not None and _same(self.top, constants, self._constants):
             return
         self._constants = constants
         description = None
         with contextlib.suppress(ArithmeticError, ValueError):
-            description = dataclasses.replace(ExactSolution(self.top, state).describe(),
-                                              name=regime(self.top, state, SNAP))
-        self.motions = [*self.motions[-MOST_MOTIONS:],
-                        DescribedMotion.of(int(stamps_ns[-1]), self.top, state, description)]
+            description = None if rides else dataclasses.replace(
+                ExactSolution(self.top, state).describe(), name=regime(self.top, state, SNAP))
+        self.motions = [*self.motions[-MOST_MOTIONS:], DescribedMotion.of(
+            int(stamps_ns[-1]), self.top, state, description, rides=rides)]
 
 
 def state_of(top: Top, row: NDArray[np.float64]) -> tuple[tuple[float, float, float], State]:

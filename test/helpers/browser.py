@@ -66,6 +66,10 @@ class Visit:
         w, *xyz = self.scene.evaluate(f'window.__viserMutable.nodePoseData[{name!r}].wxyz')
         return [*xyz, w]
 
+    def place(self, name):
+        """Return the position of a node of the scene."""
+        return self.scene.evaluate(f'window.__viserMutable.nodePoseData[{name!r}].position')
+
     def read(self, pattern):
         """Wait for a text; return its groups."""
         self.page.wait_for_function('text => RegExp(text).test(document.body.innerText)',
@@ -84,9 +88,12 @@ class Visit:
         box.press('Enter')
 
     def choose(self, label, option):
-        """Choose from a drop-down."""
-        self.page.get_by_label(label, exact=True).first.click()
-        self.page.get_by_role('option', name=option, exact=True).click()
+        """Choose from a drop-down by keys: its list scrolls while a mouse moves to an option."""
+        box = self.page.get_by_label(label, exact=True).first
+        box.fill(option)
+        self.page.get_by_role('option', name=option, exact=True).wait_for()
+        box.press('ArrowDown')
+        box.press('Enter')
 
     def tick(self, label):
         self.page.get_by_label(label, exact=True).click()

@@ -7,7 +7,8 @@ The blocks of a page run in order, in one empty folder and one Python namespace.
 - `python` blocks are executed, unless their first line is a comment with the name of a file, such
   as `# my_filter.py`: then they are written to that file.  So are `yaml` blocks.
 - `bash` blocks are run by bash.  `<!-- background -->` in the line before keeps one running until
-  the page ends; `<!-- not run: REASON -->` leaves one out, and fails where REASON is not known.
+  the page ends; `<!-- exit code 1 -->` expects another than 0; `<!-- not run: REASON -->` leaves
+  one out, and fails where REASON is not known.
 - A `text` block right behind a block that ran is its output.  Integers are equal, other numbers
   agree within 2 %, and a line `...` stands for any lines.
 """
@@ -122,7 +123,8 @@ class Runner:
         except BaseException:
             os.killpg(process.pid, signal.SIGKILL)
             raise
-        assert process.returncode == 0, f'{self._name}:{block.line}: {said}'
+        expected = block.mark.removeprefix('exit code ') or '0'
+        assert str(process.returncode) == expected, f'{self._name}:{block.line}: {said}'
         return said
 
     def end(self):

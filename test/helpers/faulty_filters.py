@@ -15,16 +15,20 @@ HALF = 0.5 ** 0.5
 class Misreading:
     """Another filter, of which readings or attitudes are taken for what they are not."""
 
-    def __init__(self, make_filter, rates=1.0, force=1.0, said=lambda q: q):
+    def __init__(self, make_filter, rates=1.0, force=1.0, field=1.0, iron=0.0, step=None,
+                 said=lambda q: q):
         self._filter = make_filter()
-        self._rates, self._force, self._said = rates, force, said
+        self._rates, self._force, self._field, self._iron = rates, force, field, iron
+        self._step, self._said = step, said
 
     def __getattr__(self, name):
         return getattr(self._filter, name)
 
     def update(self, gyroscope, accelerometer, magnetometer, dt):
+        if magnetometer is not None:
+            magnetometer = self._field * magnetometer + self._iron
         return self._said(self._filter.update(self._rates * gyroscope, self._force * accelerometer,
-                                              magnetometer, dt))
+                                              magnetometer, self._step or dt))
 
 
 class Late(Misreading):
@@ -39,6 +43,33 @@ class Late(Misreading):
         return self._kept.popleft() if len(self._kept) > round(0.05 / dt) else self._kept[0]
 
 
+class LateRates(Misreading):
+    """It gets rates that are 50 ms old."""
+
+    def __init__(self, make_filter):
+        super().__init__(make_filter)
+        self._kept = deque()
+
+    def update(self, gyroscope, accelerometer, magnetometer, dt):
+        self._kept.append(gyroscope)
+        old = self._kept.popleft() if len(self._kept) > round(0.05 / dt) else self._kept[0]
+        return super().update(old, accelerometer, magnetometer, dt)
+
+
+class Drifting(Misreading):
+    """Its heading drifts."""
+
+    def update(self, gyroscope, accelerometer, magnetometer, dt):
+        self._angle = getattr(self, '_angle', 0.0) + 0.005 * dt
+        return product(np.array((0.0, 0.0, np.sin(self._angle), np.cos(self._angle))),
+                       super().update(gyroscope, accelerometer, magnetometer, dt))
+
+
+def longer(q):
+    scaled = q * (1.05, 1.05, 1.05, 1.0)
+    return scaled / np.linalg.norm(scaled)
+
+
 # What every filter may misread.
 MISREADINGS = {
     'gyroscope_units': partial(Misreading, rates=np.pi / 180.0),
@@ -47,7 +78,14 @@ MISREADINGS = {
     'frame_ned': partial(Misreading, said=partial(product, np.array((HALF, HALF, 0.0, 0.0)))),
     'gravity_sign': partial(Misreading, force=-1.0),
     'stamp_offset': Late,
-    'diverges': partial(Misreading, rates=-1.0),
+    'gyroscope_wiring': partial(Misreading, rates=-1.0),
+    'accelerometer_wiring': partial(Misreading, force=np.array((1.0, 1.0, -1.0))),
+    'magnetometer_wiring': partial(Misreading, field=np.array((1.0, -1.0, 1.0))),
+    'time_step': partial(Misreading, step=0.01),
+    'heading_offset': partial(Misreading, said=partial(product, np.array(
+        (0.0, 0.0, np.sin(0.04), np.cos(0.04))))),
+    'hard_iron': partial(Misreading, iron=np.array((10e-6, 0.0, 0.0))),
+    'lag': LateRates, 'inaccurate': partial(Misreading, said=longer), 'diverges': Drifting,
     'invalid_output': partial(Misreading, said=lambda q: q * np.nan)}
 
 
@@ -68,6 +106,10 @@ class Tuned(Vqf):
         self._make = partial(self._make, **settings)
 
 
+class Negated(Vqf):
+    bias = property(lambda self: -super().bias)
+
+
 class HalfCovariance(ReferenceFilter):
     covariance = property(lambda self: 0.5 * self._p[:3, :3])
 
@@ -80,6 +122,6 @@ class TwiceCovariance(ReferenceFilter):
 FAULTY = {
     'first_order_integration': FirstOrder,
     'covariance_small': HalfCovariance, 'covariance_large': TwiceCovariance,
-    'lever_arm': partial(Tuned, tauAcc=0.1),
+    'bias_report': Negated, 'lever_arm': partial(Tuned, tauAcc=0.1),
     'no_bias_estimate': partial(Tuned, motionBiasEstEnabled=False, restBiasEstEnabled=False),
     **{name: partial(misread, Vqf) for name, misread in MISREADINGS.items()}}

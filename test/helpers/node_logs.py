@@ -24,8 +24,6 @@ KINDS = {'pose': PoseStamped, 'joint_states': JointState, 'imu/data_raw': Imu,
 PERIODS_NS = {'pose': 10_000_000, 'joint_states': 10_000_000, 'imu/data_raw': 5_000_000,
               'ground_truth/imu': 5_000_000, 'ground_truth/odom': 10_000_000,
               'ground_truth/imu_bias': 5_000_000}
-GRAVITY = 9.80665
-QUIET = {'status_period': 0.0}
 TRACEBACK = 'Traceback (most recent call last)'
 
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulations for tests, what they send, and what that costs."""
 
-import struct
-
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 
@@ -59,11 +57,6 @@ def publish(simulation, *topics):
 def times(taken, topic):
     """Return the times of the recorded samples of a stream [ns]."""
     return [t_ns for name, t_ns, _ in taken if name == topic]
-
-
-def doubles(data, count):
-    """Return the last doubles of a message."""
-    return struct.unpack(f'<{count}d', data[-8 * count:])
 
 
 class Counting:

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Grade the trajectory of a simulator: its motion beside the exact one, its IMU
+beside its motion.
+
+  spinning-top grade run.mcap                       # a log of this package
+  spinning-top grade poses.csv --scene looping      # top and start as given
+  spinning-top grade poses.csv --fit                # top and start are fitted
+
+exit codes:
+  0    no fault was found
+  1    the simulator has faults, or the file cannot be read
+  2    wrong arguments, or a file without what is needed
+  130  interrupted
+What a file may contain is in docs/grade_files.md.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.grade import files
+from spinning_top_sim.grade.fit import EXACT, LARGEST, fit, near_start, whiteness
+from spinning_top_sim.grade.grader import grade_trajectory
+from spinning_top_sim.grade.scenes import Body
+from spinning_top_sim.grade.trajectory import Trajectory
+from spinning_top_sim.physics.top import State
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools import cli, scene_file
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with these arguments, by default the program's; return its exit code."""
+    return cli.run('grade', __doc__, argv, add_arguments, _run, (LogError,))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    add = parser.add_argument
+    add('file', type=Path, help='.mcap, .csv, .parquet or .npz')
+    scene_file.add_arguments(parser)
+    add('--params', metavar='FILE', action='append', default=[],
+        help='parameter file with top, start and IMU; may be repeated')
+    add('--fit', action='store_true', help='fit top and start to the attitudes; the default '
+        'without --scene, --params and parameters in the file')
+    add('--fit-imu', action='store_true', help='the same, and mounting, place and stamps of the '
+        'IMU to its readings')
+    add('--lever-arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+        help='position of the IMU in the body [m]; default: 0 0 0, or as the parameters tell')
+    add('--topic', help='topic of the attitudes in a log; default: the first that has some')
+    add('--json', action='store_true', help='print everything as JSON')
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    recorded = files.read(arguments.file, arguments.topic)
+    paths = [*scene_file.chosen_files(arguments), *arguments.params]
+    fits = arguments.fit or arguments.fit_imu
+    if fits and paths:
+        raise ValueError('give either --fit, or --scene and --params')
+    given: dict[str, object] = {}
+    for path in paths:
+        given.update(scene_file.read_scene(path))
+    known = recorded.parameters if not paths else None
+    values = parameters.checked(given) if known is None else known
+    body, state, found = _body(values), parameters.start_state(values), None
+    if arguments.lever_arm is not None:
+        body = replace(body, lever_arm=tuple(arguments.lever_arm))
+    if fits or not (paths or known):
+        found = fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
+                    imu=arguments.fit_imu)
+        body, state = found.body(body), found.start
+        recorded.begin_at(found.begin)
+    elif off := near_start(recorded.parts, body, state):
+        raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
+                         '--fit finds top and start')
+    trajectory = _without_noise(recorded, body, state)
+    report = grade_trajectory(trajectory, body, state, subject=arguments.file.name)
+    if arguments.json:
+        print(json.dumps({**json.loads(report.as_json()), 'notes': recorded.notes,
+                          'fit': found and found.as_dict()}, indent=2))
+    else:
+        lines = (*recorded.notes, *(found.lines() if found else ()), *str(report).splitlines())
+        for line in lines:
+            cli.print_line(line)
+    return cli.OK if report.passed and (found is None or found.reached) else cli.FAILED
+
+
+def _without_noise(recorded: files.Recorded, body: Body, state: State) -> Trajectory:
+    """Return the trajectory, with the exact attitudes if it has them but for white noise."""
+    trajectory = recorded.trajectory()
+    q = ExactSolution(body, state).states_at_seconds(trajectory.t).quaternion
+    level, white = whiteness((Rotation.from_quat(q).inv() * trajectory.rotation).as_rotvec().T)
+    if not white or not EXACT < level < LARGEST:
+        return trajectory
+    recorded.notes.append(f'the attitudes are exact but for noise of {level:.3g} rad: graded '
+                          'without it')
+    return replace(trajectory, attitudes=np.roll(q, 1, axis=1))
+
+
+def _body(values: Mapping[str, Any]) -> Body:
+    """Return the top and the IMU of parameters."""
+    x, y, z, w = Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()
+    return Body.of(parameters.top_of(values), lever_arm=tuple(values['imu.lever_arm']),
+                   mounting=(w, x, y, z), field=tuple(values['mag.field']))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,424 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Fits the exact motion of a top to attitudes, and the place of an IMU to its readings.
+
+A fit begins with a short part of the attitudes and goes on to longer ones, each twice as long, so
+that no phase is ever off by half a turn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.grade import guess
+from spinning_top_sim.grade.problem import (
+    L3,
+    LATE,
+    MOTION,
+    MOUNTING,
+    PLACE,
+    RATES,
+    SENSOR,
+    SPIN,
+    TURN,
+    UNKNOWNS,
+    P,
+    Problem,
+    Readings,
+    turned,
+)
+from spinning_top_sim.grade.scenes import Body, Reals
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.exact import ExactSolution
+
+FEWEST = 32                 # attitudes that can be fitted
+FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
+NAMES = {'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'psi': 'rad', 'L3/lambda1': 'rad/s',
+         'Lz/lambda1': 'rad/s', 'lambda3/lambda1': '1', 'P/lambda1': '1/s^2', 'mounting_x': 'rad',
+         'mounting_y': 'rad', 'mounting_z': 'rad', 'lever_arm_x': 'm', 'lever_arm_y': 'm',
+         'lever_arm_z': 'm', 'stamp_offset': 's'}
+ANGLES, RATIO = (2, 3), 6   # of NAMES: those that may change by a turn, lambda3/lambda1
+EXACT = 1e-7                # residual that needs no noise: quaternions in single precision [rad]
+LARGEST = 0.3               # noise [rad]
+ONCE_IN = 1000.0            # noise that is called a residue of the motion
+SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
+VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
+TRIALS = 8
+INTERVAL = 1.96             # standard deviations: 95 %
+OFF = 0.1                   # rad, or share of the rates: another start
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    A fitted motion; `lines` tells it.
+
+    Attributes
+    ----------
+    top, start : Top, State
+        At the first attitude.  lambda1 is as given: attitudes tell ratios only.
+    mounting, lever_arm : tuple of float
+        Of the IMU, as `Body` has them.
+    begin : float
+        Time of the first attitude [s].
+    values, deviations : dict
+        Estimates and standard deviations by the names of NAMES; inf where the readings do not
+        tell the value.
+    covariance : (k, k) array
+        Of the values.
+    undetermined : tuple of str
+        What the readings cannot tell apart.
+    residual, noise : float
+        Root mean square of a component of the attitude residual, and of its white part [rad].
+    reached : bool
+        Whether the residuals are noise.  If not, the intervals mean nothing.
+    """
+
+    top: Top
+    start: State
+    mounting: tuple[float, ...]
+    lever_arm: tuple[float, ...]
+    begin: float
+    values: Mapping[str, float]
+    deviations: Mapping[str, float]
+    covariance: Reals
+    undetermined: tuple[str, ...]
+    residual: float
+    noise: float
+    reached: bool
+
+    def body(self, given: Body) -> Body:
+        """Return the fitted top with the IMU of a body, or the fitted one."""
+        imu = {name: getattr(given, name) for name in Body.__dataclass_fields__
+               if name not in Top.__dataclass_fields__}
+        if 'stamp_offset' in self.values:
+            imu.update(mounting=self.mounting, lever_arm=self.lever_arm)
+        return Body.of(self.top, **imu)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what JSON can hold; null: not told by the readings."""
+        return {'values': dict(self.values), 'undetermined': list(self.undetermined),
+                'deviations': {name: value if math.isfinite(value) else None
+                               for name, value in self.deviations.items()},
+                'residual': self.residual, 'noise': self.noise, 'reached': self.reached}
+
+    def lines(self) -> Iterator[str]:
+        """Yield lines for a reader."""
+        yield (f'fit: residual {self.residual:.3g} rad, noise {self.noise:.3g} rad' + (
+            '' if self.reached else ': the residual is not noise. No motion of a top that was '
+            'found explains the attitudes; what follows is of the nearest one'))
+        for name, value in self.values.items():
+            spread = INTERVAL * self.deviations[name]
+            yield f'  {name:<16}{value:>16.9g} ' + (
+                f'+- {spread:.2g} {NAMES[name]}' if math.isfinite(spread) else '(not told)')
+        yield from (f'  the file does not tell {one}' for one in self.undetermined)
+
+
+class _Trial(NamedTuple):
+    problem: Problem
+    x: Reals
+    residual: float
+    noise: float
+    reached: bool
+    frozen: tuple[int, ...] = ()        # unknowns that the attitudes cannot tell
+
+
+def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
+        gravity: float = 9.80665, imu: bool = False) -> Fit:
+    """
+    Fit a top and its start to attitudes, and on request the place of an IMU to its readings.
+
+    Parameters
+    ----------
+    parts : mapping
+        Times (n,), ascending [s], and values (n, k) by name, as of a `Trajectory`: `attitudes`,
+        whose third axis is that of the top; `gyroscope` and `accelerations`; `rates` or
+        `gyroscope` also tell how many whole turns the top makes between two attitudes.
+    lambda1, gravity : float
+        Scale of the inertia [kg m^2] and gravity [m/s^2], which attitudes do not tell.
+    imu : bool
+        Whether mounting, lever arm and offset of the stamps of the IMU are fitted.
+
+    Raises
+    ------
+    ValueError
+        If there are too few attitudes, no readings, or no motion of a top comes near.
+    """
+    one, begin = _attitudes(parts)
+    best: _Trial | None = None
+    for trial in _trials(one, parts, gravity):
+        if best is None or trial.residual < best.residual:
+            best = trial
+        if best.reached:
+            break
+    if best is None:
+        raise ValueError('no motion of a top comes near the attitudes')
+    best.problem.readings = [replace(one, sigma=max(best.residual, 1e-15))]
+    best = _settled(best)
+    if imu:
+        best = _with_imu(best, parts, begin)
+    return _conclude(best, begin, lambda1, gravity)
+
+
+def _attitudes(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
+    """Return attitudes from t = 0 on, and the time of the first."""
+    times, attitudes = parts['attitudes']
+    if len(times) < FEWEST:
+        raise ValueError(f'{len(times)} attitudes: must be {FEWEST} at least for a fit')
+    q = np.roll(attitudes / np.linalg.norm(attitudes, axis=1)[:, np.newaxis], -1, axis=1).T
+    return Readings('attitude', times - times[0], np.ascontiguousarray(q)), float(times[0])
+
+
+def _hint(parts: Mapping[str, tuple[Reals, Reals]]) -> float | None:
+    told = parts.get('rates', parts.get('gyroscope'))
+    return None if told is None else float(np.median(told[1][:, 2]))
+
+
+def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
+            gravity: float) -> Iterator[_Trial]:
+    """Yield fits from one guess after another."""
+    times, q = one.times, one.values
+    axis = np.stack(attitude.axis_in_world(tuple(q)))
+    spin, sure = guess.spin_rate(times, q, _hint(parts))
+    weak, small = guess.weak(times, axis), list(guess.small_nutation(times, axis))
+    seeds = [*weak[:1], *((0, *pair) for pair in small[:2]), *weak[1:3],
+             *((0, *pair) for pair in small[2:])]
+    for size, l3, p in seeds[:TRIALS]:
+        x = np.zeros(UNKNOWNS)
+        x[RATES] = (*guess.transverse_rates(times, q, axis)[:2], spin)
+        x[L3], x[P] = l3, p
+        try:
+            trial = _fit_from(one, x, size, gravity)
+        except ValueError:          # no motion begins so
+            continue
+        if not sure:
+            _add_turns(trial.x, times)
+        yield trial
+
+
+def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
+    """Fit longer and longer parts; L3 and P beyond 2 `size` attitudes, with 0 in the last."""
+    problem = Problem([one], one.values[:, 0], gravity)
+    count, last = FIRST, len(one.times)
+    while count < last:
+        chosen = slice(0, count, math.ceil(count / ENOUGH))
+        problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
+        x = descend(problem, x, MOTION if size and count > 2 * size else MOTION[:6], 8, 1e-3)
+        count *= 2
+    problem.readings = [one]
+    x = descend(problem, x, MOTION)
+    rest = problem.residuals(x).reshape(3, -1)
+    residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
+    noise, white = whiteness(rest)
+    return _Trial(problem, x, residual, noise,
+                  residual <= EXACT or (white and residual < LARGEST))
+
+
+def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
+            tolerance: float = 1e-10) -> Reals:
+    """Return the unknowns at the least sum of squares."""
+    chosen = [*free]
+
+    def at(y: Reals) -> Reals:
+        moved = x.copy()
+        moved[chosen] = y
+        return moved
+
+    def residuals(y: Reals) -> Reals:
+        try:
+            return problem.residuals(at(y))
+        except ValueError:          # no motion begins so: a shorter step
+            return far
+
+    far = np.full(len(problem.residuals(x)), 1e9)
+    return at(least_squares(
+        residuals, x[chosen], lambda y: problem.jacobian(at(y), chosen), method='lm',
+        x_scale='jac', max_nfev=evaluations, ftol=tolerance, xtol=1e-15, gtol=1e-15).x)
+
+
+def whiteness(rest: Reals) -> tuple[float, bool]:
+    """Return the level of the white part of residuals (rows, n), and whether they are white."""
+    power = np.abs(np.fft.rfft(rest, axis=1)[:, 1:]) ** 2 / rest.shape[1]
+    level = float(np.median(power)) / math.log(2.0)
+    # A line of white noise exceeds the mean by the factor ln(lines/p) with the probability p.
+    strongest = float(np.max(power)) / max(float(np.mean(power)), 1e-300)
+    return math.sqrt(level), strongest < math.log(ONCE_IN * power.size)
+
+
+def _add_turns(x: Reals, times: Reals) -> None:
+    """
+    Make the spin the slowest with 0 < lambda3 <= 2 lambda1.
+
+    A spin that is faster by whole turns between evenly spaced attitudes passes through them all.
+    """
+    step = float(times[-1]) / (len(times) - 1)
+    if np.max(np.abs(np.diff(times) - step)) < 1e-5 * step and not (
+            0.0 < x[L3] <= 2.02 * x[SPIN] or 0.0 > x[L3] >= 2.02 * x[SPIN]):
+        sign, turn = math.copysign(1.0, x[L3]), math.tau / step
+        x[SPIN] += sign * turn * math.ceil((0.5 * abs(x[L3]) - sign * x[SPIN]) / turn)
+
+
+def _settled(trial: _Trial) -> _Trial:
+    """Return the motion with lambda3 = lambda1 if it has no nutation that would tell L3 and P."""
+    at, frozen = without_unseen_nutation(trial.problem, trial.x, trial.residual, settle=True)
+    free = [k for k in MOTION if k not in frozen]
+    return trial if not frozen else trial._replace(
+        frozen=frozen, x=descend(trial.problem, at, free))
+
+
+def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: float) -> _Trial:
+    """Fit the readings of an IMU, first with the motion as it is, then together."""
+    problem, x, streams = trial.problem, trial.x, []
+    for name, kind in (('gyroscope', 'rates'), ('accelerations', 'force')):
+        if name not in parts:
+            raise ValueError(f'the file has no {name}: the place of the IMU cannot be fitted')
+        streams.append(Readings(kind, parts[name][0] - begin,
+                                np.ascontiguousarray(parts[name][1].T)))
+    (one,), problem.readings = problem.readings, streams[:1]
+    model = problem.rates(x, streams[0].times)
+    problem.mounting = Rotation.align_vectors(model.T, streams[0].values.T)[0].as_quat()
+    for stream, own in zip(streams, ((8, 9, 10, LATE), (11, 12, 13)), strict=True):
+        problem.readings = [stream]
+        x = descend(problem, x, own)
+    problem.readings = [one, *streams]
+    free = [k for k in (*MOTION, *SENSOR) if k not in trial.frozen]
+    for _ in range(2):          # noise of each, then all with it
+        for stream in problem.readings:
+            rest = problem.residual(x, stream)
+            stream.sigma = max(math.sqrt(float(np.mean(rest * rest))), 1e-15)
+        x = descend(problem, x, free)
+    rests = [problem.residual(x, stream) for stream in problem.readings]
+    noise, white = whiteness(rests[0])
+    residual = math.sqrt(float(np.mean(rests[0] ** 2)))
+    return _Trial(problem, x, residual, noise, trial.reached and all(
+        whiteness(rest)[1] or float(np.std(rest)) < EXACT for rest in rests), trial.frozen)
+
+
+def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fit:
+    """Return the fit in public parameters, with what the readings do not tell."""
+    problem, x = trial.problem, trial.x
+    free = [*MOTION, *SENSOR] if len(problem.readings) > 1 else [*MOTION]
+    rate = max(float(np.linalg.norm(x[RATES])), abs(float(x[L3])), math.sqrt(abs(float(x[P]))))
+    sizes = np.array([1.0] * 3 + [rate] * 4 + [rate * rate] + [1.0] * 6 + [1.0 / rate])[free]
+    at, frozen = without_unseen_nutation(problem, x, trial.residual)
+    problem.jacobian(at, free)          # sets the steps
+    jacobian = problem.jacobian(at, free, central=True) * sizes
+    _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
+    told = singular > max(1.0 / VAGUE, (1e-6 if frozen else 1e-9) * singular[0])
+    values, slopes = _public(problem, x)[free], _slopes(problem, x, free, sizes)
+    half = slopes @ (directions[told].T / singular[told])
+    deviations = np.sqrt(np.sum(half * half, axis=1))
+    allowed = VAGUE * np.array([1.0, rate, 1.0, 1.0, rate, rate, abs(values[RATIO]), rate * rate,
+                                *sizes[8:]])
+    hidden = np.abs(slopes @ directions[~told].T) > 0.01 * allowed[:, np.newaxis]
+    deviations[np.any(hidden, axis=1) | ~(deviations < allowed)] = math.inf
+    names = [list(NAMES)[k] for k in free]
+    top, start = _scaled(problem, x, lambda1, gravity)
+    mx, my, mz, mw = (float(part[0]) for part in turned(problem.mounting, x[MOUNTING]))
+    return Fit(top, start, (mw, mx, my, mz), tuple(x[PLACE].tolist()), begin,
+               dict(zip(names, values.tolist(), strict=True)),
+               dict(zip(names, deviations.tolist(), strict=True)), half @ half.T,
+               tuple(_not_told(names, values, deviations, hidden)), trial.residual, trial.noise,
+               trial.reached)
+
+
+def _not_told(names: Sequence[str], values: Reals, deviations: Reals,
+              hidden: NDArray[np.bool_]) -> Iterator[str]:
+    """Yield what the readings do not tell; `hidden`: the names of each combination (k, m)."""
+    for column in hidden.T:
+        several = [name for name, part in zip(names, column, strict=True) if part]
+        yield f'{", ".join(several)}' + (' apart' if len(several) > 1 else '')
+    if np.all(np.isinf(deviations[[*ANGLES]])):
+        yield f'phi and psi, but for their {"sum" if values[0] < 1.0 else "difference"}'
+    if math.isinf(deviations[RATIO]) and not np.any(hidden[RATIO]):
+        yield 'lambda3, because the top does not spin'
+    no_torque = abs(values[P]) < 3.0 * deviations[P] < math.inf
+    yield 'mass and com_distance, ' + ('because no torque acts' if no_torque else
+                                       'but for P = mass gravity com_distance')
+    yield 'the scale of lambda1, lambda3, mass, L3 and Lz'
+
+
+def without_unseen_nutation(problem: Problem, x: Reals, residual: float,
+                            settle: bool = False) -> tuple[Reals, tuple[int, ...]]:
+    """
+    Return the steady or sleeping motion next to one whose nutation may be noise.
+
+    settle : with lambda3 = lambda1
+
+    Returns the unknowns, and those of them that such a motion does not tell: () if the nutation
+    is none of noise, and the unknowns are as they were.
+    """
+    motion = ExactSolution(*problem.start(x))
+    low, high = motion.theta_min, motion.theta_max
+    small = SEEN * residual * math.sqrt(2.0 / len(problem.readings[0].times))
+    if high - low > 2.0 * small:
+        return x, ()
+    start, rate, theta = motion.start, motion.mean_precession_rate, 0.5 * (low + high)
+    upright = min(high, math.pi - low) < small
+    if upright:
+        theta, rate = (0.0 if high < 1.0 else math.pi), 0.0
+    q = Rotation.from_euler('ZYZ', (start.phi, theta, start.psi))
+    x = x.copy()
+    x[TURN] = (Rotation.from_quat(problem.reference).inv() * q).as_rotvec()
+    x[RATES] = (*(rate * q.inv().apply((0.0, 0.0, 1.0))[:2]), x[SPIN])
+    x[L3] = x[SPIN] if settle else x[L3]
+    x[P] = x[L3] * rate - rate * rate * math.cos(theta)
+    return x, (L3, P) if upright else (L3,)
+
+
+def _public(problem: Problem, x: Reals) -> Reals:
+    """Return the values of NAMES."""
+    _, state = problem.start(x)
+    turn = Rotation.from_quat([float(part[0]) for part in turned(problem.mounting, x[MOUNTING])])
+    return np.array([state.theta, state.theta_dot, state.phi, state.psi, state.l3, state.lz,
+                     state.l3 / (float(x[SPIN]) or 1e-300), x[P], *turn.as_rotvec(), *x[PLACE],
+                     x[LATE]])
+
+
+def _slopes(problem: Problem, x: Reals, free: Sequence[int], sizes: Reals) -> Reals:
+    """Return the derivatives of the values of NAMES by the unknowns, in units of their sizes."""
+    columns = []
+    for k, size in zip(free, sizes, strict=True):
+        step = np.zeros(UNKNOWNS)
+        step[k] = 1e-6 * size
+        change = (_public(problem, x + step) - _public(problem, x - step))[[*free]]
+        change[[*ANGLES]] = np.remainder(change[[*ANGLES]] + math.pi, math.tau) - math.pi
+        columns.append(change / 2e-6)
+    return np.stack(columns, axis=1)
+
+
+def _scaled(problem: Problem, x: Reals, lambda1: float, gravity: float) -> tuple[Top, State]:
+    """Return top and start with this lambda1."""
+    (_, state), p, gravity = problem.start(x), float(x[P]), gravity or 9.80665
+    ratio = state.l3 / float(x[SPIN]) if x[SPIN] else 1.0
+    distance = math.copysign(min(0.1, gravity / (4.0 * max(abs(p), 1e-9))), p)
+    top = Top(lambda1=lambda1, lambda3=(ratio if ratio > 0.0 else 1.0) * lambda1, gravity=gravity,
+              com_distance=distance, mass=abs(p) * lambda1 / abs(gravity * distance))
+    return top, replace(state, l3=state.l3 * lambda1, lz=state.lz * lambda1)
+
+
+def near_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) -> str:
+    """Return how far the attitudes are from a start at t = 0, '' if they are near it."""
+    one, begin = _attitudes(parts)
+    q = one.values
+    first = ExactSolution(top, start).states_at_seconds(np.array([begin]))
+    apart = float(attitude.angle_between(first.rows_quaternion, tuple(q[:, :1]))[0])
+    axis = np.stack(attitude.axis_in_world(tuple(q)))
+    w1, w2, error = guess.transverse_rates(one.times, q, axis)
+    right = first.angular_velocity[0]
+    spin, _ = guess.spin_rate(one.times, q, float(right[2]))
+    off = math.dist((w1, w2, spin), right)
+    noise = 6.0 * error
+    if apart <= OFF + noise * float(one.times[1]) and off <= OFF * np.linalg.norm(right) + noise:
+        return ''
+    return (f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates '
+            f'{off:.3g} rad/s')

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exam with trials of BROAD; those here are simulated and written as BROAD's files are."""
+
+import re
+import sys
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from helpers.reference import ROOT
+from scipy.io import savemat
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam import scenarios
+from spinning_top_sim.exam.broad import COLUMNS, examine_data
+from spinning_top_sim.exam.command import main
+from spinning_top_sim.exam.page import draw_page
+
+NAME = '40_made_slow'
+
+
+@pytest.fixture(scope='module')
+def run():
+    return scenarios.record(replace(scenarios.SLOW, duration=4.0), scenarios.CALIBRATED, 1)
+
+
+@pytest.fixture(scope='module')
+def trial(run):
+    """The arrays of a trial: movement from 1 s on, and a truth that is unknown from 3 s on."""
+    truth = run.truth[:, [3, 0, 1, 2]].copy()
+    truth[run.t > 3.0] = np.nan
+    return {'imu_gyr': run.gyroscope, 'imu_acc': run.accelerometer,
+            'imu_mag': 1e6 * run.magnetometer, 'opt_quat': truth,
+            'movement': np.uint8(run.t > 1.0)[:, np.newaxis], 'sampling_rate': 100.0}
+
+
+@pytest.fixture(scope='module')
+def folder(trial, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('broad')
+    savemat(folder / f'{NAME}.mat', trial)
+    (folder / 'README.md').write_text('Trials.')
+    return folder
+
+
+class Known:
+    """Returns the truth, turned in the world; before 1 s and from 3 s on it is wrong."""
+
+    def __init__(self, run, turn):
+        wrong = (run.t <= 1.0) | (run.t > 3.0)
+        self._run, self._k = run, 0
+        self._said = (turn * Rotation.from_quat(run.truth)).as_quat()
+        self._said[wrong] = (0.0, 0.0, 0.0, 1.0)
+
+    def update(self, gyroscope, accelerometer, magnetometer, dt):
+        k, self._k, run = self._k, self._k + 1, self._run
+        for read, true in ((gyroscope, run.gyroscope), (accelerometer, run.accelerometer),
+                           (magnetometer, run.magnetometer), (dt, run.dt)):
+            assert np.allclose(read, true[k], rtol=1e-12, atol=0.0)
+        return self._said[k]
+
+
+@pytest.mark.parametrize(('axis', 'deg', 'heading', 'tilt'), [
+    ((1.0, 0.0, 0.0), 0.0, 0.0, 0.0), ((0.0, 0.0, 1.0), -5.0, 5.0, 0.0),
+    ((0.6, 0.8, 0.0), 3.0, 0.0, 3.0)])
+def test_errors_are_those_of_broad_and_count_in_motion_where_the_truth_is_known(
+        run, folder, axis, deg, heading, tilt):
+    turn = Rotation.from_rotvec(np.radians(deg) * np.array(axis))
+    report = examine_data(partial(Known, run, turn), folder, subject='known')
+    assert report.passed, str(report)
+    assert report.measures == pytest.approx({
+        'data_rms_deg': abs(deg), 'data_heading_rms_deg': heading, 'data_tilt_rms_deg': tilt,
+        f'data_rms_{NAME}_deg': abs(deg)}, abs=1e-5)
+
+
+def test_the_marks_are_means_over_trials(run, trial, tmp_path):
+    part = Rotation.from_euler('z', 4.0, degrees=True).as_quat()
+    turned = (Rotation.from_quat(part) * Rotation.from_quat(run.truth)).as_quat()
+    savemat(tmp_path / 'a.mat', trial)
+    savemat(tmp_path / 'b.mat', {**trial, 'opt_quat': turned[:, [3, 0, 1, 2]],
+                                 'movement': np.uint8((run.t > 1.0) & (run.t <= 3.0))})
+    report = examine_data(partial(Known, run, Rotation.identity()), tmp_path)
+    assert report.measures['data_rms_a_deg'] == pytest.approx(0.0, abs=1e-5)
+    assert report.measures['data_rms_b_deg'] == pytest.approx(4.0, abs=1e-5)
+    assert report.measures['data_rms_deg'] == pytest.approx(2.0, abs=1e-5)
+
+
+def test_the_command_writes_the_same_report_and_page(folder, tmp_path, capsys):
+    pytest.importorskip('vqf')
+    page = tmp_path / 'page.svg'
+    assert main(['--filter', 'vqf', '--data', str(folder), '--page', str(page)]) == 0
+    found, = re.findall(r'data_rms_deg +([\d.e-]+)  of real readings', capsys.readouterr().out)
+    assert float(found) < 0.2
+    assert f'<!-- {NAME} -->' in page.read_text()
+
+
+def test_a_filter_that_fails_in_a_trial_is_told(folder, tmp_path):
+    class Bad:
+        def update(self, gyroscope, accelerometer, magnetometer, dt):
+            raise ValueError('no calibration')
+
+    report = examine_data(Bad, folder)
+    assert report.faults == ['invalid_output'] and not report.measures
+    assert f'{NAME}: update 1 of 400 raises ValueError: no calibration' in str(report)
+    draw_page(report, tmp_path / 'page.svg')
+
+
+@pytest.mark.parametrize('name', COLUMNS)
+def test_a_file_without_an_array_is_no_trial(trial, tmp_path, name):
+    savemat(tmp_path / 'a.mat', {key: value for key, value in trial.items() if key != name})
+    with pytest.raises(ValueError, match=rf"a\.mat is no trial of BROAD: it has no '{name}'"):
+        examine_data(None, tmp_path)
+
+
+@pytest.mark.parametrize('change', [
+    {'sampling_rate': 0.0}, {'movement': np.zeros(400)}, {'opt_quat': np.full((400, 4), np.nan)},
+    {'imu_gyr': np.full((400, 3), np.nan)}])
+def test_a_trial_in_which_nothing_counts_is_refused(trial, tmp_path, change):
+    savemat(tmp_path / 'a.mat', {**trial, **change})
+    with pytest.raises(ValueError, match='must have a sampling_rate > 0, finite readings, and'):
+        examine_data(None, tmp_path)
+
+
+def test_what_cannot_be_read_is_told_in_one_line(tmp_path, capsys, monkeypatch):
+    (tmp_path / 'empty').mkdir()
+    junk, hdf5 = tmp_path / 'junk', tmp_path / 'hdf5'
+    for folder, name in ((junk, 'a.mat'), (hdf5, 'a.hdf5')):
+        folder.mkdir()
+        (folder / name).write_bytes(b'not a file of numbers' * 99)
+    monkeypatch.setitem(sys.modules, 'h5py', None)
+    for folder, code, says in (
+            (tmp_path / 'none', 2, 'none: must be a folder with trials of BROAD'),
+            (ROOT / 'setup.py', 2, 'setup.py: must be a folder'),
+            (tmp_path / 'empty', 2, 'has no trial: must have files .mat, .hdf5'),
+            (junk, 2, 'a.mat is no trial of BROAD: '),
+            (hdf5, 1, 'an HDF5 file needs h5py, which is not installed')):
+        assert main(['--filter', 'ekf', '--data', str(folder)]) == code
+        said = capsys.readouterr().err
+        assert says in said and said.count('\n') == 1, said
+
+
+def test_an_hdf5_file_is_read_too(run, trial, tmp_path):
+    h5py = pytest.importorskip('h5py')
+    with h5py.File(tmp_path / 'a.hdf5', 'w') as file:
+        for name in COLUMNS:
+            file[name] = trial[name]
+        file.attrs['sampling_rate'] = trial['sampling_rate']
+    report = examine_data(partial(Known, run, Rotation.identity()), tmp_path)
+    assert report.measures['data_rms_deg'] == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize('arguments', [
+    ['--data', '.'], ['--data', '.', '--topic', 'imu/data'], ['run.mcap', '--data', '.']])
+def test_data_need_a_filter(capsys, arguments):
+    assert main(arguments) == 2
+    assert 'give either a' in capsys.readouterr().err
+
+
+def test_data_have_no_level(capsys):
+    assert main(['--filter', 'vqf', '--data', '.', '--level', 'full']) == 2
+    assert '--level: --data takes --data only' in capsys.readouterr().err

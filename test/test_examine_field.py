@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scenes of the field: their motion is consistent, their sensor errs as it is told to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam import examine, examiner, field
+from spinning_top_sim.exam.scenarios import GRAVITY
+from spinning_top_sim.streams.parameters import IDENTITY
+
+SHORT = ((1.0, 9.0),)
+BY_NAME = {scene.name: replace(scene, motions=SHORT) for scene in field.SCENES}
+# An IMU without errors, in a field without disturbance.
+PERFECT = {name: IDENTITY if name.endswith(('_M', 'soft_iron')) else 3 * (0.0,)
+           for name in field.LEFT} | {
+    name: 0.0 for name in field.DEVICE if name != 'mag.field'} | {
+    'mag.disturbance.world': 5 * (0.0,)}
+
+
+def turned(make_filter):
+    class Turned:
+        """The filter, whose heading is 10 degrees off."""
+
+        def __init__(self):
+            self._filter = make_filter()
+
+        def update(self, *readings):
+            turn = Rotation.from_euler('z', 10.0, degrees=True)
+            return (turn * Rotation.from_quat(self._filter.update(*readings))).as_quat()
+
+    return Turned
+
+
+@pytest.fixture
+def perfect(monkeypatch):
+    """Return what records a scene with a sensor without errors."""
+    monkeypatch.setattr(field, 'BIAS', 0.0)
+    monkeypatch.setattr(field, 'MAG_LATE', 0)
+    return lambda name: field.record(replace(BY_NAME[name], values={}), 3, PERFECT)
+
+
+@pytest.mark.parametrize('name', BY_NAME)
+def test_without_errors_the_readings_are_those_of_the_motion(perfect, name):
+    trial = perfect(name)
+    run, turns = trial.run, Rotation.from_quat(trial.run.truth)
+    assert np.array_equal(run.gyroscope, run.rates)
+    # The rates are those of the attitudes; the middle of two steps is a step.
+    step = (turns[:-2].inv() * turns[2:]).as_rotvec() / (2.0 * run.dt[0])
+    assert np.max(np.abs(step - run.rates[1:-1])) < 0.02 * np.max(np.abs(run.rates))
+    # The sensor rests before and after, so that the mean acceleration is zero; one of gravity
+    # alone, or in the wrong frame, is not.
+    acceleration = turns.apply(run.accelerometer) - (0.0, 0.0, GRAVITY)
+    size = np.sqrt(np.mean(acceleration ** 2))
+    assert np.max(np.abs(np.mean(acceleration, axis=0))) < 0.02 * size
+    assert turns.apply(run.magnetometer) == pytest.approx(np.broadcast_to(
+        field.DEVICE['mag.field'], (len(run.t), 3)), abs=1e-12)
+
+
+@pytest.mark.parametrize('name', BY_NAME)
+def test_a_scene_moves_as_it_says_and_rests_before(name):
+    scene = BY_NAME[name]
+    run, counts = (trial := field.record(scene, 0, {})).run, trial.counts
+    begin, end = SHORT[0]
+    assert run.t[counts[0]] == pytest.approx(begin + 0.5, abs=0.02)
+    assert run.t[counts[-1]] == pytest.approx(end - 0.5, abs=0.02)
+    assert np.max(np.abs(run.rates[run.t < begin])) < 1e-9
+    said = np.linalg.norm(scene.rates)
+    assert np.sqrt(np.mean(np.sum(run.rates[counts] ** 2, axis=1))) == pytest.approx(said, rel=0.3)
+
+
+def test_a_scene_depends_on_its_seed_alone():
+    one, same, other = (field.record(BY_NAME['combined'], seed, {}).run for seed in (1, 1, 2))
+    for name in ('truth', 'gyroscope', 'accelerometer', 'magnetometer'):
+        assert np.array_equal(getattr(one, name), getattr(same, name))
+        assert np.max(np.abs(getattr(one, name) - getattr(other, name))) > 1e-6
+
+
+def test_the_device_errs_by_its_bias_its_bandwidth_and_the_magnet(perfect, monkeypatch):
+    still = slice(100)
+    exact = perfect('magnet_on_it').run
+    monkeypatch.setattr(field, 'BIAS', 0.01)
+    scene = replace(BY_NAME['magnet_on_it'], values={
+        'mag.disturbance.body': (0.0, 1e3, 1e-6, 2e-6, 3e-6)})
+    run = field.record(scene, 3, {**PERFECT, 'imu.bandwidth': 20.0}).run
+    assert np.linalg.norm(run.gyroscope[still], axis=1) == pytest.approx(0.01)
+    assert run.magnetometer[still] - exact.magnetometer[still] == pytest.approx(
+        np.broadcast_to((1e-6, 2e-6, 3e-6), (100, 3)), abs=1e-12)
+    # A low pass of first order is late by 1 / (2 pi f).
+    late = exact.accelerometer[:-1] - run.accelerometer[:-1]
+    slope = np.diff(exact.accelerometer, axis=0) / exact.dt[0]
+    assert np.sum(late * slope) / np.sum(slope ** 2) == pytest.approx(
+        1.0 / (40.0 * np.pi), rel=0.15)
+
+
+def test_the_mark_is_the_mean_over_scenes_and_tells_filters_apart(monkeypatch):
+    vqf = pytest.importorskip('spinning_top_sim.exam.adapters').Vqf
+    pytest.importorskip('vqf')
+    monkeypatch.setattr(field, 'SCENES', [BY_NAME['slow_translation'], BY_NAME['vibration']])
+    good, bad = (examine(make, 'field', seeds=1).measures for make in (vqf, turned(vqf)))
+    names = [f'field_rms_{scene.name}_deg' for scene in field.SCENES]
+    assert {*good} == {*names, 'field_rms_deg', 'field_heading_rms_deg', 'field_tilt_rms_deg'}
+    assert good['field_rms_deg'] == pytest.approx(np.mean([good[name] for name in names]))
+    assert good['field_rms_deg'] < 6.0 < bad['field_rms_deg'] < 16.0
+    assert bad['field_tilt_rms_deg'] == pytest.approx(good['field_tilt_rms_deg'])
+
+
+def test_a_level_is_a_part_of_full_and_needs_new_filters(monkeypatch):
+    vqf = pytest.importorskip('spinning_top_sim.exam.adapters').Vqf
+    pytest.importorskip('vqf')
+    with pytest.raises(ValueError, match="level = 'field': the filter must be made anew"):
+        examine(vqf, 'field', restart=False)
+    monkeypatch.setattr(field, 'SCENES', [BY_NAME['slow_rotation']])
+    monkeypatch.setattr(examiner, 'EXTRA', ())
+    asked = examine(vqf, 'field', seeds=[7], imu={'mag.field': (0.0, 2e-5, 0.0)}).measures
+    assert 0.0 < asked['field_rms_deg'] < 10.0
+    assert 'field_rms_deg' in examine(vqf, 'full', seeds=1).measures

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`spinning-top grade FILE`: logs and tables of any program, the fit, errors in one line."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers.reference import ROOT
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim import State, Top, solve
+from spinning_top_sim.grade import files
+from spinning_top_sim.grade.command import main
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.tools.simulate import main as simulate
+
+TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+START = State(theta=0.5235987755982988, l3=1.6, lz=1.3)         # config/looping.yaml
+ARM = (0.1, -0.05, 0.2)
+T = np.arange(600) / 200.0
+MOTION = solve(TOP, START, T)
+Q = MOTION.quaternion
+RATES = MOTION.angular_velocity
+FORCE = np.stack(np.broadcast_arrays(*MOTION.specific_force(ARM)), axis=1)
+NS = np.rint(1e9 * T).astype(np.int64) + 1_700_000_000_123_456_789
+LOOPING = ('--scene', 'looping', '--lever-arm', *map(str, ARM))
+
+
+def table(path, columns, separator=',', head=''):
+    rows = zip(*columns.values(), strict=True)
+    path.write_text(head + separator.join(columns) + '\n' + ''.join(
+        separator.join(map(str, row)) + '\n' for row in rows))
+    return path
+
+
+def imu(gyroscope=RATES, force=FORCE, names=('gyro_x', 'gyro_y', 'gyro_z', 'acc_x', 'acc_y',
+                                             'acc_z')):
+    return dict(zip(names, np.hstack((gyroscope, force)).T, strict=True))
+
+
+def wxyz(*names):
+    return dict(zip(names, np.roll(Q, 1, axis=1).T, strict=True))
+
+
+def euler(unit):
+    return {f'{name}{unit}': np.degrees(getattr(MOTION, name)) if unit else getattr(MOTION, name)
+            for name in ('psi', 'theta', 'phi')}
+
+
+TABLES = {
+    'names of this package': ({'t [s]': T, 'theta_dot [rad/s]': T, **wxyz('qw', 'qx', 'qy', 'qz')},
+                              ',', ''),
+    'EuRoC': ({'timestamp [ns]': NS, 'p_RS_R_x [m]': T, 'p_RS_R_y [m]': T, 'p_RS_R_z [m]': T,
+               **wxyz('q_RS_w []', 'q_RS_x []', 'q_RS_y []', 'q_RS_z []'),
+               'b_w_RS_S_x [rad s^-1]': T, 'b_w_RS_S_y [rad s^-1]': T,
+               'b_w_RS_S_z [rad s^-1]': T}, ',', '#'),
+    'TUM': (dict(zip(('timestamp', 'tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw'),
+                     (T + 1.7e9, T, T, T, *Q.T), strict=True)), ' ', '# '),
+    'messages': ({'/pose/header/stamp/sec': NS // 10 ** 9,
+                  '/pose/header/stamp/nanosec': NS % 10 ** 9,
+                  'frame': ['world'] * len(T), **wxyz(
+                      'pose.orientation.w', 'pose.orientation.x', 'pose.orientation.y',
+                      'pose.orientation.z')}, ';', ''),
+    'camel case': ({**wxyz('quatW', 'quatX', 'quatY', 'quatZ'), 'Time_ms': 1e3 * T}, '\t', ''),
+    'angles': ({'time': T, **euler('')}, ',', ''),
+    'degrees': ({**euler('_deg'), 'stamp_ns': NS}, ',', '')}
+
+
+@pytest.mark.parametrize('kind', TABLES)
+def test_columns_are_known_by_their_names(tmp_path, kind):
+    columns, separator, head = TABLES[kind]
+    recorded = files.read(table(tmp_path / 'a.csv', columns, separator, head))
+    assert set(recorded.parts) == {'attitudes'}
+    times, attitudes = recorded.parts['attitudes']
+    assert times == pytest.approx(T, abs=3e-7)
+    turns = Rotation.from_quat(np.roll(attitudes, -1, axis=1))
+    assert (turns.inv() * Rotation.from_quat(Q)).magnitude().max() < 1e-6
+    assert len(recorded.trajectory().t) == len(T)
+
+
+@pytest.mark.parametrize(('names', 'unit'), [
+    (('wx', 'wy', 'wz', 'ax', 'ay', 'az'), 1.0),
+    (('angular_velocity.x', 'angular_velocity.y', 'angular_velocity.z', 'linear_acceleration.x',
+      'linear_acceleration.y', 'linear_acceleration.z'), 1.0),
+    (('gyr_x_dps', 'gyr_y_dps', 'gyr_z_dps', 'imu_ax', 'imu_ay', 'imu_az'), np.pi / 180.0)])
+def test_readings_are_known_by_their_names(tmp_path, names, unit):
+    path = table(tmp_path / 'a.csv', {
+        'time': T, **imu(RATES / unit, names=names), **wxyz('qw', 'qx', 'qy', 'qz')})
+    parts = files.read(path).parts
+    assert parts['gyroscope'][1] == pytest.approx(RATES)
+    assert parts['accelerations'][1] == pytest.approx(FORCE)
+
+
+def test_arrays_and_parquet_are_read(tmp_path):
+    pa = pytest.importorskip('pyarrow')
+    from pyarrow import parquet
+
+    parquet.write_table(pa.table({'t': T, **wxyz('qw', 'qx', 'qy', 'qz')}), tmp_path / 'a.parquet')
+    np.savez(tmp_path / 'b.npz', t=T, quaternion=Q, rates=RATES)
+    np.savez(tmp_path / 'c.npz', t=T, attitudes=np.roll(Q, 1, axis=1), gyroscope=RATES)
+    for name in ('a.parquet', 'b.npz', 'c.npz'):
+        assert files.read(tmp_path / name).parts['attitudes'][1] == pytest.approx(
+            np.roll(Q, 1, axis=1)), name
+
+
+def test_rows_may_be_uneven_out_of_order_or_without_some_sensors(tmp_path):
+    random = np.random.default_rng(1)
+    t = np.sort(T + random.uniform(-1e-3, 1e-3, len(T)))
+    q = solve(TOP, START, t).quaternion
+    order = random.permutation(len(T))
+    rows = {'t': t, **dict(zip(('qx', 'qy', 'qz', 'qw'), q.T, strict=True)), **imu()}
+    cells = {name: [str(values[k]) for k in order] for name, values in rows.items()}
+    for k in range(0, len(T), 2):
+        cells['acc_y'][k] = ''
+    recorded = files.read(table(tmp_path / 'a.csv', cells))
+    assert [len(recorded.parts[name][0]) for name in ('attitudes', 'gyroscope', 'accelerations')
+            ] == [600, 600, 300]
+    even = recorded.trajectory()
+    assert 'not evenly spaced' in recorded.notes[0]
+    right = Rotation.from_quat(solve(TOP, START, even.t).quaternion)
+    assert (right.inv() * even.rotation).magnitude().max() < 1e-4
+
+
+def foreign_log(path, late=0, covariance=0.0):
+    """Write a log of another program: poses, and readings that come some steps late."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    make = {name.rpartition('/')[2]: one for name, one in store.types.items()}
+    pose, reading = 'geometry_msgs/msg/PoseStamped', 'sensor_msgs/msg/Imu'
+    file = create_file(path, [RecordedTopic('/body/pose', pose), RecordedTopic('/imu', reading)],
+                       {}, compression='none')
+
+    def vector(v):
+        return make['Vector3'](*map(float, v))
+
+    for k, stamp in enumerate(NS.tolist()):
+        header = make['Header'](make['Time'](stamp // 10 ** 9, stamp % 10 ** 9), 'world')
+        place = make['Pose'](make['Point'](0.0, 0.0, 0.0), make['Quaternion'](*Q[k].tolist()))
+        now = max(k - late, 0)
+        unknown = np.zeros(9)
+        imu_message = make['Imu'](
+            header, make['Quaternion'](0.0, 0.0, 0.0, 1.0), np.array([-1.0, *unknown[1:]]),
+            vector(RATES[now]), unknown + covariance, vector(FORCE[now]), unknown + covariance)
+        received = stamp + 3_000_000 + 200_000 * (k % 7)
+        file.append(0, received, bytes(store.serialize_cdr(make['PoseStamped'](header, place),
+                                                           pose)))
+        file.append(1, received, bytes(store.serialize_cdr(imu_message, reading)))
+    file.write_chunk()
+    file.finish()
+    return path
+
+
+def test_a_log_of_another_program_is_graded(tmp_path, capsys):
+    right, wrong = (foreign_log(tmp_path / f'{late}.mcap', late) for late in (0, 1))
+    assert main([str(right), *LOOPING]) == 0
+    assert main([str(wrong), *LOOPING, '--json']) == 1
+    _, _, text = capsys.readouterr().out.partition('{')
+    faults = {fault['name'] for fault in json.loads('{' + text)['faults']}
+    assert faults == {'imu_one_step_late'}
+
+
+@pytest.mark.parametrize(('fault', 'columns'), [
+    ('no_lever_arm', imu(force=np.stack(MOTION.specific_force((0.0, 0.0, 0.0)), axis=1))),
+    ('units', imu(np.degrees(RATES))),
+    ('rates_in_world', imu(Rotation.from_quat(Q).apply(RATES)))])
+def test_faults_in_a_table_are_named_with_a_fitted_top(tmp_path, capsys, fault, columns):
+    path = table(tmp_path / 'a.csv', {'t': T, **wxyz('qw', 'qx', 'qy', 'qz'), **columns})
+    assert main([str(path), '--fit', '--lever-arm', *map(str, ARM)]) == 1
+    out = capsys.readouterr().out
+    assert f'a.csv: {fault}\n' in out
+    assert 'P/lambda1' in out
+
+
+def test_a_log_of_this_package_brings_its_top(tmp_path, capsys):
+    path = tmp_path / 'run.mcap'
+    assert simulate(['--quiet', '-o', str(path), '--duration', '3', '--command', '2:1.5:1.4',
+                     '--params', str(ROOT / 'config/looping.yaml'),
+                     '-p', 'imu.lever_arm:=[0.1, 0.0, 0.2]', '-p', 'imu.rpy:=[0.3, 0.1, -1.0]',
+                     ]) == 0
+    assert main([str(path)]) == 0
+    assert main([str(path), '--scene', 'cusp']) == 2
+    out, err = capsys.readouterr()
+    assert 'run.mcap: passed' in out
+    assert 'accelerations_discrepancy' in out
+    assert err.startswith('spinning-top grade: ')
+    assert 'the parameters do not fit the trajectory' in err
+    assert '--fit' in err
+
+
+def test_noise_of_the_attitudes_is_no_fault(tmp_path, capsys):
+    noise = Rotation.from_rotvec(np.random.default_rng(2).normal(0.0, 2e-3, (len(T), 3)))
+    noisy = (Rotation.from_quat(Q) * noise).as_quat()
+    path = table(tmp_path / 'a.csv', {'t': T, **dict(zip(
+        ('qx', 'qy', 'qz', 'qw'), noisy.T, strict=True)), **imu()})
+    assert main([str(path), *LOOPING]) == 0
+    assert 'exact but for noise of 0.00' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('name', 'content', 'words', 'code'), [
+    ('none.csv', None, 'No such file', 1),
+    ('empty.csv', '', 'is empty', 2),
+    ('empty.mcap', '', 'it is empty', 1),
+    ('text.csv', 'Dear all,\nthe log is\n', 'must have a line with the names', 2),
+    ('text.mcap', 'Dear all', 'it is no MCAP file', 1),
+    ('text.npz', 'Dear all', 'is no file of numpy.savez', 2),
+    ('no.csv', 't,x\n1,2\n', 'has no attitudes', 2),
+    ('no_time.csv', 'qw,qx,qy,qz\n1,0,0,0\n', 'no column of times', 2),
+    ('short.csv', 't,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n', 'has 2 attitudes: must have', 2),
+    ('log.doc', 'x', 'the name must end in', 2)])
+def test_errors_are_one_line(tmp_path, capsys, name, content, words, code):
+    path = tmp_path / name
+    if content is not None:
+        path.write_text(content)
+    assert main([str(path)]) == code
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.count('\n') == 1
+    assert words in err
+    assert name in err
+    assert {*tmp_path.iterdir()} <= {path}
