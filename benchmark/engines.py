@@ -104,22 +104,23 @@ ENTRIES = (
 
 
 class Timed:
-    """Runs an engine, and adds up the processor time of runs with the step dt but the first."""
+    """Runs an engine; adds up the processor time of runs with the step dt that repeat a length."""
 
     def __init__(self, entry: Entry) -> None:
         module, name = entry.place.split(':')
         made = getattr(importlib.import_module(f'engines.{module}'), name)
         self._run = made(**entry.given) if isinstance(made, type) else made
-        self._entry, self._calls = entry, 0
+        self._entry, self._lengths = entry, set[int]()
         self.spent = self.simulated = 0.0
 
     def __call__(self, top: Any, start: Any, times: Any, dt: float) -> Any:
         began = time.process_time()
         said = self._run(top, start, times, dt, **self._entry.options)
-        if self._calls and math.isclose(dt, self._entry.dt):
-            self.spent += time.process_time() - began
-            self.simulated += times[-1]
-        self._calls += 1
+        if math.isclose(dt, self._entry.dt):
+            if len(times) in self._lengths:     # before, something may have been compiled
+                self.spent += time.process_time() - began
+                self.simulated += times[-1]
+            self._lengths.add(len(times))
         return said
 
 
@@ -189,8 +190,8 @@ NOTES = """\
   which are large near a pitch of 90 degrees; the error control of RK3 takes shorter steps there.
 - Bullet has no IMU, and that of Newton needs a solver that tells accelerations: both are graded
   without one.
-- The first call of JAX and Warp compiles; `ms` leaves it out.
-- Newton's solver MuJoCo is left out: it asks for MuJoCo 3.17, whose RK4 is of second order here.
+- JAX and Warp compile at first; `ms` leaves it out.
+- Newton's solver MuJoCo is left out: it asks for MuJoCo 3.17.
 - Genesis cannot be installed beside these versions, and the engine of Brax is MJX.
 """
 
