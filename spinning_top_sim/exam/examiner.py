@@ -223,7 +223,10 @@ class _Exam:
             self.faults = [fault for fault in self.faults if fault.name != 'inaccurate']
         consistency = diagnosis.consistency(noisy, self._absolute)
         self.measures |= diagnosis.nees_marks(consistency)
-        if self.judges_covariance and not self.faults:  # faults are another reason for errors
+        # Faults are another reason for errors; without noise there is nothing random to judge by.
+        if self.judges_covariance and not self.faults and any(
+                self._imu.get(f'imu.{sensor}_noise_density')
+                for sensor in ('gyroscope', 'accelerometer')):
             self._add(diagnosis.covariance_fault(consistency))
 
     def _add(self, fault: Fault | None) -> None:
