@@ -28,7 +28,7 @@ NEVER_ZERO = 1e-6
 KICK_S, KICK = 0.1, np.radians((0.7, 0.0, 0.7))     # of the gyroscope only; axes of the world
 
 # Limits of a right filter; docs/exam.md compares them with the values of filters.
-TILT, HEADING = np.radians(0.3), np.radians(0.8)    # rms errors [rad]
+TILT, TILT_MOVING, HEADING = np.radians((0.3, 0.9, 0.8)).tolist()   # rms errors [rad]
 
 
 class Course(NamedTuple):
@@ -182,5 +182,16 @@ class Clean(NamedTuple):
     @property
     def wrong(self) -> bool:
         """Whether one is larger than that of a right filter."""
-        return (max(self.tilt, self.tilt_moving) > TILT
+        return (self.tilt > TILT or self.tilt_moving > TILT_MOVING
                 or max(self.heading, self.heading_moving) > HEADING)
+
+
+def unit(quaternions: Reals) -> Reals:
+    """Return the quaternions (n, 4) with norm 1."""
+    scaled: Reals = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return scaled
+
+
+def rows_of(matrix: Reals) -> str:
+    """Return a matrix as text."""
+    return ' '.join('[' + ' '.join(f'{value:.2g}' for value in row) + ']' for row in matrix)

@@ -206,7 +206,7 @@ class _Exam:
         noisy = self._noisy_runs()
         if not noisy:
             return
-        self.measures |= diagnosis.marks(self.outcomes, self._absolute)
+        self.measures = diagnosis.marks(self.outcomes, self._absolute) | self.measures
         offset, fault = diagnosis.stamp_fault(noisy[0].last(), self._absolute)
         self.measures['stamp_offset_s'] = offset.seconds
         self._add(fault)

@@ -34,7 +34,9 @@ from spinning_top_sim.exam.course import (
     mapped,
     moved,
     of_world,
+    rows_of,
     shifted,
+    unit,
     untilted,
     with_iron,
     words,
@@ -70,7 +72,6 @@ LEARNED, LEARNING, BIAS_FOUND = 0.5, 0.9, 0.05
 LEVI_CIVITA = np.cross(np.eye(3)[:, np.newaxis], np.eye(3)).transpose(2, 0, 1)
 BIAS_OFF = 0.5                  # by which the reported bias differs, relative
 
-
 SIGNED = [np.array(signs)[:, np.newaxis] * np.eye(3)[list(order)]
           for order in itertools.permutations(range(3))
           for signs in itertools.product((1.0, -1.0), repeat=3)][1:]
@@ -78,7 +79,6 @@ ONE_STEP = (        # no fault: the filter corrects before it takes the step
     Hypothesis((), 'corrected before the step',
                given=shifted(('accelerometer', 'magnetometer'), -1)),
     Hypothesis((), 'a step ahead', read=lambda q: moved(q, -1)))
-
 
 Tried = tuple[Hypothesis, Outcome]
 
@@ -213,7 +213,7 @@ class Responses:
                        f'turned by {-math.degrees(heading):.3g} deg about the vertical',
                        read=lambda q: (back * Rotation.from_quat(q)).as_quat()),
             Hypothesis(('inaccurate',), f'with the vector part of the attitude divided by '
-                       f'{scale:.4g}', read=lambda q: _unit(q / (scale, scale, scale, 1.0)))))
+                       f'{scale:.4g}', read=lambda q: unit(q / (scale, scale, scale, 1.0)))))
 
     def _of_gyroscope(self) -> Iterator[Tried]:
         """Try the inverse of the matrix that the gyroscope has."""
@@ -258,8 +258,8 @@ class Responses:
             matrix = np.linalg.svd(products.reshape(-1, 9))[2][-1].reshape(3, 3)
             matrix *= 3.0 ** 0.5 * np.sign(np.sum(said * (true @ matrix.T)))
             if np.linalg.cond(matrix) < WORST:
-                tried.append(wired(name, f'gravity is taken as {_rows(matrix)} times itself: with '
-                                   'the inverse of that', np.linalg.inv(matrix)))
+                tried.append(wired(name, f'with the inverse of {rows_of(matrix)} on the {name}',
+                                   np.linalg.inv(matrix)))
         return self._tried((*tried, *(
             wired(name, f'with the {name} multiplied by {by:.4g}', by * np.eye(3))
             for by in (scenarios.GRAVITY, 1.0 / scenarios.GRAVITY))))
@@ -352,14 +352,12 @@ class Responses:
         elif left.wrong and whole.late > 1:
             self.faults.append(Fault('lag', f'turns are followed {whole.late} samples late; '
                                      + text))
-        elif left.wrong:
+        elif not self._judge_kicks() and left.wrong:
             self.faults.append(Fault('inaccurate', f'{text}: no cause explains it'))
-        else:
-            self._judge_kicks()
 
-    def _judge_kicks(self) -> None:
-        """Judge whether the attitude returns after a kick of the gyroscope alone."""
-        n = round(ANSWER_S * scenarios.SLOW.rate)
+    def _judge_kicks(self) -> bool:
+        """Name what does not return after a kick of the gyroscope alone; return whether."""
+        named, n = len(self.faults), round(ANSWER_S * scenarios.SLOW.rate)
         error = (Rotation.from_quat(self.outcome.estimates)
                  * Rotation.from_quat(self.outcome.run.truth).inv()).as_rotvec()
         up, down = ((error[first + LATEST] - error[first - 1], error[first + n - 1]
@@ -373,6 +371,7 @@ class Responses:
                 self.faults.append(Fault(
                     name, f'{left:.0%} of an error of the {what} are left after {ANSWER_S:g} s: '
                     f'the {sensor} does not correct it'))
+        return len(self.faults) > named
 
     def bias(self) -> tuple[dict[str, float], Fault | None]:
         """Judge the effect of a gyroscope bias; return measures and the fault."""
@@ -418,12 +417,3 @@ class Responses:
         learned = again < LEARNED * first or (
             again < LEARNING * first and part[0] > max(BIAS_FOUND * size ** 2, 1.2 * part[1]))
         return rms(apart[motion]) / size, bool(learned), found
-
-
-def _unit(quaternions: Reals) -> Reals:
-    unit: Reals = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return unit
-
-
-def _rows(matrix: Reals) -> str:
-    return ' '.join('[' + ' '.join(f'{value:.2g}' for value in row) + ']' for row in matrix)
