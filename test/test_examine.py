@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from helpers.faulty_filters import FAULTY, MISREADINGS
 from helpers.reference import ROOT
+from helpers.wrong_filters import TABLE
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import (
@@ -129,6 +130,14 @@ def test_a_fault_of_the_method_is_named(report, name):
     found = report(name, 'component_order')
     assert found.faults == ['component_order', name]        # which hides the other comes first
     assert set(FAULTY) == set(FAULTS)
+
+
+@pytest.mark.parametrize('name', ['mahony, right', 'mahony, no gravity', 'mahony, bias clamped',
+                                  'complementary, wrong side', 'ekf, hard iron'])
+def test_filters_of_other_kinds_are_blamed_for_their_fault_only(name):
+    make, causes = TABLE[name]
+    found = examine(make, seeds=1, isolated=False)
+    assert bool(found.faults) == bool(causes) and causes.issuperset(found.faults), found
 
 
 def test_a_filter_without_faults_passes(report):

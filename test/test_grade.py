@@ -19,6 +19,7 @@ from helpers.faulty_simulators import (
     Stepped,
     exact,
 )
+from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top
@@ -172,6 +173,42 @@ def test_a_motion_that_exists_is_graded():
     assert grade_trajectory(first, WHEEL, start).names == ['first_order']
     noisy, _ = trajectory_of(lambda *given: Imu(defect='residuals')(SENSOR, *given[1:]))
     assert grade_trajectory(noisy, top, start, **imu).passed, 'no noise is declared'
+
+
+@pytest.mark.parametrize('scene', [SCENES[1], SCENES[3]], ids=['waves', 'near the separatrix'])
+def test_a_log_with_fewer_samples_than_steps_shows_their_kind(scene):
+    for method, fault in (('semi-implicit', 'explicit_gyroscopic_term'),
+                          ('implicit', 'implicit_damping'), ('rk4', None)):
+        start, times = scene.start_of(WHEEL, 0), 0.01 * np.arange(400)
+        attitudes, rates, _ = Stepped(method=method)(WHEEL, start, times, 0.002)
+        said = {'attitudes': attitudes[:, [3, 0, 1, 2]], 'rates': rates}
+        report = grade_trajectory(said, WHEEL, start, times=times)
+        assert report.names == [fault] * bool(fault), report
+
+
+@pytest.mark.parametrize('theta', [0.0, math.pi])
+@pytest.mark.parametrize('gravity', [0.0, 9.8, -9.8])
+def test_a_top_that_only_spins_shows_no_faults_that_cannot_be_seen(theta, gravity):
+    body = replace(WHEEL, gravity=gravity)
+    start = Start.of(body, State(theta=theta, l3=2.0, lz=2.0 * math.cos(theta)))
+    times = 0.01 * np.arange(50)
+    said = Imu(defect='increments', parts=(
+        'rates', 'gyroscope', 'accelerations', 'magnetometer', 'increments'))(
+            body, start, times, 0.01)
+    assert grade_trajectory(said, body, start, times=times).passed
+
+
+def test_all_faults_are_in_the_page_and_no_other():
+    page = (ROOT / 'docs/grade.md').read_text(encoding='utf-8')
+    _, table = page.split('| fault | signature |')
+    names = [name for line in table.splitlines() if line.startswith('| `')
+             for name in re.findall(r'`(\w+)`', line.split('|')[1])]
+    assert sorted(names) == sorted(FAULTS)
+    named = {name for faults in (*PUBLISHED.values(), *OTHER.values(),
+                                 *(faults for _, faults in STEPPED.values())) for name in faults}
+    # Those without a simulator there have a test of their own here.
+    assert set(FAULTS) - named == {
+        'invalid_output', 'not_deterministic', 'inaccurate', 'inconsistent_reading'}
 
 
 def test_a_report_is_readable_and_json():

@@ -42,7 +42,7 @@ def ride_of(case):
 
 def errors(case):
     """
-    Return the worst error of each quantity over max(1, its true size).
+    Return the worst error of a component of each quantity over max(1, its true size).
 
     Euler's equations give alpha as a difference of products of rates: it has the size of omega^2.
     """
@@ -53,11 +53,11 @@ def errors(case):
         worst[name] = 0.0
         for row, state in zip(rows, case['states'], strict=True):
             true = [Decimal(x) for x in state[name]]
-            size = max(1, *map(abs, true))
-            if name == 'alpha':
-                size = max(size, *(Decimal(x) ** 2 for x in state['omega']))
-            worst[name] = max(worst[name], *(float(abs(Decimal(float(x)) - y) / size)
-                                             for x, y in zip(row, true, strict=True)))
+            least = 1 if name != 'alpha' else max(
+                1, *map(abs, true), *(Decimal(x) ** 2 for x in state['omega']))
+            worst[name] = max(worst[name], *(
+                float(abs(Decimal(float(x)) - y) / max(least, abs(y)))
+                for x, y in zip(row, true, strict=True)))
     return worst
 
 

@@ -304,6 +304,15 @@ def test_a_command_comes_after_what_is_due():
     assert run.loop.commands == run.told.count('command') == 1
 
 
+def test_of_the_velocities_in_twenty_milliseconds_the_last_one_counts():
+    run = started()
+    for number in range(1, 12):
+        run.loop.drive((number, 0.0, 0.0))
+        run.tick()
+    assert [entry[:2] for entry in run.simulation.history] == [
+        (5_000_000, 1.0), (25_000_000, 5.0), (45_000_000, 9.0)]
+
+
 def test_nothing_leads_on_from_the_end():
     run = started(duration=0.02).ticks(10)
     for act in (run.loop.start, run.loop.pause, run.loop.resume,

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run without noise that shows one input at a time, and the answer to the gyroscope on it."""
 
+import itertools
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -49,25 +51,20 @@ class Course(NamedTuple):
 def course(imu: Mapping[str, Any], rate: float) -> Course:
     """Return the run for the IMU's place and field, sampled at a rate [Hz]."""
     motion = scenarios.record(replace(scenarios.PIVOT, duration=MOTION_S, rate=rate), imu, 0)
-    steps, rests, turns = [np.zeros((round(FIRST_S * rate), 3))], [], []
-    for axis, angle in TURNS:
-        begin = sum(map(len, steps))
-        n = round(abs(math.radians(angle)) / TURN_RATE * rate)
-        rests.append(begin - 1)
-        turns.append(begin)
-        steps += [np.tile(math.radians(angle) / n * np.eye(3)[axis], (n, 1)),
-                  np.zeros((round(REST_S * rate), 3))]
-    rests.append(sum(map(len, steps)) - 1)
     at = Rotation.identity()
-    path = [at, *(at := at * Rotation.from_rotvec(step) for step in np.concatenate(steps))]
-    for goal in (path[0], Rotation.from_quat(motion.truth[0])):
+    path = [np.tile(at.as_quat(), (round(FIRST_S * rate) + 1, 1))]
+    ways = [math.radians(angle) * np.eye(3)[axis] for axis, angle in TURNS]
+    ends = list(itertools.accumulate(map(Rotation.from_rotvec, ways), operator.mul))
+    rests, turns = [len(path[0]) - 2], []
+    for goal in (*ends, at, Rotation.from_quat(motion.truth[0])):
         way = (at.inv() * goal).as_rotvec()
-        n = round(np.linalg.norm(way) / TURN_RATE * rate) + 1
-        path += [at * Rotation.from_rotvec(k / n * way) for k in range(1, n + 1)]
-        path += [goal] * round(REST_S * rate)
+        n = round(float(np.linalg.norm(way)) / TURN_RATE * rate) + 1
+        turns.append(rests[-1] + 1)
+        path += [(at * Rotation.from_rotvec(np.outer(np.arange(1, n + 1) / n, way))).as_quat(),
+                 np.tile(goal.as_quat(), (round(REST_S * rate), 1))]
+        rests.append(rests[-1] + n + round(REST_S * rate))
         at = goal
-        rests.append(len(path) - 2)
-    lead = scenarios.along('', Rotation.concatenate(path), imu, rate)
+    lead = scenarios.along('', Rotation.from_quat(np.concatenate(path)), imu, rate)
     n = round(ANSWER_S * rate)
     tail = scenarios.along('', Rotation.from_quat(np.tile(motion.truth[-1], (3 * n + 1, 1))), imu,
                            rate)
@@ -77,8 +74,8 @@ def course(imu: Mapping[str, Any], rate: float) -> Course:
     run = replace(tail.after(motion.after(lead)), name='course')
     run.gyroscope[:] += NEVER_ZERO
     end = len(lead.t) + len(motion.t)
-    return Course(run, np.array(rests), np.array(turns), slice(end - len(motion.t) // 2, end),
-                  (end + n, end + 2 * n))
+    return Course(run, np.array(rests), np.array(turns[:len(TURNS)]),
+                  slice(end - len(motion.t) // 2, end), (end + n, end + 2 * n))
 
 
 class Gyroscope(NamedTuple):

@@ -211,14 +211,16 @@ class _Exam:
         self.measures['stamp_offset_s'] = offset.seconds
         self._add(fault)
         self._add(diagnosis.divergence(noisy[0], self._absolute))
+        clear = self._responses is None or not self._responses.unclear
         for part in (self._judge_integration, partial(self._judge_lever_arm, noisy[0]),
-                     self._judge_bias):
+                     self._judge_bias)[:3 if clear else 1]:
             with self._guarded():
                 part()
         self._do_extra(extra)
         if not self.faults:
             self._add(diagnosis.inaccuracy(noisy[0], self._absolute))
-        self._sort_out()
+        if any(fault.name not in SHOW_ELSEWHERE for fault in self.faults):
+            self.faults = [fault for fault in self.faults if fault.name != 'inaccurate']
         consistency = diagnosis.consistency(noisy, self._absolute)
         self.measures |= diagnosis.nees_marks(consistency)
         if self.judges_covariance and not self.faults:  # faults are another reason for errors
@@ -336,25 +338,21 @@ class _Exam:
         for outcome in outcomes:
             said, true = map(increments, (outcome.estimates, outcome.run.truth))
             answers.append(float(np.sum(said * true) / np.sum(true * true)))
-        if abs(answers[-1] - answers[0]) <= STEP * abs(answers[0]):
+        if abs(answers[-1] - answers[0]) < STEP * max(abs(answers[0]), STEP):
             return
         # A wrong step turns up as a wrong scale at one rate.
         self.faults = [fault for fault in self.faults if not (
             fault.name == 'gyroscope_wiring' and 'time_step' in dict(self.faults))]
-        self._add(Fault('time_step', f'at {self.finer[-1]:g} times the rate the same turn moves '
-                        f'it {answers[-1] / answers[0]:.3g} times as far: the step is not used'))
+        self._add(Fault('time_step', f'at {" and ".join(f"{one.run.name}" for one in outcomes)} '
+                        f'turns move it {" and ".join(f"{one:.3g}" for one in answers)} times as '
+                        'far as the sensor: the step is not used'))
 
     def _judge_bias(self) -> None:
         """Compare two runs with and without a gyroscope bias."""
         if self._responses is not None:
-            before = len(self._responses.faults)
-            self.measures |= self._responses.bias()
-            self.faults += self._responses.faults[before:]
-
-    def _sort_out(self) -> None:
-        """Drop `inaccurate` where a cause is named that shows in these runs."""
-        if any(fault.name not in SHOW_ELSEWHERE for fault in self.faults):
-            self.faults = [fault for fault in self.faults if fault.name != 'inaccurate']
+            measured, fault = self._responses.bias()
+            self.measures |= measured
+            self._add(fault)
 
     def _do_extra(self, extra: Sequence[Scenario]) -> None:
         for scenario in extra:

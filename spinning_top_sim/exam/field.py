@@ -95,17 +95,8 @@ def examine_field(make_filter: MakeFilter, seeds: Iterable[int], *, subject: str
     """
     Examine a filter with the scenes.
 
-    The measures are the root mean squares of the errors in motion, as in `examine_data`.
-
-    Parameters
-    ----------
-    make_filter, subject : as for `examine`
-    seeds : iterable of int
-        Each decides on the motions, the noise and the device.
-    imu : mapping, optional
-        Parameters imu.* and mag.* that differ from those of DEVICE.
-    feed : callable, optional
-        Feeds a new filter; by default in another process.
+    The measures are those of `examine_data`.  A seed decides on motions, noise and device; `imu`
+    has the parameters imu.* and mag.* that differ from those of DEVICE.
     """
     return judge(make_filter, (record(scene, seed, imu or {}) for seed in seeds
                                for scene in SCENES), 'field', subject, feed)

@@ -13,6 +13,8 @@ from scipy.special import gammaincinv
 from spinning_top_sim.exam.scenarios import Reals
 
 CONVERGED_DEG = 1.0
+# Runs from which their spread is known, and how much of it has another reason than chance.
+FEWEST_RUNS, APART = 3, 5.0
 
 
 class Errors(NamedTuple):
@@ -174,6 +176,12 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
         values = np.stack([squares[:shortest] for squares, _ in parts])
         mean = max(float(np.mean(values)), 1e-300)
         independent = len(runs) if absolute else values.size / autocorrelation_time(values)
+        if len(runs) >= FEWEST_RUNS:
+            # A constant error, such as that of a bias, is one draw a run: then the means of the
+            # runs differ by more than the errors in a run let expect.
+            spread = float(np.var(np.mean(values, axis=1), ddof=1)) / mean ** 2
+            draws = 2.0 * len(runs) / max(dimensions * spread, 1e-12)
+            independent = draws if draws < independent / APART else independent
         # Negative log-likelihood for the best common factor of the covariances.
         unlikely = dimensions * math.log(mean) + float(np.mean([size for _, size in parts]))
         found.append((unlikely, Nees(mean / dimensions, dimensions * independent)))

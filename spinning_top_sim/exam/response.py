@@ -22,6 +22,7 @@ from spinning_top_sim.exam import measures, scenarios
 from spinning_top_sim.exam.course import (
     ANSWER_S,
     EARLY,
+    HEADING,
     LATEST,
     TILT,
     WHOLE,
@@ -82,6 +83,17 @@ ONE_STEP = (        # no fault: the filter corrects before it takes the step
 Tried = tuple[Hypothesis, Outcome]
 
 
+def wired(sensor: str, text: str, matrix: Any) -> Hypothesis:
+    """Return the hypothesis that the readings of a sensor need this matrix."""
+    return Hypothesis((f'{sensor}_wiring',), text, given=mapped(sensor, matrix))
+
+
+def permuted(sensor: str, likely: Sequence[Reals], count: int) -> list[Hypothesis]:
+    """Return the hypotheses that the filter has these signed permutations of a sensor."""
+    return [wired(sensor, f'with {axes(one.T)} of the {sensor} for its x, y, z', one.T)
+            for one in likely[:count]]
+
+
 class Responses:
     """
     The answers of one filter.
@@ -105,6 +117,8 @@ class Responses:
         self.faults: list[Fault] = []
         self.undone: list[Hypothesis] = []
         self._harmless: list[Hypothesis] = []
+        # Whether an error is left that would be taken for that by a lever arm or a bias.
+        self.unclear = False
         self.outcome = self._answer(())
 
     def identify(self) -> None:
@@ -120,7 +134,13 @@ class Responses:
                                   'after this correction') for name in one.faults]
             kept = self.undone if set(one.faults) - {'stamp_offset'} else self._harmless
             kept.insert(0, one)
+            self.unclear |= one.given is of_world
+        before = len(self.faults)
         self._name_the_rest()
+        self.unclear |= len(self.faults) > before
+        if self.unclear:
+            self.faults[-1] = self.faults[-1]._replace(evidence=f'{self.faults[-1].evidence}; '
+                                                       'no lever arm and no bias is judged')
 
     def clean(self, outcome: Outcome) -> Clean:
         """Return the errors on the course."""
@@ -155,8 +175,8 @@ class Responses:
         if not self.clean(self.outcome).wrong and not self._turns_wrong(self.outcome, GAIN):
             return None
         limit = EXPLAINED * self._whole(self.outcome)
-        for stage in (self._of_attitudes, self._of_gyroscope, self._of_steps,
-                      self._of_accelerometer, self._of_axes, self._of_field, self._of_delays):
+        for stage in (self._of_attitudes, self._of_delays, self._of_gyroscope,
+                      self._of_accelerometer, self._of_axes, self._of_field, self._of_inputs):
             gross = stage == self._of_gyroscope and self._turns_wrong(self.outcome, GROSS_GAIN)
             tried = []
             for one, outcome in stage():
@@ -182,8 +202,8 @@ class Responses:
         square = group[int(np.argmin((group.inv() * in_sensor).magnitude()))]
         vectors, last = (np.array([np.linalg.norm(one.as_quat()[:, :3], axis=1),
                                    np.abs(one.as_quat()[:, 3])]) for one in (said, true))
-        scale = float(np.median(vectors[0] * last[1]
-                                / np.maximum(vectors[1] * last[0], 1e-9))) or 1.0
+        scale = max(float(np.median(
+            vectors[0] * last[1] / np.maximum(vectors[1] * last[0], 1e-9))), 1e-3)
         return self._tried((
             *READINGS,
             Hypothesis(('frame_ned',), 'read as attitude of axes '
@@ -202,16 +222,18 @@ class Responses:
             return iter(())
         fit = whole if whole.scatter < SCATTER else early
         scale = float(np.trace(fit.matrix)) / 3.0
-        uniform = bool(np.max(np.abs(fit.matrix - scale * np.eye(3))) < GAIN < scale)
-        tried = [Hypothesis(
-            ('gyroscope_wiring',), f'with {axes(one)} of the gyroscope for its x, y, z',
-            given=mapped('gyroscope', one.T)) for one in sorted(
-                SIGNED, key=lambda one: float(np.sum((one - fit.matrix) ** 2)))[:3]]
-        tried += [Hypothesis(('gyroscope_units',), f'with the gyroscope multiplied by {text}',
-                             given=mapped('gyroscope', by * np.eye(3)))
-                  for text, by in (('pi/180', math.radians(1.0)), ('180/pi', math.degrees(1.0)))]
-        tried.append(Hypothesis(('gyroscope_wiring',), 'with rates about axes of the world (a '
-                                'product on the wrong side)', given=of_world))
+        uniform = bool(np.max(np.abs(fit.matrix - scale * np.eye(3))) < 0.3 * abs(scale - 1.0))
+        tried = []
+        if min(whole.off, early.off) > GROSS_GAIN:
+            tried = permuted('gyroscope', sorted(
+                SIGNED, key=lambda one: float(np.sum((one - fit.matrix) ** 2))), 3)
+            tried += [Hypothesis(
+                ('gyroscope_units',), f'with the gyroscope multiplied by {text}',
+                given=mapped('gyroscope', by * np.eye(3))) for text, by in (
+                    ('pi/180', math.radians(1.0)), ('180/pi', math.degrees(1.0)))]
+            tried.append(Hypothesis(
+                ('gyroscope_wiring',), 'with rates about axes of the world (a product on the '
+                'wrong side)', given=of_world))
         if np.linalg.cond(fit.matrix) < WORST:
             tried.append(Hypothesis(
                 ('gyroscope_wiring', 'time_step') if uniform else ('gyroscope_wiring',),
@@ -219,9 +241,6 @@ class Responses:
                 + ' (a scale of the rates and one of the step cannot be told apart)' * uniform,
                 given=mapped('gyroscope', np.linalg.inv(fit.matrix))))
         return self._tried(tried)
-
-    def _of_steps(self) -> Iterator[Tried]:
-        return self._tried(ONE_STEP)
 
     def _of_accelerometer(self) -> Iterator[Tried]:
         """Try signs, axes and scales of the accelerometer that fit the verticals at rest."""
@@ -231,22 +250,19 @@ class Responses:
         said, true = (turns.inv().apply((0.0, 0.0, 1.0)) for turns in (
             attitudes, Rotation.from_quat(self.course.run.truth[rows])))
         name = 'accelerometer'
-        likely = sorted(SIGNED, key=lambda one: -float(np.sum(said * (true @ one.T))))[:LIKELY]
-        # said x (matrix true) = 0
-        products = np.einsum('ijk,nj,nl->nikl', LEVI_CIVITA, said, true).reshape(-1, 9)
-        matrix = np.linalg.svd(products)[2][-1].reshape(3, 3)
-        matrix *= 3.0 ** 0.5 * np.sign(np.sum(said * (true @ matrix.T)))
-        tried = [GRAVITY_SIGN, *(Hypothesis(
-            (f'{name}_wiring',), f'with {axes(one)} of the {name} for its x, y, z',
-            given=mapped(name, one.T)) for one in likely if np.any(one != -np.eye(3)))]
-        if np.linalg.cond(matrix) < WORST:
-            tried.append(Hypothesis(
-                (f'{name}_wiring',), f'gravity is taken as {_rows(matrix)} times itself: with the '
-                'inverse of that', given=mapped(name, np.linalg.inv(matrix))))
-        tried += [Hypothesis((f'{name}_wiring',), f'with the {name} multiplied by {by:.4g}',
-                             given=mapped(name, by * np.eye(3)))
-                  for by in (scenarios.GRAVITY, 1.0 / scenarios.GRAVITY)]
-        return self._tried(tried)
+        likely = sorted(SIGNED, key=lambda one: -float(np.sum(said * (true @ one.T))))
+        tried = [GRAVITY_SIGN, *permuted(name, likely, LIKELY)]
+        for part in np.array_split(np.arange(len(rows)), 2 if self._restarts else 1)[::-1]:
+            # said x (matrix true) = 0
+            products = np.einsum('ijk,nj,nl->nikl', LEVI_CIVITA, said[part], true[part])
+            matrix = np.linalg.svd(products.reshape(-1, 9))[2][-1].reshape(3, 3)
+            matrix *= 3.0 ** 0.5 * np.sign(np.sum(said * (true @ matrix.T)))
+            if np.linalg.cond(matrix) < WORST:
+                tried.append(wired(name, f'gravity is taken as {_rows(matrix)} times itself: with '
+                                   'the inverse of that', np.linalg.inv(matrix)))
+        return self._tried((*tried, *(
+            wired(name, f'with the {name} multiplied by {by:.4g}', by * np.eye(3))
+            for by in (scenarios.GRAVITY, 1.0 / scenarios.GRAVITY))))
 
     def _at_rest(self) -> tuple[Rotation, NDArray[np.intp]]:
         """Return attitudes at rest, at the end and of filters that start there, and the rows."""
@@ -260,7 +276,7 @@ class Responses:
     def _of_axes(self) -> Iterator[Tried]:
         """Try signs and axes of the magnetometer that fit the headings at rest best."""
         before, name = self.clean(self.outcome), 'magnetometer'
-        if not self._absolute or max(before.tilt, before.heading) < TILT:
+        if not self._absolute or max(before.tilt, before.heading) < HEADING:
             return iter(())
         said, rows = self._at_rest()
         field = self.course.run.magnetometer[rows]
@@ -271,14 +287,12 @@ class Responses:
 
         return self._tried((
             Hypothesis((f'{name}_wiring',), 'with the field of a level sensor', given=untilted),
-            *(Hypothesis((f'{name}_wiring',), f'with {axes(one)} of the {name} for its x, y, z',
-                         given=mapped(name, one.T))
-              for one in sorted(SIGNED, key=north, reverse=True)[:LIKELY])))
+            *permuted(name, sorted(SIGNED, key=north, reverse=True), LIKELY)))
 
     def _of_field(self) -> Iterator[Tried]:
         """Try a hard iron, scales and units of the magnetometer."""
         before, name = self.clean(self.outcome), 'magnetometer'
-        if not self._absolute or max(before.tilt, before.heading) < TILT:
+        if not self._absolute or max(before.tilt, before.heading) < HEADING:
             return
         iron = self._fitted([partial(with_iron, one) for one in np.eye(3)])
         scale = 1.0 + 0.02 * self._fitted([mapped(name, np.eye(3) + 0.02 * np.diag(one))
@@ -286,23 +300,27 @@ class Responses:
         yield from self._tried((
             Hypothesis(('hard_iron',), f'with {", ".join(f"{value:.3g}" for value in iron)} uT '
                        f'added to the {name}', given=partial(with_iron, iron)),
-            Hypothesis((f'{name}_wiring',), f'with x, y of the {name} multiplied by '
-                       f'{", ".join(f"{value:.3g}" for value in scale)}',
-                       given=mapped(name, np.diag((*scale, 1.0))))))
+            wired(name, f'with x, y of the {name} multiplied by '
+                  f'{", ".join(f"{value:.3g}" for value in scale)}', np.diag((*scale, 1.0)))))
 
     def _of_delays(self) -> Iterator[Tried]:
-        """Try delays of each sensor, and of the attitudes."""
+        """Try delays of the attitudes and the gyroscope, and what is no fault."""
         late = self.gyroscope(self.outcome)[0].late
         part = self.outcome.since(self.course.motion.start)
         offset = measures.time_offset(part.estimates, part.run.truth, part.run.rates,
                                       self._absolute).seconds * scenarios.SLOW.rate
-        found = [Hypothesis(('lag',), f'with the gyroscope {late} samples earlier',
-                            given=shifted(('gyroscope',), late))] if late > 0 else []
+        tried = [*ONE_STEP]
         if not AHEAD <= offset <= DELAYED:
-            found.append(Hypothesis(
+            tried.append(Hypothesis(
                 ('stamp_offset',), f'with the attitude {round(offset)} samples earlier',
                 read=lambda q: moved(q, round(offset))))
-        yield from self._tried(found)
+        if late > 0:
+            tried.append(Hypothesis(('lag',), f'with the gyroscope {late} samples earlier',
+                                    given=shifted(('gyroscope',), late)))
+        return self._tried(tried)
+
+    def _of_inputs(self) -> Iterator[Tried]:
+        """Try delays of the other sensors."""
         for names in (('accelerometer',), ('magnetometer',), ('accelerometer', 'magnetometer')):
             by = 2.0 * float(self._fitted([shifted(names, 2)])[0])
             if by > 0.5:
@@ -356,28 +374,26 @@ class Responses:
                     name, f'{left:.0%} of an error of the {what} are left after {ANSWER_S:g} s: '
                     f'the {sensor} does not correct it'))
 
-    def bias(self) -> dict[str, float]:
-        """Judge the effect of a gyroscope bias; return measures."""
+    def bias(self) -> tuple[dict[str, float], Fault | None]:
+        """Judge the effect of a gyroscope bias; return measures and the fault."""
         late, learned, found = self._with_bias(BIAS)
-        size = float(np.linalg.norm(BIAS))
+        size, known = float(np.linalg.norm(BIAS)), bool(np.isfinite(found[0]))
         measured = {'bias_error_s': late, 'bias_found': float(found @ BIAS) / size ** 2}
-        known = bool(np.isfinite(found[0]))
-        if late > BIAS_LEFT_S and not learned:
-            text = (f'with a gyroscope bias of 1 deg/s the '
-                    f'{"attitude" if self._absolute else "tilt"} is {late:.3g} deg off in the end:'
-                    ' the bias is not learned')
-            if known:
-                text += f', and the estimate has {measured["bias_found"]:.1%} of the bias'
-                small = self._with_bias(0.05 * BIAS)
-                if small[0] <= BIAS_LEFT_S or small[1]:
-                    text += '; one twenty times as small is learned, so the estimate is limited'
-            self.faults.append(Fault('no_bias_estimate', text))
-        elif known and late <= BIAS_LEFT_S and np.linalg.norm(found - BIAS) > BIAS_OFF * size:
-            self.faults.append(Fault(
+        if late <= BIAS_LEFT_S or learned:
+            if not known or late > BIAS_LEFT_S or np.linalg.norm(found - BIAS) < BIAS_OFF * size:
+                return measured, None
+            return measured, Fault(
                 'bias_report', 'the effect of a gyroscope bias of '
                 f'{np.degrees(BIAS).round(2).tolist()} deg/s disappears, but the estimate is '
-                f'{np.degrees(found).round(2).tolist()} deg/s'))
-        return measured
+                f'{np.degrees(found).round(2).tolist()} deg/s')
+        text = (f'with a gyroscope bias of 1 deg/s the {"attitude" if self._absolute else "tilt"} '
+                f'is {late:.3g} deg off in the end: the bias is not learned')
+        if known:
+            text += f', and the estimate has {measured["bias_found"]:.1%} of the bias'
+            small = self._with_bias(0.05 * BIAS)
+            if small[0] <= BIAS_LEFT_S or small[1]:
+                text += '; one twenty times as small is learned, so the estimate is limited'
+        return measured, Fault('no_bias_estimate', text)
 
     def _with_bias(self, bias: Reals) -> tuple[float, bool, Reals]:
         """Return the effect in the end [s], whether it is being learned, and the estimate."""

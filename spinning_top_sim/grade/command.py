@@ -23,15 +23,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade import files
-from spinning_top_sim.grade.fit import EXACT, LARGEST, fit, near_start, whiteness
+from spinning_top_sim.grade.fit import fit, near_start
 from spinning_top_sim.grade.grader import grade_trajectory
 from spinning_top_sim.grade.scenes import Body
-from spinning_top_sim.grade.trajectory import Trajectory
-from spinning_top_sim.physics.top import State
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
@@ -82,7 +79,7 @@ def _run(arguments: argparse.Namespace) -> int:
     elif off := near_start(recorded.parts, body, state):
         raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
                          '--fit finds top and start')
-    trajectory = _without_noise(recorded, body, state)
+    trajectory = recorded.trajectory(ExactSolution(body, state))
     report = grade_trajectory(trajectory, body, state, subject=arguments.file.name)
     if arguments.json:
         print(json.dumps({**json.loads(report.as_json()), 'notes': recorded.notes,
@@ -92,18 +89,6 @@ def _run(arguments: argparse.Namespace) -> int:
         for line in lines:
             cli.print_line(line)
     return cli.OK if report.passed and (found is None or found.reached) else cli.FAILED
-
-
-def _without_noise(recorded: files.Recorded, body: Body, state: State) -> Trajectory:
-    """Return the trajectory, with the exact attitudes if it has them but for white noise."""
-    trajectory = recorded.trajectory()
-    q = ExactSolution(body, state).states_at_seconds(trajectory.t).quaternion
-    level, white = whiteness((Rotation.from_quat(q).inv() * trajectory.rotation).as_rotvec().T)
-    if not white or not EXACT < level < LARGEST:
-        return trajectory
-    recorded.notes.append(f'the attitudes are exact but for noise of {level:.3g} rad: graded '
-                          'without it')
-    return replace(trajectory, attitudes=np.roll(q, 1, axis=1))
 
 
 def _body(values: Mapping[str, Any]) -> Body:

@@ -45,16 +45,14 @@ def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
                                for size, part in zip(sizes, parts, strict=True)])
 
     target = pooled(derived) - pooled(told)
-    if not rms(target):
-        return told, []
     step = np.concatenate([size * derivative(rates, 1.0)
                            for size, rates in zip(sizes, told, strict=True)])
     (lead,), left = least_squares(target, [step])
-    if abs(lead) <= LATE and rms(left) <= STRANGE:
-        return told, []
-    if rms(left) < 0.5 * rms(target):
+    if abs(lead) > LATE and 1e-6 < rms(target) > 2.0 * rms(left):
         return derived, [Fault('imu_one_step_late', f'rates belong to the attitudes of {lead:.3g} '
                                'steps before', float(lead))]
+    if rms(left) <= STRANGE:
+        return told, []
     turned = [motion.trajectory.rotation[MARGIN:-MARGIN].inv().apply(rates)
               for motion, rates in zip(motions, told, strict=True)]
 
@@ -136,7 +134,8 @@ def _gyroscopic(found: Reals) -> Fault:
 
 def _step(found: Reals) -> Fault:
     at, gravity_at = (0.5 + found).tolist()
-    name, means = (('first_order', f'gravity at {gravity_at:.3g}') if abs(at - 0.5) < NEAR else
+    name, means = (('first_order', f'gravity at {gravity_at:.3g}') if
+                   abs(found[0]) < 0.5 * abs(found[1]) else
                    ('implicit_damping', 'it removes energy') if at > 0.5 else
                    ('explicit_gyroscopic_term', 'it adds energy') if at > -0.5 else
                    ('coriolis_sign', 'its derivative in an implicit step has the wrong sign'))

@@ -19,13 +19,16 @@ from typing import Any
 from zipfile import is_zipfile
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from spinning_top_sim.grade.fit import EXACT, LARGEST, whiteness
 from spinning_top_sim.grade.scenes import Reals
 from spinning_top_sim.grade.trajectory import LEAST_SAMPLES, Trajectory
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 from spinning_top_sim.tools import recorded_run
 
@@ -48,8 +51,10 @@ UNITS = {'deg': math.pi / 180.0, 'dps': math.pi / 180.0}
 NEEDED = ('columns such as t, qw, qx, qy, qz or phi, theta, psi, or messages of a type that '
           'docs/grade_files.md lists')
 SAME_S = 1e-6               # between two stamps of one time
-EVEN = 1e-3                 # share of the interval by which evenly spaced samples may be off
-GAP = 1.5                   # intervals that are a gap
+EVEN = 1e-4                 # share of the interval by which evenly spaced samples may be off
+GAP = 2.5                   # intervals that are a gap
+DEGREE = 5                  # of the splines between samples
+COARSE = 0.5                # turned from one sample to the next [rad]: derivatives fail
 LATEST_START_S = 1.0        # an earlier first stamp counts from the start, a later one is a date
 
 
@@ -69,45 +74,72 @@ class Recorded:
     parameters: Mapping[str, Any] | None = None
     notes: list[str] = field(default_factory=list)
 
-    def add(self, kind: str, times: Reals, values: Reals) -> None:
-        """Add rows in any order; the first part of a name and the first of equal times stay."""
+    def add(self, kind: str, times: Reals, values: Reals) -> bool:
+        """Add rows in any order, unless there are some; return whether they were added."""
         known = np.isfinite(times) & np.all(np.isfinite(values), axis=1)
         at, first = np.unique(times[known], return_index=True)
         if kind == ANGLES:
             kind, values = ATTITUDES, np.roll(Rotation.from_euler('ZYZ', values).as_quat(), 1, 1)
-        if len(at):
-            self.parts.setdefault(kind, (at, values[known][first]))
+        added = bool(len(at)) and kind not in self.parts
+        if added:
+            self.parts[kind] = at, values[known][first]
+        return added
 
     def begin_at(self, time: float) -> None:
         """Count the times from this one on."""
         self.parts = {name: (at - time, values) for name, (at, values) in self.parts.items()}
 
-    def trajectory(self) -> Trajectory:
-        """Return all parts at the times of the attitudes, which are made evenly spaced."""
-        times, attitudes = self.parts[ATTITUDES]
-        steps = np.diff(times)
-        ends = np.array([0, *(np.flatnonzero(steps > GAP * np.median(steps)) + 1), len(times)])
-        longest = slice(*ends[np.argmax(np.diff(ends)):][:2])
-        if len(ends) > 2:
-            self.notes.append(f'{len(ends) - 2} gaps: the longest part without one is used')
-        even = times = times[longest]
-        turns, steps = Rotation.from_quat(np.roll(attitudes[longest], -1, axis=1)), np.diff(times)
-        if np.max(np.abs(steps - np.median(steps))) > EVEN * np.median(steps):
-            even = np.linspace(times[0], times[-1], len(times))
-            turns = RotationSpline(times, turns)(even)
-            self.notes.append('stamps are not evenly spaced: interpolated')
-        within, others = np.ones(len(even), bool), {}
+    def trajectory(self, motion: ExactSolution) -> Trajectory:
+        """
+        Return all parts at the times of the one with most samples, made evenly spaced.
+
+        motion : about which attitudes are interpolated; white noise about it is taken away
+        """
+        parts, notes = {}, self.notes
         for name, (at, values) in self.parts.items():
-            inside = (even >= at[0] - SAME_S) & (even <= at[-1] + SAME_S)
-            if np.mean(inside) < 0.5:
-                self.notes.append(f'{name}: not at the times of the attitudes, left out')
-            elif name != ATTITUDES:
-                others[name] = np.stack([np.interp(even, at, one) for one in values.T], axis=1)
-                within &= inside
-        return Trajectory.of({
-            'attitudes': np.roll(turns.as_quat(), 1, axis=1)[within],
-            **{name: values[within] for name, values in others.items()},
-            'covariance': self.covariance or None}, even[within])
+            steps = np.diff(at)
+            ends = np.array([0, *(np.flatnonzero(steps > GAP * np.median(steps)) + 1), len(at)])
+            longest = slice(*ends[np.argmax(np.diff(ends)):][:2])
+            if len(ends) > 2:
+                notes.append(f'{name}: the longest part without a gap is used')
+            parts[name] = at[longest], values[longest]
+        times, attitudes = parts[ATTITUDES]
+        for name in [*parts]:
+            shared = min(parts[name][0][-1], times[-1]) - max(parts[name][0][0], times[0])
+            if shared < 0.5 * np.ptp(times):
+                notes.append(f'{name}: not at the times of the attitudes, left out')
+                del parts[name]
+        begin = max(at[0] for at, _ in parts.values()) - SAME_S
+        end = min(at[-1] for at, _ in parts.values()) + SAME_S
+        grid = max((at[(at >= begin) & (at <= end)] for at, _ in parts.values()), key=len)
+        even = np.linspace(grid[0], grid[-1], len(grid))
+        if np.max(np.abs(even - grid)) < EVEN * (even[1] - even[0]):
+            even = grid
+        else:
+            notes.append('stamps are not evenly spaced: interpolated')
+        error = _turns(motion, times).inv() * Rotation.from_quat(np.roll(attitudes, -1, axis=1))
+        level, white = whiteness(error.as_rotvec().T)
+        turns = _turns(motion, even)
+        if white and EXACT < level < LARGEST:
+            notes.append(f'the attitudes are exact but for noise of {level:.3g} rad: graded '
+                         'without it')
+        elif np.array_equal(even, times):
+            turns = Rotation.from_quat(np.roll(attitudes, -1, axis=1))
+        else:
+            turns = turns * RotationSpline(times, error)(even)
+        made = {name: make_interp_spline(at, values, DEGREE)(even)
+                for name, (at, values) in parts.items() if name != ATTITUDES}
+        angle = float(abs(motion.start.l3 / motion.top.lambda3)) * (even[1] - even[0])
+        if angle > COARSE and made:
+            notes.append(f'the spin is {angle:.2g} rad from one sample to the next: too much to '
+                         'compare readings')
+            made = {}
+        return Trajectory.of({ATTITUDES: np.roll(turns.as_quat(), 1, axis=1), **made,
+                              'covariance': self.covariance or None}, even)
+
+
+def _turns(motion: ExactSolution, times: Reals) -> Rotation:
+    return Rotation.from_quat(motion.states_at_seconds(times).quaternion)
 
 
 def read(path: Path, topic: str | None = None) -> Recorded:
@@ -296,7 +328,8 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
 
     store, recorded, origin_ns, end_ns = get_typestore(Stores.ROS2_JAZZY), Recorded(), -1, 1 << 63
-    found: dict[str, Any] = defaultdict(lambda: defaultdict(list))
+    covariances: dict[tuple[str, str], Reals] = {}
+    found: dict[tuple[str, str], Any] = defaultdict(lambda: defaultdict(list))
     with LogReader(path) as reader:
         types = {topic.name: topic.type_name for topic in reader.topics
                  if topic.type_name in MESSAGES and not topic.name.endswith(NOT_OF_BODY)}
@@ -310,10 +343,12 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
         if not reader.whole:
             recorded.notes.append('the log is truncated: read as far as it goes')
         for message in reader.messages(types, end=end_ns):
-            type_name, parts = types[message.topic], found[message.topic]
+            type_name = types[message.topic]
             try:
                 content = store.deserialize_cdr(message.data, type_name)
-                stamp = getattr(content, 'transforms', [content])[0].header.stamp
+                first = getattr(content, 'transforms', [content])[0]
+                stamp, child = first.header.stamp, getattr(first, 'child_frame_id', '')
+                parts = found[message.topic, child]
                 for kind, values in MESSAGES[type_name](content).items():
                     parts[kind].append((stamp.sec * 10 ** 9 + stamp.nanosec or message.log_time,
                                         values))
@@ -321,17 +356,22 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
                 raise LogError(f'cannot read {path}: a message of {message.topic} is no '
                                f'{type_name}: {error}') from error
             if type_name.endswith('Imu') and not parts[GYROSCOPE][1:]:
-                for kind, name in COVARIANCES.items():
-                    matrix = getattr(content, name).reshape(3, 3)
-                    if not 0.0 < np.max(np.abs(matrix)) <= EXACT_VARIANCE:
-                        recorded.covariance.setdefault(kind, matrix)
+                covariances.update(((message.topic, kind), getattr(content, name).reshape(3, 3))
+                                   for kind, name in COVARIANCES.items())
     if origin_ns < 0:
         origin_ns = min((row[0] for parts in found.values() for rows in parts.values()
                          for row in rows), default=0)
         origin_ns = origin_ns if origin_ns > LATEST_START_S * 1e9 else 0
     order = list(MESSAGES)
-    for name in sorted(found, key=lambda name: (name != wanted, order.index(types[name]), name)):
-        for kind, rows in found[name].items():
+    for name, child in sorted(found, key=lambda one: (
+            one[0] != wanted, order.index(types[one[0]]), one)):
+        for kind, rows in found[name, child].items():
             stamps_ns, values = zip(*rows, strict=True)
-            recorded.add(kind, (np.array(stamps_ns) - origin_ns) * 1e-9, np.array(values, float))
+            if recorded.add(kind, (np.array(stamps_ns) - origin_ns) * 1e-9,
+                            np.array(values, float)):
+                recorded.notes.append(f'{kind} of {name}')
+                matrix = covariances.get((name, kind))
+                # The smallest variance means exact, and is none of noise.
+                if matrix is not None and not 0.0 < np.max(np.abs(matrix)) <= EXACT_VARIANCE:
+                    recorded.covariance[kind] = matrix
     return recorded

@@ -2,8 +2,8 @@
 """
 Fits the exact motion of a top to attitudes, and the place of an IMU to its readings.
 
-A fit begins with a short part of the attitudes and goes on to longer ones, each twice as long, so
-that no phase is ever off by half a turn.
+A fit begins with a short part of the attitudes and goes on to longer ones, each three times as
+long, so that no phase is ever off by half a turn.
 """
 
 from __future__ import annotations
@@ -52,7 +52,6 @@ LARGEST = 0.3               # noise [rad]
 ONCE_IN = 1000.0            # noise that is called a residue of the motion
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
-TRIALS = 8
 INTERVAL = 1.96             # standard deviations: 95 %
 OFF = 0.1                   # rad, or share of the rates: another start
 
@@ -80,7 +79,8 @@ class Fit:
     residual, noise : float
         Root mean square of a component of the attitude residual, and of its white part [rad].
     reached : bool
-        Whether the residuals are noise.  If not, the intervals mean nothing.
+        Whether the fit has converged and the residuals are noise.  If not, the intervals mean
+        nothing.
     """
 
     top: Top
@@ -114,8 +114,8 @@ class Fit:
     def lines(self) -> Iterator[str]:
         """Yield lines for a reader."""
         yield (f'fit: residual {self.residual:.3g} rad, noise {self.noise:.3g} rad' + (
-            '' if self.reached else ': the residual is not noise. No motion of a top that was '
-            'found explains the attitudes; what follows is of the nearest one'))
+            '' if self.reached else ': the residual is not noise, or the fit has not converged. '
+            'No motion that was found explains the attitudes; what follows is of the nearest one'))
         for name, value in self.values.items():
             spread = INTERVAL * self.deviations[name]
             yield f'  {name:<16}{value:>16.9g} ' + (
@@ -130,6 +130,7 @@ class _Trial(NamedTuple):
     noise: float
     reached: bool
     frozen: tuple[int, ...] = ()        # unknowns that the attitudes cannot tell
+    explained: bool = False             # the residual is noise
 
 
 def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
@@ -158,12 +159,12 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     for trial in _trials(one, parts, gravity):
         if best is None or trial.residual < best.residual:
             best = trial
-        if best.reached:
+        if best.explained:          # another guess finds the same
             break
     if best is None:
         raise ValueError('no motion of a top comes near the attitudes')
     best.problem.readings = [replace(one, sigma=max(best.residual, 1e-15))]
-    best = _settled(best)
+    best = _settled(best) if best.reached else best
     if imu:
         best = _with_imu(best, parts, begin)
     return _conclude(best, begin, lambda1, gravity)
@@ -190,9 +191,8 @@ def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
     axis = np.stack(attitude.axis_in_world(tuple(q)))
     spin, sure = guess.spin_rate(times, q, _hint(parts))
     weak, small = guess.weak(times, axis), list(guess.small_nutation(times, axis))
-    seeds = [*weak[:1], *((0, *pair) for pair in small[:2]), *weak[1:3],
-             *((0, *pair) for pair in small[2:])]
-    for size, l3, p in seeds[:TRIALS]:
+    seeds = [*weak[:1], *((0, *pair) for pair in small[:4]), *weak[1:2]]
+    for size, l3, p in seeds:
         x = np.zeros(UNKNOWNS)
         x[RATES] = (*guess.transverse_rates(times, q, axis)[:2], spin)
         x[L3], x[P] = l3, p
@@ -212,20 +212,21 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
     while count < last:
         chosen = slice(0, count, math.ceil(count / ENOUGH))
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
-        x = descend(problem, x, MOTION if size and count > 2 * size else MOTION[:6], 8, 1e-3)
-        count *= 2
+        x, _ = descend(problem, x, MOTION if size and count > 2 * size else MOTION[:6], 8, 1e-3)
+        count *= 3
     problem.readings = [one]
-    x = descend(problem, x, MOTION)
+    x, converged = descend(problem, x, MOTION)
     rest = problem.residuals(x).reshape(3, -1)
     residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
     noise, white = whiteness(rest)
-    return _Trial(problem, x, residual, noise,
-                  residual <= EXACT or (white and residual < LARGEST))
+    explained = residual <= EXACT or (white and residual < LARGEST)
+    return _Trial(problem, x, residual, noise, explained and (converged or residual <= EXACT),
+                  explained=explained)
 
 
 def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
-            tolerance: float = 1e-10) -> Reals:
-    """Return the unknowns at the least sum of squares."""
+            tolerance: float = 1e-10) -> tuple[Reals, bool]:
+    """Return the unknowns at the least sum of squares, and whether it was reached."""
     chosen = [*free]
 
     def at(y: Reals) -> Reals:
@@ -240,9 +241,10 @@ def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 
             return far
 
     far = np.full(len(problem.residuals(x)), 1e9)
-    return at(least_squares(
+    found = least_squares(
         residuals, x[chosen], lambda y: problem.jacobian(at(y), chosen), method='lm',
-        x_scale='jac', max_nfev=evaluations, ftol=tolerance, xtol=1e-15, gtol=1e-15).x)
+        x_scale='jac', max_nfev=evaluations, ftol=tolerance, xtol=1e-15, gtol=1e-15)
+    return at(found.x), found.status > 0
 
 
 def whiteness(rest: Reals) -> tuple[float, bool]:
@@ -272,7 +274,7 @@ def _settled(trial: _Trial) -> _Trial:
     at, frozen = without_unseen_nutation(trial.problem, trial.x, trial.residual, settle=True)
     free = [k for k in MOTION if k not in frozen]
     return trial if not frozen else trial._replace(
-        frozen=frozen, x=descend(trial.problem, at, free))
+        frozen=frozen, x=descend(trial.problem, at, free)[0])
 
 
 def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: float) -> _Trial:
@@ -288,18 +290,18 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
     problem.mounting = Rotation.align_vectors(model.T, streams[0].values.T)[0].as_quat()
     for stream, own in zip(streams, ((8, 9, 10, LATE), (11, 12, 13)), strict=True):
         problem.readings = [stream]
-        x = descend(problem, x, own)
+        x, _ = descend(problem, x, own)
     problem.readings = [one, *streams]
     free = [k for k in (*MOTION, *SENSOR) if k not in trial.frozen]
     for _ in range(2):          # noise of each, then all with it
         for stream in problem.readings:
             rest = problem.residual(x, stream)
             stream.sigma = max(math.sqrt(float(np.mean(rest * rest))), 1e-15)
-        x = descend(problem, x, free)
+        x, converged = descend(problem, x, free)
     rests = [problem.residual(x, stream) for stream in problem.readings]
     noise, white = whiteness(rests[0])
     residual = math.sqrt(float(np.mean(rests[0] ** 2)))
-    return _Trial(problem, x, residual, noise, trial.reached and all(
+    return _Trial(problem, x, residual, noise, trial.reached and converged and all(
         whiteness(rest)[1] or float(np.std(rest)) < EXACT for rest in rests), trial.frozen)
 
 
@@ -398,11 +400,12 @@ def _slopes(problem: Problem, x: Reals, free: Sequence[int], sizes: Reals) -> Re
 
 def _scaled(problem: Problem, x: Reals, lambda1: float, gravity: float) -> tuple[Top, State]:
     """Return top and start with this lambda1."""
-    (_, state), p, gravity = problem.start(x), float(x[P]), gravity or 9.80665
+    (_, state), p = problem.start(x), float(x[P]) if gravity else 0.0
     ratio = state.l3 / float(x[SPIN]) if x[SPIN] else 1.0
-    distance = math.copysign(min(0.1, gravity / (4.0 * max(abs(p), 1e-9))), p)
+    distance = math.copysign(min(0.1, gravity / (4.0 * max(abs(p), 1e-9))), p) or 0.1
+    mass = abs(p) * lambda1 / abs(gravity * distance) if gravity else 1.0
     top = Top(lambda1=lambda1, lambda3=(ratio if ratio > 0.0 else 1.0) * lambda1, gravity=gravity,
-              com_distance=distance, mass=abs(p) * lambda1 / abs(gravity * distance))
+              com_distance=distance, mass=mass)
     return top, replace(state, l3=state.l3 * lambda1, lz=state.lz * lambda1)
 
 

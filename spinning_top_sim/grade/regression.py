@@ -13,6 +13,7 @@ from spinning_top_sim.grade.scenes import Reals
 MOST_CAUSES = 3
 ENOUGH = 0.2            # of the discrepancy may remain: further causes are not looked for
 WORTHWHILE = 0.8        # of what remains is left at most by another cause
+TINY = 1e-6             # rms of an effect that cannot be seen
 NEAR = 0.25             # of a coefficient to the value that it has for a fault
 AS_GOOD = 2.0           # a cause with fewer columns may leave so many times more
 
@@ -57,8 +58,9 @@ def explain(target: Reals, causes: Sequence[Cause], floor: float = 0.0) -> Expla
     residual, fitted = target, np.empty(0)
     enough = max(ENOUGH * _excess(target, floor), 0.1 * floor)
     while len(chosen) < MOST_CAUSES and (before := _excess(residual, floor)) > enough:
-        tried = [(one, _fit(target, [*chosen, one])) for one in causes
-                 if not any(one is other for other in chosen)]
+        tried = [(one, least_squares(target, [column for other in (*chosen, one)
+                                              for column in other.columns]))
+                 for one in causes if not any(one is other for other in chosen)]
         after = [_excess(left, floor) for _, (_, left) in tried]
         good = max(AS_GOOD * min(after), 0.02 * before)
         size, left, number = min((len(one.columns), left, number)
@@ -68,26 +70,23 @@ def explain(target: Reals, causes: Sequence[Cause], floor: float = 0.0) -> Expla
             break
         one, (fitted, residual) = tried[number]
         chosen.append(one)
-    faults, at = [], 0
-    for one in chosen:
-        fault = one.judge(fitted[at:at + len(one.columns)])
-        at += len(one.columns)
-        if fault is not None:
-            faults.append(fault)
-    return Explained(faults, residual, _excess(residual, floor) / (_excess(target, floor) or 1.0))
+    ends = np.cumsum([len(one.columns) for one in chosen], dtype=int)[:-1]
+    judged = [one.judge(found) for one, found in zip(chosen, np.split(fitted, ends), strict=False)]
+    return Explained([fault for fault in judged if fault is not None], residual,
+                     _excess(residual, floor) / (_excess(target, floor) or 1.0))
 
 
 def least_squares(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
-    """Return the coefficients (k,) of columns (N, 3) by least squares, and the residual."""
+    """
+    Return the coefficients (k,) of columns (N, 3) by least squares, and the residual.
+
+    The coefficient of a column that is TINY is 0.
+    """
     matrix = np.stack([column.ravel() for column in columns], axis=1)
     size = np.sqrt(np.sum(matrix * matrix, axis=0))
-    size[size == 0.0] = 1.0
+    size[size <= TINY * np.sqrt(len(matrix))] = np.inf
     found = np.linalg.lstsq(matrix / size, target.ravel(), rcond=1e-9)[0] / size
     return found, target - (matrix @ found).reshape(target.shape)
-
-
-def _fit(target: Reals, causes: Sequence[Cause]) -> tuple[Reals, Reals]:
-    return least_squares(target, [column for one in causes for column in one.columns])
 
 
 def _excess(values: Reals, floor: float) -> float:

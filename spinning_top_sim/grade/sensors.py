@@ -24,7 +24,7 @@ LAGS = range(-3, 31)        # samples that are tried
 LATE = 0.75                 # steps
 STRANGE = 2e-3              # of the reading, beside its noise: it is not what it should be
 CONSISTENT = 1e-3           # of the reading: the lag is not looked for
-MEANS_STRANGE = 2e-2        # of means over a step that are those of its ends
+MEANS_STRANGE = 5e-2        # of means over a step that are those of its ends
 UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
 NOISY = 1e-4                # of the reading: smaller noise is rounding
 NOISE_BAND = 0.05           # of the noise, to either side of what is declared, beside its doubt
@@ -122,7 +122,7 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
 
     Returns the faults and the measures.
     """
-    lag = _lag(runs)
+    lag = 0 if kind == 'velocities' else _lag(runs)
     noise = [_noise(run, lag) for run in runs]
     parts = [_discrepancy(kind, run, lag) for run in runs]
     target = np.concatenate([one for one, _ in parts])
@@ -136,7 +136,8 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     # The acceleration of a step may be that of its begin, without a lag of the reading.
     fractions, left = least_squares(target, [effects[name] for name in (
         'step', 'tangential step') if name in effects])
-    late = lag - float(fractions[0]) if rms(left) < UNEXPLAINED * rms(target) else float(lag)
+    tells = kind != 'velocities' and 1e-6 < rms(target) > 2.0 * rms(left)
+    late = lag - (float(fractions[0]) if tells else 0.0)
     marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(noise)),
              f'{kind}_discrepancy': before}
     faults, residual = [], target
@@ -149,7 +150,7 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
                               for run in runs)
     if before > strange:
         causes = _causes(kind, effects, motion.body)
-        found, residual, _ = explain(target, causes, floor)
+        found, residual, _ = explain(target, causes, math.hypot(floor, 0.5 * strange))
         faults += found
         rest = math.sqrt(max(rms(residual) ** 2 - most ** 2, 0.0))
         if rest > max(UNEXPLAINED * before, strange):

@@ -58,18 +58,16 @@ class Trajectory:
     @classmethod
     def of(cls, said: Any, times: Reals) -> Self:
         """Return what a run has said.  Raises InvalidTrajectoryError if it is no motion."""
-        if isinstance(said, Trajectory):
-            said = {name: getattr(said, name) for name in cls.__dataclass_fields__}
+        if hasattr(said, 'attitudes'):
+            said = {name: getattr(said, name, None) for name in cls.__dataclass_fields__}
         elif not isinstance(said, Mapping):
-            names = [*cls.__dataclass_fields__]
-            said = ({name: getattr(said, name, None) for name in names}
-                    if hasattr(said, 'attitudes') else {'attitudes': said})
+            said = {'attitudes': said}
         n = len(times)
+        if 'attitudes' not in said:
+            raise InvalidTrajectoryError(f'the mapping has {sorted(map(str, said))}: must have '
+                                         'attitudes')
         try:
             attitudes = unit_quaternions(said['attitudes'])
-        except KeyError:
-            raise InvalidTrajectoryError(
-                f'the mapping has {sorted(map(str, said))}: must have attitudes') from None
         except (TypeError, ValueError) as error:
             raise InvalidTrajectoryError(str(error)) from error
         parts = {name: _numbers(name, said[name], (n, columns) if columns else (n,))
@@ -82,8 +80,8 @@ class Trajectory:
         attitudes[1:] *= flips[:, np.newaxis]
         covariance = said.get('covariance')
         if covariance is not None:
-            if not isinstance(covariance, Mapping):
-                covariance = dict.fromkeys(('gyroscope', 'accelerations'), covariance)
+            covariance = covariance if isinstance(covariance, Mapping) else dict.fromkeys(
+                ('gyroscope', 'accelerations'), covariance)
             covariance = {name: _numbers(f'covariance of {name}', matrix, (3, 3))
                           for name, matrix in covariance.items()}
         return cls(times, attitudes, covariance=covariance, **parts)

@@ -137,6 +137,12 @@ class ExactSolution:
             across = across + self._top_rate * (cosine / sine)
         return across
 
+    def _across_of(self, states: _ExactStates) -> Column:
+        # A moving pivot has another formula beside it.  Here there is none, so that earlier logs
+        # are computed again to the last bit.
+        across: Column = self._across(*states._rows('half_theta'))
+        return across
+
     def describe(self) -> Description:
         top, start = self.top, self.start
         rests = axis_rests(top, start)
@@ -232,5 +238,5 @@ class _ExactStates(States):
     def transverse_velocity(self) -> tuple[Column, Column]:
         """omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top"."""
         theta_dot, cos_psi, sin_psi = self._axis_rates
-        across = self._solution._across(*self._rows('half_theta'))
+        across = self._solution._across_of(self)
         return theta_dot * sin_psi - across * cos_psi, theta_dot * cos_psi + across * sin_psi

@@ -106,6 +106,7 @@ class ThetaMotion:
     quarter0, offset0 : N and 2y/pi at t = 0, offset0 accurate relative to itself
     size : coefficients of each polynomial that doubles need
     u_dot, u_dot_series : c at even and at odd N, and theta1, of u' = c theta1(2y)/D^4
+    momentum, swing : p and q at even and at odd N, of (Lz - L3 u)/lambda1 = p + q theta1(y)^2/D^2
     """
 
     alpha: Factor
@@ -116,6 +117,8 @@ class ThetaMotion:
     offset0: Decimal = ZERO
     u_dot: tuple[Decimal, Decimal] = (ZERO, ZERO)
     u_dot_series: Series = NOTHING
+    momentum: tuple[Decimal, Decimal] = (ZERO, ZERO)
+    swing: tuple[Decimal, Decimal] = (ZERO, ZERO)
     m: Decimal = ZERO
     m1: Decimal = ONE
     size: int = MOST_TERMS
@@ -201,7 +204,7 @@ def _set_up(top: Top, gravity: Decimal, start: State | HalfAngles, digits: int) 
         return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
     # theta -> pi - theta leaves P >= 0, and exchanges alpha and beta.
     sense = -1 if torque < 0 else 1
-    return _nutating(sides[::sense], lambda1, sense, (
+    return _nutating(sides[::sense], lambda1, sense, l3, lz - l3 + 2 * l3 * sin_half ** 2, (
         f0, sense * f1, f2, sense * f3 or NO_GRAVITY * abs(f2)),
         falling=sense * theta_dot > 0, digits=digits)
 
@@ -215,10 +218,14 @@ def _resting(side: _Side, lambda1: Decimal) -> Factor:
     return Factor(rate, side.turns, ZERO, (parts, parts), 0, ZERO)
 
 
-def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int,
-              cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool,
+def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decimal,
+              momentum: Decimal, cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool,
               digits: int) -> ThetaMotion:
-    """Return a motion with P >= 0; with sense -1 that of which this is the mirror image."""
+    """
+    Return a motion with P >= 0; with sense -1 that of which this is the mirror image.
+
+    momentum : Lz - L3 u at the start of the motion itself
+    """
     roots, f3 = cubic_roots(*cubic), cubic[3]
     imaginary = roots.gap21 > roots.gap32
     poles = _poles(sides, roots, lambda1 ** 2 * f3, imaginary)
@@ -241,12 +248,17 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int,
                                    (direction * sin, cos, xi)))
         scale = sense * f3.sqrt() * a / 2 * roots.gap21         # w (u2 - u1)
         even, odd = form.slopes_of_sn2()
+        turn = sense * l3 / lambda1
+        swing = turn * roots.gap21 * (form.mean.quarter_period / form.theta1.leading) ** 2
         alpha, beta = factors[::sense]
         return ThetaMotion(
             alpha, beta, stretch=stretch,
             # w/K, where w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
             quarter_rate=f3.sqrt() * mean.mean / pi(), quarter0=quarter0, offset0=y0 * 2 / pi(),
             u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
+            momentum=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
+            swing=(-swing * form.theta4.leading ** 2,
+                   swing * form.theta3.leading ** 2 * roots.gap32 / roots.gap31),
             m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31, size=form.size)
 
 

@@ -14,6 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from functools import cached_property
+from operator import sub
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,7 @@ class ThetaFunctions:
     real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
     zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
     u_dot, u_dot_coefficients : of u'
+    momentum, swing : of (Lz - L3 u)/lambda1
     bounds : the least and the greatest theta in [0, pi] [rad]
     planar_rotation : (i, j) if both poles are passed: theta/2 is then within a quarter turn of
         (pi/2) (i + j N)
@@ -58,8 +60,9 @@ class ThetaFunctions:
     def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
         self.rates = Rates([motion.quarter_rate, *(x.rate / pi() for x in factors)])
-        whole = [motion.quarter0, *(round(2 * x.phase_turns) for x in factors)]
-        rest = [motion.offset0, *(2 * x.phase_turns - round(2 * x.phase_turns) for x in factors)]
+        turns = [2 * x.phase_turns for x in factors]
+        whole = [motion.quarter0, *map(round, turns)]
+        rest = [motion.offset0, *map(sub, turns, whole[1:])]
         self.start_whole = _column(whole)
         self.offset, self.offset_rest = map(_column, zip(*map(double_double, rest), strict=True))
         self.drifts = _column(0.5 * float(factor.drift) for factor in factors)
@@ -73,6 +76,8 @@ class ThetaFunctions:
         _check_amplitudes(motion)
         self.u_dot = np.array([in_range("cos(theta)'", x) for x in motion.u_dot])
         self.u_dot_coefficients = _coefficients([[motion.u_dot_series]], motion.size)[:, 0]
+        self.momentum, self.swing = (
+            np.array([*map(float, pair)]) for pair in (motion.momentum, motion.swing))
         # The rows where y = 0, at N = 0 and N = 1.
         alpha, beta, alpha_imag, beta_imag = np.where(
             np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
@@ -143,7 +148,7 @@ class ThetaValues:
         for k, (one, other) in enumerate(constants.prefactors):
             rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
         self._real, self._imag = rows[:2], rows[2:]
-        self._sin_cos, self._cos_y = bases[3], cos
+        self._sin_cos, self._cos_y, self._sin_y = bases[3], cos, sin
 
     @cached_property
     def moduli(self) -> Matrix:
@@ -223,6 +228,16 @@ class ThetaValues:
         theta_dot: Column = -constants.u_dot.take(self._parity) * (series / size) / (
             without[0] * without[1])
         return theta_dot
+
+    @cached_property
+    def across(self) -> Matrix:
+        """The two terms of phi' sin(theta) [rad/s] if no pole is passed exactly, (2, n)."""
+        constants, (alpha, beta) = self._constants, self.moduli
+        series = self._sin_y * _horner(constants.u_dot_coefficients, self._xi)
+        twice: Column = 2.0 * alpha * beta
+        return np.stack((
+            constants.momentum.take(self._parity) * (alpha * alpha + beta * beta) / twice,
+            constants.swing.take(self._parity) * (series * series) / twice))
 
     @cached_property
     def rates(self) -> Matrix:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spinning_top_sim.physics.attitude import Quaternion
+from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.pivot import Exact
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
@@ -32,7 +32,7 @@ from spinning_top_sim.solvers.decimal_math import (
     precision,
     sin_cos,
 )
-from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.exact import ExactSolution, _ExactStates
 from spinning_top_sim.solvers.theta_series import DIGITS_HANDED_OVER, SIN_ODD
 from spinning_top_sim.solvers.theta_setup import (
     DIGITS_TO_TRY,
@@ -165,6 +165,17 @@ class AcceleratedMotion(ExactSolution):
         with precision(DIGITS):
             self._take_constants(self._motion, *self._momenta)
         self._check_start()
+
+    def _across_of(self, states: _ExactStates) -> Column:
+        usual = super()._across_of(states)
+        if self._theta.real or not self._theta.u_dot.any():
+            return usual
+        # Of two sums that may cancel, the one with the smaller terms.  The other one cancels
+        # where a fast top hardly precesses.
+        (one, two), (cosine, sine) = states._rows('across'), states._rows('half_theta')
+        cancels = (abs(self._bottom_rate) * (sine / cosine) + abs(self._top_rate) * (cosine / sine)
+                   > np.abs(one) + np.abs(two))
+        return np.where(cancels, one + two, usual)
 
     def posture(self, ns: int) -> Posture:
         """

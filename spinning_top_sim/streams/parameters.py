@@ -9,7 +9,7 @@ The defaults describe the cusp scene: a bicycle wheel on a pivot, spun about its
 import contextlib
 import enum
 import math
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
@@ -336,65 +336,62 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
         if name not in BY_NAME:
             raise ValueError(f'{name} = {shown(value)}: there is no such parameter')
         result[name] = BY_NAME[name].check(value)
-    names = [row[0] for row in STREAM_DEFAULTS]
-    for name in result['record.streams']:
-        if name not in ('all', *names):
-            raise ValueError(f'record.streams = {list(result["record.streams"])!r}: {name!r} '
-                             f'is no stream; must be all or some of {", ".join(names)}')
-    shortest, longest = result['imu.bias_instability_band']
-    if not shortest < longest:
-        raise ValueError(f'imu.bias_instability_band = {[shortest, longest]!r}: the second number '
-                         'must be larger than the first')
-    if result['imu.rate'] < LOWEST_RATE_OF_INTERVALS and (
-            result['increments.enabled'] or result['imu.sampling'] == 'mean'):
-        raise ValueError(f'imu.rate = {result["imu.rate"]!r}: must be >= '
-                         f'{LOWEST_RATE_OF_INTERVALS:g} with increments.enabled, or with '
-                         'imu.sampling = mean')
-    _check_sensor(result)
+    _check_together(result)
+    if result['gnss.enabled'] and find_spec('pymap3d') is None:
+        raise ValueError('gnss.enabled = True: needs pymap3d, which is not installed: '
+                         f'{remedy("gnss")}')
     top_of(result)
     start_state(result)
     pivot_path(result)
-    _check_gnss(result)
     return result
 
 
-def _check_sensor(values: Mapping[str, Value]) -> None:
-    """Raise ValueError for a bandwidth with means, or for profiles and events that make none."""
-    if values['imu.bandwidth'] and values['imu.sampling'] == 'mean':
-        raise ValueError(f'imu.bandwidth = {values["imu.bandwidth"]!r}: must be 0 with '
-                         'imu.sampling = mean, which is a low pass itself')
+def _check_together(values: Mapping[str, Value]) -> None:
+    """Raise ValueError for values that only together, or with what is installed, are wrong."""
+    def need(allowed: bool, name: str, text: str) -> None:
+        value = values[name]
+        if not allowed:
+            raise ValueError(
+                f'{name} = {list(value) if isinstance(value, tuple) else value!r}: {text}')
+
+    names = [row[0] for row in STREAM_DEFAULTS]
+    for name in values['record.streams']:
+        need(name in ('all', *names), 'record.streams',
+             f'{name!r} is no stream; must be all or some of {", ".join(names)}')
+    need(_ascend(values['imu.bias_instability_band']), 'imu.bias_instability_band',
+         'the second number must be larger than the first')
+    is_mean = values['imu.sampling'] == 'mean'
+    need(values['imu.rate'] >= LOWEST_RATE_OF_INTERVALS
+         or not (is_mean or values['increments.enabled']), 'imu.rate',
+         f'must be >= {LOWEST_RATE_OF_INTERVALS:g} with increments.enabled, or with '
+         'imu.sampling = mean')
+    need(not (is_mean and values['imu.bandwidth']), 'imu.bandwidth',
+         'must be 0 with imu.sampling = mean, which is a low pass itself')
     for name in ('imu.vibration.force_psd', 'imu.vibration.rate_psd'):
-        profile, frequencies = values[name], values[name][::2]
-        if any(profile) and (len(profile) < 4 or not all(profile) or not all(
-                one < next_one for one, next_one in pairwise(frequencies))):
-            raise ValueError(f'{name} = {list(profile)!r}: must be two or more ascending '
-                             'frequencies > 0, each with a density > 0')
+        profile = values[name]
+        is_profile = len(profile) >= 4 and all(profile) and _ascend(profile[::2])
+        need(is_profile or not any(profile), name,
+             'must be two or more ascending frequencies > 0, each with a density > 0')
     for name in ('mag.disturbance.world', 'mag.disturbance.body'):
         times = values[name]
         for begin, end in zip(times[::5], times[1::5], strict=True):
-            if begin > end:
-                raise ValueError(f'{name}: an event from {begin!r} to {end!r} s: must not end '
-                                 'before it begins')
+            need(begin <= end, name,
+                 f'an event from {begin!r} to {end!r} s: must not end before it begins')
+    latitude, longitude, _ = values['gnss.origin']
+    need(abs(latitude) <= 90.0 and abs(longitude) <= 180.0, 'gnss.origin',
+         'must be a latitude from -90 to 90, a longitude from -180 to 180, and a height')
+    need(not any(values['gnss.outages']) or _ascend(values['gnss.outages']), 'gnss.outages',
+         'must be begin and end of each, ascending')
+
+
+def _ascend(numbers: Iterable[float]) -> bool:
+    return all(one < next_one for one, next_one in pairwise(numbers))
 
 
 def top_of(values: Mapping[str, Value]) -> Top:
     """Return the top that these parameters describe.  Raises ValueError like `Top`."""
     return Top(**{name: values[f'top.{name}']
                   for name in ('lambda1', 'lambda3', 'mass', 'com_distance', 'gravity')})
-
-
-def _check_gnss(values: Mapping[str, Value]) -> None:
-    latitude, longitude, _ = values['gnss.origin']
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
-        raise ValueError(f'gnss.origin = {list(values["gnss.origin"])!r}: must be a latitude from '
-                         '-90 to 90, a longitude from -180 to 180, and a height')
-    edges = values['gnss.outages']
-    if any(edges) and any(not a < b for a, b in pairwise(edges)):
-        raise ValueError(f'gnss.outages = {list(edges)!r}: must be begin and end of each, '
-                         'ascending')
-    if values['gnss.enabled'] and find_spec('pymap3d') is None:
-        raise ValueError('gnss.enabled = True: needs pymap3d, which is not installed: '
-                         f'{remedy("gnss")}')
 
 
 def pivot_path(values: Mapping[str, Value]) -> PivotPath | None:

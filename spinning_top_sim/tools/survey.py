@@ -118,10 +118,15 @@ def survey(reader: LogReader) -> Survey:
                    damage.end_ns, {topic.name: TopicReport(topic.type_name)
                                    for topic in reader.topics})
     try:
-        found.run = recorded_run.read_run_description(reader)
-        _follow_run(found, found.run)
+        run = found.run = recorded_run.read_run_description(reader)
     except recorded_run.ForeignLogError as error:
         found.foreign_reason = str(error)
+    else:
+        found.notes += [f'journal, entry at {seconds(stamp_ns)}: {reason}'
+                        for stamp_ns, reason in run.broken]
+        for name, topic in run.topics.items():
+            found.topics[topic].stream = name
+        _follow_run(found, run)
     stamps_ns = _read_messages(found, reader)
     sections = [section for motion in found.motions for section in motion.sections]
     if sections:        # the last entry of the journal may be later than the last sample
@@ -137,10 +142,6 @@ def survey(reader: LogReader) -> Survey:
 
 def _follow_run(found: Survey, run: RunDescription) -> None:
     """Compute the motions of a run; add notes about what cannot be followed."""
-    found.notes += [f'journal, entry at {seconds(stamp_ns)}: {reason}'
-                    for stamp_ns, reason in run.broken]
-    for name, topic in run.topics.items():
-        found.topics[topic].stream = name
     motions = found.motions
     try:
         for simulation, event in recorded_run.rerun(run, found.damage.end_ns):

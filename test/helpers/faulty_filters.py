@@ -111,11 +111,11 @@ class Negated(Vqf):
 
 
 class HalfCovariance(ReferenceFilter):
-    covariance = property(lambda self: 0.5 * self._p[:3, :3])
+    covariance = property(lambda self: 0.5 * ReferenceFilter.covariance.fget(self))
 
 
 class TwiceCovariance(ReferenceFilter):
-    covariance = property(lambda self: 2.0 * self._p[:3, :3])
+    covariance = property(lambda self: 2.0 * ReferenceFilter.covariance.fget(self))
 
 
 # A filter with each fault.

@@ -316,6 +316,12 @@ class Imu:
         turn = self.rotation * self.mounting
         said['magnetometer'] = turn.apply(self.top.field)
 
+    def field_in_world(self, said):
+        said['magnetometer'][:] = self.top.field
+
+    def gyroscope_twice(self, said):
+        said['gyroscope'] *= 2.0
+
     def field_sign(self, said):
         said['magnetometer'] = -said['magnetometer']
 
@@ -398,6 +404,8 @@ OTHER = {
     'late_by_seven': ('imu_one_step_late',),
     'gyroscope_sign': ('reading_sign',),
     'field_sign': ('reading_sign',),
+    'field_in_world': ('reading_in_world',),
+    'gyroscope_twice': ('reading_scale',),
     'times_root_two': ('noise_scale',),
     'increments_in_degrees': ('units',),
     'wrong_energy': ('energy',)}

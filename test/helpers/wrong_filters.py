@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Filters of three kinds, right or wrong by their parameters."""
 
+import math
 from collections import deque
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,7 +34,10 @@ class Part:
         self.bias = np.zeros(3)
         self.start(**settings)
 
-    def _delay(self, line, value, n):
+    @staticmethod
+    def _delay(line, value, n):
+        if not n:
+            return value
         line.append(value)
         return line.popleft() if len(line) > n else line[0]
 
@@ -51,6 +56,11 @@ class Part:
         return self._said(self._delay(self._lines[3], q, self._late[3]))
 
 
+def cross(one, other):
+    (a, b, c), (x, y, z) = one.tolist(), other.tolist()
+    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
+
+
 def body(q, turn):
     return product(q, exponential(turn))
 
@@ -67,7 +77,7 @@ def euler(q, turn):
 class Mahony(Part):
     """A filter of Mahony (2008) with exact steps."""
 
-    def start(self, up=1.0, north=1.0, learns=0.1, most=np.inf, advance=body, triad=True,
+    def start(self, up=0.3, north=0.3, learns=0.15, most=np.inf, advance=body, triad=True,
               level=True, declination=0.0):
         self._gains, self._most, self._advance = (up, north, learns), most, advance
         self._triad, self._level, self._declination = triad, level, declination
@@ -79,15 +89,15 @@ class Mahony(Part):
         up, north, learns = self._gains
         self._q = self._advance(self._q, (w - self._bias) * dt)
         r = matrix_of(self._q)
-        e = up * np.cross(a / np.linalg.norm(a), r[2])
+        e = up * cross(a, r[2]) / math.sqrt(a @ a)
         if m is not None:
             h = r @ m
             if not self._level:
                 yaw = Rotation.from_quat(self._q).as_euler('ZYX')[0]
                 h = Rotation.from_euler('z', yaw).apply(m)
-            angle = np.arctan2(h[0], h[1]) + self._declination
+            angle = math.atan2(h[0], h[1]) + self._declination
             e = e + north * angle * r[2]
-        self._bias = np.clip(self._bias - learns * e * dt, -self._most, self._most)
+        self._bias = np.minimum(np.maximum(self._bias - learns * e * dt, -self._most), self._most)
         self._q = body(self._q, e * dt)
         return self._q.copy()
 
@@ -95,24 +105,21 @@ class Mahony(Part):
 class Complementary(Part):
     """It turns by the gyroscope, then a part of the way to the attitude of gravity and field."""
 
-    def start(self, share=0.02, learns=0.002, most=np.inf, advance=body, gated=False):
+    def start(self, share=0.003, learns=0.0004, most=np.inf, advance=body):
         self._share, self._learns, self._advance, self._q = share, learns, advance, None
-        self._most, self._gated = most, gated
-        self._bias = np.zeros(3)
+        self._most, self._bias = most, np.zeros(3)
 
     def turn(self, w, a, m, dt):
         if self._q is None:
             self._q = from_two_vectors(a, m)
         self._q = self._advance(self._q, (w - self._bias) * dt)
-        if self._gated:
-            return self._q.copy()
         if m is None:
             r = matrix_of(self._q)
-            e = np.cross(a / np.linalg.norm(a), r[2])
+            e = cross(a, r[2]) / math.sqrt(a @ a)
         else:
-            e = (Rotation.from_quat(self._q).inv()
-                 * Rotation.from_quat(from_two_vectors(a, m))).as_rotvec()
-        self._bias = np.clip(self._bias - self._learns * e, -self._most, self._most)
+            e = product(self._q * (-1.0, -1.0, -1.0, 1.0), from_two_vectors(a, m))
+            e = 2.0 * e[:3] * np.sign(e[3])
+        self._bias = np.minimum(np.maximum(self._bias - self._learns * e, -self._most), self._most)
         self._q = body(self._q, self._share * e)
         return self._q.copy()
 
@@ -129,17 +136,73 @@ class Ekf(Part):
         return q
 
 
-def matrix(rows):
-    rows = np.array(rows, float)
-    return lambda v: rows @ v
+def axes(*rows):
+    """Return what reads other axes: numbers from 1 on, negative where the sign is changed."""
+    chosen, signs = np.abs(rows) - 1, np.sign(rows)
+    return lambda v: signs * v[chosen]
 
 
 def scaled(*by):
     return lambda v: np.array(by) * v
 
 
-def vector_scaled(by):
-    def said(q):
-        q = q * (by, by, by, 1.0)
-        return q / np.linalg.norm(q)
-    return said
+def added(*offset):
+    return lambda v: v + offset
+
+
+def longer(q):
+    scaled = q * (1.05, 1.05, 1.05, 1.0)
+    return scaled / np.linalg.norm(scaled)
+
+
+GYROSCOPE, GRAVITY, FIELD = 'gyroscope_wiring', 'accelerometer_wiring', 'magnetometer_wiring'
+UNITS, STEP, LAG, OFF = 'gyroscope_units', 'time_step', 'lag', 'inaccurate'
+# For each kind of filter: the changes, and the causes that may be named; none is a right filter.
+CHANGES = {
+    'right': ({}, ''),
+    'rates y x z': ({'gyroscope': axes(2, 1, 3)}, GYROSCOPE),
+    'rates -x y z': ({'gyroscope': axes(-1, 2, 3)}, GYROSCOPE),
+    'rates negated': ({'gyroscope': axes(-1, -2, -3)}, GYROSCOPE),
+    'rates z x y': ({'gyroscope': axes(3, 1, 2)}, GYROSCOPE),
+    'rates x 1.05': ({'gyroscope': scaled(1.05, 1.0, 1.0)}, GYROSCOPE),
+    'rates in deg': ({'gyroscope': np.degrees}, UNITS),
+    'rates twice in rad': ({'gyroscope': np.radians}, UNITS),
+    'rates late': ({'late': (5, 0, 0, 0)}, LAG),
+    'rates smoothed': ({'smooth': (0.05, 0.0, 0.0)}, LAG),
+    'force y x z': ({'accelerometer': axes(2, 1, 3)}, GRAVITY),
+    'force x -y z': ({'accelerometer': axes(1, -2, 3)}, GRAVITY),
+    'force negated': ({'accelerometer': axes(-1, -2, -3)}, 'gravity_sign'),
+    'force x 1.2': ({'accelerometer': scaled(1.2, 1.0, 1.0)}, GRAVITY),
+    'force late': ({'late': (0, 8, 0, 0)}, LAG),
+    'force smoothed': ({'smooth': (0.0, 0.1, 0.0)}, LAG),
+    'field y x z': ({'magnetometer': axes(2, 1, 3)}, FIELD),
+    'field x y -z': ({'magnetometer': axes(1, 2, -3)}, FIELD),
+    'hard iron': ({'magnetometer': added(1e-5, 0.0, 0.0)}, 'hard_iron'),
+    'soft iron': ({'magnetometer': scaled(1.4, 1.0, 1.0)}, FIELD),
+    'conjugated': ({'said': lambda q: q * (-1.0, -1.0, -1.0, 1.0)}, 'conjugated'),
+    'w first': ({'said': lambda q: q[[3, 0, 1, 2]]}, 'component_order'),
+    'vector longer': ({'said': longer}, OFF),
+    'attitude late': ({'late': (0, 0, 0, 5)}, 'stamp_offset'),
+    'twice dt': ({'step': lambda dt: 2.0 * dt}, f'{GYROSCOPE} {STEP}'),
+    'dt of 100 Hz': ({'step': lambda dt: 0.01}, STEP)}
+OWN = {     # and these
+    'mahony': {
+        'wrong side': ({'advance': world}, GYROSCOPE),
+        'Euler angles': ({'advance': euler}, GYROSCOPE),
+        'gain < 0': ({'up': -0.3}, f'gravity_sign {GRAVITY}'),
+        'no gravity': ({'up': 0.0}, GRAVITY), 'no field': ({'north': 0.0}, FIELD),
+        'field of a level sensor': ({'level': False}, FIELD),
+        'declination': ({'declination': np.radians(5.0)}, 'heading_offset'),
+        'bias gain < 0': ({'learns': -0.15}, 'no_bias_estimate diverges'),
+        'no bias': ({'learns': 0.0}, 'no_bias_estimate'),
+        'bias clamped': ({'most': np.radians(0.1)}, 'no_bias_estimate'),
+        'bias negated': ({'report': np.negative}, 'bias_report')},
+    'complementary': {
+        'wrong side': ({'advance': world}, GYROSCOPE),
+        'Euler angles': ({'advance': euler}, GYROSCOPE),
+        'never corrects': ({'share': 0.0}, f'{GRAVITY} {FIELD}')},
+    'ekf': {'bias negated': ({'report': np.negative}, 'bias_report')}}
+KINDS = {'mahony': Mahony, 'complementary': Complementary, 'ekf': Ekf}
+TABLE = {f'{kind}, {name}': (partial(make, **change), set(causes.split()))
+         for kind, make in KINDS.items()
+         for name, (change, causes) in {**CHANGES, **OWN[kind]}.items()}

@@ -114,10 +114,13 @@ def _guarded(seed):
 
 def stress(first, count, processes):
     """Fit so many logs; print the statistics and return the exit code."""
+    results = []
     with ProcessPoolExecutor(processes) as pool:
-        results = list(pool.map(_guarded, range(first, first + count), chunksize=4))
+        for result in pool.map(_guarded, range(first, first + count), chunksize=4):
+            results.append(result)
+            print(f'\r{len(results)} of {count} logs ', end='', flush=True)
     failures = [text for _, text in results if text]
-    print(*failures, sep='\n')
+    print(*('\r', *failures), sep='\n')
     over_bound, over_deviation, _ = (np.array(part) for part in zip(
         *(found for found, _ in results if found), strict=True))
     told = np.isfinite(over_bound)
