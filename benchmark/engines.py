@@ -104,23 +104,24 @@ ENTRIES = (
 
 
 class Timed:
-    """Runs an engine; adds up the processor time of runs with the step dt that repeat a length."""
+    """Runs an engine; adds up the processor time of runs with the step dt that are repeated."""
 
     def __init__(self, entry: Entry) -> None:
         module, name = entry.place.split(':')
         made = getattr(importlib.import_module(f'engines.{module}'), name)
         self._run = made(**entry.given) if isinstance(made, type) else made
-        self._entry, self._lengths = entry, set[int]()
+        self._entry, self._runs = entry, set[Any]()
         self.spent = self.simulated = 0.0
 
     def __call__(self, top: Any, start: Any, times: Any, dt: float) -> Any:
         began = time.process_time()
         said = self._run(top, start, times, dt, **self._entry.options)
         if math.isclose(dt, self._entry.dt):
-            if len(times) in self._lengths:     # before, something may have been compiled
+            this = start.attitude, len(times)
+            if this in self._runs:      # before, something may have been compiled
                 self.spent += time.process_time() - began
                 self.simulated += times[-1]
-            self._lengths.add(len(times))
+            self._runs.add(this)
         return said
 
 
@@ -167,7 +168,7 @@ def main() -> None:
     with ThreadPoolExecutor(TOGETHER) as pool:
         for found in pool.map(row, ENTRIES):        # whoever stops it keeps the rows before
             rows.append(found)
-            report.write('engines.md', f'{head}\n{TEXT}\n{report.table(heads, rows)}\n{NOTES}')
+            report.write('engines.md', f'{head}\n{TEXT}\n\n{report.table(heads, rows)}\n{NOTES}')
 
 
 TEXT = f"""\
@@ -176,7 +177,7 @@ the largest angle to the exact attitude, `energy drift` is relative to the energ
 `order` is that in which the error falls with the step, and `ms` is the processor time of a
 simulated second, with a sample read after every step from Python. `faults` are those that `grade`
 names with a tolerance of 0.1 degrees: in all scenes at the first step, in the cusps alone at the
-finer one, a {FINER}th of it.
+finer one, 1/{FINER} of it.
 
 Every engine runs as its documentation shows. The first step is the default where there is one,
 else that of its examples. Damping that is on by default is switched off, as the top has none. A
