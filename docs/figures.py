@@ -63,7 +63,8 @@ def page_about_a_log(path):
         simulate.main(['-o', log, '--duration', '30', '--quiet',
                        '-p', 'imu.gyroscope_noise_density:=0.01',
                        '-p', 'imu.accelerometer_noise_density:=0.05'])
-        inspect.main([log, '--plot', str(path)])
+        path.unlink(missing_ok=True)
+        assert inspect.main([log, '--plot', str(path)]) == 0
 
 
 def cubic(path):

@@ -108,7 +108,9 @@ def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
         Times [s], equally spaced; default: the `t` of the trajectory.
     dt : float, optional
         Step of the simulator [s]; default: the time between two samples.
-    tolerance, subject :
+    tolerance : float
+        As of `grade`.
+    subject : str
         As of `grade`.
     **imu :
         Parameters of `Body` beside those of the top: `lever_arm`, `mounting`, ...
