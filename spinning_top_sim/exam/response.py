@@ -411,8 +411,10 @@ class Responses:
         size = float(np.linalg.norm(bias))
         estimates = outcome.biases - self.outcome.biases[:motion.stop]
         estimates = estimates[np.isfinite(estimates[:, 0])]
-        found: Reals = estimates[-1] if len(estimates) else np.full(3, math.nan)
-        part = [float(found @ bias), *(estimates[len(estimates) // 4:] @ bias)[:1].tolist()]
+        if not len(estimates):
+            estimates = np.full((1, 3), math.nan)
+        found: Reals = estimates[-1]
+        part = (estimates[[-1, len(estimates) // 4]] @ bias).tolist()
         first, again = apart[self.course.rests[[0, -2]]].tolist()
         learned = again < LEARNED * first or (
             again < LEARNING * first and part[0] > max(BIAS_FOUND * size ** 2, 1.2 * part[1]))
