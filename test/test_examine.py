@@ -133,7 +133,7 @@ def test_a_fault_of_the_method_is_named(report, name):
 
 
 @pytest.mark.parametrize('name', ['mahony, right', 'mahony, no gravity', 'mahony, bias clamped'])
-def test_another_filter_is_blamed_for_their_fault_only(name):
+def test_another_filter_is_blamed_for_its_fault_only(name):
     make, causes = TABLE[name]
     found = examine(make, seeds=1, isolated=False)
     assert bool(found.faults) == bool(causes) and causes.issuperset(found.faults), found
