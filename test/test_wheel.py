@@ -104,6 +104,8 @@ def test_without_ros_a_scene_is_simulated_and_verified_with_the_same_bytes(empty
     code, out, err = run(command, 'inspect', 'run.mcap', '--verify', cwd=tmp_path)
     assert (code, err) == (0, '')
     assert re.search(r'^verify: identical, all \d+ messages', out, re.MULTILINE)
+    code, out, err = run(command, 'grade', 'run.mcap', cwd=tmp_path)
+    assert (code, err) == (0, '') and 'run.mcap: passed' in out
     (tmp_path / 'ros').mkdir()
     here = tmp_path / 'ros/run.mcap'
     assert main([*arguments, str(here)]) == 0       # in this environment, with the files of ROS

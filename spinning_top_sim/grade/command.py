@@ -44,11 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add = parser.add_argument
     add('file', type=Path, help='.mcap, .csv, .parquet or .npz')
-    scene_file.add_arguments(parser)
-    add('--params', metavar='FILE', action='append', default=[],
-        help='parameter file with top, start and IMU; may be repeated')
+    scene_file.add_parameters(parser)
     add('--fit', action='store_true', help='fit top and start to the attitudes; the default '
-        'without --scene, --params and parameters in the file')
+        'without --scene, --params, -p and parameters in the file')
     add('--fit-imu', action='store_true', help='the same, and mounting, place and stamps of the '
         'IMU to its readings')
     add('--lever-arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
@@ -59,19 +57,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     recorded = files.read(arguments.file, arguments.topic)
-    paths = [*scene_file.chosen_files(arguments), *arguments.params]
+    given = scene_file.given(arguments)
     fits = arguments.fit or arguments.fit_imu
-    if fits and paths:
-        raise ValueError('give either --fit, or --scene and --params')
-    given: dict[str, object] = {}
-    for path in paths:
-        given.update(scene_file.read_scene(path))
-    known = recorded.parameters if not paths else None
+    if fits and given:
+        raise ValueError('give either --fit, or --scene, --params and -p')
+    known = recorded.parameters if not given else None
     values = parameters.checked(given) if known is None else known
     body, state, found = _body(values), parameters.start_state(values), None
     if arguments.lever_arm is not None:
         body = replace(body, lever_arm=tuple(arguments.lever_arm))
-    if fits or not (paths or known):
+    if fits or not (given or known):
         found = fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
                     imu=arguments.fit_imu)
         body, state = found.body(body), found.start

@@ -325,7 +325,8 @@ NOT_OF_BODY = ('imu_odom', 'imu_bias')      # topics of this package
 
 
 def _read_log(path: Path, wanted: str | None) -> Recorded:
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
+    with needed('a log', 'rosbags'):
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
 
     store, recorded, origin_ns, end_ns = get_typestore(Stores.ROS2_JAZZY), Recorded(), -1, 1 << 63
     covariances: dict[tuple[str, str], Reals] = {}
