@@ -60,9 +60,8 @@ def test_live(browser, peer, tmp_path):
 
             # What is drawn was published, also while it runs.
             shown = visit.attitude()
-            poses.wait_more(1)
-            assert min(apart(shown, message.pose.orientation)
-                       for message in poses.messages()) < 1e-6
+            wait_for('the pose that is drawn', lambda: any(
+                apart(shown, message.pose.orientation) < 1e-6 for message in poses.messages()))
 
             # A command, as of any client.
             visit.put('L3 [kg m²/s]', 2.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Newton on the CPU, with each of its solvers, in the single precision of Warp."""
+"""Newton on the CPU, with one of its solvers, in the single precision of Warp."""
 
 from __future__ import annotations
 
