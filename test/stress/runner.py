@@ -98,7 +98,7 @@ class Worker:
         return json.loads(line) if line else {}
 
     def _said(self):
-        return (self._folder / 'errors').read_text(errors='replace')[-4000:]
+        return (self._folder / 'errors').read_text(errors='replace')[-20000:]
 
     def close(self):
         if self._process is not None:
