@@ -46,8 +46,8 @@ def sent_offline(values, drives, until_ns):
 
 
 @pytest.mark.parametrize('values', [
-    {'solver.method': method, **more} for method in METHODS
-    for more in (SHUTTLE, {'pivot.path': (0.7, 1.0, 0.0, 9.0, 0.7, -1.0, 0.0, -9.0)})])
+    {'solver.method': 'exact', **SHUTTLE},
+    {'solver.method': 'rk45', 'pivot.path': (0.7, 1.0, 0.0, 9.0, 0.7, -1.0, 0.0, -9.0)}])
 def test_live_and_offline_agree_to_the_last_bit(values):
     values = everything({'imu.lever_arm': (0.1, 0.2, 0.3), 'markers.trace_points': 20, **values})
     live, sent = simulation_of(LiveSimulation, **values), []
