@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from spinning_top_sim.tools import ensemble_part, ensemble_spec
 from spinning_top_sim.tools.ensemble import main
 from spinning_top_sim.tools.ensemble_part import EnsembleError, compute_part, table
 
-pytest.importorskip('distributed')
+pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='Dask is not there')
 pa = pytest.importorskip('pyarrow')
 parquet = pytest.importorskip('pyarrow.parquet')
 

@@ -64,7 +64,7 @@ def test_noise_has_the_power_of_the_profile_and_the_filter_acts_on_it():
         power = np.trapezoid(density * gain, frequencies) if hasattr(np, 'trapezoid') else (
             np.trapz(density * gain, frequencies))
         _, found = run({**values, 'imu.bandwidth': corner, 'imu.bandwidth_order': 2},
-                       10 * SECOND, 'imu/data_raw')
+                       6 * SECOND, 'imu/data_raw')
         _, _, _, rates, force, *_ = found['imu/data_raw']
         assert not rates.any()
         at, spectra = signal.welch(force, 2000.0, nperseg=1024, axis=0)
