@@ -67,7 +67,7 @@ def remedy(wanted: str) -> str:
         library, *_ = re.split('[^\\w.-]', requirement)
         if library == wanted or re.findall(r'[\w.-]+', condition)[1:] == [wanted]:
             lines.append(requirement)
-    quoted = (f"'{line}'" for line in lines or [wanted])
+    quoted = (f"'{line}'" for line in dict.fromkeys(lines or [wanted]))
     return f'{sys.executable} -m pip install {" ".join(quoted)}'
 
 

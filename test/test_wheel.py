@@ -156,7 +156,8 @@ REMEDIES = [
     (['inspect', 'a.mcap', '--plot', 'a.png'], "pip install 'matplotlib"),
     (['simulate', '--duration', '1', '-o', 'b.parquet'], "pip install 'pyarrow"),
     (['examine', '--filter', 'vqf'], "pip install 'vqf"),
-    (['ensemble', 'e.yaml', '-o', 'runs'], "pip install 'ahrs<0.5,>=0.4' 'distributed"),
+    (['examine', '--node', 'a', '--topic', 'b'], "pip install 'ros-jazzy-rclpy"),
+    (['ensemble', 'e.yaml', '-o', 'runs'], "pip install 'distributed"),
 ]
 
 
@@ -169,6 +170,8 @@ def test_what_is_missing_is_told_with_its_remedy(empty, tmp_path):
         assert code in (1, 2)
         assert err.startswith(f'spinning-top {arguments[0]}: ') and err.count('\n') == 1
         assert f'{empty}/bin/python -m {remedy}' in err
+        words = err.split()
+        assert len(set(words)) == len(words)
 
 
 def test_python_m_is_the_same_command(empty, tmp_path):
