@@ -18,12 +18,11 @@ SPOKES, SMOOTH = 8, 96              # number of spokes and of the sides of a rou
 
 
 class Part(NamedTuple):
-    """A mesh in the frame of the body; `opacity` as viser takes it."""
+    """A mesh in the frame of the body."""
 
     name: str
     mesh: trimesh.Trimesh
     colour: Colour
-    opacity: float | None = None
 
 
 def wheel(shape: Shape, length: float) -> list[Part]:

@@ -63,7 +63,7 @@ class DrawnTop:
         for part in (body.wheel if track.known else body.disc)(track.shape, far):
             scene.add_mesh_simple(
                 f'{name}/body/{part.name}', part.mesh.vertices, part.mesh.faces,
-                color=part.colour, opacity=0.4 if number else part.opacity,
+                color=part.colour, opacity=0.4 if number else None,
                 flat_shading=part.name != 'axle', side='double')
         peg = body.stand(FOOT * radius)
         self._stand = scene.add_mesh_simple(f'{name}/stand', peg.vertices, peg.faces, color=STAND,
