@@ -18,7 +18,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 
 
-class MotionReport:
+class NodeStatus:
     """Describes a running simulation; the caller holds the simulation's lock."""
 
     def __init__(self, simulation: LiveSimulation, loop: TickLoop,

@@ -39,7 +39,7 @@ from spinning_top_sim.tools.ensemble_part import (
     versions,
     write_row,
 )
-from spinning_top_sim.tools.recorded_run import ODD, reason_of
+from spinning_top_sim.tools.recorded_run import MALFORMED, reason_of
 
 MANIFEST = 'manifest.json'
 
@@ -146,7 +146,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         manifest: dict[str, Any] = json.loads(path.read_bytes())
         ensemble_spec.parse(manifest['specification'], 'specification')
         return {**manifest, 'versions': dict(manifest['versions'])}
-    except ODD as error:
+    except MALFORMED as error:
         raise ValueError(f'{path} is no manifest of an ensemble: {reason_of(error)}') from error
 
 

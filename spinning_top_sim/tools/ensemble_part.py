@@ -41,7 +41,7 @@ LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_
           'gnss/fix': PLACE, 'ground_truth/gnss/fix': PLACE}
 
 # Times of samples (n,) [ns], and the numbers in their messages as columns (n,) by name.
-Samples = tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]
+TimedColumns = tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]
 
 
 class EnsembleError(Exception):
@@ -55,7 +55,7 @@ def versions() -> dict[str, str]:
             **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}
 
 
-def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samples]:
+def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, TimedColumns]:
     """
     Return the samples of a run by topic, for the streams with these names.
 

@@ -45,7 +45,7 @@ def _read_log(path: Path, name: str) -> Track:
             _read_samples(reader, track, run.topics)
             try:
                 _follow_run(track, run, reader.span[1])
-            except recorded_run.ODD as error:
+            except recorded_run.MALFORMED as error:
                 notes.append(f'the run cannot be followed: {recorded_run.reason_of(error)}')
     if not len(track.attitudes.rows):
         raise LogError(f'{path}: no attitude in it ({", ".join(LAYOUTS)})')
