@@ -7,6 +7,7 @@ writes them, at least every half `max_loss`, so that a SIGKILL takes no more.  A
 to the disk meanwhile; `possible_loss` tells what a power loss would take.
 """
 
+import atexit
 import contextlib
 import os
 import threading
@@ -92,9 +93,11 @@ class McapRecorder:
         self._syncing: threading.Thread | None = None
         self._wake = threading.Event()
         self._taken = threading.Event()
-        # A daemon, so that a forgotten recording cannot hold up the end of the interpreter.
+        # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
+        # exit handler runs before daemons are stopped and closes the file properly.
         self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
         self._thread.start()
+        atexit.register(self.close)
 
     @property
     def room(self) -> bool:
@@ -162,6 +165,7 @@ class McapRecorder:
         May be called again.  Where the disk does not finish within `timeout` [s], the summary's
         `error` says so and the file goes on being closed in the background.
         """
+        atexit.unregister(self.close)
         self._accepting = False
         self._wake.set()
         self._thread.join(timeout)
