@@ -63,7 +63,7 @@ def remedy(wanted: str) -> str:
             requirement, _, condition = line.partition(';')
             if wanted in (*re.findall('[\\w.-]+', condition)[1:], *re.findall('^[\\w.-]+', line)):
                 lines.append(f"'{requirement.strip()}'")
-    return f'{sys.executable} -m pip install {" ".join(lines or [wanted])}'
+    return f'{sys.executable} -m pip install {" ".join(dict.fromkeys(lines or [wanted]))}'
 
 
 def parameter_files(kind: str) -> dict[str, Path]:

@@ -113,7 +113,7 @@ def test_without_ros_a_scene_is_simulated_and_verified_with_the_same_bytes(empty
 
 
 @pytest.mark.parametrize('name', ['', 'node', 'replay', 'simulate', 'inspect', 'recover',
-                                  'ensemble', 'examine', 'grade', 'view'])
+                                  'export', 'ensemble', 'examine', 'grade', 'view'])
 def test_help_needs_nothing(empty, tmp_path, name):
     code, out, err = run(empty / 'bin/spinning-top', *name.split(), '--help', cwd=tmp_path)
     assert (code, err) == (0, '')
@@ -128,7 +128,8 @@ def test_help_needs_nothing(empty, tmp_path, name):
     (['inspect', 'a.mcap', '--plot', 'a.png'], "pip install 'matplotlib"),
     (['simulate', '--duration', '1', '-o', 'b.parquet'], "pip install 'pyarrow"),
     (['examine', '--filter', 'vqf'], "pip install 'vqf"),
-    (['ensemble', 'e.yaml', '-o', 'runs'], "pip install 'ahrs<0.5,>=0.4' 'distributed"),
+    (['examine', '--node', 'a', '--topic', 'b'], "pip install 'ros-jazzy-rclpy"),
+    (['ensemble', 'e.yaml', '-o', 'runs'], "pip install 'distributed"),
 ])
 def test_what_is_missing_is_told_with_its_remedy(empty, tmp_path, arguments, remedy):
     assert main(['simulate', '--duration', '0.1', '--quiet', '-o', str(tmp_path / 'a.mcap')]) == 0
@@ -137,6 +138,8 @@ def test_what_is_missing_is_told_with_its_remedy(empty, tmp_path, arguments, rem
     assert code in (1, 2)
     assert err.startswith(f'spinning-top {arguments[0]}: ') and err.count('\n') == 1
     assert f'{empty}/bin/python -m {remedy}' in err
+    words = err.split()
+    assert len(set(words)) == len(words)
 
 
 def test_python_m_is_the_same_command(empty, tmp_path):

@@ -124,7 +124,7 @@ def _cannot_start(name: str, error: Exception) -> int:
     if isinstance(error, ModuleNotFoundError) and not find_spec('rclpy'):
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
                              f'{remedy("ros")}' + name.endswith('view') * (
-                                 '; a log needs none: spinning-top view LOG'))
+                                 '; `view LOG` works without'))
     expected = (isinstance(error, ValueError | RuntimeError | OSError | LogError | ImportError)
                 or kind.startswith('Invalid'))
     print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(error)}',

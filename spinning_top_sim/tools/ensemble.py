@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.workers is not None and arguments.workers < 1:
         raise ValueError(f'--workers {arguments.workers}: must be >= 1')
-    with needed('an ensemble', 'exam'):
+    with needed('an ensemble', 'ensemble'):
         return (_compute_dataset if arguments.row is None else _compute_row)(arguments)
 
 

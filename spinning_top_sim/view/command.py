@@ -137,6 +137,8 @@ def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, argv: l
     if arguments.html is not None:
         raise ValueError(f'--html {arguments.html}: must have a log')
     files = scene_file.chosen_files(arguments)
+    for path in files:
+        scene_file.read_scene(path)
     from spinning_top_sim.view.live import LiveView  # noqa: PLC0415
 
     def make_node() -> RunnableNode:
