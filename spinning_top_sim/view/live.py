@@ -169,8 +169,8 @@ class LiveView(Node):
             row[0, [ENERGY_DRIFT, ORIENTATION_ERROR]] = self._errors
             track.add('~/invariants', Samples(np.array([newest_ns]), row))
             self._errors = None
-        track.forget(max(newest_ns - KEPT_NS, min(self._origin_ns or 0, newest_ns)))
-        track.follow()
+        track.drop_before(max(newest_ns - KEPT_NS, min(self._origin_ns or 0, newest_ns)))
+        track.detect_motion()
         if track.motions:
             self._controls.show_spin(track.motions[-1].l3, track.motions[-1].lz)
         self._page.draw(newest_ns, self._origin_ns or newest_ns)
@@ -187,7 +187,7 @@ class LiveView(Node):
             stamps_ns = [_stamp_ns(data) for data in messages]
             known_ns = self._track.samples[topic].stamps_ns
             if len(known_ns) and stamps_ns[-1] < known_ns[-1] - RESTART_NS:
-                self._track.forget(known_ns[-1] + 1)        # the sim_node was started again
+                self._track.drop_before(known_ns[-1] + 1)        # the sim_node was started again
             self._track.add(topic, self._track.decode(topic, stamps_ns, messages))
         for topic in KIND_OF.keys() - self._listeners.keys():   # these get old
             self._track.samples[topic] = empty(topic)
