@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
+from spinning_top_sim.grade.motion import MARGIN, Motion
 from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, least_squares
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
@@ -92,7 +92,7 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
         reading, first = reading[:, :3] / said.step, first + 1
         terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
     else:
-        first, a, w = 2 * MARGIN, derivative(w, said.step), w[inner]
+        first, a, w = 2 * MARGIN, motion.accelerations(w), w[inner]
         axes = np.eye(3)[:, np.newaxis]
         tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
         arms = tangential + centripetal
@@ -160,9 +160,11 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     if kind in ('gyroscope', 'accelerations') and not any(
             fault.name in ('units', 'reading_scale') for fault in faults):
         ends = np.cumsum([len(one) for one, _ in parts])[:-1]
-        noises = np.concatenate([run.size * one for run, one in zip(
-            runs, np.split(residual, ends), strict=True)])
-        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), noises, motion,
+        noises = [run.size * one for run, one in zip(
+            runs, np.split(residual, ends), strict=True)]
+        # A cause that is found has taken fast motion away, or has left some.
+        level = np.mean(np.minimum(noise, [*map(_white, noises)]))
+        faults += _noise_faults(kind, runs[0], float(level), np.concatenate(noises), motion,
                                 NOISE_BAND + doubt)
     return faults, marks
 
@@ -218,9 +220,14 @@ def _lag(runs: Sequence[Readings]) -> int:
 
 
 def _noise(run: Readings, lag: int) -> float:
-    """Return the standard deviation of white noise, by differences in which motions vanish."""
+    """Return the standard deviation of the white noise of a reading."""
     reading, part = run.late(lag)
-    return rms(np.diff(reading - run.total[part], 6, axis=0)) / math.sqrt(924.0)
+    return _white(reading - run.total[part])
+
+
+def _white(rows: Reals) -> float:
+    """Return the standard deviation of white noise, by differences in which motions vanish."""
+    return rms(np.diff(rows, 6, axis=0)) / math.sqrt(924.0)
 
 
 def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, Reals]]:

@@ -35,7 +35,7 @@ ACCELERATIONS, MAGNETOMETER, ANGLES = 'accelerations', 'magnetometer', 'angles'
 # Words in the name of a column, before its component.
 WORDS = {
     ATTITUDES: {'q', 'quat', 'quaternion', 'orientation', 'attitude', 'attitudes', 'rotation'},
-    GYROSCOPE: {'gyro', 'gyr', 'gyroscope'},
+    GYROSCOPE: {'g', 'gyro', 'gyr', 'gyroscope'},
     ACCELERATIONS: {'a', 'acc', 'accel', 'acceleration', 'accelerations', 'accelerometer'},
     RATES: {'w', 'omega', 'rate', 'rates', 'angular'},
     MAGNETOMETER: {'m', 'mag', 'magnetic', 'magnetometer'}}
