@@ -84,8 +84,10 @@ class Fit:
 
     def body(self, given: Body) -> Body:
         """Return the fitted top with the IMU of a body, or the fitted one."""
-        imu = {'mounting': self.mounting, 'lever_arm': self.lever_arm}
-        return replace(given, **vars(self.top), **imu if 'stamp_offset' in self.values else {})
+        new: dict[str, Any] = dict(vars(self.top))
+        if 'stamp_offset' in self.values:
+            new.update(mounting=self.mounting, lever_arm=self.lever_arm)
+        return replace(given, **new)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; null: not told by the readings."""
@@ -285,7 +287,7 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     """Return the fit in public parameters, with what the readings do not tell."""
     problem, x = trial.problem, trial.x
     free = [*MOTION, *SENSOR] if len(problem.readings) > 1 else [*MOTION]
-    rate = max(float(np.linalg.norm(x[unknowns.RATES])), abs(float(x[L3])), math.sqrt(abs(float(x[P]))))
+    rate = float(max(np.linalg.norm(x[unknowns.RATES]), abs(x[L3]), math.sqrt(abs(x[P]))))
     sizes = np.array([1.0] * 3 + [rate] * 4 + [rate * rate] + [1.0] * 6 + [1.0 / rate])[free]
     at, frozen = without_unseen_nutation(problem, x, trial.residual)
     problem.jacobian(at, free)          # sets the steps
@@ -301,7 +303,7 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     deviations[np.any(hidden, axis=1) | ~(deviations < allowed)] = math.inf
     names = [list(NAMES)[k] for k in free]
     top, start = _scaled(values[:8].tolist(), lambda1, gravity)
-    mx, my, mz, mw = (float(part[0]) for part in turned(problem.mounting, x[unknowns.MOUNTING]))
+    mx, my, mz, mw = np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])).tolist()
     return Fit(top, start, (mw, mx, my, mz), tuple(x[unknowns.PLACE].tolist()), begin,
                dict(zip(names, values.tolist(), strict=True)),
                dict(zip(names, deviations.tolist(), strict=True)), half @ half.T,
@@ -356,10 +358,10 @@ def without_unseen_nutation(problem: Problem, x: Reals, residual: float,
 def _public(problem: Problem, x: Reals) -> Reals:
     """Return the values of NAMES."""
     _, state = problem.start(x)
-    turn = Rotation.from_quat([float(part[0]) for part in turned(problem.mounting, x[unknowns.MOUNTING])])
+    mounting = Rotation.from_quat(np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])))
     return np.array([state.theta, state.theta_dot, state.phi, state.psi, state.l3, state.lz,
-                     state.l3 / (float(x[SPIN]) or 1e-300), x[P], *turn.as_rotvec(), *x[unknowns.PLACE],
-                     x[unknowns.LATE]])
+                     state.l3 / (float(x[SPIN]) or 1e-300), x[P], *mounting.as_rotvec(),
+                     *x[unknowns.PLACE], x[unknowns.LATE]])
 
 
 def _slopes(problem: Problem, x: Reals, free: Sequence[int], sizes: Reals) -> Reals:
