@@ -7,7 +7,6 @@ its own attitudes and rates, would cause.  Errors do not add up there, so that t
 every motion, and for every size of the error.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np

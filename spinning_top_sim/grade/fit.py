@@ -27,6 +27,8 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
 FEWEST = 32                 # attitudes that can be fitted
+GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
+LOST = 0.05                 # residual of a part that is too long to begin with [rad]
 FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
 NAMES = {'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'psi': 'rad', 'L3/lambda1': 'rad/s',
          'Lz/lambda1': 'rad/s', 'lambda3/lambda1': '1', 'P/lambda1': '1/s^2', 'mounting_x': 'rad',
@@ -194,14 +196,20 @@ def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
 def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
     """Fit longer and longer parts; L3 and P beyond 2 `size` attitudes, with 0 in the last."""
     problem = Problem([one], one.values[:, 0], gravity)
-    count, last = FIRST, len(one.times)
-    while count < last:
-        chosen = slice(0, count, math.ceil(count / ENOUGH))
+    done, growth, level, last = FIRST / GROWTH, GROWTH, math.inf, len(one.times)
+    converged = False
+    while done < last:
+        count = min(math.ceil(done * growth), last)
+        chosen = slice(0, count, math.ceil(count / ENOUGH) if count < last else 1)
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
-        x, _ = descend(problem, x, MOTION if size and count > 2 * size else MOTION[:6], 8, 1e-3)
-        count *= 3
-    problem.readings = [one]
-    x, converged = descend(problem, x, MOTION)
+        free = MOTION if count == last or 0 < 2 * size < count else MOTION[:6]
+        precisely = (30, 1e-10) if count == last else (8, 1e-3)
+        found, converged = descend(problem, x, free, *precisely)
+        rest = float(np.std(problem.residuals(found)))
+        if rest > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
+            growth = math.sqrt(growth)
+        else:
+            x, done, level, growth = found, count, rest, min(growth * growth, GROWTH)
     rest = problem.residuals(x).reshape(3, -1)
     residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
     noise, white = whiteness(rest)

@@ -147,11 +147,8 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     Returns the faults and the measures.
     """
     lag = 0 if kind == 'velocities' else _lag(runs)
+    target, effects = _pooled([_discrepancy(kind, run, lag) for run in runs])
     noise = [_noise(run, lag) for run in runs]
-    parts = [_discrepancy(kind, run, lag) for run in runs]
-    target = np.concatenate([one for one, _ in parts])
-    effects = {name: np.concatenate([columns[name] for _, columns in parts])
-               for name in parts[0][1]}
     floor = rms(np.array(noise) / [run.size for run in runs])
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
     most = floor * math.sqrt(1.05 + 2.0 * doubt)
@@ -178,12 +175,15 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
             return faults, marks
     scaled = {'units', 'reading_scale'} & {fault.name for fault in faults}
     if kind in ('gyroscope', 'accelerations') and not scaled:
-        ends = np.cumsum([len(one) for one, _ in parts])[:-1]
-        noises = np.concatenate([run.size * one for run, one in zip(
-            runs, np.split(residual, ends), strict=True)])
-        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), noises, motion,
-                                NOISE_BAND + doubt)
+        faults += _noise_faults(kind, runs[0], float(np.mean(noise)),
+                                effects['size'] * residual, motion, NOISE_BAND + doubt)
     return faults, marks
+
+
+def _pooled(parts: Sequence[tuple[Reals, dict[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
+    targets, effects = zip(*parts, strict=True)
+    return np.concatenate(targets), {name: np.concatenate([one[name] for one in effects])
+                                     for name in effects[0]}
 
 
 def _fraction(kind: str, target: Reals, effects: Mapping[str, Reals]) -> float:
@@ -203,13 +203,11 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motio
                motion.body.accelerometer_noise_density)
     covariance = (motion.trajectory.covariance or {}).get(kind)
     exists, root = noise > NOISY * run.size, math.sqrt(run.step)
-    declared = None if density is None else density / root
     text = f'{kind}: the noise has a standard deviation of {noise:.4g}'
-    if covariance is not None and not np.any(covariance):
-        if exists:
-            yield Fault('covariance_zero', f'{text}, its covariance is told as 0', noise)
-    elif covariance is not None and declared is None:
-        declared = math.sqrt(float(np.trace(covariance)) / 3.0)
+    told = math.nan if covariance is None else math.sqrt(abs(np.trace(covariance)) / 3.0)
+    if told == 0.0 and exists:
+        yield Fault('covariance_zero', f'{text}, its covariance is told as 0', noise)
+    declared = (told or math.nan) if density is None else density / root
     if declared == 0.0 and exists:
         yield Fault('noise_scale', f'{text}, it is declared as 0', math.inf)
     elif declared and abs((ratio := noise / declared) - 1.0) > band:
@@ -218,13 +216,8 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motio
             ('1/sqrt(dt)', 1.0 / root)) if abs(ratio / factor - 1.0) < band]
         yield Fault('noise_scale', f'{text}, {ratio:.4g}{"".join(as_if)} times what is declared',
                     ratio)
-    if exists and rms(residual) < 1.05 * noise:
-        yield from _shape_fault(kind, residual)
-
-
-def _shape_fault(kind: str, noise: Reals) -> Iterator[Fault]:
-    kurtosis = float(np.mean(noise ** 4) / np.mean(noise ** 2) ** 2)
-    if kurtosis < LEAST_KURTOSIS:
+    kurtosis = float(np.mean(residual ** 4)) / (rms(residual) ** 4 or 1.0)
+    if exists and rms(residual) < 1.05 * noise and kurtosis < LEAST_KURTOSIS:
         yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; normal '
                     'noise has 3, uniform noise 1.8', kurtosis)
 
@@ -261,6 +254,7 @@ def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, R
     reading, part = run.late(lag)
     total = run.total
     effects = {**run.terms, 'total': total, 'step': _rate(total),
+               'size': run.size ** 2 + 0.0 * total,
                'mounted': run.mounting.apply(total),
                'world': (world := run.rotation.apply(total)),
                'reversed': run.rotation.apply(world)}
