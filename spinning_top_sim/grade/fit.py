@@ -203,7 +203,7 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
         chosen = slice(0, count, math.ceil(count / ENOUGH) if count < last else 1)
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
         free = MOTION if count == last or 0 < 2 * size < count else MOTION[:6]
-        precisely = (30, 1e-10) if count == last else (8, 1e-3)
+        precisely = (30, 1e-8) if count == last else (8, 1e-3)
         found, converged = descend(problem, x, free, *precisely)
         rest = float(np.std(problem.residuals(found)))
         if rest > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
@@ -219,7 +219,7 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
 
 
 def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
-            tolerance: float = 1e-10) -> tuple[Reals, bool]:
+            tolerance: float = 1e-8) -> tuple[Reals, bool]:
     """Return the unknowns at the least sum of squares, and whether it was reached."""
     chosen = [*free]
 
