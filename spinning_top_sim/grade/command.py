@@ -60,7 +60,7 @@ def _run(arguments: argparse.Namespace) -> int:
     trajectory = trajectory_of(recorded, ExactSolution(body, state), found.begin if found else 0.0)
     report = grade_trajectory(trajectory, body, state, subject=arguments.file.name)
     if arguments.json:
-        print(json.dumps({**json.loads(report.as_json()), 'notes': recorded.notes,
+        print(json.dumps({**report.as_dict(), 'notes': recorded.notes,
                           'fit': found and found.as_dict()}, indent=2))
     else:
         fitted = found.lines() if found else ()

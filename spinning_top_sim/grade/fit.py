@@ -27,6 +27,8 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
 FEWEST = 32                 # attitudes that can be fitted
+GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
+LOST = 0.05                 # residual of a part that is too long to begin with [rad]
 FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
 NAMES = {'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'psi': 'rad', 'L3/lambda1': 'rad/s',
          'Lz/lambda1': 'rad/s', 'lambda3/lambda1': '1', 'P/lambda1': '1/s^2', 'mounting_x': 'rad',
@@ -84,8 +86,10 @@ class Fit:
 
     def body(self, given: Body) -> Body:
         """Return the fitted top with the IMU of a body, or the fitted one."""
-        imu = {'mounting': self.mounting, 'lever_arm': self.lever_arm}
-        return replace(given, **vars(self.top), **imu if 'stamp_offset' in self.values else {})
+        new: dict[str, Any] = dict(vars(self.top))
+        if 'stamp_offset' in self.values:
+            new.update(mounting=self.mounting, lever_arm=self.lever_arm)
+        return replace(given, **new)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; null: not told by the readings."""
@@ -192,14 +196,20 @@ def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
 def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
     """Fit longer and longer parts; L3 and P beyond 2 `size` attitudes, with 0 in the last."""
     problem = Problem([one], one.values[:, 0], gravity)
-    count, last = FIRST, len(one.times)
-    while count < last:
-        chosen = slice(0, count, math.ceil(count / ENOUGH))
+    done, growth, level, last = FIRST / GROWTH, GROWTH, math.inf, len(one.times)
+    converged = False
+    while done < last:
+        count = min(math.ceil(done * growth), last)
+        chosen = slice(0, count, math.ceil(count / ENOUGH) if count < last else 1)
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
-        x, _ = descend(problem, x, MOTION if size and count > 2 * size else MOTION[:6], 8, 1e-3)
-        count *= 3
-    problem.readings = [one]
-    x, converged = descend(problem, x, MOTION)
+        free = MOTION if count == last or 0 < 2 * size < count else MOTION[:6]
+        precisely = (30, 1e-8) if count == last else (8, 1e-3)
+        found, converged = descend(problem, x, free, *precisely)
+        rest = float(np.std(problem.residuals(found)))
+        if rest > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
+            growth = math.sqrt(growth)
+        else:
+            x, done, level, growth = found, count, rest, min(growth * growth, GROWTH)
     rest = problem.residuals(x).reshape(3, -1)
     residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
     noise, white = whiteness(rest)
@@ -209,7 +219,7 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
 
 
 def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
-            tolerance: float = 1e-10) -> tuple[Reals, bool]:
+            tolerance: float = 1e-8) -> tuple[Reals, bool]:
     """Return the unknowns at the least sum of squares, and whether it was reached."""
     chosen = [*free]
 
@@ -285,7 +295,7 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     """Return the fit in public parameters, with what the readings do not tell."""
     problem, x = trial.problem, trial.x
     free = [*MOTION, *SENSOR] if len(problem.readings) > 1 else [*MOTION]
-    rate = max(float(np.linalg.norm(x[unknowns.RATES])), abs(float(x[L3])), math.sqrt(abs(float(x[P]))))
+    rate = float(max(np.linalg.norm(x[unknowns.RATES]), abs(x[L3]), math.sqrt(abs(x[P]))))
     sizes = np.array([1.0] * 3 + [rate] * 4 + [rate * rate] + [1.0] * 6 + [1.0 / rate])[free]
     at, frozen = without_unseen_nutation(problem, x, trial.residual)
     problem.jacobian(at, free)          # sets the steps
@@ -301,7 +311,7 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     deviations[np.any(hidden, axis=1) | ~(deviations < allowed)] = math.inf
     names = [list(NAMES)[k] for k in free]
     top, start = _scaled(values[:8].tolist(), lambda1, gravity)
-    mx, my, mz, mw = (float(part[0]) for part in turned(problem.mounting, x[unknowns.MOUNTING]))
+    mx, my, mz, mw = np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])).tolist()
     return Fit(top, start, (mw, mx, my, mz), tuple(x[unknowns.PLACE].tolist()), begin,
                dict(zip(names, values.tolist(), strict=True)),
                dict(zip(names, deviations.tolist(), strict=True)), half @ half.T,
@@ -356,10 +366,10 @@ def without_unseen_nutation(problem: Problem, x: Reals, residual: float,
 def _public(problem: Problem, x: Reals) -> Reals:
     """Return the values of NAMES."""
     _, state = problem.start(x)
-    turn = Rotation.from_quat([float(part[0]) for part in turned(problem.mounting, x[unknowns.MOUNTING])])
+    mounting = Rotation.from_quat(np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])))
     return np.array([state.theta, state.theta_dot, state.phi, state.psi, state.l3, state.lz,
-                     state.l3 / (float(x[SPIN]) or 1e-300), x[P], *turn.as_rotvec(), *x[unknowns.PLACE],
-                     x[unknowns.LATE]])
+                     state.l3 / (float(x[SPIN]) or 1e-300), x[P], *mounting.as_rotvec(),
+                     *x[unknowns.PLACE], x[unknowns.LATE]])
 
 
 def _slopes(problem: Problem, x: Reals, free: Sequence[int], sizes: Reals) -> Reals:

@@ -28,6 +28,7 @@ TURN, RATES, SPIN, L3, P = slice(0, 3), slice(3, 6), 5, 6, 7
 MOUNTING, PLACE, LATE = slice(8, 11), slice(11, 14), 14
 MOTION, SENSOR = range(8), range(8, 15)
 UNKNOWNS = 15
+ROUNDING = 1e-14            # of rates
 CHANGE = 1e-6               # of the readings by a step of finite differences [rad], [rad/s], ..
 
 
@@ -66,9 +67,10 @@ class Problem:
     def start(self, x: Reals) -> tuple[Top, State]:
         """Return top and state with lambda1 = lambda3 = 1: its spin is L3, not omega_3."""
         q = turned(self.reference, x[TURN])
-        rates = attitude.in_world(q, (x[3], x[4], x[L3]))
+        rates = np.ravel(attitude.in_world(q, (x[3], x[4], x[L3])))
+        rates[np.abs(rates) < ROUNDING * np.max(np.abs(rates))] = 0.0   # an upright top may rest
         top = Top(lambda1=1.0, lambda3=1.0, mass=1.0, com_distance=float(x[P]), gravity=1.0)
-        return top, state_of(top, np.ravel(q), np.ravel(rates))
+        return top, state_of(top, np.ravel(q), rates)
 
     def residuals(self, x: Reals) -> Reals:
         """Return (readings - model)/sigma (m,).  Raises ValueError where there is no motion."""

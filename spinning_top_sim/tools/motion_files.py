@@ -265,26 +265,32 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
             end_ns = next((one.stamp_ns for one in run.events if one.name != 'start'), end_ns)
         if not reader.whole:
             recorded.notes.append('the log is truncated: read as far as it goes')
-        tables: dict[tuple[str, str], dict[str, list[Any]]] = defaultdict(
-            lambda: defaultdict(list))
-        first: dict[str, Any] = {}
-        for topic, log_time, content in _contents(reader, types, end_ns):
-            frame = getattr(content, 'child_frame_id', '') if types[topic] == MESSAGES[5] else ''
-            first.setdefault(topic, content)
-            stamp, table = content.header.stamp, tables[topic, frame]
-            table['stamp_ns'].append(stamp.sec * 10 ** 9 + stamp.nanosec or log_time)
-            for name, value in _fields(content):
-                table[name].append(value)
+        tables, first = _log_tables(reader, types, end_ns)
     chosen = sorted(tables, key=lambda one: (
         one[0] != wanted, MESSAGES.index(types[one[0]]), one))
     recorded.add({' '.join(filter(None, one)): tables[one] for one in chosen}, origin)
     for kind, name in COVARIANCES.items():
         for topic in [topic for topic in first if f'{kind} of {topic}' in recorded.notes]:
             matrix = np.reshape(getattr(first[topic], name), (3, 3))
-            # The smallest variance means exact, and is none of noise.
-            if not 0.0 < np.max(np.abs(matrix)) <= EXACT_VARIANCE:
+            # -1: there are no such readings.  The smallest variance means exact, none of noise.
+            if matrix[0, 0] >= 0.0 and not 0.0 < np.max(matrix) <= EXACT_VARIANCE:
                 recorded.covariance[kind] = matrix
     return recorded
+
+
+def _log_tables(reader: LogReader, types: Mapping[str, str], end_ns: int,
+                ) -> tuple[dict[tuple[str, str], Table], dict[str, Any]]:
+    """Return tables by topic and, of transforms, frame; and the first message of each topic."""
+    tables: dict[tuple[str, str], Any] = defaultdict(lambda: defaultdict(list))
+    first: dict[str, Any] = {}
+    for topic, log_time, content in _contents(reader, types, end_ns):
+        frame = content.child_frame_id if hasattr(content, 'transform') else ''
+        first.setdefault(topic, content)
+        stamp, table = content.header.stamp, tables[topic, frame]
+        table['stamp_ns'].append(stamp.sec * 10 ** 9 + stamp.nanosec or log_time)
+        for name, value in _fields(content):
+            table[name].append(value)
+    return tables, first
 
 
 def _contents(reader: LogReader, types: Mapping[str, str],
