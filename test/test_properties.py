@@ -42,7 +42,7 @@ def is_a_line(text):
 
 # ------------------------------------------------------------------------------------ parameters
 
-@examples(100)
+@examples(60)
 @given(NAMES | LISTS, ANYTHING)
 def test_any_value_of_a_parameter_is_taken_or_refused_by_its_name(name, value):
     try:
@@ -87,7 +87,7 @@ YAML = st.one_of(
                                f'{pair[1]:#x}]}}}}'))
 
 
-@examples(80)
+@examples(60)
 @given(YAML)
 def test_any_parameter_file_is_read_or_refused_by_its_path(tmp_path, text):
     path = tmp_path / 'scene.yaml'
@@ -125,7 +125,7 @@ SPECIFICATIONS = st.one_of(st.fixed_dictionaries(
             OF_YAML)}), OF_YAML)
 
 
-@examples(120)
+@examples(60)
 @given(SPECIFICATIONS)
 def test_any_specification_gives_its_runs_or_is_refused_by_its_source(content):
     try:

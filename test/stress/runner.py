@@ -34,7 +34,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 STARTING_S = 120.0          # patience for imports
 MOST_FAILURES = 20          # then enough is known
-PARTS = ('logs', 'nodes', 'disk', 'sensor', 'exam', 'wrong', 'grade')
+PARTS = ('logs', 'nodes', 'sensor', 'exam', 'wrong', 'grade')
 
 
 def module_of(part):
