@@ -13,7 +13,6 @@ from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import why_not_written
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # argparse uses 2, too
-
 ERRORS: tuple[type[Exception], ...] = (ValueError, ArithmeticError, OSError, ImportError)
 
 

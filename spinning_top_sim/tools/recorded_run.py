@@ -194,30 +194,26 @@ def _event(stamp_ns: int, data: bytes) -> Event:
     return Event(name, stamp_ns, t_ns, sent_ns, details)
 
 
-def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
-          ) -> Iterator[tuple[Simulation, Event | Block]]:
+class Rerun:
     """
-    Compute the run of a log again; yield it at the start, after each event and after each block.
+    The computation of the run of a log, within limits that the size of the log sets.
 
-    end_ns : log time of the end [ns]
     samples : yield the messages of the log's streams in blocks; else only motions are computed
-
-    Raises one of MALFORMED where there is no motion with these parameters and commands, or where
-    it takes far more work than a run that fits into the log.
     """
-    return _Rerun(run, samples).events(end_ns)
 
-
-class _Rerun:
-    """The computation of a run, within limits that the size of its log sets."""
-
-    def __init__(self, run: RunDescription, samples: bool) -> None:
+    def __init__(self, run: RunDescription, *, samples: bool = False) -> None:
         self._run, self._samples = run, samples
         self._most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
         self._samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
         self._simulation = Simulation(run.values_at_start, run.epoch_ns)
 
     def events(self, end_ns: int) -> Iterator[tuple[Simulation, Event | Block]]:
+        """
+        Yield the simulation at the start, after each event and after each block, up to a log time.
+
+        Raises one of MALFORMED where there is no motion with these parameters and commands, or
+        where it takes far more work than a run that fits into the log.
+        """
         simulation, run = self._simulation, self._run
         # Before the recording: the motion and its commands, no samples.
         for event in run.history:
