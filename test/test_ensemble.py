@@ -20,7 +20,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import ensemble_part, ensemble_spec
 from spinning_top_sim.tools.ensemble import main
-from spinning_top_sim.tools.ensemble_part import EnsembleError, compute_part, table
+from spinning_top_sim.tools.ensemble_part import compute_part, table
 
 pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='Dask is not there')
 pa = pytest.importorskip('pyarrow')
@@ -53,11 +53,10 @@ def contents(folder):
 
 def parts_of(specification, folder):
     """Compute all parts without Dask; return the runs that failed."""
-    for name in ('data', 'unfinished'):
-        (folder / name).mkdir(exist_ok=True)
+    (folder / 'data').mkdir(exist_ok=True)
     failed = {}
     for part in range(specification.parts):
-        failed |= compute_part(specification, part, str(folder), ensemble_part.versions())
+        failed |= compute_part(specification, part, str(folder))
     return failed
 
 
@@ -297,13 +296,6 @@ def test_a_part_has_so_many_runs_by_default(runs, duration, together):
     assert ensemble_spec.parse(given, 'test').runs_per_part == together
 
 
-def test_a_worker_with_other_versions_computes_nothing(tmp_path):
-    specification = ensemble_spec.parse({'runs': 1, 'duration': 0.1}, 'test')
-    with pytest.raises(EnsembleError, match=r"gives other bytes than \{'numpy': '1.0'\}"):
-        compute_part(specification, 0, str(tmp_path), {'numpy': '1.0'})
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(('content', 'counts'), [
     # A magnetometer in one of two IMUs; a value that is unset in some runs.
     ({'runs': 4, 'sample': {'params': {'values': [
@@ -369,12 +361,12 @@ def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble
     assert contents(folder) == before
     assert ensemble(path, '-o', folder) == 2
     error = capsys.readouterr().err
-    assert f'{folder} has another ensemble: runs = 1, not 32, duration' in error
+    assert f'{folder} has another ensemble' in error
     assert error.endswith(': choose a new folder, or --overwrite\n')
     turned = written(tmp_path, runs=1, duration=0.05, sample={      # it is another grid
         'spin.l3': {'values': [1.5, 1.7]}, 'initial.theta': {'values': [0.3, 0.6]}})
     assert ensemble(turned, '-o', folder) == 2
-    assert 'has another ensemble: sample = ' in capsys.readouterr().err
+    assert 'has another ensemble' in capsys.readouterr().err
     assert contents(folder) == before
     (folder / 'notes').write_text('mine')
     assert ensemble(turned, '-o', folder, '--overwrite') == 0

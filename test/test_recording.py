@@ -39,7 +39,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
 
-from spinning_top_sim.recording.chunks import CHUNK_BYTES, PlainChunk, time_span
+from spinning_top_sim.recording.chunks import CHUNK_BYTES, ChunkBuilder, time_span
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
 from spinning_top_sim.recording.writer import McapRecorder, create_file
@@ -273,7 +273,7 @@ def test_rows_give_the_chunk_that_single_messages_give():
     times = np.array([*range(30, 50), *range(30)])
     rows = np.frombuffer(b''.join(pose_cdr(number) for number in range(50)), 'u1').reshape(50, -1)
     many = np.arange(600), np.zeros((600, 6000), np.uint8)
-    together, singly = PlainChunk(), PlainChunk()
+    together, singly = ChunkBuilder(), ChunkBuilder()
     for _ in range(2):
         for chunk in (together, singly):
             chunk.clear()
@@ -327,7 +327,7 @@ def test_rows_are_written_in_order_and_the_bytes_are_always_the_same(tmp_path, c
 def test_a_chunk_of_noise_survives_whatever_its_size(compression, size):
     """It becomes longer by being compressed; a message that is too long gets more memory."""
     message = random.Random(size).randbytes(size)
-    chunk = PlainChunk(compression)
+    chunk = ChunkBuilder(compression)
     for before in (b'', b'before'):
         chunk.clear()
         chunk.add(1, 0, 7, 7, before)

@@ -111,8 +111,8 @@ def test_a_missing_message_and_a_changed_journal_are_found(short, tmp_path, caps
 
 
 def test_another_machine_is_warned_of(short, capsys, monkeypatch):
-    here = provenance.surroundings()
-    monkeypatch.setattr(provenance, 'surroundings', lambda: {**here, 'platform': 'abacus'})
+    here = provenance.environment()
+    monkeypatch.setattr(provenance, 'environment', lambda: {**here, 'platform': 'abacus'})
     verdict = verified(capsys, short)
     assert verdict['identical']
     assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]

@@ -290,8 +290,8 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
     try:
         with np.errstate(over='ignore', invalid='ignore'):
             segment = _begun(top, start, start_ns, values, pivot)
-        if not math.isfinite(segment.energy):
-            raise ValueError(f'the energy would be {segment.energy!r} J')
+            if isinstance(start, State) and not math.isfinite(segment.energy):
+                raise ValueError(f'the energy would be {segment.energy!r} J')
         if not segment.reach(start_ns + 1, FIRST_STEPS):
             raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
         spin = abs(start.l3) / top.lambda3 / math.tau
