@@ -157,7 +157,7 @@ def test_a_recording_overwrites_nothing_and_is_made_where_the_node_runs(peer, se
 
 def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagnostics, tmp_path):
     """Before the clock, with it, when it stops, and steps back."""
-    clock = DrivenClock(peer, 1_000_000_000_000)
+    clock = DrivenClock(peer, '/driven', 1_000_000_000_000)     # /clock is that of `served`
 
     def waits():
         status = diagnostics.wait_for(node, 'a warning', lambda s: 'waiting' in s.message)
@@ -170,7 +170,7 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
         return len(pose.raw) > count + 50
 
     with SimNode(tmp_path, {'use_sim_time': True, 'status_period': 0.2, 'time_scale': 2.0},
-                 namespace='/follower') as node:
+                 namespace='/follower', arguments=('-r', '/clock:=/driven')) as node:
         waits()
         refused = peer.set_together(node, spin__l3=2.0)     # it would send t = 0 to nobody
         assert not refused.successful and 'waiting for /clock' in refused.reason
