@@ -24,8 +24,6 @@ from stress import fit, runner, tops  # noqa: E402
 
 
 def main():
-    if sys.argv[1:2] == ['--worker']:
-        return runner.serve(*sys.argv[2:])
     parser = argparse.ArgumentParser(
         prog='python test/stress', description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -55,8 +53,7 @@ def stress(options):
                         options.processes or 1, tell)
     outcomes = ', '.join(f'{name} {count}' for name, count in result.outcomes.most_common())
     print(f'\r{options.part}: seeds {options.first} to {options.first + result.seeds - 1}: '
-          f'{outcomes}; a worker had {result.peak_mb:.0f} MB at most; '
-          f'{len(result.failures)} failures')
+          f'{outcomes}; {len(result.failures)} failures')
     return 1 if result.failures else 0
 
 
