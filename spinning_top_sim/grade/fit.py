@@ -210,9 +210,9 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
             growth = math.sqrt(growth)
         else:
             x, done, level, growth = found, count, rest, min(growth * growth, GROWTH)
-    rest = problem.residuals(x).reshape(3, -1)
-    residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
-    noise, white = whiteness(rest)
+    left = problem.residuals(x).reshape(3, -1)
+    residual = math.sqrt(float(np.sum(left * left)) / (left.size - len(MOTION)))
+    noise, white = whiteness(left)
     explained = residual <= EXACT or (white and residual < LARGEST)
     return _Trial(problem, x, residual, noise, explained,
                   explained and (converged or residual <= EXACT))

@@ -175,9 +175,10 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
             return faults, marks
     scaled = {'units', 'reading_scale'} & {fault.name for fault in faults}
     if kind in ('gyroscope', 'accelerations') and not scaled:
-        noises, ends = effects['size'] * residual, np.cumsum([len(one) for one, _ in parts])[:-1]
+        noises, ends = effects['size'] * residual, np.cumsum([
+            len(run.late(lag)[0]) for run in runs])
         # A cause that is found has taken fast motion away, or has left some.
-        level = np.mean(np.minimum(noise, [*map(_white, np.split(noises, ends))]))
+        level = np.mean(np.minimum(noise, [*map(_white, np.split(noises, ends[:-1]))]))
         faults += _noise_faults(kind, runs[0], float(level), noises, motion, NOISE_BAND + doubt)
     return faults, marks
 
