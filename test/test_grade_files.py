@@ -9,11 +9,12 @@ from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.grade import files
 from spinning_top_sim.grade.command import main
+from spinning_top_sim.grade.files import trajectory_of
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.tools import motion_files
 from spinning_top_sim.tools.simulate import main as simulate
 
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
@@ -72,13 +73,13 @@ TABLES = {
 @pytest.mark.parametrize('kind', TABLES)
 def test_columns_are_known_by_their_names(tmp_path, kind):
     columns, separator, head = TABLES[kind]
-    recorded = files.read(table(tmp_path / 'a.csv', columns, separator, head))
+    recorded = motion_files.read(table(tmp_path / 'a.csv', columns, separator, head))
     assert set(recorded.parts) == {'attitudes'}
     times, attitudes = recorded.parts['attitudes']
     assert times == pytest.approx(T, abs=3e-7)
     turns = Rotation.from_quat(np.roll(attitudes, -1, axis=1))
     assert (turns.inv() * Rotation.from_quat(Q)).magnitude().max() < 1e-6
-    assert len(recorded.trajectory(EXACT).t) == len(T)
+    assert len(trajectory_of(recorded, EXACT).t) == len(T)
 
 
 @pytest.mark.parametrize(('names', 'unit'), [
@@ -89,7 +90,7 @@ def test_columns_are_known_by_their_names(tmp_path, kind):
 def test_readings_are_known_by_their_names(tmp_path, names, unit):
     path = table(tmp_path / 'a.csv', {
         'time': T, **imu(RATES / unit, names=names), **wxyz('qw', 'qx', 'qy', 'qz')})
-    parts = files.read(path).parts
+    parts = motion_files.read(path).parts
     assert parts['gyroscope'][1] == pytest.approx(RATES)
     assert parts['accelerations'][1] == pytest.approx(FORCE)
 
@@ -102,7 +103,7 @@ def test_arrays_and_parquet_are_read(tmp_path):
     np.savez(tmp_path / 'b.npz', t=T, quaternion=Q, rates=RATES)
     np.savez(tmp_path / 'c.npz', t=T, attitudes=np.roll(Q, 1, axis=1), gyroscope=RATES)
     for name in ('a.parquet', 'b.npz', 'c.npz'):
-        assert files.read(tmp_path / name).parts['attitudes'][1] == pytest.approx(
+        assert motion_files.read(tmp_path / name).parts['attitudes'][1] == pytest.approx(
             np.roll(Q, 1, axis=1)), name
 
 
@@ -115,10 +116,10 @@ def test_rows_may_be_uneven_out_of_order_or_without_some_sensors(tmp_path):
     cells = {name: [str(values[k]) for k in order] for name, values in rows.items()}
     for k in np.flatnonzero(order % 2):
         cells['acc_y'][k] = ''
-    recorded = files.read(table(tmp_path / 'a.csv', cells))
+    recorded = motion_files.read(table(tmp_path / 'a.csv', cells))
     assert [len(recorded.parts[name][0]) for name in ('attitudes', 'gyroscope', 'accelerations')
             ] == [600, 600, 300]
-    even = recorded.trajectory(EXACT)
+    even = trajectory_of(recorded, EXACT)
     assert 'not evenly spaced' in recorded.notes[0]
     right = Rotation.from_quat(solve(TOP, START, even.t).quaternion)
     assert (right.inv() * even.rotation).magnitude().max() < 1e-4

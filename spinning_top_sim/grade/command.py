@@ -18,21 +18,20 @@ What a file may contain is in docs/grade_files.md.
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import files
-from spinning_top_sim.grade.fit import fit, near_start
+from spinning_top_sim.grade.files import trajectory_of
+from spinning_top_sim.grade.fit import Fit, fit, near_start
 from spinning_top_sim.grade.grader import grade_trajectory
 from spinning_top_sim.grade.scenes import Body
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools import cli, scene_file
+from spinning_top_sim.tools import cli, motion_files, scene_file
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,41 +55,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    recorded = files.read(arguments.file, arguments.topic)
-    given = scene_file.given(arguments)
-    fits = arguments.fit or arguments.fit_imu
-    if fits and given:
-        raise ValueError('give either --fit, or --scene, --params and -p')
-    known = recorded.parameters if not given else None
-    values = parameters.checked(given) if known is None else known
-    body, state, found = _body(values), parameters.start_state(values), None
-    if arguments.lever_arm is not None:
-        body = replace(body, lever_arm=tuple(arguments.lever_arm))
-    if fits or not (given or known):
-        found = fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
-                    imu=arguments.fit_imu)
-        body, state = found.body(body), found.start
-        recorded.begin_at(found.begin)
-    elif off := near_start(recorded.parts, body, state):
-        raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
-                         '--fit finds top and start')
-    trajectory = recorded.trajectory(ExactSolution(body, state))
+    recorded = motion_files.read(arguments.file, arguments.topic)
+    body, state, found = _motion(arguments, recorded)
+    trajectory = trajectory_of(recorded, ExactSolution(body, state), found.begin if found else 0.0)
     report = grade_trajectory(trajectory, body, state, subject=arguments.file.name)
     if arguments.json:
-        print(json.dumps({**json.loads(report.as_json()), 'notes': recorded.notes,
+        print(json.dumps({**report.as_dict(), 'notes': recorded.notes,
                           'fit': found and found.as_dict()}, indent=2))
     else:
-        lines = (*recorded.notes, *(found.lines() if found else ()), *str(report).splitlines())
-        for line in lines:
+        fitted = found.lines() if found else ()
+        for line in (*recorded.notes, *fitted, *str(report).splitlines()):
             cli.print_line(line)
     return cli.OK if report.passed and (found is None or found.reached) else cli.FAILED
 
 
-def _body(values: Mapping[str, Any]) -> Body:
-    """Return the top and the IMU of parameters."""
+def _motion(arguments: argparse.Namespace,
+            recorded: motion_files.Recorded) -> tuple[Body, State, Fit | None]:
+    """Return top with IMU and start, as given or as fitted, and the fit."""
+    given, fits = scene_file.given(arguments), arguments.fit or arguments.fit_imu
+    if fits and given:
+        raise ValueError('give either --fit, or --scene, --params and -p')
+    known = None if given else recorded.parameters
+    values = known or parameters.checked(given)
     x, y, z, w = Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()
-    return Body.of(parameters.top_of(values), lever_arm=tuple(values['imu.lever_arm']),
+    top, start = parameters.top_of(values), parameters.start_state(values)
+    body = Body.of(top, lever_arm=tuple(arguments.lever_arm or values['imu.lever_arm']),
                    mounting=(w, x, y, z), field=tuple(values['mag.field']))
+    if fits or not (given or known):
+        found = fit(recorded.parts, lambda1=top.lambda1, gravity=top.gravity,
+                    imu=arguments.fit_imu)
+        return found.body(body), found.start, found
+    if off := near_start(recorded.parts, top, start):
+        raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
+                         '--fit finds top and start')
+    return body, start, None
 
 
 if __name__ == '__main__':

@@ -7,74 +7,24 @@ its own attitudes and rates, would cause.  Errors do not add up there, so that t
 every motion, and for every size of the error.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
-from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, least_squares
+from spinning_top_sim.grade.motion import MARGIN, Motion
+from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
-LATE = 0.75         # steps
-STRANGE = 0.02      # of the rates, or of what changes in them in a step: they are not these
 UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
 EXPLAINED = 0.25    # of the discrepancy is left at most
 
 
-def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
-    """
-    Compare the rates that a simulator tells with its attitudes.
-
-    Returns body rates (n - 6, 3) of each motion: those told where they are right, or else those of
-    the attitudes; and the faults of those told.
-    """
-    derived = [motion.rates for motion in motions]
-    if any(motion.trajectory.rates is None for motion in motions):
-        return derived, []
-    told = [motion.trajectory.rates[MARGIN:-MARGIN]     # type: ignore[index]
-            for motion in motions]
-    sizes = [1.0 / (rms(rates) or 1.0) for rates in derived]
-
-    def pooled(parts: Sequence[Reals]) -> Reals:
-        return np.concatenate([size * part[MARGIN:-MARGIN]
-                               for size, part in zip(sizes, parts, strict=True)])
-
-    target = pooled(derived) - pooled(told)
-    step = np.concatenate([size * derivative(rates, 1.0)
-                           for size, rates in zip(sizes, told, strict=True)])
-    (lead,), left = least_squares(target, [step])
-    if abs(lead) > LATE and 1e-6 < rms(target) > 2.0 * rms(left):
-        return derived, [Fault('imu_one_step_late', f'rates belong to the attitudes of {lead:.3g} '
-                               'steps before', float(lead))]
-    if rms(left) <= STRANGE:
-        return told, []
-    turned = [motion.trajectory.rotation[MARGIN:-MARGIN].inv().apply(rates)
-              for motion, rates in zip(motions, told, strict=True)]
-
-    def scale(found: Reals) -> Fault:
-        factor = 1.0 / (1.0 + found[0])
-        units = any(abs(factor / unit - 1.0) < 0.01 for unit in (180.0 / math.pi, math.pi / 180.0))
-        return Fault('units' if units else 'rates_scale',
-                     f'rates are {factor:.4g} times those at which the attitude turns', factor)
-
-    world = instead('rates_in_world', 'rates turned from axes of the world to those of the body '
-                    'are those of the attitude')
-    faults = explain(target, [Cause([pooled(told)], scale),
-                              Cause([pooled(told), pooled(turned)], world)]).faults
-    if not faults:
-        faults = [Fault('rates_scale', f'the attitude turns at other rates: they differ by '
-                        f'{100.0 * rms(target):.3g} %', math.nan)]
-    right = {'rates_in_world': turned, 'rates_scale': told}.get(faults[0].name, derived)
-    return right, faults
-
-
 def faults_of(motions: Sequence[Motion], rates: Sequence[Reals], dt: float) -> list[Fault]:
-    """Return the causes of the error of motions; rates as `rates_of` returns them."""
+    """Return the causes of the error of motions; rates as `sensors.rates_of` returns them."""
     blocks = [_terms(motion, w, dt) for motion, w in zip(motions, rates, strict=True)]
     # Motions count the same, unless what is not explained is small there.
     sizes = [rms(target) for target, _ in blocks]

@@ -19,28 +19,16 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade import guess
-from spinning_top_sim.grade.problem import (
-    L3,
-    LATE,
-    MOTION,
-    MOUNTING,
-    PLACE,
-    RATES,
-    SENSOR,
-    SPIN,
-    TURN,
-    UNKNOWNS,
-    P,
-    Problem,
-    Readings,
-    turned,
-)
+from spinning_top_sim.grade import problem as unknowns
+from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Readings, turned
 from spinning_top_sim.grade.scenes import Body, Reals
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
 FEWEST = 32                 # attitudes that can be fitted
+GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
+LOST = 0.05                 # residual of a part that is too long to begin with [rad]
 FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
 NAMES = {'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'psi': 'rad', 'L3/lambda1': 'rad/s',
          'Lz/lambda1': 'rad/s', 'lambda3/lambda1': '1', 'P/lambda1': '1/s^2', 'mounting_x': 'rad',
@@ -98,11 +86,10 @@ class Fit:
 
     def body(self, given: Body) -> Body:
         """Return the fitted top with the IMU of a body, or the fitted one."""
-        imu = {name: getattr(given, name) for name in Body.__dataclass_fields__
-               if name not in Top.__dataclass_fields__}
+        new: dict[str, Any] = dict(vars(self.top))
         if 'stamp_offset' in self.values:
-            imu.update(mounting=self.mounting, lever_arm=self.lever_arm)
-        return Body.of(self.top, **imu)
+            new.update(mounting=self.mounting, lever_arm=self.lever_arm)
+        return replace(given, **new)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; null: not told by the readings."""
@@ -128,9 +115,9 @@ class _Trial(NamedTuple):
     x: Reals
     residual: float
     noise: float
-    reached: bool
+    explained: bool                     # the residual is noise
+    reached: bool                       # the same, and the fit has converged
     frozen: tuple[int, ...] = ()        # unknowns that the attitudes cannot tell
-    explained: bool = False             # the residual is noise
 
 
 def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
@@ -155,16 +142,21 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
         If there are too few attitudes, no readings, or no motion of a top comes near.
     """
     one, begin = _attitudes(parts)
-    best: _Trial | None = None
+    trials = []
     for trial in _trials(one, parts, gravity):
-        if best is None or trial.residual < best.residual:
-            best = trial
-        if best.explained:          # another guess finds the same
+        trials.append(trial)
+        if trial.explained:         # another guess finds the same
             break
-    if best is None:
+    if not trials:
         raise ValueError('no motion of a top comes near the attitudes')
+    best = min(trials, key=lambda trial: trial.residual)
     best.problem.readings = [replace(one, sigma=max(best.residual, 1e-15))]
-    best = _settled(best) if best.reached else best
+    if best.reached:
+        # lambda3 = lambda1 if there is no nutation that would tell L3 and P.
+        at, frozen = without_unseen_nutation(best.problem, best.x, best.residual, settle=True)
+        free = [k for k in MOTION if k not in frozen]
+        best = best._replace(frozen=frozen, x=descend(best.problem, at, free)[0]
+                             if frozen else best.x)
     if imu:
         best = _with_imu(best, parts, begin)
     return _conclude(best, begin, lambda1, gravity)
@@ -179,22 +171,18 @@ def _attitudes(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, floa
     return Readings('attitude', times - times[0], np.ascontiguousarray(q)), float(times[0])
 
 
-def _hint(parts: Mapping[str, tuple[Reals, Reals]]) -> float | None:
-    told = parts.get('rates', parts.get('gyroscope'))
-    return None if told is None else float(np.median(told[1][:, 2]))
-
-
 def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
             gravity: float) -> Iterator[_Trial]:
     """Yield fits from one guess after another."""
     times, q = one.times, one.values
     axis = np.stack(attitude.axis_in_world(tuple(q)))
-    spin, sure = guess.spin_rate(times, q, _hint(parts))
+    told = parts.get('rates', parts.get('gyroscope'))
+    spin, sure = guess.spin_rate(times, q, told and float(np.median(told[1][:, 2])))
     weak, small = guess.weak(times, axis), list(guess.small_nutation(times, axis))
     seeds = [*weak[:1], *((0, *pair) for pair in small[:4]), *weak[1:2]]
     for size, l3, p in seeds:
-        x = np.zeros(UNKNOWNS)
-        x[RATES] = (*guess.transverse_rates(times, q, axis)[:2], spin)
+        x = np.zeros(unknowns.UNKNOWNS)
+        x[unknowns.RATES] = (*guess.transverse_rates(times, q, axis)[:2], spin)
         x[L3], x[P] = l3, p
         try:
             trial = _fit_from(one, x, size, gravity)
@@ -208,24 +196,30 @@ def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
 def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
     """Fit longer and longer parts; L3 and P beyond 2 `size` attitudes, with 0 in the last."""
     problem = Problem([one], one.values[:, 0], gravity)
-    count, last = FIRST, len(one.times)
-    while count < last:
-        chosen = slice(0, count, math.ceil(count / ENOUGH))
+    done, growth, level, last = FIRST / GROWTH, GROWTH, math.inf, len(one.times)
+    converged = False
+    while done < last:
+        count = min(math.ceil(done * growth), last)
+        chosen = slice(0, count, math.ceil(count / ENOUGH) if count < last else 1)
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
-        x, _ = descend(problem, x, MOTION if size and count > 2 * size else MOTION[:6], 8, 1e-3)
-        count *= 3
-    problem.readings = [one]
-    x, converged = descend(problem, x, MOTION)
+        free = MOTION if count == last or 0 < 2 * size < count else MOTION[:6]
+        precisely = (30, 1e-8) if count == last else (8, 1e-3)
+        found, converged = descend(problem, x, free, *precisely)
+        rest = float(np.std(problem.residuals(found)))
+        if rest > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
+            growth = math.sqrt(growth)
+        else:
+            x, done, level, growth = found, count, rest, min(growth * growth, GROWTH)
     rest = problem.residuals(x).reshape(3, -1)
     residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
     noise, white = whiteness(rest)
     explained = residual <= EXACT or (white and residual < LARGEST)
-    return _Trial(problem, x, residual, noise, explained and (converged or residual <= EXACT),
-                  explained=explained)
+    return _Trial(problem, x, residual, noise, explained,
+                  explained and (converged or residual <= EXACT))
 
 
 def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
-            tolerance: float = 1e-10) -> tuple[Reals, bool]:
+            tolerance: float = 1e-8) -> tuple[Reals, bool]:
     """Return the unknowns at the least sum of squares, and whether it was reached."""
     chosen = [*free]
 
@@ -269,14 +263,6 @@ def _add_turns(x: Reals, times: Reals) -> None:
         x[SPIN] += sign * turn * math.ceil((0.5 * abs(x[L3]) - sign * x[SPIN]) / turn)
 
 
-def _settled(trial: _Trial) -> _Trial:
-    """Return the motion with lambda3 = lambda1 if it has no nutation that would tell L3 and P."""
-    at, frozen = without_unseen_nutation(trial.problem, trial.x, trial.residual, settle=True)
-    free = [k for k in MOTION if k not in frozen]
-    return trial if not frozen else trial._replace(
-        frozen=frozen, x=descend(trial.problem, at, free)[0])
-
-
 def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: float) -> _Trial:
     """Fit the readings of an IMU, first with the motion as it is, then together."""
     problem, x, streams = trial.problem, trial.x, []
@@ -288,7 +274,7 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
     (one,), problem.readings = problem.readings, streams[:1]
     model = problem.rates(x, streams[0].times)
     problem.mounting = Rotation.align_vectors(model.T, streams[0].values.T)[0].as_quat()
-    for stream, own in zip(streams, ((8, 9, 10, LATE), (11, 12, 13)), strict=True):
+    for stream, own in zip(streams, ((8, 9, 10, unknowns.LATE), (11, 12, 13)), strict=True):
         problem.readings = [stream]
         x, _ = descend(problem, x, own)
     problem.readings = [one, *streams]
@@ -299,17 +285,17 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
             stream.sigma = max(math.sqrt(float(np.mean(rest * rest))), 1e-15)
         x, converged = descend(problem, x, free)
     rests = [problem.residual(x, stream) for stream in problem.readings]
-    noise, white = whiteness(rests[0])
+    noise, _ = whiteness(rests[0])
     residual = math.sqrt(float(np.mean(rests[0] ** 2)))
-    return _Trial(problem, x, residual, noise, trial.reached and converged and all(
-        whiteness(rest)[1] or float(np.std(rest)) < EXACT for rest in rests), trial.frozen)
+    return trial._replace(x=x, residual=residual, noise=noise, reached=trial.reached and (
+        converged and all(whiteness(rest)[1] or np.std(rest) < EXACT for rest in rests)))
 
 
 def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fit:
     """Return the fit in public parameters, with what the readings do not tell."""
     problem, x = trial.problem, trial.x
     free = [*MOTION, *SENSOR] if len(problem.readings) > 1 else [*MOTION]
-    rate = max(float(np.linalg.norm(x[RATES])), abs(float(x[L3])), math.sqrt(abs(float(x[P]))))
+    rate = float(max(np.linalg.norm(x[unknowns.RATES]), abs(x[L3]), math.sqrt(abs(x[P]))))
     sizes = np.array([1.0] * 3 + [rate] * 4 + [rate * rate] + [1.0] * 6 + [1.0 / rate])[free]
     at, frozen = without_unseen_nutation(problem, x, trial.residual)
     problem.jacobian(at, free)          # sets the steps
@@ -324,9 +310,9 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     hidden = np.abs(slopes @ directions[~told].T) > 0.01 * allowed[:, np.newaxis]
     deviations[np.any(hidden, axis=1) | ~(deviations < allowed)] = math.inf
     names = [list(NAMES)[k] for k in free]
-    top, start = _scaled(problem, x, lambda1, gravity)
-    mx, my, mz, mw = (float(part[0]) for part in turned(problem.mounting, x[MOUNTING]))
-    return Fit(top, start, (mw, mx, my, mz), tuple(x[PLACE].tolist()), begin,
+    top, start = _scaled(values[:8].tolist(), lambda1, gravity)
+    mx, my, mz, mw = np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])).tolist()
+    return Fit(top, start, (mw, mx, my, mz), tuple(x[unknowns.PLACE].tolist()), begin,
                dict(zip(names, values.tolist(), strict=True)),
                dict(zip(names, deviations.tolist(), strict=True)), half @ half.T,
                tuple(_not_told(names, values, deviations, hidden)), trial.residual, trial.noise,
@@ -370,8 +356,8 @@ def without_unseen_nutation(problem: Problem, x: Reals, residual: float,
         theta, rate = (0.0 if high < 1.0 else math.pi), 0.0
     q = Rotation.from_euler('ZYZ', (start.phi, theta, start.psi))
     x = x.copy()
-    x[TURN] = (Rotation.from_quat(problem.reference).inv() * q).as_rotvec()
-    x[RATES] = (*(rate * q.inv().apply((0.0, 0.0, 1.0))[:2]), x[SPIN])
+    x[unknowns.TURN] = (Rotation.from_quat(problem.reference).inv() * q).as_rotvec()
+    x[unknowns.RATES] = (*(rate * q.inv().apply((0.0, 0.0, 1.0))[:2]), x[SPIN])
     x[L3] = x[SPIN] if settle else x[L3]
     x[P] = x[L3] * rate - rate * rate * math.cos(theta)
     return x, (L3, P) if upright else (L3,)
@@ -380,17 +366,17 @@ def without_unseen_nutation(problem: Problem, x: Reals, residual: float,
 def _public(problem: Problem, x: Reals) -> Reals:
     """Return the values of NAMES."""
     _, state = problem.start(x)
-    turn = Rotation.from_quat([float(part[0]) for part in turned(problem.mounting, x[MOUNTING])])
+    mounting = Rotation.from_quat(np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])))
     return np.array([state.theta, state.theta_dot, state.phi, state.psi, state.l3, state.lz,
-                     state.l3 / (float(x[SPIN]) or 1e-300), x[P], *turn.as_rotvec(), *x[PLACE],
-                     x[LATE]])
+                     state.l3 / (float(x[SPIN]) or 1e-300), x[P], *mounting.as_rotvec(),
+                     *x[unknowns.PLACE], x[unknowns.LATE]])
 
 
 def _slopes(problem: Problem, x: Reals, free: Sequence[int], sizes: Reals) -> Reals:
     """Return the derivatives of the values of NAMES by the unknowns, in units of their sizes."""
     columns = []
     for k, size in zip(free, sizes, strict=True):
-        step = np.zeros(UNKNOWNS)
+        step = np.zeros(unknowns.UNKNOWNS)
         step[k] = 1e-6 * size
         change = (_public(problem, x + step) - _public(problem, x - step))[[*free]]
         change[[*ANGLES]] = np.remainder(change[[*ANGLES]] + math.pi, math.tau) - math.pi
@@ -398,15 +384,16 @@ def _slopes(problem: Problem, x: Reals, free: Sequence[int], sizes: Reals) -> Re
     return np.stack(columns, axis=1)
 
 
-def _scaled(problem: Problem, x: Reals, lambda1: float, gravity: float) -> tuple[Top, State]:
+def _scaled(values: Sequence[float], lambda1: float, gravity: float) -> tuple[Top, State]:
     """Return top and start with this lambda1."""
-    (_, state), p = problem.start(x), float(x[P]) if gravity else 0.0
-    ratio = state.l3 / float(x[SPIN]) if x[SPIN] else 1.0
+    theta, theta_dot, phi, psi, l3, lz, ratio, p = values
+    p = p if gravity else 0.0
     distance = math.copysign(min(0.1, gravity / (4.0 * max(abs(p), 1e-9))), p) or 0.1
     mass = abs(p) * lambda1 / abs(gravity * distance) if gravity else 1.0
     top = Top(lambda1=lambda1, lambda3=(ratio if ratio > 0.0 else 1.0) * lambda1, gravity=gravity,
               com_distance=distance, mass=mass)
-    return top, replace(state, l3=state.l3 * lambda1, lz=state.lz * lambda1)
+    return top, State(theta=theta, theta_dot=theta_dot, phi=phi, psi=psi, l3=l3 * lambda1,
+                      lz=lz * lambda1)
 
 
 def near_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) -> str:

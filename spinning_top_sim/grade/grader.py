@@ -146,7 +146,7 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
     """Return the report on these motions, and orders of convergence by the name of the scene."""
     if not motions:
         return Report(subject, faults, {})
-    rates, more = dynamics.rates_of(motions)
+    rates, more = sensors.rates_of(motions)
     faults += more
     marks = {f'{name}: {motion.name}': value for motion, w in zip(motions, rates, strict=True)
              for name, value in motion.marks(w).items()}

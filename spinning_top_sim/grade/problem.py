@@ -9,14 +9,14 @@ L3/lambda1 and P/lambda1; and of an IMU its mounting, its place and how late its
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from spinning_top_sim.grade.scenes import Reals, Start
+from spinning_top_sim.grade.scenes import Reals
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -28,8 +28,8 @@ TURN, RATES, SPIN, L3, P = slice(0, 3), slice(3, 6), 5, 6, 7
 MOUNTING, PLACE, LATE = slice(8, 11), slice(11, 14), 14
 MOTION, SENSOR = range(8), range(8, 15)
 UNKNOWNS = 15
+ROUNDING = 1e-14            # of rates
 CHANGE = 1e-6               # of the readings by a step of finite differences [rad], [rad/s], ..
-AT_POLE = 1e-9              # sin(theta/2) of an axis that is vertical
 
 
 @dataclass
@@ -66,13 +66,11 @@ class Problem:
 
     def start(self, x: Reals) -> tuple[Top, State]:
         """Return top and state with lambda1 = lambda3 = 1: its spin is L3, not omega_3."""
-        qx, qy, qz, qw = (float(part[0]) for part in turned(self.reference, x[TURN]))
-        if math.hypot(qx, qy) < AT_POLE:
-            qx = qy = 0.0
-        elif math.hypot(qz, qw) < AT_POLE:
-            qz = qw = 0.0
+        q = turned(self.reference, x[TURN])
+        rates = np.ravel(attitude.in_world(q, (x[3], x[4], x[L3])))
+        rates[np.abs(rates) < ROUNDING * np.max(np.abs(rates))] = 0.0   # an upright top may rest
         top = Top(lambda1=1.0, lambda3=1.0, mass=1.0, com_distance=float(x[P]), gravity=1.0)
-        return top, Start((qw, qx, qy, qz), (float(x[3]), float(x[4]), float(x[L3]))).state_of(top)
+        return top, state_of(top, np.ravel(q), rates)
 
     def residuals(self, x: Reals) -> Reals:
         """Return (readings - model)/sigma (m,).  Raises ValueError where there is no motion."""

@@ -56,24 +56,26 @@ def explain(target: Reals, causes: Sequence[Cause], floor: float = 0.0) -> Expla
     """
     chosen: list[Cause] = []
     residual, fitted = target, np.empty(0)
-    enough = max(ENOUGH * _excess(target, floor), 0.1 * floor)
-    while len(chosen) < MOST_CAUSES and (before := _excess(residual, floor)) > enough:
-        tried = [(one, least_squares(target, [column for other in (*chosen, one)
-                                              for column in other.columns]))
-                 for one in causes if not any(one is other for other in chosen)]
-        after = [_excess(left, floor) for _, (_, left) in tried]
+    enough = max(ENOUGH * beyond(target, floor), 0.1 * floor)
+    others = [*causes]
+    while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
+        tried = [least_squares(target, _columns(*chosen, one)) for one in others]
+        after = [beyond(left, floor) for _, left in tried]
         good = max(AS_GOOD * min(after), 0.02 * before)
-        size, left, number = min((len(one.columns), left, number)
-                                 for number, ((one, _), left) in enumerate(
-                                     zip(tried, after, strict=True)) if left <= good)
+        _, left, best = min((len(one.columns), left, k) for k, (one, left) in enumerate(
+            zip(others, after, strict=True)) if left <= good)
         if left > WORTHWHILE * before:
             break
-        one, (fitted, residual) = tried[number]
-        chosen.append(one)
+        fitted, residual = tried[best]
+        chosen.append(others.pop(best))
     ends = np.cumsum([len(one.columns) for one in chosen], dtype=int)[:-1]
     judged = [one.judge(found) for one, found in zip(chosen, np.split(fitted, ends), strict=False)]
     return Explained([fault for fault in judged if fault is not None], residual,
-                     _excess(residual, floor) / (_excess(target, floor) or 1.0))
+                     beyond(residual, floor) / (beyond(target, floor) or 1.0))
+
+
+def _columns(*causes: Cause) -> list[Reals]:
+    return [column for one in causes for column in one.columns]
 
 
 def least_squares(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
@@ -89,6 +91,6 @@ def least_squares(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals
     return found, target - (matrix @ found).reshape(target.shape)
 
 
-def _excess(values: Reals, floor: float) -> float:
+def beyond(values: Reals, floor: float) -> float:
     """Return the rms beyond that of noise."""
     return float(np.sqrt(max(rms(values) ** 2 - floor ** 2, 0.0)))

@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 # docs/grade.md defines them.
 FAULTS = (
@@ -74,12 +74,15 @@ class Report:
                   if not math.isnan(value)]
         return '\n'.join(lines)
 
-    def as_json(self) -> str:
-        """Return JSON with subject, passed, faults (name, evidence, number) and marks."""
+    def as_dict(self) -> dict[str, Any]:
+        """Return subject, passed, faults (name, evidence, number) and marks; None: no number."""
         def number(value: float) -> float | None:
             return value if math.isfinite(value) else None
-        return json.dumps({
-            'subject': self.subject, 'passed': self.passed,
-            'faults': [{**fault._asdict(), 'number': number(fault.number)}
-                       for fault in self.faults],
-            'marks': {name: number(value) for name, value in self.marks.items()}}, indent=2)
+        return {'subject': self.subject, 'passed': self.passed,
+                'faults': [{**fault._asdict(), 'number': number(fault.number)}
+                           for fault in self.faults],
+                'marks': {name: number(value) for name, value in self.marks.items()}}
+
+    def as_json(self) -> str:
+        """Return `as_dict` as JSON."""
+        return json.dumps(self.as_dict(), indent=2)

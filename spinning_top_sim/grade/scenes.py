@@ -7,8 +7,10 @@ from dataclasses import dataclass, field, fields
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
@@ -106,24 +108,12 @@ class Start:
         return cls((w, x, y, z), tuple(first.angular_velocity[0].tolist()), state)
 
     def state_of(self, top: Top) -> State:
-        """Return the start as a state of `top`.  Raises ValueError for what is no attitude."""
+        """Return the start as a state of `top`."""
         if self.state is not None:
             return self.state
-        (w, x, y, z), = unit_quaternions([self.attitude]).tolist()
-        w1, w2, w3 = self.rates
-        low, high = math.hypot(x, y), math.hypot(z, w)
-        theta, l3 = 2.0 * math.atan2(low, high), top.lambda3 * w3
-        half_sum, half_difference = math.atan2(z, w), math.atan2(-x, y)
-        if low and high:
-            psi = half_sum - half_difference
-            up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x))
-            lz = top.lambda1 * (w1 * up[0] + w2 * up[1]) + l3 * (high * high - low * low)
-        else:       # at a pole one angle is free
-            psi = math.atan2(w1, w2)
-            theta, lz = (0.0, l3) if high else (math.pi, -l3)
-        phi = 2.0 * half_sum - psi if high else 2.0 * half_difference + psi
-        return State(theta=theta, phi=phi, psi=psi, l3=l3, lz=lz,
-                     theta_dot=w1 * math.sin(psi) + w2 * math.cos(psi))
+        w, x, y, z = self.attitude
+        return state_of(top, np.array((x, y, z, w)), Rotation.from_quat((x, y, z, w)).apply(
+            self.rates))
 
 
 @dataclass(frozen=True)
@@ -161,15 +151,3 @@ SCENES = (
     Scene('near the separatrix', {'theta': 1.179087, 'l3': 1.0, 'lz': 1.0}, 4.0),
     Scene('pole', {'theta': 0.6, 'theta_dot': -4.0, 'l3': 1.0, 'lz': 1.0}, 4.0),
     Scene('fast spin', {'theta': TILT, 'l3': 9.0, 'lz': 9.0 * math.cos(TILT)}, 2.0, (1, 2, 4)))
-
-
-def unit_quaternions(rows: ArrayLike) -> Reals:
-    """Return quaternions (n, 4) with norm 1.  Raises ValueError where a norm is not near 1."""
-    quaternions = np.array(rows, dtype=float)
-    if quaternions.ndim != 2 or quaternions.shape[1:] != (4,):
-        raise ValueError(f'attitudes have shape {quaternions.shape}: must be (n, 4), w x y z')
-    norms = np.linalg.norm(quaternions, axis=1)
-    for at in np.flatnonzero(~(np.abs(norms - 1.0) < 1e-2)):
-        raise ValueError(f'attitudes[{at}] = {quaternions[at].tolist()}: the norm must be 1')
-    unit: Reals = quaternions / norms[:, np.newaxis]
-    return unit

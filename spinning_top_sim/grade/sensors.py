@@ -15,25 +15,27 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
-from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, least_squares
+from spinning_top_sim.grade.motion import MARGIN, Motion
+from spinning_top_sim.grade.regression import NEAR, Cause, beyond, explain, instead, least_squares
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
 LAGS = range(-3, 31)        # samples that are tried
 LATE = 0.75                 # steps
-STRANGE = 2e-3              # of the reading, beside its noise: it is not what it should be
+# Of the reading, beside its noise: it is not what it should be.  Velocities are means over a step,
+# compared with those of its ends; rates of the state may be those of the middle of a step.
+STRANGE = {'rates': 2e-2, 'velocities': 5e-2}
+STRANGE_ELSE = 2e-3
 CONSISTENT = 1e-3           # of the reading: the lag is not looked for
-MEANS_STRANGE = 5e-2        # of means over a step that are those of its ends
 UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
 NOISY = 1e-4                # of the reading: smaller noise is rounding
 NOISE_BAND = 0.05           # of the noise, to either side of what is declared, beside its doubt
 FOUR_SIGMA = 4.0            # that doubt
 LEAST_KURTOSIS = 2.4        # normal 3, uniform 1.8
 KINDS = ('gyroscope', 'accelerations', 'magnetometer', 'rotations', 'velocities')
-UNITS = {'gyroscope': (180.0 / math.pi, math.pi / 180.0), 'accelerations': (1.0 / 9.80665,),
-         'magnetometer': (1e4, 1e6, 1e9)}
-UNITS.update(rotations=UNITS['gyroscope'], velocities=UNITS['accelerations'])
+_DEGREES, _G = (180.0 / math.pi, math.pi / 180.0), (1.0 / 9.80665,)
+UNITS = {'gyroscope': _DEGREES, 'rates': _DEGREES, 'rotations': _DEGREES, 'accelerations': _G,
+         'velocities': _G, 'magnetometer': (1e4, 1e6, 1e9)}
 FORCES = ('accelerations', 'velocities')
 _rate = partial(np.gradient, axis=0)        # change per step of values (m, 3)
 
@@ -76,7 +78,7 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
     Return the readings of a sensor, None if there are none.
 
     kind : one of KINDS
-    w : rates (n - 6, 3), as `dynamics.rates_of` returns them
+    w : rates (n - 6, 3), as `rates_of` returns them
     """
     said, body, inner = motion.trajectory, motion.body, slice(MARGIN, -MARGIN)
     reading: Reals | None = getattr(said, 'increments' if kind in ('rotations', 'velocities')
@@ -84,7 +86,10 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
     if reading is None:
         return None
     rotation, first, arms = said.rotation[inner], MARGIN, np.empty((0, len(w), 3))
-    if kind == 'gyroscope':
+    mounting = Rotation.from_quat((*body.mounting[1:], body.mounting[0]))
+    if kind == 'rates':
+        terms, mounting = {'rates': w}, Rotation.identity()
+    elif kind == 'gyroscope':
         terms = {'rates': w}
     elif kind == 'magnetometer':
         terms = {'field': rotation.inv().apply(body.field)}
@@ -92,7 +97,7 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
         reading, first = reading[:, :3] / said.step, first + 1
         terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
     else:
-        first, a, w = 2 * MARGIN, derivative(w, said.step), w[inner]
+        first, a, w = 2 * MARGIN, motion.accelerations(w), w[inner]
         axes = np.eye(3)[:, np.newaxis]
         tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
         arms = tangential + centripetal
@@ -103,19 +108,38 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
             reading, first = reading[:, 3:] / said.step, first + 1
             arms = 0.5 * (arms[:, :-1] + arms[:, 1:])
             terms = {name: 0.5 * (term[:-1] + term[1:]) for name, term in terms.items()}
-    mounting = Rotation.from_quat((*body.mounting[1:], body.mounting[0]))
     to_imu, m = mounting.inv().apply, len(next(iter(terms.values())))
     return Readings(reading, first, {name: to_imu(term) for name, term in terms.items()},
                     said.step, said.rotation[first:first + m] * mounting, mounting,
                     [to_imu(arm) for arm in arms])
 
 
+def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
+    """
+    Compare the rates that a simulator tells with its attitudes.
+
+    Returns body rates (n - 6, 3) of each motion: those told where they are right, or else those of
+    the attitudes; and the faults of those told.
+    """
+    derived = [motion.rates for motion in motions]
+    runs = [one for motion in motions if (one := readings_of('rates', motion, motion.rates))]
+    if not runs:
+        return derived, []
+    faults, _ = judge('rates', runs, motions[0])
+    told = [run.reading[MARGIN:-MARGIN] for run in runs]
+    if not faults or faults[0].name == 'rates_scale':
+        return told, faults
+    if faults[0].name != 'rates_in_world':
+        return derived, faults
+    return [run.rotation.inv().apply(one) for run, one in zip(runs, told, strict=True)], faults
+
+
 def judge(kind: str, runs: Sequence[Readings], motion: Motion,
-          derived: bool) -> tuple[list[Fault], dict[str, float]]:
+          derived: bool = False) -> tuple[list[Fault], dict[str, float]]:
     """
     Compare the readings of a sensor in several motions with what they should be.
 
-    kind : one of KINDS
+    kind : one of KINDS, or 'rates'
     motion : one of the motions
     derived : whether the rates are those of the attitudes, which may be half a step apart from
         those of the simulator
@@ -123,28 +147,19 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     Returns the faults and the measures.
     """
     lag = 0 if kind == 'velocities' else _lag(runs)
+    target, effects = _pooled([_discrepancy(kind, run, lag) for run in runs])
     noise = [_noise(run, lag) for run in runs]
-    parts = [_discrepancy(kind, run, lag) for run in runs]
-    target = np.concatenate([one for one, _ in parts])
-    effects = {name: np.concatenate([columns[name] for _, columns in parts])
-               for name in parts[0][1]}
-    floor = math.sqrt(float(np.mean([(one / run.size) ** 2
-                                     for one, run in zip(noise, runs, strict=True)])))
+    floor = rms(np.array(noise) / [run.size for run in runs])
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
     most = floor * math.sqrt(1.05 + 2.0 * doubt)
-    before = math.sqrt(max(rms(target) ** 2 - most ** 2, 0.0))
-    # The acceleration of a step may be that of its begin, without a lag of the reading.
-    fractions, left = least_squares(target, [effects[name] for name in (
-        'step', 'tangential step') if name in effects])
-    tells = kind != 'velocities' and 1e-6 < rms(target) > 2.0 * rms(left)
-    late = lag - (float(fractions[0]) if tells else 0.0)
+    before, late = beyond(target, most), lag - _fraction(kind, target, effects)
     marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(noise)),
              f'{kind}_discrepancy': before}
     faults, residual = [], target
     if abs(late) > LATE:
         faults.append(Fault('imu_one_step_late', f'{kind}: readings belong to the motion of '
                             f'{late:.3g} steps ({1e3 * late * runs[0].step:.3g} ms) before', late))
-    strange = MEANS_STRANGE if kind == 'velocities' else STRANGE
+    strange = STRANGE.get(kind, STRANGE_ELSE)
     if derived:
         strange += 0.25 * max((run.rotation[0].inv() * run.rotation[1]).magnitude() ** 2
                               for run in runs)
@@ -152,19 +167,35 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
         causes = _causes(kind, effects, motion.body)
         found, residual, _ = explain(target, causes, math.hypot(floor, 0.5 * strange))
         faults += found
-        rest = math.sqrt(max(rms(residual) ** 2 - most ** 2, 0.0))
+        rest = beyond(residual, most)
         if rest > max(UNEXPLAINED * before, strange):
-            faults.append(Fault('inconsistent_reading', f'{kind}: {100.0 * rest:.3g} % of the '
-                                'reading is not that of the motion', rest))
+            name = 'rates_scale' if kind == 'rates' else 'inconsistent_reading'
+            faults.append(Fault(name, f'{kind}: {100.0 * rest:.3g} % of the reading is not that '
+                                'of the motion', rest))
             return faults, marks
-    if kind in ('gyroscope', 'accelerations') and not any(
-            fault.name in ('units', 'reading_scale') for fault in faults):
-        ends = np.cumsum([len(one) for one, _ in parts])[:-1]
-        noises = np.concatenate([run.size * one for run, one in zip(
-            runs, np.split(residual, ends), strict=True)])
-        faults += _noise_faults(kind, runs[0], float(np.mean(noise)), noises, motion,
-                                NOISE_BAND + doubt)
+    scaled = {'units', 'reading_scale'} & {fault.name for fault in faults}
+    if kind in ('gyroscope', 'accelerations') and not scaled:
+        noises, ends = effects['size'] * residual, np.cumsum([len(one) for one, _ in parts])[:-1]
+        # A cause that is found has taken fast motion away, or has left some.
+        level = np.mean(np.minimum(noise, [*map(_white, np.split(noises, ends))]))
+        faults += _noise_faults(kind, runs[0], float(level), noises, motion, NOISE_BAND + doubt)
     return faults, marks
+
+
+def _pooled(parts: Sequence[tuple[Reals, dict[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
+    targets, effects = zip(*parts, strict=True)
+    return np.concatenate(targets), {name: np.concatenate([one[name] for one in effects])
+                                     for name in effects[0]}
+
+
+def _fraction(kind: str, target: Reals, effects: Mapping[str, Reals]) -> float:
+    """Return by how many steps a reading is early, 0 if that does not explain it."""
+    if kind == 'velocities':
+        return 0.0
+    # The acceleration of a step may be that of its begin, without a lag of the reading.
+    fractions, left = least_squares(target, [effects[name] for name in (
+        'step', 'tangential step') if name in effects])
+    return float(fractions[0]) if 1e-6 < rms(target) > 2.0 * rms(left) else 0.0
 
 
 def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motion: Motion,
@@ -174,13 +205,11 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motio
                motion.body.accelerometer_noise_density)
     covariance = (motion.trajectory.covariance or {}).get(kind)
     exists, root = noise > NOISY * run.size, math.sqrt(run.step)
-    declared = None if density is None else density / root
     text = f'{kind}: the noise has a standard deviation of {noise:.4g}'
-    if covariance is not None and not np.any(covariance):
-        if exists:
-            yield Fault('covariance_zero', f'{text}, its covariance is told as 0', noise)
-    elif covariance is not None and declared is None:
-        declared = math.sqrt(float(np.trace(covariance)) / 3.0)
+    told = math.nan if covariance is None else math.sqrt(abs(np.trace(covariance)) / 3.0)
+    if told == 0.0 and exists:
+        yield Fault('covariance_zero', f'{text}, its covariance is told as 0', noise)
+    declared = (told or math.nan) if density is None else density / root
     if declared == 0.0 and exists:
         yield Fault('noise_scale', f'{text}, it is declared as 0', math.inf)
     elif declared and abs((ratio := noise / declared) - 1.0) > band:
@@ -189,11 +218,10 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motio
             ('1/sqrt(dt)', 1.0 / root)) if abs(ratio / factor - 1.0) < band]
         yield Fault('noise_scale', f'{text}, {ratio:.4g}{"".join(as_if)} times what is declared',
                     ratio)
-    if exists and rms(residual) < 1.05 * noise:
-        kurtosis = float(np.mean(residual ** 4) / np.mean(residual ** 2) ** 2)
-        if kurtosis < LEAST_KURTOSIS:
-            yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; '
-                        'normal noise has 3, uniform noise 1.8', kurtosis)
+    kurtosis = float(np.mean(residual ** 4)) / (rms(residual) ** 4 or 1.0)
+    if exists and rms(residual) < 1.05 * noise and kurtosis < LEAST_KURTOSIS:
+        yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; normal '
+                    'noise has 3, uniform noise 1.8', kurtosis)
 
 
 def _lag(runs: Sequence[Readings]) -> int:
@@ -218,9 +246,14 @@ def _lag(runs: Sequence[Readings]) -> int:
 
 
 def _noise(run: Readings, lag: int) -> float:
-    """Return the standard deviation of white noise, by differences in which motions vanish."""
+    """Return the standard deviation of the white noise of a reading."""
     reading, part = run.late(lag)
-    return rms(np.diff(reading - run.total[part], 6, axis=0)) / math.sqrt(924.0)
+    return _white(reading - run.total[part])
+
+
+def _white(rows: Reals) -> float:
+    """Return the standard deviation of white noise, by differences in which motions vanish."""
+    return rms(np.diff(rows, 6, axis=0)) / math.sqrt(924.0)
 
 
 def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, Reals]]:
@@ -228,6 +261,7 @@ def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, R
     reading, part = run.late(lag)
     total = run.total
     effects = {**run.terms, 'total': total, 'step': _rate(total),
+               'size': run.size ** 2 + 0.0 * total,
                'mounted': run.mounting.apply(total),
                'world': (world := run.rotation.apply(total)),
                'reversed': run.rotation.apply(world)}
@@ -248,7 +282,7 @@ def _causes(kind: str, effects: Mapping[str, Reals], body: Body) -> list[Cause]:
     def only(judge: object, *names: str) -> Cause:
         return Cause([effects[name] for name in names], judge)      # type: ignore[arg-type]
 
-    in_world = 'rates_in_world' if kind == 'gyroscope' else 'reading_in_world'
+    in_world = 'rates_in_world' if kind in ('gyroscope', 'rates') else 'reading_in_world'
     text = f'{kind}: the readings are in axes of '
     causes = [only(partial(_scale, kind), 'total'), only(lambda found: None, 'step'),
               only(instead('mounting', f'{text}the body, not of the IMU'), 'total', 'mounted'),
@@ -269,6 +303,8 @@ def _scale(kind: str, found: Reals) -> Fault:
     text = f'{kind}: the readings are {factor:.4g} times what they should be'
     if any(abs(abs(factor) / unit - 1.0) < 0.01 for unit in UNITS[kind]):
         return Fault('units', text, factor)
+    if kind == 'rates':
+        return Fault('rates_scale', text, factor)
     return Fault('reading_sign' if factor < 0.0 else 'acceleration_scale' if
                  kind == 'accelerations' else 'reading_scale', text, factor)
 

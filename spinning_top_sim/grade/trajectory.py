@@ -9,10 +9,11 @@ from typing import Any, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.scenes import Reals, unit_quaternions
+from spinning_top_sim.grade.scenes import Reals
 
-# Columns of each optional part.
-_PARTS = {'rates': 3, 'accelerations': 3, 'gyroscope': 3, 'magnetometer': 3, 'increments': 6}
+# Columns of each part, 0: numbers.
+_PARTS = {'attitudes': 4, 'rates': 3, 'accelerations': 3, 'gyroscope': 3, 'magnetometer': 3,
+          'increments': 6, 'energy': 0}
 LEAST_SAMPLES = 50
 
 
@@ -66,16 +67,14 @@ class Trajectory:
         if 'attitudes' not in said:
             raise InvalidTrajectoryError(f'the mapping has {sorted(map(str, said))}: must have '
                                          'attitudes')
-        try:
-            attitudes = unit_quaternions(said['attitudes'])
-        except (TypeError, ValueError) as error:
-            raise InvalidTrajectoryError(str(error)) from error
         parts = {name: _numbers(name, said[name], (n, columns) if columns else (n,))
-                 for name, columns in {**_PARTS, 'energy': 0}.items()
-                 if said.get(name) is not None}
-        if len(attitudes) != n:
-            raise InvalidTrajectoryError(f'there are {len(attitudes)} attitudes: must be one for '
-                                         f'each of the {n} times')
+                 for name, columns in _PARTS.items() if said.get(name) is not None}
+        attitudes = parts.pop('attitudes')
+        norms = np.linalg.norm(attitudes, axis=1, keepdims=True)
+        for at in np.flatnonzero(~(np.abs(norms - 1.0) < 1e-2)):
+            raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
+                                         'must be 1')
+        attitudes /= norms
         flips = np.cumprod(np.where(np.sum(attitudes[1:] * attitudes[:-1], axis=1) < 0.0, -1, 1))
         attitudes[1:] *= flips[:, np.newaxis]
         covariance = said.get('covariance')

@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reads the motions of other programs: ROS 2 logs (MCAP), and tables (CSV, Parquet, npz).
+
+The fields of messages are columns like those of tables.  docs/grade_files.md lists the types of
+messages and the names of columns that are understood.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import math
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+from zipfile import is_zipfile
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.installation import needed
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams.messages import EXACT_VARIANCE
+from spinning_top_sim.tools import recorded_run
+
+ATTITUDES, GYROSCOPE, RATES = 'attitudes', 'gyroscope', 'rates'
+ACCELERATIONS, MAGNETOMETER, ANGLES = 'accelerations', 'magnetometer', 'angles'
+# Words in the name of a column, before its component.
+WORDS = {
+    ATTITUDES: {'q', 'quat', 'quaternion', 'orientation', 'attitude', 'attitudes', 'rotation'},
+    GYROSCOPE: {'g', 'gyro', 'gyr', 'gyroscope'},
+    ACCELERATIONS: {'a', 'acc', 'accel', 'acceleration', 'accelerations', 'accelerometer'},
+    RATES: {'w', 'omega', 'rate', 'rates', 'angular'},
+    MAGNETOMETER: {'m', 'mag', 'magnetic', 'magnetometer'}}
+ANGLE_WORDS = {'phi': 'a', 'precession': 'a', 'theta': 'b', 'nutation': 'b', 'psi': 'c',
+               'spin': 'c'}
+COMPONENTS = {'w': 'w', 'x': 'x', 'y': 'y', 'z': 'z', '1': 'x', '2': 'y', '3': 'z'}
+OTHERS = {'dot', 'bias', 'b', 'covariance', 'cov', 'std', 'error'}
+TIMES = {'t', 'time', 'times', 'timestamp', 'stamp', 'sec', 'secs'}
+SECONDS = {'nanosec': '1e-9', 'nsec': '1e-9', 'ns': '1e-9', 'us': '1e-6', 'ms': '1e-3'}
+UNITS = {'deg': math.pi / 180.0, 'dps': math.pi / 180.0}
+# In the order of preference.
+MESSAGES = [f'{package}/msg/{name}' for package, name in (
+    ('geometry_msgs', 'PoseStamped'), ('geometry_msgs', 'PoseWithCovarianceStamped'),
+    ('nav_msgs', 'Odometry'), ('geometry_msgs', 'QuaternionStamped'),
+    ('sensor_msgs', 'JointState'), ('tf2_msgs', 'TFMessage'), ('sensor_msgs', 'Imu'),
+    ('sensor_msgs', 'MagneticField'))]
+COVARIANCES = {GYROSCOPE: 'angular_velocity_covariance',
+               ACCELERATIONS: 'linear_acceleration_covariance'}
+NOT_OF_BODY = ('imu_odom', 'imu_bias')      # topics of this package
+TUM = 'timestamp tx ty tz qx qy qz qw'      # of a file that does not name its columns
+NEEDED = ('columns such as t, qw, qx, qy, qz or phi, theta, psi, or messages of a type that '
+          'docs/grade_files.md lists')
+LEAST_SAMPLES = 50
+LATEST_START_S = 1.0        # an earlier first stamp counts from the start, a later one is a date
+
+Reals = NDArray[np.float64]
+Table = Mapping[str, Sequence[Any]]
+
+
+@dataclass
+class Recorded:
+    """
+    What is in a file.
+
+    parts : times (n,), ascending [s], and values (n, k) by name: attitudes, q(world <- body) as
+        w, x, y, z; rates, in the body; gyroscope, accelerations and magnetometer of the IMU
+    covariance : (3, 3) that the first message of an IMU tells, by name
+    parameters : of the run, if the file tells them, as `parameters.checked` returns them
+    notes : what was chosen or left out
+    """
+
+    parts: dict[str, tuple[Reals, Reals]] = field(default_factory=dict)
+    covariance: dict[str, Reals] = field(default_factory=dict)
+    parameters: Mapping[str, Any] | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def add(self, tables: Mapping[str, Table], origin: Decimal | None = None) -> None:
+        """Add what is in tables, the first of each kind; `origin` is the stamp of t = 0 [s]."""
+        read = {name: _parts(columns) for name, columns in tables.items()}
+        if origin is None:
+            origin = min((one for stamps, _ in read.values() for one in stamps
+                          if one.is_finite()), default=Decimal(0))
+            origin = origin if abs(origin) > LATEST_START_S else Decimal(0)
+        for name, (stamps, parts) in read.items():
+            times = (stamps - origin).astype(float)
+            for kind, values in parts.items():
+                known = np.isfinite(times) & np.all(np.isfinite(values), axis=1)
+                at, first = np.unique(times[known], return_index=True)
+                if len(at) and kind not in self.parts:
+                    self.parts[kind] = at, values[known][first]
+                    self.notes += [f'{kind} of {name}'] if name else []
+
+
+def read(path: Path, topic: str | None = None) -> Recorded:
+    """
+    Read a file.
+
+    topic : of the attitudes in a log; default: the first whose type has some
+
+    Raises OSError, LogError, ImportError or ValueError, which name the file and what it lacks.
+    """
+    if path.is_dir() or path.suffix == '.mcap':
+        recorded = _read_log(path, topic)
+    elif path.suffix not in READERS or topic is not None:
+        raise ValueError(f'{path}: the name must end in .mcap' + (
+            f', {", ".join(READERS)}' if topic is None else ' where --topic is given'))
+    elif not path.stat().st_size:
+        raise ValueError(f'{path} is empty')
+    else:
+        recorded = Recorded()
+        try:
+            recorded.add({'': READERS[path.suffix](path)})
+        except (ValueError, EOFError) as error:
+            raise ValueError(f'{path}: {" ".join(str(error).split())}') from error
+    found = len(recorded.parts.get(ATTITUDES, ((), ()))[0])
+    if found < LEAST_SAMPLES:
+        raise ValueError(f'{path} has {found or "no"} attitudes: must have {LEAST_SAMPLES} at '
+                         f'least; from {NEEDED}')
+    return recorded
+
+
+# ------------------------------------------------------------------------------------- tables
+
+def _csv(path: Path) -> Table:
+    lines = [line for line in path.read_text('utf-8-sig', errors='replace').splitlines()
+             if line.strip()]
+    comments = [line.lstrip('# ') for line in lines if line.startswith('#')]
+    lines = [line for line in lines if not line.startswith('#')]
+    if not comments and re.match('[-+.0-9]', lines[0]):
+        comments = [TUM]
+    head = comments[-1] if comments else lines.pop(0)
+    mark = next((mark for mark in ',;\t' if mark in head), ' ')
+    names, *rows = csv.reader((head, *lines), delimiter=mark, skipinitialspace=True)
+    whole = [row for row in rows if len(row) == len(names)]
+    if len(whole) < max(len(rows) - 1, 1):      # the last may be cut off
+        raise ValueError('must have a line with the names of columns, then lines with as many '
+                         'values')
+    return dict(zip(names, zip(*whole, strict=True), strict=True))
+
+
+def _parquet(path: Path) -> Table:
+    with needed('a Parquet file', 'parquet'):
+        from pyarrow import parquet  # noqa: PLC0415
+    table = parquet.read_table(path)
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def _npz(path: Path) -> Table:
+    columns: dict[str, Sequence[Any]] = {}
+    if not is_zipfile(path):
+        raise ValueError('it is no file of numpy.savez')
+    with np.load(path, allow_pickle=False) as arrays:
+        for name, values in arrays.items():
+            # `Trajectory.attitudes` are w, x, y, z, `States.quaternion` x, y, z, w.
+            order = 'wxyz' if name == ATTITUDES else 'xyzw'
+            columns.update({name: values} if values.ndim == 1 else {
+                f'{name}_{part}': one for part, one in zip(order, values.T, strict=False)})
+    return columns
+
+
+READERS = {'.csv': _csv, '.txt': _csv, '.tum': _csv, '.parquet': _parquet, '.npz': _npz}
+
+
+def _words(name: str) -> tuple[list[str], str]:
+    """Return the words of the name of a column, the last being its component, and its unit."""
+    bare, _, unit = name.partition('[')
+    words = re.findall('[a-z]+|[0-9]+', re.sub('([a-z])([A-Z])', r'\1_\2', bare).lower())
+    if len(words) > 1 and words[-1] in {*UNITS, *SECONDS, 's', 'rad'}:
+        unit = unit or words.pop()
+    if words and words[-1][-1] in 'wxyz' and words[-1][:-1] in set().union(*WORDS.values()):
+        words[-1:] = words[-1][:-1], words[-1][-1]      # qw, accx
+    return words, re.split('[^a-z]', unit.lower())[0]
+
+
+def _kind(words: Sequence[str]) -> tuple[str, str]:
+    """Return to what a column belongs, '' if to nothing, and its component."""
+    said, component = {*words[:-1]}, COMPONENTS.get(words[-1], '') if words else ''
+    if said & OTHERS:
+        return '', ''
+    for angle in [ANGLE_WORDS[word] for word in words if word in ANGLE_WORDS]:
+        return ('', '') if {'dot', 'rate', 'velocity'} & {*words} else (ANGLES, angle)
+    for kind, names in WORDS.items() if component else ():
+        if said & names and not (kind == ACCELERATIONS and 'angular' in said):
+            return (GYROSCOPE if kind == RATES and 'imu' in said else kind), component
+    return '', ''
+
+
+def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Reals]]:
+    """Return stamps (n,), decimals [s], and the parts (n, k) that these columns make."""
+    stamps: dict[str, Sequence[Any]] = {}
+    groups: dict[tuple[str, str], dict[str, Reals]] = defaultdict(dict)
+    for name, cells in columns.items():
+        words, unit = _words(name)
+        if TIMES & {*words}:
+            stamps.setdefault(unit if unit in SECONDS else words[-1], cells)
+        elif (named := _kind(words))[0]:
+            kind, component = named
+            groups[kind, '' if kind == ANGLES else ' '.join(words[:-1])].setdefault(
+                component, UNITS.get(unit, 1.0) * np.array([_number(cell) for cell in cells]))
+    if not stamps:
+        raise ValueError(f'no column of times among {", ".join(columns)}: must be t, time, '
+                         'timestamp or stamp')
+    parts: dict[str, Reals] = {}
+    for (kind, _), group in groups.items():
+        order = {ATTITUDES: 'wxyz', ANGLES: 'abc'}.get(kind, 'xyz')
+        if group.keys() >= {*order}:
+            parts.setdefault(kind, np.stack([group[part] for part in order], axis=1))
+    if ANGLES in parts:
+        turns = Rotation.from_euler('ZYZ', np.nan_to_num(angles := parts.pop(ANGLES)))
+        known = np.isfinite(np.sum(angles, axis=1, keepdims=True))
+        parts.setdefault(ATTITUDES, np.where(known, np.roll(turns.as_quat(), 1, axis=1), np.nan))
+    if {RATES, ACCELERATIONS} <= parts.keys() and GYROSCOPE not in parts:
+        parts[GYROSCOPE] = parts.pop(RATES)     # wx .. az are those of an IMU
+    return _seconds(stamps), parts
+
+
+def _number(cell: Any) -> float:
+    try:
+        return float(cell)
+    except (TypeError, ValueError):     # an empty cell, a word
+        return math.nan
+
+
+def _decimal(cell: Any) -> Decimal:
+    try:
+        return Decimal(str(cell).strip())
+    except InvalidOperation:
+        return Decimal('NaN')
+
+
+def _seconds(stamps: Mapping[str, Sequence[Any]]) -> NDArray[np.object_]:
+    """Return stamps (n,), decimals [s], of columns by their unit."""
+    unit = next(iter(stamps))
+    times = np.array([_decimal(cell) for cell in stamps[unit]], object)
+    for fine in stamps.keys() & {'nanosec', 'nsec'} if unit in ('sec', 'secs') else ():
+        times += [_decimal(part) * Decimal('1e-9') for part in stamps[fine]]
+    scale = Decimal(SECONDS.get(unit, '1'))
+    first = min((one for one in times if one.is_finite()), default=Decimal(0))
+    if scale == 1 and first > 10 ** 11:         # a date in ms, us or ns: in s it has ten digits
+        scale = Decimal(10) ** (-3 * round((first.adjusted() - 9) / 3))
+    return times * scale
+
+
+# --------------------------------------------------------------------------------------- logs
+
+def _read_log(path: Path, wanted: str | None) -> Recorded:
+    recorded, origin, end_ns = Recorded(), None, 1 << 63
+    with LogReader(path) as reader:
+        types = {topic.name: topic.type_name for topic in reader.topics
+                 if topic.type_name in MESSAGES and not topic.name.endswith(NOT_OF_BODY)}
+        if wanted is not None and wanted not in types:
+            raise ValueError(f'{path} has no topic {wanted} with attitudes; it has '
+                             f'{", ".join(types) or "none"}')
+        with contextlib.suppress(recorded_run.ForeignLogError):
+            run = recorded_run.read_run_description(reader)
+            recorded.parameters, origin = run.values_in_effect, Decimal(run.epoch_ns) / 10 ** 9
+            end_ns = next((one.stamp_ns for one in run.events if one.name != 'start'), end_ns)
+        if not reader.whole:
+            recorded.notes.append('the log is truncated: read as far as it goes')
+        tables, first = _log_tables(reader, types, end_ns)
+    chosen = sorted(tables, key=lambda one: (
+        one[0] != wanted, MESSAGES.index(types[one[0]]), one))
+    recorded.add({' '.join(filter(None, one)): tables[one] for one in chosen}, origin)
+    for kind, name in COVARIANCES.items():
+        for topic in [topic for topic in first if f'{kind} of {topic}' in recorded.notes]:
+            matrix = np.reshape(getattr(first[topic], name), (3, 3))
+            # -1: there are no such readings.  The smallest variance means exact, none of noise.
+            if matrix[0, 0] >= 0.0 and not 0.0 < np.max(matrix) <= EXACT_VARIANCE:
+                recorded.covariance[kind] = matrix
+    return recorded
+
+
+def _log_tables(reader: LogReader, types: Mapping[str, str], end_ns: int,
+                ) -> tuple[dict[tuple[str, str], Table], dict[str, Any]]:
+    """Return tables by topic and, of transforms, frame; and the first message of each topic."""
+    tables: dict[tuple[str, str], Any] = defaultdict(lambda: defaultdict(list))
+    first: dict[str, Any] = {}
+    for topic, log_time, content in _contents(reader, types, end_ns):
+        frame = content.child_frame_id if hasattr(content, 'transform') else ''
+        first.setdefault(topic, content)
+        stamp, table = content.header.stamp, tables[topic, frame]
+        table['stamp_ns'].append(stamp.sec * 10 ** 9 + stamp.nanosec or log_time)
+        for name, value in _fields(content):
+            table[name].append(value)
+    return tables, first
+
+
+def _contents(reader: LogReader, types: Mapping[str, str],
+              end_ns: int) -> Iterator[tuple[str, int, Any]]:
+    """Yield topics, log times and messages; of transforms the first one.  Raises LogError."""
+    with needed('a log', 'rosbags'):
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for message in reader.messages(types, end=end_ns):
+        try:
+            content: Any = store.deserialize_cdr(message.data, types[message.topic])
+            content = getattr(content, 'transforms', [content])[0]
+        except Exception as error:      # whatever rosbags raises
+            raise LogError(f'cannot read {reader.path}: a message of {message.topic} is no '
+                           f'{types[message.topic]}: {error}') from error
+        yield message.topic, message.log_time, content
+
+
+def _fields(message: Any, prefix: str = '') -> Iterator[tuple[str, float]]:
+    """Yield the names and values of the numbers in a message; of joints those of the positions."""
+    if hasattr(message, 'position') and hasattr(message, 'effort'):
+        yield from zip(message.name, message.position.tolist(), strict=False)
+        return
+    covariance = getattr(message, 'orientation_covariance', None)
+    for name in message.__dataclass_fields__:
+        value = getattr(message, name)
+        if isinstance(value, float):
+            yield prefix + name, value
+        elif hasattr(value, '__dataclass_fields__') and not (
+                name == 'orientation' and covariance is not None and covariance[0] == -1.0):
+            yield from _fields(value, f'{prefix}{name}.')
