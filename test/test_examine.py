@@ -117,7 +117,7 @@ def test_covariances_may_be_about_the_axes_of_sensor_or_world(report, factor, fa
 def test_a_misreading_is_named_with_its_evidence(report, name):
     found = report('vqf', name)
     assert found.faults == [name] and not found.passed, found
-    if name not in ('stamp_offset', 'time_step', 'inaccurate', 'diverges',
+    if name not in ('stamp_offset', 'time_step', 'diverges',
                     'invalid_output'):      # it is undone
         assert found.measures['tilt_rms_deg'] < 0.1 and found.measures['convergence_s'] < 1.0
         assert found.outcomes[0].errors.tilt[-1] < 0.01

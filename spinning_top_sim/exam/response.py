@@ -172,6 +172,10 @@ class Responses:
         back = Rotation.from_rotvec((0.0, 0.0, -heading))
         group = Rotation.create_group('O')
         square = group[int(np.argmin((group.inv() * in_sensor).magnitude()))]
+        vectors, last = (np.array([np.linalg.norm(one.as_quat()[:, :3], axis=1),
+                                   np.abs(one.as_quat()[:, 3])]) for one in (estimated, true))
+        scale = max(float(np.median(
+            vectors[0] * last[1] / np.maximum(vectors[1] * last[0], 1e-9))), 1e-3)
         return self._tried((
             *diagnosis.READINGS,
             Hypothesis(('frame_ned',), 'read as attitude of axes '
@@ -179,7 +183,10 @@ class Responses:
                        read=lambda q: (Rotation.from_quat(q) * square.inv()).as_quat()),
             Hypothesis(('magnetometer_wiring' if abs(heading) > 3.0 else 'heading_offset',),
                        f'turned by {-math.degrees(heading):.3g} deg about the vertical',
-                       read=lambda q: (back * Rotation.from_quat(q)).as_quat())))
+                       read=lambda q: (back * Rotation.from_quat(q)).as_quat()),
+            Hypothesis(('inaccurate',), f'with the vector part of the attitude divided by '
+                       f'{scale:.4g}', read=lambda q: Rotation.from_quat(
+                           q / (scale, scale, scale, 1.0)).as_quat())))
 
     def _of_delays(self) -> Iterator[Tried]:
         """Try delays of the attitudes and the gyroscope, and what is no fault."""
