@@ -21,12 +21,13 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.grade import guess
 from spinning_top_sim.grade import problem as unknowns
 from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Readings, turned
-from spinning_top_sim.grade.scenes import Body, Reals
+from spinning_top_sim.grade.scenes import Body, Reals, Start
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
 FEWEST = 32                 # attitudes that can be fitted
+BEGIN = 64                  # attitudes that tell a start, whatever follows
 GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
 LOST = 0.05                 # residual of a part that is too long to begin with [rad]
 FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
@@ -36,6 +37,7 @@ NAMES = {'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'psi': 'rad', 'L3/l
          'lever_arm_z': 'm', 'stamp_offset': 's'}
 ANGLES, RATIO = (2, 3), 6   # of NAMES: those that may change by a turn, lambda3/lambda1
 EXACT = 1e-7                # residual that needs no noise: quaternions in single precision [rad]
+NEGLIGIBLE = 1e-5           # of readings: errors of a simulator's steps
 LARGEST = 0.3               # noise [rad]
 ONCE_IN = 1000.0            # noise that is called a residue of the motion
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
@@ -162,6 +164,31 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     return _conclude(best, begin, lambda1, gravity)
 
 
+def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> State:
+    """Return the start of a known top: the fitted one, or if none was found that of the begin."""
+    if found.reached:
+        start = Start.of(found.top, found.start)
+        return Start(start.attitude, start.rates).state_of(top)
+    one, _ = _attitudes(parts)
+    first = replace(one, times=one.times[:BEGIN], values=one.values[:, :BEGIN])
+    problem, (x, _) = Problem([first], one.values[:, 0], top.gravity), _first_values(one, parts)
+    x[P] = top.gravity_torque / top.lambda1
+    for _ in range(3):
+        x[L3] = top.lambda3 / top.lambda1 * x[SPIN]
+        x, _ = descend(problem, x, MOTION[:6])
+    _, state = problem.start(x)
+    return replace(state, l3=state.l3 * top.lambda1, lz=state.lz * top.lambda1)
+
+
+def _first_values(one: Readings, parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Reals, bool]:
+    """Return unknowns with the rates at the begin, and whether whole turns are known."""
+    told = parts.get('rates', parts.get('gyroscope'))
+    spin, sure = guess.spin_rate(one.times, one.values, told and float(np.median(told[1][:, 2])))
+    axis, x = np.stack(attitude.axis_in_world(tuple(one.values))), np.zeros(unknowns.UNKNOWNS)
+    x[unknowns.RATES] = (*guess.transverse_rates(one.times, one.values, axis)[:2], spin)
+    return x, sure
+
+
 def _attitudes(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
     """Return attitudes from t = 0 on, and the time of the first."""
     times, attitudes = parts['attitudes']
@@ -176,13 +203,11 @@ def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
     """Yield fits from one guess after another."""
     times, q = one.times, one.values
     axis = np.stack(attitude.axis_in_world(tuple(q)))
-    told = parts.get('rates', parts.get('gyroscope'))
-    spin, sure = guess.spin_rate(times, q, told and float(np.median(told[1][:, 2])))
+    first, sure = _first_values(one, parts)
     weak, small = guess.weak(times, axis), list(guess.small_nutation(times, axis))
     seeds = [*weak[:1], *((0, *pair) for pair in small[:4]), *weak[1:2]]
     for size, l3, p in seeds:
-        x = np.zeros(unknowns.UNKNOWNS)
-        x[unknowns.RATES] = (*guess.transverse_rates(times, q, axis)[:2], spin)
+        x = first.copy()
         x[L3], x[P] = l3, p
         try:
             trial = _fit_from(one, x, size, gravity)
@@ -205,11 +230,11 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
         free = MOTION if count == last or 0 < 2 * size < count else MOTION[:6]
         precisely = (30, 1e-8) if count == last else (8, 1e-3)
         found, converged = descend(problem, x, free, *precisely)
-        rest = float(np.std(problem.residuals(found)))
-        if rest > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
+        left = float(np.std(problem.residuals(found)))
+        if left > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
             growth = math.sqrt(growth)
         else:
-            x, done, level, growth = found, count, rest, min(growth * growth, GROWTH)
+            x, done, level, growth = found, count, left, min(growth * growth, GROWTH)
     rest = problem.residuals(x).reshape(3, -1)
     residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
     noise, white = whiteness(rest)
@@ -287,8 +312,10 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
     rests = [problem.residual(x, stream) for stream in problem.readings]
     noise, _ = whiteness(rests[0])
     residual = math.sqrt(float(np.mean(rests[0] ** 2)))
-    return trial._replace(x=x, residual=residual, noise=noise, reached=trial.reached and (
-        converged and all(whiteness(rest)[1] or np.std(rest) < EXACT for rest in rests)))
+    explained = all(whiteness(rest)[1] or np.std(rest) < EXACT + NEGLIGIBLE * np.std(stream.values)
+                    for stream, rest in zip(problem.readings, rests, strict=True))
+    return trial._replace(x=x, residual=residual, noise=noise,
+                          reached=trial.reached and converged and explained)
 
 
 def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fit:
