@@ -8,7 +8,7 @@ VENV ?= .venv$(if $(filter kilted,$(ROS)),-kilted)
 SCENE ?= cusp
 LOGS ?= logs
 TESTS ?= test
-WORKERS ?= 6
+WORKERS ?= 3
 SECONDS ?= 180
 $(if $(filter-out jazzy kilted,$(ROS)),$(error ROS=$(ROS) is neither jazzy nor kilted))
 
@@ -28,6 +28,8 @@ ifneq ($(_ROS_WHEELS_BOOTSTRAP_COMPLETE)$(AMENT_PREFIX_PATH),)
 unexport LD_LIBRARY_PATH
 endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONPATH PYTHONHOME VIRTUAL_ENV ROS_DISTRO
+# The assertions of the tests are rewritten once, not in each run and worker.
+unexport PYTHONDONTWRITEBYTECODE
 export AMENT_PREFIX_PATH := $(abspath $(VENV))
 export RMW_IMPLEMENTATION := rmw_fastrtps_cpp
 export PYTHONUNBUFFERED := 1
@@ -35,7 +37,9 @@ export DIST_EXTRA_CONFIG := $(abspath $(VENV))/setup.cfg
 
 BIN := '$(VENV)/bin
 PIP := $(BIN)/python' -m pip --disable-pip-version-check install --quiet --quiet
-PYTEST = $(BIN)/pytest' -n $(WORKERS) --max-worker-restart=0
+# Each worker would import the other plug-ins, and rewrite their assertions, in two seconds.
+test coverage: export PYTEST_DISABLE_PLUGIN_AUTOLOAD := 1
+PYTEST = $(BIN)/pytest' -p xdist -n $(WORKERS) --max-worker-restart=0
 INSTALL = @flock Makefile $(MAKE) --silent --no-print-directory
 
 help:

@@ -94,6 +94,6 @@ SLOW = Case('slow spin', WHEEL,
             State(theta=math.radians(30.0), l3=0.3, lz=0.2))
 NEAR_POLE = near_pole(1e-6, theta_dot=-6.0)
 HEAVY_TOP = _from_scene('Brüls, Cardona and Arnold', 'heavy_top')
-TOY_60, TOY_200 = _toy(60.0), _toy(200.0)
+TOY_200 = _toy(200.0)
 
 WORK_PRECISION = (CUSP, LOOPING, SLOW, NEAR_POLE, HEAVY_TOP)

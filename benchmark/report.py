@@ -66,7 +66,7 @@ def save(figure: Any, name: str) -> None:
 
 
 # Sections of performance.md in their order; each benchmark writes one of them.
-SECTIONS = 'node_cpu', 'startup', 'solvers', 'offline', 'compression', 'soak'
+SECTIONS = 'node_cpu', 'startup', 'solvers', 'offline', 'soak'
 
 
 def write_section(name: str, head: str, description: str, *texts: str) -> None:

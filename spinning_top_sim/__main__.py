@@ -3,11 +3,10 @@
 """The command `spinning-top`, which is `python -m spinning_top_sim` as well."""
 
 import argparse
-import contextlib
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
 
@@ -34,14 +33,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     if '_ARGCOMPLETE' in os.environ:
         _complete()
-    with _quiet_interrupt():
+    # Ctrl-C ends it at once during imports, where a KeyboardInterrupt may be lost.
+    before = signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    try:
         name = _parser().parse_args(argv[:1]).command
-        try:
-            with needed('it'):
-                command: Callable[[Sequence[str]], int] = _module(name).main
-        except ImportError as error:
-            print(f'spinning-top {name}: {error}', file=sys.stderr)
-            return 1
+        with needed('it'):
+            command: Callable[[Sequence[str]], int] = _module(name).main
+    except ImportError as error:
+        print(f'spinning-top {name}: {error}', file=sys.stderr)
+        return 1
+    finally:
+        signal.signal(signal.SIGINT, before)
     return command(argv[1:])
 
 
@@ -70,18 +72,6 @@ def _complete() -> None:
         if name in os.environ.get('COMP_LINE', '').split():
             _module(name).add_arguments(options)
     argcomplete.autocomplete(parser)
-
-
-@contextlib.contextmanager
-def _quiet_interrupt() -> Iterator[None]:
-    """End at once if Ctrl-C comes during imports, where a KeyboardInterrupt may be lost."""
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:
-        signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 if __name__ == '__main__':

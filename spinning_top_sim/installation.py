@@ -57,18 +57,13 @@ def remedy(wanted: str) -> str:
 
     wanted : an extra of the package, or the name of one library that it requires
     """
-    try:
-        requirements = metadata.requires(NAME) or []
-    except metadata.PackageNotFoundError:       # this is a checkout
-        requirements, wanted = [], str(share())
     lines = []
-    for line in requirements:
-        requirement, _, condition = (part.strip() for part in line.partition(';'))
-        library, *_ = re.split('[^\\w.-]', requirement)
-        if library == wanted or re.findall(r'[\w.-]+', condition)[1:] == [wanted]:
-            lines.append(requirement)
-    quoted = (f"'{line}'" for line in lines or [wanted])
-    return f'{sys.executable} -m pip install {" ".join(quoted)}'
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        for line in metadata.requires(NAME) or []:
+            requirement, _, condition = line.partition(';')
+            if wanted in (*re.findall('[\\w.-]+', condition)[1:], *re.findall('^[\\w.-]+', line)):
+                lines.append(f"'{requirement.strip()}'")
+    return f'{sys.executable} -m pip install {" ".join(dict.fromkeys(lines or [wanted]))}'
 
 
 def parameter_files(kind: str) -> dict[str, Path]:

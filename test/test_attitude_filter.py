@@ -18,8 +18,8 @@ EXAMPLE = ROOT / 'examples/attitude_filter.py'
 SETTLE = 15.0
 LOGS = {
     'pivot': ['--duration', '30'],
-    'lever arm': ['--duration', '21', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.0]'],
-    'nine axes': ['--duration', '21', '-p', 'mag.enabled:=true'],
+    'lever arm': ['--duration', '18', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.0]'],
+    'nine axes': ['--duration', '18', '-p', 'mag.enabled:=true'],
 }
 
 
@@ -69,7 +69,7 @@ def test_at_the_pivot_a_perfect_imu_leaves_the_filters_own_error(summaries):
 
 def test_nine_axes_know_the_heading(summaries):
     found = summaries('nine axes', 'vqf9', 'vqf')
-    assert found['vqf9'].compared == 2100 and found['vqf9'].tilt_max < 0.01
+    assert found['vqf9'].compared == 1800 and found['vqf9'].tilt_max < 0.01
     assert found['vqf9'].heading_max < 0.03
     assert math.isnan(found['vqf'].heading_max)
     wrong = summaries('nine axes', 'vqf9', declination=0.0)['vqf9']

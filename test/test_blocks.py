@@ -16,6 +16,7 @@ from helpers.reference import scene_parameters
 from helpers.simulations import MILLISECOND, play, record, simulate
 
 from spinning_top_sim import State, Top, solve
+from spinning_top_sim.streams import parameters
 
 # ---------------------------------------------------------------------------------- scenarios
 
@@ -39,19 +40,32 @@ MOUNTED = {'imu.lever_arm': (0.1, -0.2, 0.3), 'imu.rpy': (0.1, 0.2, 0.3),
            'imu.sampling': 'mean', 'gnss.latency': 0.03, 'gnss.outages': (0.1, 0.2),
            'gnss.position_noise': (1.0, 2.0), 'gnss.velocity_noise': (0.1, 0.2),
            'gnss.rate': 300.0}
+FILTERED = {'imu.sampling': 'instant', 'imu.bandwidth': 40.0, 'imu.bandwidth_order': 2,
+            'imu.vibration.force': (1.0, 2.0, 3.0),
+            'imu.vibration.rate_psd': (10.0, 1e-3, 100.0, 1e-4),
+            'mag.disturbance.world': (0.1, 0.3, 1e-5, 0.0, 0.0)}
 SCENES = {
     'cusps': {},
     'a sensor elsewhere': {**scene_parameters('looping'), **MOUNTED},
+    # The acceleration changes at samples and between them.
+    'a filtered sensor': {
+        'pivot.path': (0.1, 2.0, 0.0, 0.0, 0.0123, 0.0, 0.0, -9.80665, 0.1, -2.0, 0.0, 0.0),
+        **MOUNTED, **FILTERED},
     'through a pole': {'initial.theta': 0.5, 'spin.l3': 0.2, 'spin.lz': 0.2},
     'planar rotation': scene_parameters('planar_pendulum'),
 }
 CASES = (('a sensor elsewhere', 'exact'), ('planar rotation', 'exact'),
+         ('a filtered sensor', 'rk45'),
          ('cusps', 'euler'), ('a sensor elsewhere', 'rk45'), ('through a pole', 'rk45'))
 DURATION_NS = 500_000_000
-# Two commands and two changes of rates, and when they come [ns].
+# Commands, changes of rates, a velocity of the pivot and a state, and when they come [ns].
 EVENTS = ((125_000_000, command(1.1, 1.1)),
           (225_000_001, lambda simulation: simulation.apply({'pose.rate': 250.0})),
-          (225_000_001, rate(320.0)), (350_000_003, command(0.9, 0.85)))
+          (225_000_001, rate(320.0)),
+          (300_000_000, lambda simulation: simulation.drive((0.5, 0.0, 0.0))),
+          (350_000_003, command(0.9, 0.85)), (350_000_003, command(1.2, 1.2)),
+          (450_000_000, lambda simulation: simulation.set_state(
+              parameters.start_state(parameters.checked({'initial.theta': 1.0})))))
 
 
 def start(scene, method):
@@ -66,7 +80,7 @@ def go(simulation, advance, splits):
         if t_ns > simulation.now_ns:
             advance(t_ns)
         act(simulation)
-    assert len(simulation.history) == 3
+    assert len(simulation.history) == 6
 
 
 def offline(scene, method, splits=()):

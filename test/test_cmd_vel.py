@@ -46,8 +46,8 @@ def sent_offline(values, drives, until_ns):
 
 
 @pytest.mark.parametrize('values', [
-    {'solver.method': method, **more} for method in METHODS
-    for more in (SHUTTLE, {'pivot.path': (0.7, 1.0, 0.0, 9.0, 0.7, -1.0, 0.0, -9.0)})])
+    {'solver.method': 'exact', **SHUTTLE},
+    {'solver.method': 'rk45', 'pivot.path': (0.7, 1.0, 0.0, 9.0, 0.7, -1.0, 0.0, -9.0)}])
 def test_live_and_offline_agree_to_the_last_bit(values):
     values = everything({'imu.lever_arm': (0.1, 0.2, 0.3), 'markers.trace_points': 20, **values})
     live, sent = simulation_of(LiveSimulation, **values), []
@@ -55,18 +55,18 @@ def test_live_and_offline_agree_to_the_last_bit(values):
         output.publish = lambda data, topic=output.stream.topic: sent.append(
             (live.now_ns, topic, data))
     drives, now = list(DRIVES), 0
-    while now < 6 * S:
-        now = min(now + 137_000_001, drives[0][0] if drives else 6 * S)
+    while now < 5 * S:
+        now = min(now + 137_000_001, drives[0][0] if drives else 5 * S)
         live.advance(now)
         live.prepare(now + S // 4)
         if drives and drives[0][0] == now:
             live.drive(drives.pop(0)[1])
             live.prepare(now + 2 * S)
-    assert sorted(sent) == sent_offline(values, DRIVES, 6 * S)
+    assert sorted(sent) == sent_offline(values, DRIVES, 5 * S)
 
 
 @pytest.mark.parametrize(('method', 'arm', 'seconds'), [
-    ('exact', (0.1, -0.2, 0.3), 60), ('rk45', (0.0, 0.0, 0.0), 12)])
+    ('exact', (0.1, -0.2, 0.3), 20), ('rk45', (0.0, 0.0, 0.0), 12)])
 def test_increments_along_a_shuttle_add_up_to_its_motion(method, arm, seconds):
     simulation = simulation_of(**{
         **scene_parameters('shuttle'), 'solver.method': method, 'increments.enabled': True,

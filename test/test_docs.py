@@ -22,7 +22,7 @@ PAGES = {str(path.relative_to(ROOT)): path.read_text(encoding='utf-8')
 NOT_RUN = {
     'installs packages from the network': 1,
     'the tests have a domain of their own': 1,
-    'needs the command line tools of a ROS installation': 7,
+    'needs the command line tools of a ROS installation': 6,
     'runs until Ctrl-C, after it has installed packages': 3,
     'takes minutes or hours': 1,
     'needs data that are not part of the package': 1,

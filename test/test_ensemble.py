@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -19,13 +20,13 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import ensemble_part, ensemble_spec
 from spinning_top_sim.tools.ensemble import main
-from spinning_top_sim.tools.ensemble_part import EnsembleError, compute_part, table
+from spinning_top_sim.tools.ensemble_part import compute_part, table
 
-pytest.importorskip('distributed')
+pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='Dask is not there')
 pa = pytest.importorskip('pyarrow')
 parquet = pytest.importorskip('pyarrow.parquet')
 
-RUNS, DURATION = 40, 2.0
+RUNS, DURATION = 32, 1.0
 SPEC = {
     'runs': RUNS, 'seed': 5, 'duration': DURATION, 'runs_per_part': 2,
     'params': [str(ROOT / 'config/wavy.yaml'), {'imu.lever_arm': [0.1, 0.0, 0.0],
@@ -52,11 +53,10 @@ def contents(folder):
 
 def parts_of(specification, folder):
     """Compute all parts without Dask; return the runs that failed."""
-    for name in ('data', 'unfinished'):
-        (folder / name).mkdir(exist_ok=True)
+    (folder / 'data').mkdir(exist_ok=True)
     failed = {}
     for part in range(specification.parts):
-        failed |= compute_part(specification, part, str(folder), ensemble_part.versions())
+        failed |= compute_part(specification, part, str(folder))
     return failed
 
 
@@ -145,7 +145,7 @@ def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
     assert rows['params'].to_pylist() == len(rows) * [run // 2 % 3]
     assert set(rows['spin.l3'].to_pylist()) == {values['spin.l3']}
     assert set(rows['seed'].to_pylist()) == {values['seed']}
-    assert rows['t'].to_pylist() == [k / 200.0 for k in range(401)]
+    assert rows['t'].to_pylist() == [k / 200.0 for k in range(201)]
     assert not [name for name in every.column_names if 'data_raw.orientation' in name]
     log = tmp_path / 'run.mcap'
     assert main([str(path), '--row', str(run), '-o', str(log)]) == 0
@@ -165,7 +165,7 @@ def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
         assert kept == {stamp_ns: fields[field][0, 'xyzw'.index(column[-1])]
                         for stamp_ns, fields in logged[f'/{topic}'].items()}
         lost = max(lost, len(values) - len(kept))
-    assert lost > 40
+    assert lost > 20
 
 
 def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
@@ -296,13 +296,6 @@ def test_a_part_has_so_many_runs_by_default(runs, duration, together):
     assert ensemble_spec.parse(given, 'test').runs_per_part == together
 
 
-def test_a_worker_with_other_versions_computes_nothing(tmp_path):
-    specification = ensemble_spec.parse({'runs': 1, 'duration': 0.1}, 'test')
-    with pytest.raises(EnsembleError, match=r"gives other bytes than \{'numpy': '1.0'\}"):
-        compute_part(specification, 0, str(tmp_path), {'numpy': '1.0'})
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(('content', 'counts'), [
     # A magnetometer in one of two IMUs; a value that is unset in some runs.
     ({'runs': 4, 'sample': {'params': {'values': [
@@ -368,12 +361,12 @@ def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble
     assert contents(folder) == before
     assert ensemble(path, '-o', folder) == 2
     error = capsys.readouterr().err
-    assert f'{folder} has another ensemble: runs = 1, not 40, duration' in error
+    assert f'{folder} has another ensemble' in error
     assert error.endswith(': choose a new folder, or --overwrite\n')
     turned = written(tmp_path, runs=1, duration=0.05, sample={      # it is another grid
         'spin.l3': {'values': [1.5, 1.7]}, 'initial.theta': {'values': [0.3, 0.6]}})
     assert ensemble(turned, '-o', folder) == 2
-    assert 'has another ensemble: sample = ' in capsys.readouterr().err
+    assert 'has another ensemble' in capsys.readouterr().err
     assert contents(folder) == before
     (folder / 'notes').write_text('mine')
     assert ensemble(turned, '-o', folder, '--overwrite') == 0
@@ -395,7 +388,7 @@ def test_what_is_no_manifest_is_refused(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [
-    (['--row', '40', '-o', 'one.mcap'], '--row 40: must be from 0 to 39'),
+    (['--row', '32', '-o', 'one.mcap'], '--row 32: must be from 0 to 31'),
     (['--row', '1', '-o', 'one.csv'], 'one.csv: the name must end in .mcap or .parquet'),
     (['-o', 'out', '--workers', '0'], '--workers 0: must be')])
 def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, said):

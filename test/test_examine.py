@@ -72,7 +72,7 @@ def test_tilt_and_heading_are_those_of_the_world():
 
 
 def test_the_gyroscope_reads_the_mean_over_its_step_and_a_delay_is_measured():
-    scenario = replace(scenarios.WAVES, duration=4.0, noisy=False)
+    scenario = replace(scenarios.FAST, duration=4.0, reversals=())
     coarse, fine = (scenarios.record(replace(scenario, rate=rate), {}, 1)
                     for rate in (100.0, 1600.0))
     mean = fine.gyroscope.reshape(-1, 16, 3).mean(axis=1)
@@ -117,7 +117,7 @@ def test_covariances_may_be_about_the_axes_of_sensor_or_world(report, factor, fa
 def test_a_misreading_is_named_with_its_evidence(report, name):
     found = report('vqf', name)
     assert found.faults == [name] and not found.passed, found
-    if name not in ('stamp_offset', 'time_step', 'diverges',
+    if name not in ('stamp_offset', 'time_step', 'inaccurate', 'diverges',
                     'invalid_output'):      # it is undone
         assert found.measures['tilt_rms_deg'] < 0.1 and found.measures['convergence_s'] < 1.0
         assert found.outcomes[0].errors.tilt[-1] < 0.01
@@ -193,12 +193,6 @@ def test_a_filter_that_goes_on_from_run_to_run_gets_the_same_verdict_but_for_its
     assert found.measures['heading_rms_deg'] < 1.0
 
 
-def test_a_full_exam_has_more_motions(report):
-    marks = report('vqf', 'gyroscope_units', level='full', seeds=2).measures    # it is undone
-    assert marks['tilt_rms_pole_deg'] < 0.1 and marks['tilt_rms_command_deg'] < 0.1
-    assert marks['tilt_rms_saturation_deg'] > 0.1 and marks['tilt_rms_drops_deg'] > 0.1
-
-
 class Bad:
     def __init__(self, said):
         self._said = said
@@ -271,13 +265,14 @@ def update_for_ever():
 
 
 @pytest.mark.parametrize(('said', 'says'), [
-    (update_for_ever, 'update 1 of 100 takes more than 1 s: killed'),
-    (lambda: ctypes.string_at(0), 'update 1 of 100 ends the process: Segmentation fault'),
-    (partial(os._exit, 3), 'update 1 of 100 ends the process: exit code 3'),
+    (update_for_ever, '100 updates take more than 1 s'),
+    (lambda: ctypes.string_at(0), 'the filter ends the process: Segmentation fault'),
+    (partial(os._exit, 3), 'the filter ends the process: exit code 3'),
     (partial(sys.exit, 3), 'update 1 of 100 raises SystemExit: 3')])
 def test_a_filter_that_never_returns_or_crashes_is_told(monkeypatch, slow, said, says):
-    if says.endswith('killed'):
+    if says.endswith(' s'):
         monkeypatch.setattr(isolation, 'LONGEST_S', 1.0)
+        monkeypatch.setattr(isolation, 'UPDATE_S', 0.0)
     with pytest.raises(InvalidOutputError, match=says):
         follow(partial(Bad, said), slow, feed=isolation.feed_apart)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import examine, examiner, field
+from spinning_top_sim.exam import examine, field
 from spinning_top_sim.exam.scenarios import GRAVITY
 from spinning_top_sim.streams.parameters import IDENTITY
 
@@ -113,7 +113,6 @@ def test_a_level_is_a_part_of_full_and_needs_new_filters(monkeypatch):
     with pytest.raises(ValueError, match="level = 'field': the filter must be made anew"):
         examine(vqf, 'field', restart=False)
     monkeypatch.setattr(field, 'SCENES', [BY_NAME['slow_rotation']])
-    monkeypatch.setattr(examiner, 'EXTRA', ())
     asked = examine(vqf, 'field', seeds=[7], imu={'mag.field': (0.0, 2e-5, 0.0)}).measures
     assert 0.0 < asked['field_rms_deg'] < 10.0
     assert 'field_rms_deg' in examine(vqf, 'full', seeds=1).measures

@@ -17,8 +17,11 @@ NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-5,
          'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 0.02,
          'imu.accelerometer_random_walk': 1e-4, 'imu.accelerometer_turn_on_bias': 0.1}
 VALUES = {**NOISY, 'ground_truth_imu_odom.enabled': True, 'ground_truth_imu_odom.rate': 125.0,
-          'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.3, -0.7, 1.9]}
-FILES = {'tum': 'truth.tum', 'euroc': 'truth.csv', 'euroc_imu': 'imu.csv', 'kalibr': 'imu.yaml'}
+          'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.3, -0.7, 1.9], 'gnss.enabled': True,
+          'gnss.position_noise': [1.0, 2.0], 'gnss.velocity_noise': [0.1, 0.2],
+          'gnss.outages': [0.35, 0.55]}
+FILES = {'tum': 'truth.tum', 'euroc': 'truth.csv', 'euroc_imu': 'imu.csv', 'kalibr': 'imu.yaml',
+         'gnss_fix': 'fix.csv', 'gnss_velocity': 'velocity.csv'}
 
 
 def options(values, **more):
@@ -109,6 +112,19 @@ def test_euroc_imu_is_what_the_sensor_reads(folder, messages):
         [*xyz(one.angular_velocity), *xyz(one.linear_acceleration)] for one in raw])
     head = (folder / 'imu.csv').read_text().splitlines()[0]
     assert head.startswith('#timestamp [ns],w_RS_S_x [rad s^-1],') and head.count(',') == 6
+
+
+def test_tables_of_the_receiver_are_its_messages(folder, messages):
+    for name, topic, values in (
+            ('fix.csv', '/gnss/fix', lambda one: [one.latitude, one.longitude, one.altitude]),
+            ('velocity.csv', '/gnss/velocity', lambda one: xyz(one.twist.twist.linear))):
+        found = rows(folder / name, ',')
+        assert [int(row[0]) for row in found] == stamps(messages[topic])
+        assert np.array_equal(np.array(found, np.float64)[:, 1:], [*map(values, messages[topic])],
+                              equal_nan=True)
+    # Two of the eleven fall into the outage.
+    assert sum('nan' in row for row in rows(folder / 'fix.csv', ',')) == 2
+    assert len(found) == 9
 
 
 def test_kalibr_gets_the_parameters(folder):

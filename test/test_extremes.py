@@ -197,5 +197,5 @@ def short_life(rng):
 
 
 def test_every_combination_that_the_ranges_allow_runs_or_is_refused():
-    found = [short_life(random.Random(seed)) for seed in range(6 * TIMES)]
-    assert found.count('ran') >= 3 * TIMES
+    found = [short_life(random.Random(seed)) for seed in range(3 * TIMES)]
+    assert found.count('ran') >= TIMES

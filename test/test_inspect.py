@@ -223,7 +223,8 @@ def test_a_reader_that_leaves_is_no_error(short, monkeypatch, capsys):
 @pytest.mark.parametrize(('key', 'text'), [
     ('parameters', '[' * 100_000), ('parameters', '{"top.lambda1": 1e-320}'),
     ('begun_ns', str(10 ** 18)), ('history', '[[5, 1.0, 1.0], [4, 1.0, 1.0]]'),
-    ('history', '[[1e300, 1.0, 1.0]]'), ('history', '[[0, 1, NaN]]')])
+    ('history', '[[1e300, 1.0, 1.0]]'), ('history', '[[0, 1, NaN]]'), ('epoch_ns', 'NaN'),
+    ('parameters', '{"spin.l3": []}'), ('parameters', '{"seed": "\\ud800"}')])
 def test_odd_metadata_end_in_words(short, tmp_path, capsys, key, text):
     path = rewritten(short, tmp_path / 'odd.mcap', metadata={key: text})
     code, out, _ = told(capsys, path, '--verify')

@@ -29,7 +29,6 @@ from helpers.logs import (
     records_of,
     seen_by_mcap,
     seen_by_us,
-    write_log,
     write_stranger,
 )
 from helpers.mutations import repair
@@ -219,10 +218,3 @@ def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):
     assert seen_by_us(path) == seen_by_us(output) == seen_by_mcap(output) == [('/a', 5, b'x')]
     with LogReader(path) as reader:
         assert reader.damage.lossless
-
-
-def test_the_output_has_the_mode_of_the_log(tmp_path):
-    path = tmp_path / 'a.mcap'
-    write_log(path)
-    path.chmod(0o400)
-    assert recover(path).stat().st_mode & 0o777 == 0o400

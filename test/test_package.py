@@ -3,6 +3,7 @@
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 import tomllib
@@ -128,13 +129,20 @@ def test_ctrl_c_during_the_imports_of_a_tool_is_quiet():
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
 def test_an_installed_executable_tells_its_version_where_ros2_run_looks(
-        script, prefix, project):
+        script, prefix, project, monkeypatch, capsys):
     installed = prefix / 'lib' / NAME / script.name
-    search_path = f'{Path(sys.executable).parent}{os.pathsep}{os.environ.get("PATH", "")}'
-    done = subprocess.run([installed, '--version'], env={**os.environ, 'PATH': search_path},
-                          capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stderr) == (0, '')
-    assert done.stdout.split()[-1] == project['version']
+    monkeypatch.setattr(sys, 'argv', [str(installed), '--version'])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(installed), run_name='__main__')
+    said = capsys.readouterr()
+    assert (ended.value.code, said.err) == (0, '')
+    assert said.out.split()[-1] == project['version']
+    assert os.access(installed, os.X_OK)
+    if script.name == 'recover':                # as a process, too
+        search_path = f'{Path(sys.executable).parent}{os.pathsep}{os.environ.get("PATH", "")}'
+        assert subprocess.check_output(
+            [installed, '--version'], env={**os.environ, 'PATH': search_path}, text=True,
+            timeout=60) == said.out
 
 
 # ------------------------------------------------------------------------------ what is there

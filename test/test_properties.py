@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools import ensemble_spec, scene_file
+from spinning_top_sim.tools import scene_file
 
 NUMBERS = st.one_of(st.integers(), st.floats(), st.sampled_from((10 ** 400, -2 ** 63, 5e-324)))
 # Python shows no integer of more than 4300 digits; YAML has them, in hexadecimal.
@@ -42,7 +42,7 @@ def is_a_line(text):
 
 # ------------------------------------------------------------------------------------ parameters
 
-@examples(100)
+@examples(60)
 @given(NAMES | LISTS, ANYTHING)
 def test_any_value_of_a_parameter_is_taken_or_refused_by_its_name(name, value):
     try:
@@ -87,7 +87,7 @@ YAML = st.one_of(
                                f'{pair[1]:#x}]}}}}'))
 
 
-@examples(80)
+@examples(60)
 @given(YAML)
 def test_any_parameter_file_is_read_or_refused_by_its_path(tmp_path, text):
     path = tmp_path / 'scene.yaml'
@@ -98,47 +98,3 @@ def test_any_parameter_file_is_read_or_refused_by_its_path(tmp_path, text):
         assert str(path) in str(refusal) and is_a_line(str(refusal))
     else:
         assert values.keys() <= parameters.BY_NAME.keys()
-
-
-# ------------------------------------------------------------------------------------- ensembles
-
-FLOATS = st.floats(-1e3, 1e3)
-RULES = st.one_of(
-    st.tuples(FLOATS, FLOATS).map(lambda pair: {'uniform': sorted(pair)}),
-    st.tuples(FLOATS, st.floats(0.0, 1e3)).map(lambda pair: {'normal': list(pair)}),
-    st.tuples(st.floats(1e-9, 1e3), st.floats(1.0, 1e3)).map(
-        lambda pair: {'log_uniform': [pair[0], pair[0] * pair[1]]}),
-    st.lists(FLOATS, min_size=1, max_size=4).map(lambda items: {'values': items}),
-    st.dictionaries(st.sampled_from(('uniform', 'normal', 'values', 'gauss')), OF_YAML,
-                    max_size=2), OF_YAML)
-SPECIFICATIONS = st.one_of(st.fixed_dictionaries(
-    {'runs': st.one_of(st.integers(1, 50), OF_YAML), 'duration': st.floats(1e-3, 10.0)},
-    optional={
-        'seed': st.one_of(st.integers(0, 2 ** 63 - 1), OF_YAML),
-        'streams': st.one_of(st.lists(st.sampled_from(ensemble_spec.STREAMS), max_size=3),
-                             OF_YAML),
-        'runs_per_part': st.one_of(st.integers(0, 9), OF_YAML),
-        'params': st.one_of(st.lists(st.one_of(OF_YAML, st.dictionaries(NAMES, FLOATS)),
-                                     max_size=2), OF_YAML),
-        'sample': st.one_of(st.dictionaries(
-            st.one_of(NAMES, st.just('params'), KEYS), RULES, max_size=3),
-            OF_YAML)}), OF_YAML)
-
-
-@examples(120)
-@given(SPECIFICATIONS)
-def test_any_specification_gives_its_runs_or_is_refused_by_its_source(content):
-    try:
-        specification = ensemble_spec.parse(content, 'spec.yaml')
-    except ValueError as refusal:
-        assert str(refusal).startswith('spec.yaml: ') and is_a_line(str(refusal))
-        return
-    except OSError:         # a set of parameters names a file
-        return
-    assert ensemble_spec.parse(dataclasses.asdict(specification), 'again') == specification
-    try:
-        values = specification.values(specification.runs - 1)
-    except ValueError as refusal:
-        assert is_a_line(str(refusal))
-    else:
-        assert specification.values(specification.runs - 1) == values

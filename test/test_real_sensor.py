@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from helpers.readings import command, rate, run
-from helpers.simulations import MILLISECOND, SECOND, play, record, simulate
+from helpers.readings import command, run
+from helpers.simulations import MILLISECOND, SECOND
 from scipy import signal
 
 from spinning_top_sim.streams import parameters
@@ -19,8 +19,7 @@ FREE = {'top.com_distance': 0.0, 'top.lambda1': 0.1, 'top.lambda3': 0.2, 'initia
 STANDING = {'initial.theta': 0.0, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method': 'exact'}
 
 
-@pytest.mark.parametrize('order', [1, 2])
-@pytest.mark.parametrize('corner', [7.0, 20.0, 150.0])
+@pytest.mark.parametrize(('order', 'corner'), [(1, 20.0), (2, 7.0), (2, 150.0)])
 def test_gain_and_delay_are_those_of_the_analog_filter(order, corner):
     """In the transverse rate: a sine at |1 - lambda3/lambda1| omega3, the frequency TURNS."""
     values = {**FREE, 'imu.bandwidth': corner, 'imu.bandwidth_order': order}
@@ -65,7 +64,7 @@ def test_noise_has_the_power_of_the_profile_and_the_filter_acts_on_it():
         power = np.trapezoid(density * gain, frequencies) if hasattr(np, 'trapezoid') else (
             np.trapz(density * gain, frequencies))
         _, found = run({**values, 'imu.bandwidth': corner, 'imu.bandwidth_order': 2},
-                       10 * SECOND, 'imu/data_raw')
+                       6 * SECOND, 'imu/data_raw')
         _, _, _, rates, force, *_ = found['imu/data_raw']
         assert not rates.any()
         at, spectra = signal.welch(force, 2000.0, nperseg=1024, axis=0)
@@ -110,38 +109,6 @@ def test_magnetic_events_begin_and_end():
                          np.where((k >= 10) & (k < 20), -3e-6, 0.0),
                          np.where((k >= 15) & (k < 30), 5e-6, 0.0)), axis=-1)
     assert field - exact == pytest.approx(expected, abs=1e-19)
-
-
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
-def test_any_division_of_a_run_gives_the_same_bytes(method):
-    """Live and offline, in blocks of any size, across commands and changes of rates."""
-    values = {'solver.method': method, 'imu.bandwidth': 40.0, 'imu.bandwidth_order': 2,
-              'imu.lever_arm': (0.1, -0.2, 0.3), 'imu.rpy': (0.1, 0.2, 0.3), 'imu.rate': 500.0,
-              'imu_data.rate': 77.7, 'imu.vibration.force': (1.0, 2.0, 3.0),
-              'imu.vibration.rate_psd': (10.0, 1e-3, 100.0, 1e-4),
-              'mag.disturbance.world': (0.1, 0.3, 1e-5, 0.0, 0.0)}
-    topics = ('imu/data_raw', 'imu/data', 'imu/mag', 'imu/dq', 'imu/dv')
-    events = ((125 * MILLISECOND, command(1.1, 1.1)), (225_000_001, rate(320.0)),
-              (300_000_000, lambda simulation: simulation.drive((0.5, 0.0, 0.0))),
-              (350_000_003, command(0.9, 0.85)), (350_000_003, command(1.2, 1.2)))
-
-    def go(splits, live):
-        simulation = simulate(values)
-        taken = record(simulation, *topics) if live else []
-        stops = [*events, *((t_ns, lambda _: None) for t_ns in (*splits, 500 * MILLISECOND))]
-        for t_ns, act in sorted(stops, key=lambda stop: stop[0]):
-            if live:
-                simulation.advance(t_ns)
-                simulation.prepare(t_ns + 30 * MILLISECOND, 100_000)
-            else:
-                taken += play(simulation, t_ns, *topics)
-            act(simulation)
-        return sorted(taken)
-
-    whole = go((), False)
-    assert len(whole) > 5 * 40
-    assert go((1, 2_000_000, 77_000_123, 126_000_000, 351_000_000, 352_000_000), False) == whole
-    assert go(range(3_000_000, 500_000_000, 7_000_000), True) == whole
 
 
 @pytest.mark.parametrize(('name', 'value', 'says'), [

@@ -39,7 +39,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
 
-from spinning_top_sim.recording.chunks import CHUNK_BYTES, PlainChunk, time_span
+from spinning_top_sim.recording.chunks import CHUNK_BYTES, ChunkBuilder, time_span
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
 from spinning_top_sim.recording.writer import McapRecorder, create_file
@@ -89,8 +89,12 @@ def test_checksums_are_there_and_indexes_lead_to_the_messages(tmp_path):
         assert content[group.group_start] == group.group_opcode
         assert content[group.group_start + group.group_length] in SUMMARY_OPCODES
     assert summary.statistics.chunk_count == len(summary.chunk_indexes) > 1
-    found = []
-    for chunk_index in summary.chunk_indexes:
+    found = [*indexed_messages(content, summary.chunk_indexes)]
+    assert sorted(found, key=lambda item: item[1]) == some_messages(20_000)
+
+
+def indexed_messages(content: bytes, chunk_indexes):
+    for chunk_index in chunk_indexes:
         chunk = record_at(content, chunk_index.chunk_start_offset, Chunk)
         assert chunk.uncompressed_crc != 0 and chunk.uncompressed_size <= CHUNK_BYTES + 200
         plain = get_chunk_data_stream(chunk, validate_crc=True)[0].read(2 * CHUNK_BYTES)
@@ -103,8 +107,7 @@ def test_checksums_are_there_and_indexes_lead_to_the_messages(tmp_path):
                 stream = ReadDataStream(io.BytesIO(plain[message_offset + 9:]))
                 message = Message.read(stream, length)
                 assert (message.channel_id, message.log_time) == (channel_id, stamp)
-                found.append((message.channel_id - 1, stamp, message.data))
-    assert sorted(found, key=lambda item: item[1]) == some_messages(20_000)
+                yield message.channel_id - 1, stamp, message.data
 
 
 def record_at(content: bytes, offset: int, kind):
@@ -170,13 +173,12 @@ def test_bag_metadata_agrees_with_the_messages(tmp_path, monkeypatch, count):
         records = {item.name: item.metadata for item in make_reader(file).iter_metadata()}
     assert records['spinning_top_sim'] == METADATA
     bag = yaml.safe_load(records['rosbag2']['serialized_metadata'])
-    assert bag['version'] == 9
-    assert bag['storage_identifier'] == 'mcap'
-    assert bag['ros_distro'] == 'jazzy'
-    assert bag['message_count'] == bag['files'][0]['message_count'] == count
-    assert bag['starting_time']['nanoseconds_since_epoch'] == (EPOCH_NS if count else 0)
-    assert bag['duration']['nanoseconds'] == max(0, count - 1) * 1_000_000
-    assert bag['relative_file_paths'] == [path.name]
+    expected = {'version': 9, 'storage_identifier': 'mcap', 'ros_distro': 'jazzy',
+                'message_count': count, 'relative_file_paths': [path.name],
+                'starting_time': {'nanoseconds_since_epoch': EPOCH_NS if count else 0},
+                'duration': {'nanoseconds': max(0, count - 1) * 1_000_000}}
+    assert {name: bag[name] for name in expected} == expected
+    assert bag['files'][0]['message_count'] == count
     for entry, topic in zip(bag['topics_with_message_count'], TOPICS, strict=True):
         assert entry['message_count'] == summary.counts[topic.name]
         assert entry['topic_metadata']['name'] == topic.name
@@ -273,7 +275,7 @@ def test_rows_give_the_chunk_that_single_messages_give():
     times = np.array([*range(30, 50), *range(30)])
     rows = np.frombuffer(b''.join(pose_cdr(number) for number in range(50)), 'u1').reshape(50, -1)
     many = np.arange(600), np.zeros((600, 6000), np.uint8)
-    together, singly = PlainChunk(), PlainChunk()
+    together, singly = ChunkBuilder(), ChunkBuilder()
     for _ in range(2):
         for chunk in (together, singly):
             chunk.clear()
@@ -327,7 +329,7 @@ def test_rows_are_written_in_order_and_the_bytes_are_always_the_same(tmp_path, c
 def test_a_chunk_of_noise_survives_whatever_its_size(compression, size):
     """It becomes longer by being compressed; a message that is too long gets more memory."""
     message = random.Random(size).randbytes(size)
-    chunk = PlainChunk(compression)
+    chunk = ChunkBuilder(compression)
     for before in (b'', b'before'):
         chunk.clear()
         chunk.add(1, 0, 7, 7, before)

@@ -80,8 +80,8 @@ def slow_disk(monkeypatch):
 
 def test_ticks_and_commands_go_on_while_a_log_is_being_opened_and_are_in_it(
         tmp_path, slow_disk, monkeypatch):
-    recorded, held, ordinary = Recorded(tmp_path), [], provenance.surroundings
-    monkeypatch.setattr(provenance, 'surroundings',
+    recorded, held, ordinary = Recorded(tmp_path), [], provenance.environment
+    monkeypatch.setattr(provenance, 'environment',
                         lambda: held.append(recorded.is_held()) or ordinary())
     simulation, session = recorded.simulation, recorded.session
     simulation.advance(SECOND)

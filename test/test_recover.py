@@ -213,9 +213,6 @@ DAMAGE = {
             log.content, log.chunks[1][2] - 6, 0)[log.chunks[1][1]:log.chunks[1][2]]
             + log.content[log.chunks[2][1]:]),
         (2,), SOME_LOST, 'bytes, an unknown number of messages'),
-    'another log behind the end': (
-        lambda log: log.content + log.content,
-        (0, 1, 2), SOME_LOST, 'it stands behind the end of this one'),
 }
 
 

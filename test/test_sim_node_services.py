@@ -112,7 +112,7 @@ def test_a_reset_begins_again_and_stamps_go_on(peer, served):
     assert peer.get(node, 'spin.l3', 'spin.lz') == [1.6, 1.6 * math.cos(math.radians(30.0))]
 
 
-def test_recordings_start_and_stop_and_overwrite_nothing(peer, diagnostics, served):
+def test_recordings_start_and_stop(peer, diagnostics, served):
     node, pose = served.node, served.pose
     uri = node.folder / 'take.mcap'
     assert peer.set_together(node, record__uri=str(uri)).successful
@@ -129,18 +129,24 @@ def test_recordings_start_and_stop_and_overwrite_nothing(peer, diagnostics, serv
     assert f'{sum(counts.values())} messages' in answer.message
     assert counts[node.topic('pose')] >= 50
     assert counts[node.topic('imu/data_raw')] >= 100
-    before = uri.read_bytes()
-    answer = peer.switch(node, 'record', True)
-    assert not answer.success
-    assert 'exists' in answer.message
-    assert uri.read_bytes() == before
-    assert peer.switch(node, 'record', False).message == 'not recording'
     log, _ = log_of(uri)
     logged = [data for _, data in log[node.topic('pose')]]
     wait_for('the last that was recorded', lambda: logged[-1] in pose.raw)
     assert_received_from([data for data in pose.raw
                           if stamp_of(logged[0]) <= stamp_of(data) <= stamp_of(logged[-1])],
                          logged)
+
+
+def test_a_recording_overwrites_nothing_and_is_made_where_the_node_runs(peer, served):
+    node = served.node
+    uri = node.folder / 'there.mcap'
+    uri.write_bytes(b'precious')
+    assert peer.set_together(node, record__uri=str(uri)).successful
+    answer = peer.switch(node, 'record', True)
+    assert not answer.success
+    assert 'exists' in answer.message
+    assert uri.read_bytes() == b'precious'
+    assert peer.switch(node, 'record', False).message == 'not recording'
     # Who asks need not know where the node runs.
     assert peer.set_together(node, record__uri='here.mcap').successful
     assert str(node.folder / 'here.mcap') in peer.switch(node, 'record', True).message
@@ -151,7 +157,7 @@ def test_recordings_start_and_stop_and_overwrite_nothing(peer, diagnostics, serv
 
 def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagnostics, tmp_path):
     """Before the clock, with it, when it stops, and steps back."""
-    clock = DrivenClock(peer, 1_000_000_000_000)
+    clock = DrivenClock(peer, '/driven', 1_000_000_000_000)     # /clock is that of `served`
 
     def waits():
         status = diagnostics.wait_for(node, 'a warning', lambda s: 'waiting' in s.message)
@@ -164,7 +170,7 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
         return len(pose.raw) > count + 50
 
     with SimNode(tmp_path, {'use_sim_time': True, 'status_period': 0.2, 'time_scale': 2.0},
-                 namespace='/follower') as node:
+                 namespace='/follower', arguments=('-r', '/clock:=/driven')) as node:
         waits()
         refused = peer.set_together(node, spin__l3=2.0)     # it would send t = 0 to nobody
         assert not refused.successful and 'waiting for /clock' in refused.reason

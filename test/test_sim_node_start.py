@@ -76,6 +76,16 @@ def test_what_cannot_be_started_is_said_in_one_line_with_exit_code_2(
         assert text in lines[0], (text, lines[0])
 
 
+def test_a_scene_without_parameters_of_the_node_is_refused(main, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'other.yaml').write_text('other:\n  ros__parameters:\n    a: 1\n')
+    for path, reason in (('other.yaml', 'has no parameters for the node spinning_top'),
+                         ('nowhere.yaml', 'No such file')):
+        run = main('--scene', path)
+        assert (run.code, run.out, run.err.count('\n')) == (2, '', 1)
+        assert path in run.err and reason in run.err
+
+
 def test_a_short_run_warns_of_what_is_odd_and_ends_with_code_0(main):
     run = main('--ros-args', '-p', 'spin.l33:=1.0', '-p', 'top.lambda3:=0.5', '-p',
                'duration:=0.01')

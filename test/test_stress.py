@@ -18,7 +18,7 @@ from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 
-TOPS = int(os.environ.get('STRESS_TOPS', '44'))
+TOPS = int(os.environ.get('STRESS_TOPS', '30'))
 
 
 @pytest.mark.parametrize('seeds', blocks(0, TOPS), ids=lambda seeds: f'{seeds[0]}-{seeds[-1]}')

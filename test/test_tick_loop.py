@@ -32,7 +32,7 @@ class Run:
     A loop, the steady clock it is on, and what came of it.
 
     stamps: of the poses recorded;  published: of those published
-    told: what the loop has said to its surroundings
+    told: what the loop has said to its environment
     """
 
     def __init__(self, room=lambda: True, **values):

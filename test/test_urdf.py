@@ -74,8 +74,7 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
 
 
 @pytest.mark.parametrize(('values', 'named'), [
-    ({'world_frame': ''}, "world_frame = ''"), ({'body_frame': '/base'}, "body_frame = '/base'"),
-    ({'imu.frame_id': '${1}'}, r'imu\.frame_id'), ({'world_frame': 'base_link'}, 'world_frame'),
+    ({'world_frame': 'base_link'}, 'world_frame'),
     ({'body_frame': 'nutation_link'}, 'body_frame')])
 def test_frames_that_no_tree_has_are_refused(values, named):
     with pytest.raises(ValueError, match=f'{named}.*must be'):

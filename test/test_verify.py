@@ -111,8 +111,8 @@ def test_a_missing_message_and_a_changed_journal_are_found(short, tmp_path, caps
 
 
 def test_another_machine_is_warned_of(short, capsys, monkeypatch):
-    here = provenance.surroundings()
-    monkeypatch.setattr(provenance, 'surroundings', lambda: {**here, 'platform': 'abacus'})
+    here = provenance.environment()
+    monkeypatch.setattr(provenance, 'environment', lambda: {**here, 'platform': 'abacus'})
     verdict = verified(capsys, short)
     assert verdict['identical']
     assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
@@ -206,6 +206,7 @@ def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1 and 'lacks most samples of this run' in out
     monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
+    monkeypatch.setattr(recorded_run, 'LEAST_STEPS', 5_000)
     t_ns = 3_999_999_998_000_000_000
     far = journal.event('command', t_ns, t_ns, l3=1.7, lz=1.4)
     path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (

@@ -122,7 +122,7 @@ def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
     track.add('joint_states', Samples(np.arange(20) * 40_000_000, np.column_stack(
         (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
     stamps_ns, axis, joined = model.path(track, 0, NANOSECONDS)
-    track.follow()
+    track.detect_motion()
     assert track.motions[0].description.name == 'cusps'     # as at the start
     assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
     exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
@@ -198,7 +198,7 @@ def test_every_scene_has_words_and_plots(scene):
     moved = solve(track.top, start, np.arange(300) * 0.01)
     track.add('joint_states', Samples(np.arange(300) * 10_000_000, np.column_stack(
         (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
-    track.follow()
+    track.detect_motion()
     (motion,) = track.motions
     words = text.words(track, motion, 0, 0)
     assert SENTENCES[motion.description.name] in words and 'nan' not in words
@@ -219,7 +219,7 @@ def test_a_live_track_names_the_motion_from_its_samples(start, words):
     rows = np.column_stack((moved.quaternion, moved.angular_velocity, moved.phi_dot))
     for k, row in enumerate(rows):
         track.add('joint_states', Samples(np.array([k]), row[np.newaxis]))
-        track.follow()
+        track.detect_motion()
     (motion,) = track.motions           # one: rounding begins no other
     assert motion.description.name == words
     (energy, l3, lz), _ = state_of(track.top, rows[50])
@@ -285,7 +285,7 @@ def test_the_log_of_another_program_shows_its_attitudes(log, shown, page, tmp_pa
     # The first topic has no orientation.
     path = foreign(log, tmp_path / 'run.mcap', {'/imu/data_raw': '/raw', topic: '/robot/state'})
     track, = logs.read_logs([path])
-    assert not track.known and track.origin_ns == track.span[0]
+    assert not track.has_body and track.origin_ns == track.span[0]
     if topic == '/pose':
         assert track.attitudes.rows == pytest.approx(shown.samples['pose'].rows, abs=1e-15)
     player = logs.Player(page, [track])

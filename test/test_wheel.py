@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wheel, in an environment that has its dependencies and nothing else: no ROS, no extras."""
 
+import json
 import os
 import re
 import shutil
@@ -15,9 +16,10 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from spinning_top_sim.__main__ import main
+from spinning_top_sim.__main__ import COMMANDS, main
 
 ROOT = Path(__file__).parents[1]
+NAME = 'spinning_top_sim'
 SDIST = 'import sys, setuptools.build_meta; setuptools.build_meta.build_sdist(sys.argv[1])'
 
 
@@ -36,8 +38,8 @@ def pip(*arguments, **variables):
 
 
 @pytest.fixture(scope='module')
-def wheels(tmp_path_factory):
-    """Return the wheels that are made of the sources, and of the source distribution."""
+def wheel(tmp_path_factory):
+    """Return the wheel that is made of the source distribution."""
     folder = tmp_path_factory.mktemp('build')
     settings = folder / 'setup.cfg'
     settings.write_text(f'[build]\nbuild_base={folder}/build\n[egg_info]\negg_base={folder}\n')
@@ -47,11 +49,9 @@ def wheels(tmp_path_factory):
     with tarfile.open(archive) as sdist:
         sdist.extractall(folder, filter='data')
     (unpacked,) = folder.glob('spinning_top_sim-*/')
-    made = []
-    for name, sources in (('checkout', ROOT), ('sdist', unpacked)):
-        pip('wheel', '--no-deps', '--no-build-isolation', '--no-index', '-w', folder / name,
-            sources, DIST_EXTRA_CONFIG=str(settings))
-        made += (folder / name).glob('*.whl')
+    pip('wheel', '--no-deps', '--no-build-isolation', '--no-index', '-w', folder, unpacked,
+        DIST_EXTRA_CONFIG=str(settings))
+    (made,) = folder.glob('*.whl')
     return made
 
 
@@ -64,12 +64,12 @@ def dependencies(name):
 
 
 @pytest.fixture(scope='module')
-def empty(tmp_path_factory, wheels):
+def empty(tmp_path_factory, wheel):
     """Return an environment with the wheel and its dependencies."""
     folder = tmp_path_factory.mktemp('empty')
     code, _, err = run(sys.executable, '-m', 'venv', '--without-pip', folder)
     assert code == 0, err
-    pip('--python', folder / 'bin/python', 'install', '--no-deps', '--no-index', wheels[0])
+    pip('--python', folder / 'bin/python', 'install', '--no-deps', '--no-index', wheel)
     (packages,) = folder.glob('lib/python*/site-packages')
     for distribution in dependencies('spinning_top_sim'):
         tops = {file.parts[0] for file in distribution.files if file.parts[0] != '..'}
@@ -79,14 +79,19 @@ def empty(tmp_path_factory, wheels):
     return folder
 
 
-def test_the_wheels_of_checkout_and_source_distribution_are_the_same(wheels):
-    def content(path):
-        with zipfile.ZipFile(path) as wheel:
-            return {name: wheel.read(name) for name in wheel.namelist()}
-
-    of_checkout, of_sdist = map(content, wheels)
-    assert of_checkout == of_sdist
-    assert 'spinning_top_sim/py.typed' in of_checkout
+def test_the_source_distribution_installs_what_the_checkout_does(wheel):
+    """Here the package is installed from the checkout."""
+    folder = metadata.distribution(NAME).locate_file('')
+    with zipfile.ZipFile(wheel) as archive:
+        of_sdist = {
+            os.path.normpath(folder / re.sub('.*[.]data/data/', '../../../', name)):
+            archive.read(name) for name in archive.namelist() if '.dist-info/' not in name}
+    of_checkout = {
+        os.path.normpath(file.locate()): file.locate().read_bytes()
+        for file in metadata.files(NAME) if '.dist-info/' not in str(file)
+        and file.suffix != '.pyc' and file.parent.name != 'bin'}
+    assert of_sdist == of_checkout
+    assert str(folder / NAME / 'py.typed') in of_sdist
 
 
 def test_one_command_is_on_path(empty):
@@ -112,15 +117,38 @@ def test_without_ros_a_scene_is_simulated_and_verified_with_the_same_bytes(empty
     assert (tmp_path / 'run.mcap').read_bytes() == here.read_bytes()
 
 
-@pytest.mark.parametrize('name', ['', 'node', 'replay', 'simulate', 'inspect', 'recover',
-                                  'ensemble', 'examine', 'grade', 'view'])
-def test_help_needs_nothing(empty, tmp_path, name):
-    code, out, err = run(empty / 'bin/spinning-top', *name.split(), '--help', cwd=tmp_path)
+RUN_ALL = """
+import contextlib, io, json, sys
+from spinning_top_sim.__main__ import main
+said = []
+for arguments in json.loads(sys.argv[1]):
+    with (contextlib.redirect_stdout(io.StringIO()) as out,
+          contextlib.redirect_stderr(io.StringIO()) as err):
+        try:
+            code = main(arguments)
+        except SystemExit as ended:
+            code = ended.code
+    said.append((code, out.getvalue(), err.getvalue()))
+print(json.dumps(said))
+"""
+
+
+def run_all(empty, folder, lines):
+    """Return exit code, output and errors of each command line; one process runs them all."""
+    code, out, err = run(empty / 'bin/python', '-c', RUN_ALL, json.dumps(lines), cwd=folder)
     assert (code, err) == (0, '')
-    assert out.startswith(f'usage: spinning-top {name}')
+    return json.loads(out)
 
 
-@pytest.mark.parametrize(('arguments', 'remedy'), [
+def test_help_needs_nothing(empty, tmp_path):
+    names = ['', *COMMANDS]
+    for name, (code, out, err) in zip(names, run_all(
+            empty, tmp_path, [[*name.split(), '--help'] for name in names]), strict=True):
+        assert (code, err) == (0, '')
+        assert out.startswith(f'usage: spinning-top {name}')
+
+
+REMEDIES = [
     (['node'], "pip install 'ros-jazzy-rclpy"),
     (['replay', 'a.mcap'], "pip install 'ros-jazzy-rclpy"),
     (['view'], "pip install 'ros-jazzy-rclpy"),
@@ -128,15 +156,22 @@ def test_help_needs_nothing(empty, tmp_path, name):
     (['inspect', 'a.mcap', '--plot', 'a.png'], "pip install 'matplotlib"),
     (['simulate', '--duration', '1', '-o', 'b.parquet'], "pip install 'pyarrow"),
     (['examine', '--filter', 'vqf'], "pip install 'vqf"),
-    (['ensemble', 'e.yaml', '-o', 'runs'], "pip install 'ahrs<0.5,>=0.4' 'distributed"),
-])
-def test_what_is_missing_is_told_with_its_remedy(empty, tmp_path, arguments, remedy):
+    (['examine', '--node', 'a', '--topic', 'b'], "pip install 'ros-jazzy-rclpy"),
+    (['ensemble', 'e.yaml', '-o', 'runs'], "pip install 'distributed"),
+]
+
+
+def test_what_is_missing_is_told_with_its_remedy(empty, tmp_path):
     assert main(['simulate', '--duration', '0.1', '--quiet', '-o', str(tmp_path / 'a.mcap')]) == 0
     shutil.copy(ROOT / 'examples/ensemble.yaml', tmp_path / 'e.yaml')
-    code, _, err = run(empty / 'bin/spinning-top', *arguments, cwd=tmp_path)
-    assert code in (1, 2)
-    assert err.startswith(f'spinning-top {arguments[0]}: ') and err.count('\n') == 1
-    assert f'{empty}/bin/python -m {remedy}' in err
+    lines = [arguments for arguments, _ in REMEDIES]
+    for (arguments, remedy), (code, _, err) in zip(
+            REMEDIES, run_all(empty, tmp_path, lines), strict=True):
+        assert code in (1, 2)
+        assert err.startswith(f'spinning-top {arguments[0]}: ') and err.count('\n') == 1
+        assert f'{empty}/bin/python -m {remedy}' in err
+        words = err.split()
+        assert len(set(words)) == len(words)
 
 
 def test_python_m_is_the_same_command(empty, tmp_path):

@@ -43,7 +43,7 @@ class Trial(NamedTuple):
 
     def follow(self, make_filter: MakeFilter, feed: Feed = feed_apart) -> Outcome:
         """Return the outcome of a new filter, the samples that count.  Raises as `follow`."""
-        outcome, rows = follow(make_filter, self.run, feed=feed), self.counts
+        outcome, rows = follow(make_filter, self.run, (), feed), self.counts
         return Outcome(self.run.part(rows), outcome.estimates[rows], outcome.covariances[rows],
                        outcome.biases[rows])
 
@@ -82,7 +82,7 @@ def judge(make_filter: MakeFilter, trials: Iterable[Trial], kind: str, subject: 
         try:
             outcome = trial.follow(make_filter, feed)
         except InvalidOutputError as error:
-            failed.append(f'{trial.run.name}: {error}')
+            failed.append(str(error))
         else:
             outcomes.append(outcome)
             found.setdefault(trial.run.name, []).append(

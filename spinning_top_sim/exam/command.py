@@ -127,7 +127,8 @@ def _report(arguments: argparse.Namespace) -> Report:
             return examine_data(make_filter, arguments.data, subject=subject, show=show)
     before = signal.signal(signal.SIGINT, lambda *_: INTERRUPTED.set())
     try:
-        from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415 - needs ROS
+        with needed('the exam of a node', 'ros'):
+            from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415
 
         return examine_node(command=arguments.node, **options)
     finally:

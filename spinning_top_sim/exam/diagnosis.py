@@ -8,17 +8,18 @@ disappears, it was the cause.
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import measures
+from spinning_top_sim.exam.excitation import axes, mapped, moved, shifted
 from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.exam.scenarios import Run
-from spinning_top_sim.exam.trial import ChangeAttitudes, ChangeReadings, Outcome, same
+from spinning_top_sim.exam.scenarios import Reals, Run
+from spinning_top_sim.exam.trial import ChangeAttitudes, Hypothesis, Outcome
 
 FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component_order',
           'frame_ned', 'gravity_sign', 'gyroscope_wiring', 'accelerometer_wiring',
@@ -54,15 +55,6 @@ class Fault(NamedTuple):
     evidence: str
 
 
-class Hypothesis(NamedTuple):
-    """A possible misreading, and what undoes it: other readings, or other attitudes."""
-
-    faults: tuple[str, ...]
-    text: str
-    given: ChangeReadings | None = None
-    read: ChangeAttitudes = same
-
-
 def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
             ) -> ChangeAttitudes:
     """Return the multiplication of attitudes by quaternions x, y, z, w on both sides."""
@@ -96,6 +88,27 @@ READINGS = (
                read=_turned((0.0, 0.0, _HALF, _HALF))),
     Hypothesis(('conjugated', 'component_order'), 'read as w, x, y, z and conjugated',
                read=lambda q: q[:, _W_LAST] * _CONJUGATE))
+LIKELY = 6                      # signed permutations of a sensor that are tried
+SIGNED = [np.array(signs)[:, np.newaxis] * np.eye(3)[list(order)]
+          for order in itertools.permutations(range(3))
+          for signs in itertools.product((1.0, -1.0), repeat=3)][1:]
+ONE_STEP = (        # no fault: the filter corrects before it takes the step
+    Hypothesis((), 'corrected before the step',
+               given=shifted(('accelerometer', 'magnetometer'), -1)),
+    Hypothesis((), 'a step ahead', read=lambda q: moved(q, -1)))
+
+
+def wired(sensor: str, text: str, matrix: Any) -> Hypothesis:
+    """Return the hypothesis that the readings of a sensor need this matrix."""
+    return Hypothesis((f'{sensor}_wiring',), text, given=mapped(sensor, matrix))
+
+
+def permuted(sensor: str, fit: Callable[[Reals], float], count: int = LIKELY) -> list[Hypothesis]:
+    """Return the hypotheses that the filter has those signed permutations that fit best."""
+    return [wired(sensor, f'with {axes(one.T)} of the {sensor} for its x, y, z', one.T)
+            for one in sorted(SIGNED, key=fit, reverse=True)[:count]]
+
+
 def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
     """Return the measures of the errors in several runs, as defined in docs/exam.md."""
     settled = [outcome.last() for outcome in outcomes]
@@ -127,10 +140,10 @@ def explain(outcome: Outcome, absolute: bool) -> Hypothesis | None:
         return None
     text = (f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
             'measures are those after this correction')
-    return told(best._replace(text=text), absolute)
+    return ambiguous(best._replace(text=text), absolute)
 
 
-def told(one: Hypothesis, absolute: bool) -> Hypothesis:
+def ambiguous(one: Hypothesis, absolute: bool) -> Hypothesis:
     """Return a hypothesis that has both names where two cannot be told apart."""
     if absolute or one.faults not in (('gravity_sign',), NED_WORLD.faults):
         return one
@@ -150,23 +163,6 @@ def stamp_fault(outcome: Outcome, absolute: bool) -> tuple[measures.Offset, Faul
         'stamp_offset', f'the attitude is {abs(1e3 * offset.seconds):.3g} ms {side} its stamp: '
         f'shifted by that, the error falls from {degrees(offset.before)} to '
         f'{degrees(offset.after)}')
-
-
-def first_order_fault(before: float, after: float, rate: float) -> Fault | None:
-    """Judge errors [rad] on the fast motion, `after` with the rates of `for_first_order`."""
-    if before < FIRST_ORDER or after > FIRST_ORDER_LEFT * before:
-        return None
-    return Fault('first_order_integration',
-                 f'integration is first order: correcting it reduces the error at {rate:g} Hz '
-                 f'from {degrees(before)} to {degrees(after)}')
-
-
-def lever_arm_fault(effect: float, arm: float) -> Fault | None:
-    """Judge the tilt [rad] that a lever arm [m] causes."""
-    if effect < LEVER_ARM:
-        return None
-    return Fault('lever_arm', f'{100.0 * arm:g} cm off the axis adds {degrees(effect)}: motion '
-                 'is mistaken for gravity')
 
 
 def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measures.Nees]:

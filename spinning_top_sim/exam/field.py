@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.broad import Trial, judge
@@ -197,6 +196,7 @@ def _low_pass(signals: Reals, frequency: float) -> Reals:
     """Return signals after a low pass of first order, by the trapezoidal rule."""
     if not 0.0 < frequency < 0.5 / HALF:
         return signals
+    from scipy.signal import lfilter, lfilter_zi  # noqa: PLC0415 - slow; --help needs none
     k = math.tan(math.pi * frequency * HALF)
     b, a = [k / (1.0 + k)] * 2, [1.0, (k - 1.0) / (k + 1.0)]
     filtered: Reals = lfilter(b, a, signals, zi=lfilter_zi(b, a) * signals[:, :1])[0]

@@ -2,78 +2,50 @@
 """Feeds a filter in a fork of this process, so that hanging or crashing harms nothing else."""
 
 import contextlib
-import mmap
-import os
 import signal
-import sys
-import time
 import warnings
-from functools import partial
-from multiprocessing import Pipe
+from multiprocessing import get_context
 from multiprocessing.connection import Connection
 
-from spinning_top_sim.exam.trial import (
-    InvalidOutputError,
-    MakeFilter,
-    Output,
-    Readings,
-    feed,
-    update_of,
-)
+from spinning_top_sim.exam.scenarios import Run
+from spinning_top_sim.exam.trial import InvalidOutputError, MakeFilter, Output, feed
 
-# The longest time that an update, or making the filter, may take.
-LONGEST_S = 10.0
+# The longest time that a run may take, and that it may take in addition for each update.
+LONGEST_S, UPDATE_S = 10.0, 0.05
 
 
-def feed_apart(make_filter: MakeFilter, readings: Readings) -> Output:
+def feed_apart(make_filter: MakeFilter, run: Run) -> Output:
     """Do as `feed`.  Also raise InvalidOutputError for a filter that crashes or never returns."""
-    reached = memoryview(mmap.mmap(-1, 8)).cast('q')        # shared by both processes
-    receiver, sender = Pipe(duplex=False)
-    _flush()            # or both processes write what is buffered
+    context = get_context('fork')
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_serve, args=(make_filter, run, sender))
     with warnings.catch_warnings():
         # A fork has no other threads; this one needs none, as it only runs the filter.
         warnings.simplefilter('ignore', DeprecationWarning)
-        process = os.fork()
-    if not process:
-        _serve(make_filter, readings, reached, sender)
+        process.start()
     sender.close()
-    answer, before, since = None, 0, time.monotonic()
+    patience = LONGEST_S + UPDATE_S * len(run.dt)
     try:
+        if not receiver.poll(patience):
+            raise InvalidOutputError(f'{len(run.dt)} updates take more than {patience:g} s')
         with contextlib.suppress(EOFError):
-            while not receiver.poll(0.1 * LONGEST_S):
-                if reached[0] != before:
-                    before, since = reached[0], time.monotonic()
-                elif time.monotonic() - since > LONGEST_S:
-                    raise InvalidOutputError(f'{update_of(before, readings)} takes more than '
-                                             f'{LONGEST_S:g} s: killed')
-            answer = receiver.recv()
-    finally:
-        os.kill(process, signal.SIGKILL)        # no effect on the exit code of an ended process
-        code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
-        receiver.close()
-    if answer is None:
+            output: Output | InvalidOutputError = receiver.recv()
+            if isinstance(output, InvalidOutputError):
+                raise output
+            return output
+        process.join()
+        code = process.exitcode or 0
         how = signal.strsignal(-code) if code < 0 else f'exit code {code}'
-        raise InvalidOutputError(f'{update_of(reached[0], readings)} ends the process: {how}')
-    if isinstance(answer, InvalidOutputError):
-        raise answer
-    output: Output = answer
-    return output
-
-
-def _serve(make_filter: MakeFilter, readings: Readings, reached: memoryview,
-           sender: Connection) -> None:
-    """Feed the filter, send the result and end the process, whatever happens."""
-    try:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)        # no traceback after Ctrl-C
-        try:
-            sender.send(feed(make_filter, readings, partial(reached.__setitem__, 0)))
-        except InvalidOutputError as error:
-            sender.send(error)
-        _flush()
+        raise InvalidOutputError(f'the filter ends the process: {how}')
     finally:
-        os._exit(1)
+        process.kill()
+        process.join()
+        receiver.close()
 
 
-def _flush() -> None:
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
+def _serve(make_filter: MakeFilter, run: Run, sender: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)        # no traceback after Ctrl-C
+    try:
+        sender.send(feed(make_filter, run))
+    except InvalidOutputError as error:
+        sender.send(error)

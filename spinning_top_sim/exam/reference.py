@@ -23,6 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.scenarios import GRAVITY, Reals
+from spinning_top_sim.physics import attitude
 
 # Initial standard deviations: attitude [rad], biases [rad/s], [m/s^2]; random walks of the biases.
 START, GYROSCOPE_WALK, ACCELEROMETER_WALK = (0.5, 0.05, 0.1), 3e-5, 1e-5
@@ -190,10 +191,7 @@ class ReferenceFilter:
 
 def product(p: Reals, q: Reals) -> Reals:
     """Return the normalised quaternion product p q, as x, y, z, w."""
-    a, b, c, d = p.tolist()
-    x, y, z, w = q.tolist()
-    r = np.array((d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
-                  d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z))
+    r = np.array(attitude.product(p.tolist(), q.tolist()))
     unit: Reals = r / math.sqrt(r @ r)
     return unit
 

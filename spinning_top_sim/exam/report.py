@@ -18,7 +18,6 @@ MEANINGS = {
     'tilt_clean_deg': 'without noise, at rest and in motion', 'heading_clean_deg': 'the same',
     'convergence_s': f'until the tilt error stays below {CONVERGED_DEG:g} deg',
     'heading_drift_deg_per_s': 'slope of the heading error',
-    'noise_gain': 'noise of the tilt over that of the accelerometer alone',
     'stamp_offset_s': f'> 0: late; right from {diagnosis.AHEAD:g} to {diagnosis.DELAYED:g} steps',
     'order': 'p of error ~ rate^-p on the fast motion',
     'integration_error_deg': 'on the fast motion, without noise',

@@ -43,28 +43,20 @@ class Scenario:
     values : parameters of the simulation that differ from their defaults
     duration, rate : of the run [s], [Hz]
     reversals : times at which the momenta change their sign, by an impulsive torque [s]
-    bias : of the gyroscope, added to what the IMU has itself (3,) [rad/s]
     noisy : whether the IMU has its errors
-    drop_rate : share of the samples that never come
-    jitter : standard deviation of the stamps [s]
     """
 
     name: str
     values: Mapping[str, Any]
-    duration: float = 40.0
+    duration: float = 30.0
     rate: float = 100.0
     reversals: tuple[float, ...] = ()
-    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     noisy: bool = True
-    drop_rate: float = 0.0
-    jitter: float = 0.0
 
 
 # A wheel of 2 kg on a pivot 2 cm below its centre: 4 rad/s of spin, slow precession, and a
 # nutation of many degrees.  The rates are so low that the way of integrating them matters little.
 SLOW = Scenario('slow', {'top.com_distance': 0.02, 'spin.l3': 0.6, 'initial.theta': 0.7})
-# The wheel 15 cm from the pivot with 10.7 rad/s of spin: waves.
-WAVES = Scenario('waves', {'spin.l3': 1.6, 'spin.lz': 1.42, 'initial.theta': 0.5236})
 # 10 cm off the axis, where the centripetal acceleration of the slow wheel is a sixth of gravity.
 LEVER_ARM = replace(SLOW, name='lever_arm', duration=20.0, noisy=False, values={
     **SLOW.values, 'imu.lever_arm': (0.1, 0.0, 0.0)})
@@ -74,14 +66,6 @@ PIVOT = replace(LEVER_ARM, name='pivot', values={
 # sign, no estimate of a bias can hide them.
 FAST = Scenario('fast', {'spin.l3': 1.6, 'spin.lz': 1.7816, 'initial.theta': 0.5236},
                 duration=8.0, reversals=(2.0, 4.0, 6.0), noisy=False)
-# Small waves through the upward vertical.
-POLE = Scenario('pole', {'spin.l3': 1.6, 'spin.lz': 1.6, 'initial.theta': 0.0,
-                         'initial.theta_dot': 2.0})
-SATURATION = replace(WAVES, name='saturation', values={
-    **WAVES.values, 'imu.gyroscope_range': 10.6})
-DROPS = replace(WAVES, name='drops', drop_rate=0.05, jitter=0.5e-3)
-COMMAND = replace(WAVES, name='command', reversals=(20.0,))
-
 
 @dataclass(frozen=True)
 class Truth:
@@ -121,25 +105,31 @@ class Run(Truth):
     accelerometer: Reals
     magnetometer: Reals
 
+    @property
+    def start(self) -> Rotation:
+        """The attitude at the begin of the first step."""
+        return Rotation.from_quat(self.truth[0]) * Rotation.from_rotvec(
+            -self.gyroscope[0] * self.dt[0])
+
     def after(self, lead: 'Run') -> 'Run':
         """Return this run with another one before it, of the same name; there t <= 0."""
         return Run(self.name, *(np.concatenate((getattr(lead, one.name), getattr(self, one.name)))
                                 for one in fields(self)[1:]))
 
 
-def turning(imu: Mapping[str, Any], first: Reals, last: Reals, seconds: float,
+def turning(imu: Mapping[str, Any], first: Rotation, last: Rotation, seconds: float,
             declination: float | Reals = 0.0) -> Run:
     """
     Return a slow tumbling from one attitude to another, without noise and acceleration; t <= 0.
 
     After each third of it, the sensor has gone a third of the way.
 
-    first, last : attitudes q(world <- sensor) as x, y, z, w (4,)
+    first, last : attitudes world <- sensor
     declination : by which the field is turned to the west [rad], one or for each sample
     """
     n = round(seconds * SLOW.rate)
     part = np.arange(n + 1) / n
-    turns = (Slerp((0.0, 1.0), Rotation.from_quat((first, last)))(part)
+    turns = (Slerp((0.0, 1.0), Rotation.concatenate((first, last)))(part)
              * Rotation.from_euler('zx', np.stack((
                  12.0 * np.pi * part, 0.7 * np.sin(6.0 * np.pi * part)), axis=1)))
     return along('', turns, imu, SLOW.rate, declination)
@@ -202,18 +192,9 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
     gyroscope, accelerometer, field, truth, rates = np.split(
         np.concatenate(parts, axis=1).T, (3, 6, 9, 13), axis=1)
     period = period_ns / NANOSECONDS
-    t = period * np.arange(1, len(truth) + 1)
-    stamps = t + scenario.jitter * random.standard_normal(len(t))
-    stamps[0] = t[0]            # some filters take the first step for all of them
-    run = Run(f'{scenario.name} at {scenario.rate:g} Hz, seed {seed}', stamps,
-              np.full(len(t), period), truth, rates, gyroscope + scenario.bias, accelerometer,
-              field)
-    if not (scenario.jitter or scenario.drop_rate):
-        return run
-    kept = np.flatnonzero(random.random(len(t)) >= scenario.drop_rate)
-    kept[0] = 0
-    run = run.part(kept)
-    return replace(run, dt=np.diff(run.t, prepend=0.0))
+    t = period * np.arange(1.0, len(truth) + 1.0)
+    return Run(f'{scenario.name} at {scenario.rate:g} Hz, seed {seed}', t,
+               np.full(len(t), period), truth, rates, gyroscope, accelerometer, field)
 
 
 def _readings(device: Imu, magnetometer: Magnetometer, halves: States, steps: range) -> Reals:

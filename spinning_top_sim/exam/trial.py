@@ -3,8 +3,8 @@
 
 import math
 import threading
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -66,19 +66,10 @@ class NodeError(Exception):
     """A node cannot be examined; the text says why, and what to check."""
 
 
-class Readings(NamedTuple):
-    """Readings for a filter: (n, 3) each, `magnetometer` may be None, and the steps (n,) [s]."""
-
-    gyroscope: Reals
-    accelerometer: Reals
-    magnetometer: Reals | None
-    dt: Reals
-
-
 # Attitudes, covariances and biases as in `Outcome`.
 Output = tuple[Reals, Reals, Reals]
 # Feeds a new filter.
-Feed = Callable[[MakeFilter, Readings], Output]
+Feed = Callable[[MakeFilter, Run], Output]
 
 
 @dataclass(frozen=True)
@@ -115,25 +106,27 @@ def same(estimates: Reals) -> Reals:
     return estimates
 
 
-def feed(make_filter: MakeFilter, readings: Readings,
-         tell: Callable[[int], object] = lambda number: None) -> Output:
-    """
-    Return the output of a new filter.  Raises InvalidOutputError if it fails.
+class Hypothesis(NamedTuple):
+    """A possible cause of errors, and its inverse: other readings, or other attitudes."""
 
-    tell : is called before each update with its number, from 1 on
-    """
-    k, n = 0, len(readings.dt)
+    faults: tuple[str, ...]
+    text: str
+    given: ChangeReadings | None = None
+    read: ChangeAttitudes = same
+
+
+def feed(make_filter: MakeFilter, run: Run) -> Output:
+    """Return the output of a new filter.  Raises InvalidOutputError if it fails."""
+    k, n = 0, len(run.dt)
     attitudes = np.empty((n, 4))
     covariances, biases = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
     # Copies, because the filter may keep or change its arguments.
-    gyroscope, accelerometer = readings.gyroscope.copy(), readings.accelerometer.copy()
-    fields = ([None] * n if readings.magnetometer is None else
-              readings.magnetometer.copy())
+    gyroscope, accelerometer = run.gyroscope.copy(), run.accelerometer.copy()
+    fields = [None] * n if np.isnan(run.magnetometer[0, 0]) else run.magnetometer.copy()
     try:
         filter_ = make_filter()
         for k, (rate, force, field, dt) in enumerate(zip(
-                gyroscope, accelerometer, fields, readings.dt.tolist(), strict=True), start=1):
-            tell(k)
+                gyroscope, accelerometer, fields, run.dt.tolist(), strict=True), start=1):
             attitudes[k - 1] = _numbers(
                 f'update {k} returns', filter_.update(rate, force, field, dt), (4,))
             if k % READ_EVERY == 0:
@@ -143,32 +136,34 @@ def feed(make_filter: MakeFilter, readings: Readings,
     except (InvalidOutputError, NodeError):
         raise
     except (Exception, SystemExit) as error:
-        raise InvalidOutputError(f'{update_of(k, readings)} raises '
-                                 f'{type(error).__name__}: {one_line(error)}') from error
+        where = f'update {k} of {n}' if k else 'making the filter'
+        raise InvalidOutputError(
+            f'{where} raises {type(error).__name__}: {one_line(error)}') from error
     return _quaternions(attitudes), covariances, biases
 
 
-def follow(make_filter: MakeFilter, run: Run, changes: Iterable[ChangeReadings] = (),
-           read: ChangeAttitudes = same, magnetometer: bool = True,
+def without_field(run: Run) -> Run:
+    """Return a run for which the filter gets None as the field."""
+    return replace(run, magnetometer=np.full_like(run.magnetometer, np.nan))
+
+
+def follow(make_filter: MakeFilter, run: Run, undone: Sequence[Hypothesis] = (),
            feed: Feed = feed) -> Outcome:
     """
     Return the outcome of a run that is fed to a new filter.  Raises InvalidOutputError.
 
-    changes : are applied in turn to the run before the filter gets its readings
-    read : is applied to the attitudes that the filter returns
-    magnetometer : False feeds None instead of the field
+    undone : hypotheses that are inverted; the readings are changed in this order
     """
     fed = run
-    for change in changes:
-        fed = change(fed)
-    estimates, covariances, biases = feed(make_filter, Readings(
-        fed.gyroscope, fed.accelerometer, fed.magnetometer if magnetometer else None, fed.dt))
-    return Outcome(run, read(estimates), covariances, biases)
-
-
-def update_of(number: int, readings: Readings) -> str:
-    """Return which update this is, in words; update 0 is the making of the filter."""
-    return f'update {number} of {len(readings.dt)}' if number else 'making the filter'
+    for one in undone:
+        fed = fed if one.given is None else one.given(fed)
+    try:
+        estimates, covariances, biases = feed(make_filter, fed)
+    except InvalidOutputError as error:
+        raise InvalidOutputError(f'{run.name}: {error}') from error
+    for one in reversed(undone):
+        estimates = one.read(estimates)
+    return Outcome(run, estimates, covariances, biases)
 
 
 def _quaternions(rows: Reals) -> Reals:

@@ -17,7 +17,7 @@ SAME_S = 1e-6               # between two stamps of one time
 EVEN = 1e-4                 # share of the interval by which evenly spaced samples may be off
 GAP = 2.5                   # intervals that are a gap
 DEGREE = 5                  # of the splines between samples
-COARSE = 0.5                # turned from one sample to the next [rad]: derivatives fail
+COARSE = 0.5                # turned from one sample to the next [rad]: splines fail
 
 
 def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0) -> Trajectory:
@@ -49,12 +49,15 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
         found = found * (error if np.array_equal(even, times) else
                          RotationSpline(times, error)(even))
     angle = float(abs(motion.start.l3 / motion.top.lambda3)) * (even[1] - even[0])
-    if angle > COARSE and parts:
-        notes.append(f'the spin is {angle:.2g} rad from one sample to the next: too much to '
-                     'compare readings')
-        parts.clear()
-    readings = {name: make_interp_spline(at, values, DEGREE)(even)
-                for name, (at, values) in parts.items()}
+    readings = {}
+    for name, (at, values) in parts.items():
+        if len(at) == len(even) and np.max(np.abs(at - even)) < SAME_S:
+            readings[name] = values
+        elif angle < COARSE:
+            readings[name] = make_interp_spline(at, values, DEGREE)(even)
+        else:
+            notes.append(f'{name}: not at the times of the attitudes, and the spin is '
+                         f'{angle:.2g} rad from one sample to the next: not compared')
     return Trajectory.of({'attitudes': np.roll(found.as_quat(), 1, axis=1), **readings,
                           'covariance': recorded.covariance or None}, even)
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.scenes import Body, Reals, Start
 from spinning_top_sim.grade.trajectory import Trajectory
-from spinning_top_sim.physics.states import relative_drift
+from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools.analysis import Attitudes, measure
 
@@ -60,10 +60,14 @@ class Motion:
         return ExactSolution(self.body, self.start.state_of(self.body))
 
     @cached_property
+    def truth(self) -> States:
+        """The exact states at the times of the samples."""
+        return self.solution.states_at_seconds(self.trajectory.t)
+
+    @cached_property
     def errors(self) -> dict[str, Reals]:
         """Errors of the attitude, as `errors_of` has them."""
-        truth = self.solution.states_at_seconds(self.trajectory.t).quaternion
-        return errors_of(self.trajectory.rotation, Rotation.from_quat(truth))
+        return errors_of(self.trajectory.rotation, Rotation.from_quat(self.truth.quaternion))
 
     @property
     def worst(self) -> float:
@@ -72,12 +76,23 @@ class Motion:
 
     @cached_property
     def rates(self) -> Reals:
-        """Body rates at all samples but `MARGIN` at each end, from the attitudes (n - 6, 3)."""
-        rotation, n = self.trajectory.rotation, len(self.trajectory.t) - 2 * MARGIN
-        here = rotation[MARGIN:-MARGIN].inv()
-        total: Reals = sum(weight * (here * rotation[at:at + n]).as_rotvec()
+        """
+        Body rates at all samples but `MARGIN` at each end, from the attitudes (n - 6, 3).
+
+        What is differentiated is the rotation from the exact attitudes, which turns slowly.
+        """
+        error = Rotation.from_quat(self.truth.quaternion).inv() * self.trajectory.rotation
+        inner, n = slice(MARGIN, -MARGIN), len(self.trajectory.t) - 2 * MARGIN
+        here = error[inner].inv()
+        total: Reals = sum(weight * (here * error[at:at + n]).as_rotvec()
                            for at, weight in enumerate(_WEIGHTS) if weight)
-        return total / self.trajectory.step
+        return total / self.trajectory.step + here.apply(self.truth.angular_velocity[inner])
+
+    def accelerations(self, rates: Reals) -> Reals:
+        """Return angular accelerations (n - 12, 3), given rates as `rates` has them."""
+        inner, twice = slice(MARGIN, -MARGIN), slice(2 * MARGIN, -2 * MARGIN)
+        return (derivative(rates - self.truth.angular_velocity[inner], self.trajectory.step)
+                + self.truth.angular_acceleration[twice])
 
     def data(self, rates: Reals) -> Attitudes:
         """Return attitudes and rates, given rates as `rates` has them."""

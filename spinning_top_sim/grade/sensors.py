@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.grade.motion import MARGIN, Motion, derivative
+from spinning_top_sim.grade.motion import MARGIN, Motion
 from spinning_top_sim.grade.regression import NEAR, Cause, beyond, explain, instead, least_squares
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
@@ -99,7 +99,7 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
         reading, first = reading[:, :3] / said.step, first + 1
         terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
     else:
-        first, a, w = 2 * MARGIN, derivative(w, said.step), w[inner]
+        first, a, w = 2 * MARGIN, motion.accelerations(w), w[inner]
         axes = np.eye(3)[:, np.newaxis]
         tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
         arms = tangential + centripetal
@@ -149,7 +149,8 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     Returns the faults and the measures.
     """
     lag = 0 if kind == 'velocities' else _lag(runs)
-    target, effects = _pooled([_discrepancy(kind, run, lag) for run in runs])
+    parts = [_discrepancy(kind, run, lag) for run in runs]
+    target, effects = _pooled(parts)
     noise = [_noise(run, lag) for run in runs]
     floor = rms(np.array(noise) / [run.size for run in runs])
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
@@ -161,10 +162,7 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     if abs(late) > LATE:
         faults.append(Fault('imu_one_step_late', f'{kind}: readings belong to the motion of '
                             f'{late:.3g} steps ({1e3 * late * runs[0].step:.3g} ms) before', late))
-    strange = STRANGE.get(kind, STRANGE_ELSE)
-    if derived:
-        strange += 0.25 * max((run.rotation[0].inv() * run.rotation[1]).magnitude() ** 2
-                              for run in runs)
+    strange = STRANGE.get(kind, STRANGE_ELSE) + (_half_step(runs) if derived else 0.0)
     if before > strange:
         causes = _causes(kind, effects, motion.body)
         found, residual, _ = explain(target, causes, math.hypot(floor, 0.5 * strange))
@@ -180,9 +178,11 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
             return faults, marks
     scaled = {'units', 'reading_scale'} & {fault.name for fault in faults}
     if kind in ('gyroscope', 'accelerations') and not scaled:
-        level = float(np.mean(noise))
+        noises, ends = effects['size'] * residual, np.cumsum([len(one) for one, _ in parts])[:-1]
+        # A cause that is found has taken fast motion away, or has left some.
+        level = float(np.mean(np.minimum(noise, [*map(_white, np.split(noises, ends))])))
         faults += _noise_faults(kind, runs[0], level, motion, NOISE_BAND + doubt)
-        faults += _shape_fault(kind, level, effects['size'] * residual, NOISY * runs[0].size)
+        faults += _shape_fault(kind, level, noises, NOISY * runs[0].size)
     return faults, marks
 
 
@@ -194,6 +194,12 @@ def _turned(kind: str, target: Reals, total: Reals) -> tuple[list[Fault], Reals]
     turns = ', '.join(f'{part:.3g}' for part in turn.inv().as_rotvec())
     return [Fault('mounting', f'{kind}: the readings are in axes that are turned by ({turns}) rad '
                   'from those of the IMU', turn.magnitude())], target + total - turn.apply(total)
+
+
+def _half_step(runs: Sequence[Readings]) -> float:
+    """Return the share of a reading by which rates half a step apart may change it."""
+    return 0.25 * max(float((run.rotation[0].inv() * run.rotation[1]).magnitude()) ** 2
+                      for run in runs)
 
 
 def _pooled(parts: Sequence[tuple[Reals, dict[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
@@ -263,9 +269,14 @@ def _lag(runs: Sequence[Readings]) -> int:
 
 
 def _noise(run: Readings, lag: int) -> float:
-    """Return the standard deviation of white noise, by differences in which motions vanish."""
+    """Return the standard deviation of the white noise of a reading."""
     reading, part = run.late(lag)
-    return rms(np.diff(reading - run.total[part], 6, axis=0)) / math.sqrt(924.0)
+    return _white(reading - run.total[part])
+
+
+def _white(rows: Reals) -> float:
+    """Return the standard deviation of white noise, by differences in which motions vanish."""
+    return rms(np.diff(rows, 6, axis=0)) / math.sqrt(924.0)
 
 
 def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, Reals]]:

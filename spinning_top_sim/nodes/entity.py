@@ -43,7 +43,7 @@ def fill_state(message: Message, states: States, pivot: Kinematics, stamp_ns: in
             setattr(target, name, float(column[0]))
 
 
-def asked_state(request: Message, top: Top, frame: str, now: States,
+def requested_state(request: Message, top: Top, frame: str, now: States,
                 pivot: Kinematics) -> State:
     """
     Return the state that a SetEntityState request asks for.
@@ -53,15 +53,15 @@ def asked_state(request: Message, top: Top, frame: str, now: States,
 
     Raises RefusedError or ValueError, which name the value and what is allowed.
     """
-    wanted, asked_frame = request.state, request.state.header.frame_id
+    wanted, requested_frame = request.state, request.state.header.frame_id
     # Older versions of the message have no flags, and set both.
     sets_pose, sets_twist = (getattr(request, name, True) for name in ('set_pose', 'set_twist'))
     if not (sets_pose or sets_twist):
         raise ValueError('set_pose and set_twist are false: one of them must be true; the '
                          'acceleration follows from pose and twist')
-    if asked_frame not in ('', frame):
+    if requested_frame not in ('', frame):
         raise RefusedError(
-            UNSUPPORTED, f'header.frame_id = {asked_frame!r}: must be {frame!r} or empty')
+            UNSUPPORTED, f'header.frame_id = {requested_frame!r}: must be {frame!r} or empty')
     rotation = np.concatenate(now.rows_quaternion)
     rates = np.concatenate(attitude.in_world(now.rows_quaternion, now.rows_angular_velocity))
     if sets_pose:

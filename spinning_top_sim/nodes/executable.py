@@ -49,7 +49,6 @@ def run(name: str, argv: Sequence[str] | None,
     name = f'spinning-top {name}'
     # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
     _handle(signal.SIGINT, lambda *_: _exit(130))
-    _open_standard_streams()
     try:
         make_node = prepare(argv)
         interrupts = _initialize_ros([name, *argv])
@@ -96,15 +95,6 @@ def _initialize_ros(argv: list[str]) -> list[int]:
     return interrupts
 
 
-def _open_standard_streams() -> None:
-    """Open the streams that the shell has closed (2>&-); otherwise a log gets their number."""
-    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass
-    os.close(descriptor)
-    if sys.stderr is None:
-        sys.stderr = open(2, 'w')       # noqa: SIM115 - rclpy needs it to the end
-
-
 def _handle(number: signal.Signals, handler: Callable[[int, object], object]) -> None:
     """Handle a signal unless it is ignored, as nohup ignores SIGHUP."""
     if signal.getsignal(number) != signal.SIG_IGN:
@@ -133,7 +123,8 @@ def _cannot_start(name: str, error: Exception) -> int:
     kind = type(error).__name__
     if isinstance(error, ModuleNotFoundError) and not find_spec('rclpy'):
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
-                             f'{remedy("ros")}')
+                             f'{remedy("ros")}' + name.endswith('view') * (
+                                 '; `view LOG` works without'))
     expected = (isinstance(error, ValueError | RuntimeError | OSError | LogError | ImportError)
                 or kind.startswith('Invalid'))
     print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(error)}',

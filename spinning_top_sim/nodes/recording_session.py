@@ -147,7 +147,6 @@ class RecordingSession:
         return {'recorder': recorder.state, 'recorded file': recorder.path,
                 'recorded messages': counters.messages, 'recorded bytes': counters.bytes,
                 'queued messages': counters.queued,
-                'longest flush [s]': f'{counters.longest_flush:.3f}',
                 'possible loss [s]': f'{recorder.possible_loss:.3f}'}
 
 

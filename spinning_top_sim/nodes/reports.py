@@ -17,10 +17,8 @@ from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 
-PIPED = 80                      # characters of a status line in a file or pipe
 
-
-class MotionReport:
+class NodeStatus:
     """Describes a running simulation; the caller holds the simulation's lock."""
 
     def __init__(self, simulation: LiveSimulation, loop: TickLoop,
@@ -111,10 +109,8 @@ class Terminal:
         self._open = False              # whether the cursor is at the end of a status line
 
     def show(self, line: str) -> None:
-        """Show a status line as far as it fits on the terminal, or into PIPED characters."""
+        """Show a status line as far as it fits on the terminal."""
         if sys.stdout is None or not sys.stdout.isatty():
-            if len(line) > PIPED:       # whole parts of it
-                line = line[:PIPED + 3].rpartition(' | ')[0] or line[:PIPED]
             self._write(f'{line}\n')
             return
         self._write(f'\r\x1b[K{line[:max(shutil.get_terminal_size().columns - 1, 1)]}')

@@ -281,7 +281,7 @@ class SimulationHandlers:
         top, frame = self._simulation.top, self._node.values['world_frame']
         with self._lock:
             self._loop.set_state(
-                lambda now: entity.asked_state(request, top, frame, now, self._pivot()))
+                lambda now: entity.requested_state(request, top, frame, now, self._pivot()))
         self._node.show_spin()
 
     def _get_entity_info(self, request: Any, response: Any) -> None:

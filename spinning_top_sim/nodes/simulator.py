@@ -21,11 +21,11 @@ from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import reports, ros_parameters
 from spinning_top_sim.nodes.executable import wait_for_all_acked
-from spinning_top_sim.nodes.followed_clock import DateClock
 from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.publishers import StreamPublishers
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN
+from spinning_top_sim.nodes.stamp_clock import StampClock
 from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
@@ -55,7 +55,7 @@ class Simulator(Node):
         self.values = {**values, 'spin.lz': simulation.lz}
         self.add_pre_set_parameters_callback(ros_parameters.with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self._date = DateClock(self, journal.is_enabled('clock', values))
+        self._date = StampClock(self, journal.is_enabled('clock', values))
         self.lock = FairLock()
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self.lock, self._outputs.topics_to_record)
@@ -65,7 +65,7 @@ class Simulator(Node):
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.outputs),
             source=self._date.now_ns if self._date.follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self.loop.grid, self.fail)
-        self._report = reports.MotionReport(simulation, self.loop, self._session)
+        self._report = reports.NodeStatus(simulation, self.loop, self._session)
         self._status_timer: Timer | None = None
         self._status_period = 0.0
         self._outputs.check(simulation.outputs, values)
@@ -94,13 +94,7 @@ class Simulator(Node):
         if self.values['max_error'] > 0.0:
             _ = self.simulation.segment.exact    # its modules take a while to import
         now_ns = self._date.first_ns()
-        try:
-            self.simulation.epoch_ns = next_epoch(now_ns)
-        except ValueError as error:
-            if not self._date.follows:
-                raise
-            self._log.warning(f'/clock: {error}', once=True)
-            return
+        self.simulation.epoch_ns = next_epoch(now_ns)
         self.destroy_timer(self._begin_timer)
         if not self._date.follows:
             time.sleep((self.simulation.epoch_ns - now_ns) / NANOSECONDS)
@@ -199,7 +193,7 @@ class Simulator(Node):
 
     def _change(self, changes: dict[str, Any]) -> None:
         values, start_spin = ros_parameters.changed(self.values, changes, self._start_spin)
-        self._check_surroundings(values, restarted=False)
+        self._check_context(values, restarted=False)
         rest = sorted(changes.keys() - SPIN)
         with self.lock:
             if ros_parameters.is_command(changes):
@@ -218,7 +212,7 @@ class Simulator(Node):
                 self._log.info(f'{", ".join(names)}: {effect.value}')
         self.values, self._start_spin = values, start_spin
 
-    def _check_surroundings(self, values: Mapping[str, Any], *, restarted: bool) -> None:
+    def _check_context(self, values: Mapping[str, Any], *, restarted: bool) -> None:
         if self._date.follows and journal.is_enabled('clock', values):
             raise ValueError('clock.enabled, publish_clock: must be false while this node follows '
                              'another /clock (use_sim_time)')
@@ -291,7 +285,7 @@ class Simulator(Node):
         start = self.start_values if values is None else dict(values)
         with self.lock:
             self.check_started()
-            self._check_surroundings(start, restarted=True)
+            self._check_context(start, restarted=True)
             self.loop.reset(start, self._date.first_ns(), paused)
             self._open_outputs(start)
         changed = [name for name in start if start[name] != self.values[name] and name not in SPIN]

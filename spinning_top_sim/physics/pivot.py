@@ -178,7 +178,8 @@ class PivotPath:
             raise ValueError(f't = {t_ns} ns: must not be before the start of the path at '
                              f'{self.start_ns} ns')
         offset = self.start_ns + cycle * self._cycle_ns
-        end = [*self._starts[1:], self._cycle_ns or NEVER_NS - offset][k]
+        end = (self._starts[k + 1] if k + 1 < len(self._starts)
+               else self._cycle_ns or NEVER_NS - offset)
         return Piece(offset + self._starts[k], offset + end, self._accelerations[k],
                      (self._places[k] + cycle * self._per_cycle)[:, np.newaxis],
                      self._velocities[k][:, np.newaxis])

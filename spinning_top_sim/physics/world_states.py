@@ -63,21 +63,29 @@ class WorldStates(States):
         return half_sum + half_difference, self.theta_folded, half_sum - half_difference
 
     @cached_property
-    def _rates(self) -> tuple[Column, Column]:
-        """Theta' and phi' sin(theta), eq. (4) of "Analysis of Symmetric Spinning Top"."""
-        (w1, w2), cosine, sine = self.transverse_velocity, np.cos(self.psi), np.sin(self.psi)
-        return w1 * sine + w2 * cosine, w2 * sine - w1 * cosine
+    def _meridian(self) -> tuple[Column, Column, Column]:
+        """Cosine and sine of psi, and sin(theta)/2: alpha times the conjugate of beta."""
+        x, y, z, w = self.rows_quaternion
+        cosine, sine = w * y - z * x, w * x + z * y
+        half = np.sqrt(cosine * cosine + sine * sine)
+        at_pole = half == 0.0
+        if at_pole.any():
+            cosine, sine = np.where(at_pole, w + y, cosine), np.where(at_pole, z + x, sine)
+        scale = np.where(at_pole, 1.0, half)
+        return cosine / scale, sine / scale, half
 
     @cached_property
     def theta_dot(self) -> Column:
-        return self._rates[0]
+        (w1, w2), (cosine, sine, _) = self.transverse_velocity, self._meridian
+        theta_dot: Column = w1 * sine + w2 * cosine
+        return theta_dot
 
     @cached_property
     def phi_dot(self) -> Column:
         """0 where the axis is vertical."""
-        cos2, sin2 = self.half_angle_squares
-        sine = 2.0 * np.sqrt(cos2 * sin2)
-        return np.where(sine > 0.0, self._rates[1] / np.where(sine > 0.0, sine, 1.0), 0.0)
+        (w1, w2), (cosine, sine, half) = self.transverse_velocity, self._meridian
+        tilts = half > 0.0
+        return np.where(tilts, 0.5 * (w2 * sine - w1 * cosine) / np.where(tilts, half, 1.0), 0.0)
 
     @cached_property
     def energy(self) -> Column:

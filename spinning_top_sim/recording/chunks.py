@@ -38,7 +38,7 @@ INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the
 ENTRY_SIZE = 8 + 8                      # of a message index
 
 
-class PlainChunk:
+class ChunkBuilder:
     """
     The messages of a chunk, uncompressed.
 

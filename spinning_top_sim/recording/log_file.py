@@ -46,9 +46,7 @@ class LogFile:
             if not stat.S_ISREG(os.stat(path).st_mode):
                 raise LogError(f'cannot read {path}: it is no regular file')
             self._file = open(path, 'rb')  # noqa: SIM115
-            status = os.fstat(self._file.fileno())
-        self.size = status.st_size
-        self.mode = stat.S_IMODE(status.st_mode)    # permission bits
+            self.size = os.fstat(self._file.fileno()).st_size
 
     def close(self) -> None:
         self._file.close()

@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import chunks
-from spinning_top_sim.recording.chunks import PlainChunk
+from spinning_top_sim.recording.chunks import ChunkBuilder
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata_yaml
 
 _COMPRESSING = 2    # chunks of rows that are compressed at once
@@ -45,11 +45,11 @@ class McapWriter:
 
     def __init__(self, path: Path, *, header: records.Header, compression: str) -> None:
         self._path = path
-        self._chunk = PlainChunk(compression)       # of messages that come one by one
+        self._chunk = ChunkBuilder(compression)       # of messages that come one by one
         # Chunks of rows: one is filled while the others are compressed.
-        self._spare_chunks: queue.SimpleQueue[PlainChunk] = queue.SimpleQueue()
+        self._spare_chunks: queue.SimpleQueue[ChunkBuilder] = queue.SimpleQueue()
         for _ in range(_COMPRESSING + 1):
-            self._spare_chunks.put(PlainChunk(compression))
+            self._spare_chunks.put(ChunkBuilder(compression))
         self._pool = ThreadPoolExecutor(_COMPRESSING, 'chunks')     # has no threads before rows
         self._queued = _NOTHING                     # the last chunk of rows
 
@@ -208,7 +208,7 @@ class McapWriter:
         finally:
             self._file.close()
 
-    def _queue(self, chunk: PlainChunk) -> None:
+    def _queue(self, chunk: ChunkBuilder) -> None:
         """Have a chunk compressed in a thread, and written after those queued before."""
         self._queued = self._pool.submit(self._write_in_turn, chunk, self._queued)
 
@@ -219,7 +219,7 @@ class McapWriter:
             self._queued = _NOTHING
         queued.result()
 
-    def _write_in_turn(self, chunk: PlainChunk, before: Future[None]) -> None:
+    def _write_in_turn(self, chunk: ChunkBuilder, before: Future[None]) -> None:
         try:
             record = chunk.record()
             before.result()

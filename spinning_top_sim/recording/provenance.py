@@ -30,11 +30,11 @@ def provenance(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
         'epoch_ns': str(epoch_ns),
         'begun_ns': str(begun_ns),
         'history': json.dumps(list(history)),
-        **surroundings(),
+        **environment(),
     }
 
 
-def surroundings() -> dict[str, str]:
+def environment() -> dict[str, str]:
     """Return what else decides the last bits: this package's version, machine, libraries."""
     return {
         'version': version(),

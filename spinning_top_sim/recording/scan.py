@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
@@ -214,13 +214,13 @@ class Scan:
         self._behind_chunk &= opcode == Opcode.MESSAGE_INDEX
         return end
 
-    def _search(self, offset: int, kinds: Collection[int] = _SEARCHED) -> int:
-        """Return where the next record of these kinds begins that can be decoded, or the limit."""
+    def _search(self, offset: int) -> int:
+        """Return where the next record begins that can be found and decoded, or the limit."""
         while offset < self._limit:
             block = self._file.read(offset, _BLOCK + _CANDIDATE_BYTES)
             for match in _CANDIDATE.finditer(block, 0, len(block)):
                 start = match.start()
-                if start < _BLOCK and block[start] in kinds and self._is_record(offset + start):
+                if start < _BLOCK and self._is_record(offset + start):
                     return offset + start
             offset += _BLOCK
         return self._limit
@@ -245,7 +245,7 @@ class Scan:
     # ------------------------------------------------------------------------- end of the scan
 
     def _check_end(self, offset: int) -> None:
-        """Look at the checksum in the data end, and for chunks behind it."""
+        """Look at the checksum in the data end."""
         try:
             end = self._file.record(offset, self._limit)
         except DamagedError:
@@ -260,11 +260,6 @@ class Scan:
                 self._defects.append(reason)
             else:
                 self._losses.append(Loss(0, 0, 'something', reason))
-        if self._summary.problem:
-            other = self._search(offset, [Opcode.CHUNK])
-            if other < self._limit:
-                self._losses.append(Loss(other, self._limit - other, 'another log',
-                                         'it stands behind the end of this one'))
 
     def _damage(self) -> Damage:
         if self._summary.problem:

@@ -50,7 +50,6 @@ class RecordingSummary:
     counts: dict[str, int]  # messages in it by topic name
     queued: int             # messages accepted, not yet in the file
     lost: int               # handed over after the recording stopped, or when it failed
-    longest_flush: float    # that brought the file to the disk [s]
     error: str | None       # why the recording stopped early
 
     @property
@@ -88,7 +87,6 @@ class McapRecorder:
         self._bytes_in = self._bytes_out = 0    # of the queue, ever
         self._offered = 0              # messages handed over, ever
         self._accepting = True
-        self._longest_flush = 0.0
         # (time, bytes): what had left the queue by that time is on the disk.
         self._on_disk = time.monotonic(), 0
         self._sync_error: Exception | None = None
@@ -130,7 +128,7 @@ class McapRecorder:
         return RecordingSummary(
             path=self.path, bytes=self._file.size, counts=counts,
             queued=missing if running else 0, lost=0 if running else missing,
-            longest_flush=self._longest_flush, error=self.error)
+            error=self.error)
 
     def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
         self.write_all([(topic_index, log_time_ns, data)], len(data))
@@ -229,7 +227,6 @@ class McapRecorder:
             self._syncing.start()
 
     def _sync(self, written: tuple[float, int]) -> None:
-        start = time.monotonic()
         try:
             self._file.sync()
         except Exception as error:
@@ -237,7 +234,6 @@ class McapRecorder:
             self._wake.set()
         else:
             self._on_disk = written
-            self._longest_flush = max(self._longest_flush, time.monotonic() - start)
 
     def _write_queued(self) -> None:
         for _ in range(len(self._queue)):

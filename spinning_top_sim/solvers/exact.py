@@ -96,7 +96,6 @@ class ExactSolution:
         self.mean_spin_rate = float(alpha.rate - beta.rate)
         self._bottom_rate, self._top_rate = float(bottom_rate), float(top_rate)
         self._theta = ThetaFunctions(motion)
-        self.theta_min, self.theta_max = self._theta.bounds.tolist()
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
         self._phi_phase = float(
             Decimal(start.phi) - alpha.start_argument - beta.start_argument) - self._half_turn
@@ -109,8 +108,7 @@ class ExactSolution:
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""
-        start, self._at_start = self.start, ThetaValues(self._theta, Times.from_ns(range(1)))
-        first = self._at_start
+        start, first = self.start, self._at_start
         alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
@@ -123,6 +121,10 @@ class ExactSolution:
                 raise ValueError(f'{name} = {getattr(start, name)!r} cannot be held in doubles: '
                                  f'the constants of {self.top} and {start} are too far apart in '
                                  'size')
+
+    @cached_property
+    def _at_start(self) -> ThetaValues:
+        return ThetaValues(self._theta, Times.from_ns(range(1)))
 
     def _across(self, cosine: Number, sine: Number) -> Number:
         """
@@ -142,6 +144,14 @@ class ExactSolution:
         # are computed again to the last bit.
         across: Column = self._across(*states._rows('half_theta'))
         return across
+
+    @property
+    def theta_min(self) -> float:
+        return self._theta.bounds[0]
+
+    @property
+    def theta_max(self) -> float:
+        return self._theta.bounds[1]
 
     def describe(self) -> Description:
         top, start = self.top, self.start

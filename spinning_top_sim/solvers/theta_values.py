@@ -52,9 +52,6 @@ class ThetaFunctions:
     zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
     u_dot, u_dot_coefficients : of u'
     momentum, swing : of (Lz - L3 u)/lambda1
-    bounds : the least and the greatest theta in [0, pi] [rad]
-    planar_rotation : (i, j) if both poles are passed: theta/2 is then within a quarter turn of
-        (pi/2) (i + j N)
     """
 
     def __init__(self, motion: ThetaMotion) -> None:
@@ -78,21 +75,33 @@ class ThetaFunctions:
         self.u_dot_coefficients = _coefficients([[motion.u_dot_series]], motion.size)[:, 0]
         self.momentum, self.swing = (
             np.array([*map(float, pair)]) for pair in (motion.momentum, motion.swing))
-        # The rows where y = 0, at N = 0 and N = 1.
-        alpha, beta, alpha_imag, beta_imag = np.where(
+        self._quarter0 = motion.quarter0
+
+    @property
+    def _middles(self) -> Matrix:
+        """The rows where y = 0, at N = 0 and N = 1, (4, 2)."""
+        middles: Matrix = np.where(
             np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
-        self.bounds = np.sort(2.0 * np.arctan2(np.hypot(beta, beta_imag),
-                                               np.hypot(alpha, alpha_imag)))
-        self.planar_rotation = _planar_rotation(
-            np.arctan2(beta, alpha) / QUARTER, motion.quarter0) if len(self.zeros) == 2 else None
+        return middles
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The least and the greatest theta in [0, pi] [rad]."""
+        alpha, beta, alpha_imag, beta_imag = self._middles
+        low, high = sorted((2.0 * np.arctan2(np.hypot(beta, beta_imag),
+                                             np.hypot(alpha, alpha_imag))).tolist())
+        return low, high
 
-def _planar_rotation(quarters: Matrix, quarter0: int) -> tuple[float, float]:
-    """Return (i, j) of `ThetaFunctions`; `quarters` are the half angles at N = 0 and N = 1."""
-    first, second = quarters.tolist()
-    slope = (second - first + 2.0) % 4.0 - 2.0
-    start = (first + slope * quarter0 + 1.0) % 4.0 - 1.0
-    return start - slope * quarter0, slope
+    @cached_property
+    def planar_rotation(self) -> tuple[float, float] | None:
+        """(i, j) if both poles are passed: theta/2 is within a quarter turn of pi/2 (i + j N)."""
+        if len(self.zeros) < 2:
+            return None
+        alpha, beta, *_ = self._middles
+        first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
+        slope = (second - first + 2.0) % 4.0 - 2.0
+        start = (first + slope * self._quarter0 + 1.0) % 4.0 - 1.0
+        return start - slope * self._quarter0, slope
 
 
 class ThetaValues:
@@ -234,10 +243,10 @@ class ThetaValues:
         """The two terms of phi' sin(theta) [rad/s] if no pole is passed exactly, (2, n)."""
         constants, (alpha, beta) = self._constants, self.moduli
         series = self._sin_y * _horner(constants.u_dot_coefficients, self._xi)
-        twice: Column = 2.0 * alpha * beta
+        half: Column = 0.5 / (alpha * beta)
         return np.stack((
-            constants.momentum.take(self._parity) * (alpha * alpha + beta * beta) / twice,
-            constants.swing.take(self._parity) * (series * series) / twice))
+            constants.momentum.take(self._parity) * ((alpha * alpha + beta * beta) * half),
+            constants.swing.take(self._parity) * (series * series * half)))
 
     @cached_property
     def rates(self) -> Matrix:

@@ -164,18 +164,18 @@ class AcceleratedMotion(ExactSolution):
         self._motion = set_up(top, self.vertical.gravity, start, DIGITS_HANDED_OVER)
         with precision(DIGITS):
             self._take_constants(self._motion, *self._momenta)
-        self._check_start()
 
     def _across_of(self, states: _ExactStates) -> Column:
-        usual = super()._across_of(states)
         if self._theta.real or not self._theta.u_dot.any():
-            return usual
-        # Of two sums that may cancel, the one with the smaller terms.  The other one cancels
+            return super()._across_of(states)
+        # Of two sums that may cancel, the one with the smaller terms.  The usual one cancels
         # where a fast top hardly precesses.
         (one, two), (cosine, sine) = states._rows('across'), states._rows('half_theta')
-        cancels = (abs(self._bottom_rate) * (sine / cosine) + abs(self._top_rate) * (cosine / sine)
-                   > np.abs(one) + np.abs(two))
-        return np.where(cancels, one + two, usual)
+        tangent: Column = sine / cosine
+        bottom, top = self._bottom_rate * tangent, self._top_rate / tangent
+        cancels = np.abs(bottom) + np.abs(top) > np.abs(one) + np.abs(two)
+        across: Column = np.where(cancels, one + two, bottom + top)
+        return across
 
     def posture(self, ns: int) -> Posture:
         """

@@ -6,8 +6,9 @@ A message depends on the parameters, the commands and its own time alone, never 
 it is computed in.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from functools import cache, partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from spinning_top_sim.streams.path import Path
 from spinning_top_sim.streams.stream import Rows, Samples, Stream
 
 STEPS_IN_A_PIECE = 4
+MOST_SEGMENTS = 64      # of a block
 
 
 class Block(NamedTuple):
@@ -47,35 +49,51 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
     """
     end_ns = min(until_ns, LAST_STAMP_NS - epoch_ns)
     while after_ns < end_ns:
-        segment = path.after(after_ns)
-        block_end_ns = min(end_ns, after_ns + span_ns, segment.end_ns)
-        failure = None
-        try:
-            for _ in range(-(-most_steps // STEPS_IN_A_PIECE)):
-                if segment.reach(block_end_ns, STEPS_IN_A_PIECE):
-                    break
-                yield None
-        except IntegrationError as error:
-            failure = error
-        block_end_ns = min(block_end_ns, segment.reached_ns)
-        if block_end_ns > after_ns:
+        edges, failure = yield from _reach(
+            path, after_ns, min(end_ns, after_ns + span_ns), most_steps)
+        if edges[-1] > after_ns:
             # Once for all streams of one rate.
             samples = cache(partial(Samples, path, epoch_ns=epoch_ns))
             parts = []
             for stream in streams:
-                times = stream.times(after_ns, block_end_ns)
-                if times:
-                    times_ns, rows = stream.encode(samples(times))
+                found = [samples(times) for begin_ns, end in pairwise(edges)
+                         if (times := stream.times(begin_ns, end))]
+                if found:
+                    times_ns, rows = stream.encode(*found)
                     if len(times_ns):       # a sensor may lose all samples of a block
                         parts.append((stream, times_ns, rows))
                     yield None
-            yield Block(block_end_ns, parts)
-            after_ns = block_end_ns
+            yield Block(edges[-1], parts)
+            after_ns = edges[-1]
         if failure is not None:
             raise failure
     if end_ns < until_ns:
         raise IntegrationError(f'the stamp {(epoch_ns + until_ns) / NANOSECONDS:.12g} s: must be '
                                f'< {2 ** 31} s, in January 2038')
+
+
+def _reach(path: Path, after_ns: int, until_ns: int, most_steps: int,
+           ) -> Generator[None, None, tuple[list[int], IntegrationError | None]]:
+    """
+    Let the motion reach a time [ns], or take the most steps; yield between pieces of work.
+
+    Returns the first time, where segments meet, and the time that is reached [ns]; and why the
+    motion does not go on from there, if it does not.
+    """
+    edges, pieces = [after_ns], -(-most_steps // STEPS_IN_A_PIECE)
+    try:
+        while edges[-1] < until_ns and pieces and len(edges) <= MOST_SEGMENTS:
+            segment = path.after(edges[-1])
+            goal_ns = min(until_ns, segment.end_ns)
+            try:
+                while pieces and not segment.reach(goal_ns, STEPS_IN_A_PIECE):
+                    pieces -= 1
+                    yield None
+            finally:
+                edges.append(max(edges[-1], min(goal_ns, segment.reached_ns)))
+    except IntegrationError as error:
+        return edges, error
+    return edges, None
 
 
 def span_of(streams: Sequence[Stream], most_bytes: int, longest_ns: int) -> int:

@@ -9,7 +9,7 @@ elements, then the elements.  Padding is zero, so that equal messages have equal
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Self
 
@@ -97,19 +97,27 @@ class Template:
 
     def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
         """Return messages (n, size) with stamps (n,) [ns]; they are valid until the next call."""
-        count = len(stamps_ns)
+        return self.encode_parts(stamps_ns, ((len(stamps_ns), values),))
+
+    def encode_parts(self, stamps_ns: NDArray[np.int64],
+                     parts: Iterable[tuple[int, Sequence[Field]]]) -> NDArray[np.uint8]:
+        """Return the same, with the fields of so many messages after the other."""
+        count, begin = len(stamps_ns), 0
         if len(self._rows) < count:
             self._rows = np.frombuffer(count * self._buffer, self._row_type)
         rows = self._rows[:count]
         for at in self._stamps_at:
             rows[f'sec{at}'], rows[f'nanosec{at}'] = np.divmod(stamps_ns, NANOSECONDS)
-        for i, value in zip(range(len(self._fields)), values, strict=True):
-            field = rows[f'field{i}']
-            if isinstance(value, np.ndarray):
-                field[:] = value
-            else:
-                for column, numbers in zip(field.T, value, strict=True):
-                    column[:] = numbers
+        for size, values in parts:
+            part = rows[begin:begin + size]
+            begin += size
+            for i, value in zip(range(len(self._fields)), values, strict=True):
+                field = part[f'field{i}']
+                if isinstance(value, np.ndarray):
+                    field[:] = value
+                else:
+                    for column, numbers in zip(field.T, value, strict=True):
+                        column[:] = numbers
         return rows.view(np.uint8).reshape(count, len(self))
 
     def encode_one(self, stamp_ns: int, *values: Field) -> bytes:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import Vector
 from spinning_top_sim.streams import messages, noise
 from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.path import Path
 from spinning_top_sim.streams.stream import Encoded, Samples, Stream
 
 NAN = 3 * (np.nan,)
@@ -51,13 +52,14 @@ class Gnss(Stream):
         valid = super().times(max(after_ns - self.late_ns, -1), until_ns - self.late_ns)
         return range(valid.start + self.late_ns, valid.stop + self.late_ns, valid.step)
 
-    def encode(self, samples: Samples) -> Encoded:
-        valid_ns = samples.t_ns - self.late_ns
-        return self._sent(samples.t_ns, samples.epoch_ns + valid_ns, self._measured(
-            samples, valid_ns), np.searchsorted(self._edges_ns, valid_ns, 'right') % 2 == 1)
+    def encode(self, *parts: Samples) -> Encoded:
+        t_ns = np.concatenate([one.t_ns for one in parts])
+        valid_ns = t_ns - self.late_ns
+        return self._sent(t_ns, parts[0].epoch_ns + valid_ns, self._measured(
+            parts[0].path, valid_ns), np.searchsorted(self._edges_ns, valid_ns, 'right') % 2 == 1)
 
-    def _measured(self, samples: Samples, valid_ns: NDArray[np.int64]) -> Vector:
-        value = samples.path.pivot(valid_ns)[self._index]
+    def _measured(self, path: Path, valid_ns: NDArray[np.int64]) -> Vector:
+        value = path.pivot(valid_ns)[self._index]
         if self._deviation.any():
             value = value + self._deviation * noise.white(
                 self._seed, self._purpose, valid_ns // self.period_ns, 3)

@@ -21,8 +21,6 @@ from spinning_top_sim.physics.pivot import PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
 
-Value = Any
-
 
 class Effect(enum.Enum):
     """When a changed value is used."""
@@ -46,7 +44,7 @@ class Parameter:
     """
 
     name: str
-    default: Value
+    default: Any
     text: str
     unit: str = ''
     minimum: float | None = None
@@ -77,15 +75,15 @@ class Parameter:
     def allowed(self) -> str:
         if self.choices:
             return f'must be one of {", ".join(self.choices)}'
-        kind = {bool: 'true or false', int: 'an integer', str: 'a string', float: 'a number',
-                type(None): 'a number'}.get(type(self.default))
+        kind = {bool: 'true or false', int: 'an integer', str: 'a string'}.get(
+            type(self.default), 'a number')
         if isinstance(self.default, tuple):
             kind = ('a list of strings' if isinstance(self.default[0], str)
                     else f'a list of {len(self.default)} numbers'
                     + (', or a multiple of that,' if self.is_repeated else ''))
         return f'must be {kind} {self._bounds()}'.rstrip()
 
-    def check(self, value: Value) -> Value:
+    def check(self, value: Any) -> Any:
         """Return the value in the type of the default.  Raises ValueError if it is not allowed."""
         if value is None and self.default is None:
             return None
@@ -97,7 +95,7 @@ class Parameter:
                 return float(value) if self.is_double else value
         raise ValueError(f'{self.name} = {shown(value)}: {self.allowed}')
 
-    def _is_allowed(self, value: Value) -> bool:
+    def _is_allowed(self, value: Any) -> bool:
         default = self.default
         if isinstance(default, tuple):
             if isinstance(value, str | bytes | Mapping | Set):       # iterable, but not lists
@@ -111,7 +109,7 @@ class Parameter:
             return isinstance(value, type(default)) and (not self.choices or value in self.choices)
         return (self.is_double or isinstance(value, int)) and self._is_in_range(value)
 
-    def _is_in_range(self, number: Value) -> bool:
+    def _is_in_range(self, number: Any) -> bool:
         return (isinstance(number, int | float) and not isinstance(number, bool)
                 and math.isfinite(number) and (self.above is None or number > self.above)
                 and (self.minimum is None or number >= self.minimum)
@@ -141,14 +139,10 @@ STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
 )
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HIGHEST_RATE = 10_000.0
-# Increments and means are taken over at most one second, for which the motion is kept.
-LOWEST_RATE_OF_INTERVALS = 1.0
-# Squares and products of physical quantities up to this are within the range of doubles.
-LARGEST = 1e30
-# Longest time [s], three years.
-LONGEST = 1e8
-# Speed of the pivot [m/s], and shortest time between two of its accelerations [s].
-FASTEST, SHORTEST_PIECE = 1e4, 1e-3
+LOWEST_RATE_OF_INTERVALS = 1.0      # of increments and means: the motion is kept for a second
+LARGEST = 1e30                      # of a quantity: its squares and products are doubles
+LONGEST = 1e8                       # time [s], three years
+FASTEST, SHORTEST_PIECE = 1e4, 1e-3     # of the pivot: speed [m/s], time of an acceleration [s]
 
 _at_once = partial(Parameter, effect=Effect.NOW)
 _at_reset = partial(Parameter, effect=Effect.RESET)
@@ -327,7 +321,7 @@ TABLE: tuple[Parameter, ...] = (
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
 
 
-def checked(values: Mapping[str, Value]) -> dict[str, Value]:
+def checked(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return all parameters: these values, else defaults.  Raises ValueError for bad values."""
     result = {parameter.name: parameter.default for parameter in TABLE}
     for name, value in values.items():
@@ -346,7 +340,7 @@ def checked(values: Mapping[str, Value]) -> dict[str, Value]:
     return result
 
 
-def _check_together(values: Mapping[str, Value]) -> None:
+def _check_together(values: Mapping[str, Any]) -> None:
     """Raise ValueError for values that only together, or with what is installed, are wrong."""
     def need(allowed: bool, name: str, text: str) -> None:
         value = values[name]
@@ -388,42 +382,35 @@ def _ascend(numbers: Iterable[float]) -> bool:
     return all(one < next_one for one, next_one in pairwise(numbers))
 
 
-def top_of(values: Mapping[str, Value]) -> Top:
+def top_of(values: Mapping[str, Any]) -> Top:
     """Return the top that these parameters describe.  Raises ValueError like `Top`."""
     return Top(**{name: values[f'top.{name}']
                   for name in ('lambda1', 'lambda3', 'mass', 'com_distance', 'gravity')})
 
 
-def pivot_path(values: Mapping[str, Value]) -> PivotPath | None:
+def pivot_path(values: Mapping[str, Any]) -> PivotPath | None:
     """Return the path of the pivot; None if it rests.  Raises ValueError."""
     path, points = (
         list(zip(*count * [iter(values[name])], strict=True)) if any(values[name]) else []
         for name, count in (('pivot.path', 4), ('pivot.waypoints', 3)))
-    if not path and not points:
-        return None
     if path and points:
         raise ValueError(f'pivot.waypoints = {points!r}: must be zeros with pivot.path')
     for duration, *_ in path:
         if not duration >= SHORTEST_PIECE:
             raise ValueError(f'pivot.path: the duration {duration!r} s: must be >= '
                              f'{SHORTEST_PIECE:g} s')
+    repeat = values['pivot.repeat']
     try:
         if path:
-            return PivotPath([(round(duration * 1e9), a) for duration, *a in path],
-                             repeat=values['pivot.repeat'])
-        return PivotPath.through(
-            points, speed=values['pivot.speed'], acceleration=values['pivot.acceleration'],
-            repeat=values['pivot.repeat'])
+            return PivotPath([(round(duration * 1e9), a) for duration, *a in path], repeat=repeat)
+        return PivotPath.through(points, speed=values['pivot.speed'], repeat=repeat,
+                                 acceleration=values['pivot.acceleration']) if points else None
     except ValueError as error:
         raise ValueError(f'pivot.{"path" if path else "waypoints"}: {error}') from error
 
 
-def start_state(values: Mapping[str, Value]) -> State:
-    """
-    Return the start state; an unset `spin.lz` is that of the cusp.
-
-    Raises ValueError like `State`.
-    """
+def start_state(values: Mapping[str, Any]) -> State:
+    """Return the start state; an unset `spin.lz` is that of the cusp.  Raises like `State`."""
     theta, l3, lz = values['initial.theta'], values['spin.l3'], values['spin.lz']
     if lz is None:      # "Analysis of Symmetric Spinning Top" (2023), sect. 4.1 and eq. (33)
         lz = l3 * math.cos(theta)

@@ -2,10 +2,12 @@
 """The motion of a run: segments of one solution each, joined by commands and by the pivot."""
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property, reduce
 from itertools import pairwise
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -62,7 +64,11 @@ class Segment:
         self.reached_ns = start_ns + solver.reached_ns
         self.filtered: NDArray[np.float64] | None = None
         self._first = solver.states(range(1))
-        self.energy, self.l3, self.lz = float(self._first.energy[0]), start.l3, start.lz
+        self.l3, self.lz = start.l3, start.lz
+
+    @cached_property
+    def energy(self) -> float:
+        return float(self._first.energy[0])
 
     @cached_property
     def exact(self) -> ExactSolution | None:
@@ -180,13 +186,16 @@ class Path:
                 self._append(self._follow(self._segments[-1]))
             except ValueError as error:
                 raise IntegrationError(str(error)) from error
-        return next((one for one in reversed(self._segments) if one.start_ns <= t_ns),
-                    self._segments[0])
+        return self._segments[self._number(t_ns)]
+
+    def _number(self, t_ns: int) -> int:
+        return max(bisect_right(self._segments, t_ns, key=attrgetter('start_ns')) - 1, 0)
 
     def go_on_with(self, segment: Segment) -> None:
         """Go on with another segment from its start; what was to come from there is dropped."""
         self.end_after(segment.start_ns)
         self._append(segment)
+        self.release(segment.start_ns)
 
     def end_after(self, t_ns: int) -> bool:
         """Drop the segments that start later than a time [ns]; return whether there were any."""
@@ -196,10 +205,6 @@ class Path:
 
     def _append(self, segment: Segment) -> None:
         self._carry(self._segments[-1], segment)
-        oldest_ns = segment.start_ns - max(self._keep_ns, self.keep_steps_ns)
-        ends = [later.start_ns for later in self._segments[1:]] + [segment.start_ns]
-        self._forget([one for one, end_ns in zip(self._segments, ends, strict=True)
-                      if end_ns < oldest_ns])
         self._segments.append(segment)
 
     def _forget(self, segments: list[Segment]) -> None:
@@ -209,8 +214,10 @@ class Path:
             self._gone_evaluations += one.solver.evaluations
 
     def release(self, now_ns: int) -> None:
-        """Forget the integration steps that only times before this one [ns] need."""
-        present = self.after(now_ns)
+        """Forget the segments and integration steps that only times before this one [ns] need."""
+        present = self._segments[self._number(now_ns)]
+        oldest_ns = now_ns - max(self._keep_ns, self.keep_steps_ns)
+        self._forget(self._segments[:self._number(oldest_ns - 1)])
         present.solver.release(now_ns - self.keep_steps_ns - present.start_ns)
 
     def exact_points(self, times_ns: NDArray[np.int64], along: float) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,10 +37,18 @@ FIRST_STEPS, OFFLINE_STEPS = 500, 2000
 # Offline, a block has so many bytes, but covers no more time than this, for the sake of progress;
 # nor are there more blocks than this.
 OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 4 << 20, 100 * NANOSECONDS, 20_000
-# Length of an entry of `Simulation.history` about the pivot.
-DRIVE = 5
 # Turns a second whose phases doubles hold up to the last stamp.
 MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
+
+
+class Drive(NamedTuple):
+    """A velocity of the pivot in the world [m/s], applied at a time, and when it brakes [ns]."""
+
+    t_ns: int
+    x: float
+    y: float
+    z: float
+    stop_ns: int
 
 
 class Simulation:
@@ -54,7 +62,7 @@ class Simulation:
     now_ns : every sample up to here is done (-1: not even that of t = 0); may be set
     history : what was applied since the start: commands as (t_ns, l3, lz), states that were set as
         t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate), velocities of the
-        pivot as (t_ns, x, y, z, stop_ns)
+        pivot as `Drive`
     pivot : the path of the pivot; None while it rests at the origin
     epoch_ns : stamp of t = 0 [ns]
     version : changes with all but `epoch_ns` that makes samples after `now_ns` other ones
@@ -141,7 +149,11 @@ class Simulation:
 
     @property
     def orientation_error(self) -> float:
-        """The angle between the present attitude and the exact one [rad]; NaN: not known."""
+        """
+        The angle between the present attitude and the exact one [rad]; NaN: not known.
+
+        The exact one starts where the segment does.
+        """
         return float(self.segment.orientation_error(self.state(), self._now())[0])
 
     def describe(self) -> Description | None:
@@ -230,9 +242,10 @@ class Simulation:
         if stop_ns is None:
             timeout_ns = round(self.values['pivot.cmd_timeout'] * NANOSECONDS)
             stop_ns = self.now_ns + timeout_ns if timeout_ns else NEVER_NS
-        last = self.history[-1] if self.history else ()
-        if len(last) == DRIVE and last[1:4] == target and self.now_ns < last[4]:
+        last = self.history[-1] if self.history else None
+        if isinstance(last, Drive) and last[1:4] == target and self.now_ns < last.stop_ns:
             self._put_off(stop_ns)
+            self.history[-1] = last._replace(stop_ns=stop_ns)
             return stop_ns
         pivot = self.segment.pivot(np.array([self.now_ns]))
         self._begun = partial(
@@ -240,7 +253,7 @@ class Simulation:
             velocity=pivot.velocity[:, 0].tolist(), start_ns=self.now_ns,
             most_acceleration=self.values['pivot.max_acceleration'])
         self._continue(self.segment.posture(self.now_ns), self._begun(stop_ns=stop_ns))
-        self.history.append((self.now_ns, *target, stop_ns))
+        self.history.append(Drive(self.now_ns, *target, stop_ns))
         return stop_ns
 
     def _put_off(self, stop_ns: int) -> None:
@@ -250,7 +263,6 @@ class Simulation:
         segment.ride = segment.ride._replace(piece=self.pivot.piece(segment.start_ns))
         if self.path.end_after(self.now_ns):
             self.version += 1
-        self.history[-1] = *self.history[-1][:4], stop_ns
 
     def _settle(self) -> None:
         """Let the solver reach `now_ns`, and be at t = 0 at least."""
@@ -290,8 +302,8 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
     try:
         with np.errstate(over='ignore', invalid='ignore'):
             segment = _begun(top, start, start_ns, values, pivot)
-        if not math.isfinite(segment.energy):
-            raise ValueError(f'the energy would be {segment.energy!r} J')
+            if isinstance(start, State) and not math.isfinite(segment.energy):
+                raise ValueError(f'the energy would be {segment.energy!r} J')
         if not segment.reach(start_ns + 1, FIRST_STEPS):
             raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
         spin = abs(start.l3) / top.lambda3 / math.tau

@@ -24,10 +24,10 @@ Encoded = tuple[NDArray[np.int64], Rows]
 
 class Samples:
     """
-    The motion at the times of a block; the streams of one rate share it.
+    The motion at the times of a block in one segment; the streams of one rate share it.
 
     path : the motion
-    times : of the samples, within one segment [ns]
+    times : of the samples [ns]
     epoch_ns : stamp of t = 0 [ns]
     """
 
@@ -97,9 +97,9 @@ class Stream:
         return range((after_ns // self.period_ns + 1) * self.period_ns, until_ns + 1,
                      self.period_ns)
 
-    def encode(self, samples: Samples) -> Encoded:
+    def encode(self, *parts: Samples) -> Encoded:
         """
-        Return the messages of samples.
+        Return the messages of samples, one part or more, in the order of time.
 
         Returns
         -------
@@ -108,11 +108,13 @@ class Stream:
         rows : (n, size)
             The messages, valid until the next call.
         """
-        t_ns, epoch_ns = samples.t_ns, samples.epoch_ns
+        t_ns, epoch_ns = np.concatenate([one.t_ns for one in parts]), parts[0].epoch_ns
+        stamps_ns = (epoch_ns + t_ns if self._timing is None
+                     else self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns))
+        rows = self.template.encode_parts(stamps_ns, [
+            (len(one.times), self.fields(one)) for one in parts])
         if self._timing is None:
-            return t_ns, self.template.encode(epoch_ns + t_ns, *self.fields(samples))
-        rows = self.template.encode(self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns),
-                                    *self.fields(samples))
+            return t_ns, rows
         copies = self._timing.copies(t_ns, self.period_ns)
         return np.repeat(t_ns, copies), np.repeat(rows, copies, axis=0)
 

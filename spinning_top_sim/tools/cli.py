@@ -13,7 +13,6 @@ from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import why_not_written
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # argparse uses 2, too
-
 ERRORS: tuple[type[Exception], ...] = (ValueError, ArithmeticError, OSError, ImportError)
 
 
@@ -39,15 +38,12 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
     errors : exceptions that are printed as one line, besides ValueError, ArithmeticError, OSError
         and ImportError; the exit code is then FAILED, or WRONG_USAGE for a ValueError
     """
-    # If a stream is closed, the next file that is opened would take its descriptor.
-    sys.stdout = sys.stdout or open(os.devnull, 'w')    # noqa: SIM115
-    sys.stderr = sys.stderr or open(os.devnull, 'w')    # noqa: SIM115
     parser = Parser(name, help_text)
     add_arguments(parser)
     arguments = parser.parse_args(argv)
     try:
         code = command(arguments)
-        sys.stdout.flush()
+        print(end='', flush=True)
         return code
     except BrokenPipeError:
         # The reader of the output, such as a pager, has ended.  Python flushes the output again.

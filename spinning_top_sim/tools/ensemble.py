@@ -34,13 +34,12 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.tools import cli, ensemble_spec
 from spinning_top_sim.tools.ensemble_part import (
     DATA,
-    UNFINISHED,
     EnsembleError,
     compute_part,
     versions,
     write_row,
 )
-from spinning_top_sim.tools.recorded_run import ODD, reason_of
+from spinning_top_sim.tools.recorded_run import MALFORMED, reason_of
 
 MANIFEST = 'manifest.json'
 
@@ -72,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.workers is not None and arguments.workers < 1:
         raise ValueError(f'--workers {arguments.workers}: must be >= 1')
-    with needed('an ensemble', 'exam'):
+    with needed('an ensemble', 'ensemble'):
         return (_compute_dataset if arguments.row is None else _compute_row)(arguments)
 
 
@@ -87,29 +86,30 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
         'format': 3, 'complete': False, 'versions': versions(),
         'specification': asdict(specification), 'failed': {}}))
     if (folder / MANIFEST).exists():
-        difference = _difference(_read_manifest(folder), manifest)
-        if difference and not arguments.overwrite:
-            raise ValueError(f'{folder} has another ensemble: {difference}: choose a new folder, '
-                             'or --overwrite')
+        old = _read_manifest(folder)
+        # As text: the order in entries counts, as in a grid of samples.
+        if not arguments.overwrite and any(json.dumps(old[key]) != json.dumps(manifest[key])
+                                           for key in ('specification', 'versions')):
+            raise ValueError(f'{folder} has another ensemble, or one of other versions: choose a '
+                             'new folder, or --overwrite')
     elif folder.exists() and any(folder.iterdir()):
         raise ValueError(f'{folder} exists and has no {MANIFEST}: choose a new folder')
     failed: dict[str, str] = {}
     with (cli.progress('computed', specification.runs, 'runs', quiet=arguments.quiet) as show,
           ensemble_cluster.connect(arguments.workers, arguments.scheduler) as client):
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in (DATA, UNFINISHED):
-            if arguments.overwrite:
-                shutil.rmtree(folder / name, ignore_errors=True)
-            (folder / name).mkdir(exist_ok=True)
+        if arguments.overwrite:
+            shutil.rmtree(folder / DATA, ignore_errors=True)
+        (folder / DATA).mkdir(parents=True, exist_ok=True)
         _write_manifest(folder, manifest)
-        task = partial(compute_part, specification, folder=str(folder), wanted=versions())
+        task = partial(compute_part, specification, folder=str(folder))
         parts = ensemble_cluster.compute(client, task, range(specification.parts))
         for done, reasons in enumerate(parts, start=1):
             failed.update(reasons)
             show(min(done * specification.runs_per_part, specification.runs))
     failed = dict(sorted(failed.items(), key=lambda item: int(item[0])))
     _write_manifest(folder, {**manifest, 'complete': True, 'failed': failed})
-    shutil.rmtree(folder / UNFINISHED, ignore_errors=True)  # a killed command's worker may write
+    for path in (folder / DATA).glob('.*'):     # of a worker that was killed
+        path.unlink()
     if failed:
         run, reason = next(iter(failed.items()))
         cli.print_line(f'spinning-top ensemble: '
@@ -146,7 +146,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         manifest: dict[str, Any] = json.loads(path.read_bytes())
         ensemble_spec.parse(manifest['specification'], 'specification')
         return {**manifest, 'versions': dict(manifest['versions'])}
-    except ODD as error:
+    except MALFORMED as error:
         raise ValueError(f'{path} is no manifest of an ensemble: {reason_of(error)}') from error
 
 
@@ -154,14 +154,6 @@ def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     written = folder / f'{MANIFEST}.new'
     written.write_text(json.dumps(manifest, indent=1), encoding='utf-8')
     written.replace(folder / MANIFEST)
-
-
-def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """Return in words what differs; the order in entries counts, as in a grid of samples."""
-    return ', '.join(
-        f'{name} = {old[what].get(name)!r}, not {new[what].get(name)!r}'
-        for what in ('specification', 'versions') for name in {**old[what], **new[what]}
-        if json.dumps(old[what].get(name)) != json.dumps(new[what].get(name)))
 
 
 if __name__ == '__main__':

@@ -2,18 +2,17 @@
 """
 The runs of an ensemble: the samples of one run, and the file of a part of the dataset.
 
-A file is written in a temporary folder and then moved into the dataset.  A file that is there
-already is not computed again.
+A file gets its name when it is whole.  One that is there already is not computed again.
 """
 
 import contextlib
 import json
 import platform
-import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +31,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
-# Folders of a dataset: its files, and the files that are being written.
-DATA, UNFINISHED = 'data', 'unfinished'
+DATA = 'data'                   # folder of the files of a dataset
 # Key of the metadata of a Parquet file: the reasons of the runs that failed, by run.
 FAILED = b'failed'
 ROWS_IN_A_GROUP = 40_000        # of a Parquet file
@@ -43,7 +41,7 @@ LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_
           'gnss/fix': PLACE, 'ground_truth/gnss/fix': PLACE}
 
 # Times of samples (n,) [ns], and the numbers in their messages as columns (n,) by name.
-Samples = tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]
+TimedColumns = tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]
 
 
 class EnsembleError(Exception):
@@ -57,7 +55,7 @@ def versions() -> dict[str, str]:
             **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}
 
 
-def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Samples]:
+def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, TimedColumns]:
     """
     Return the samples of a run by topic, for the streams with these names.
 
@@ -143,22 +141,16 @@ def write_row(specification: Specification, run: int, path: Path) -> None:
             parquet.write_table(rows, file)
 
 
-def compute_part(specification: Specification, part: int, folder: str,
-                 wanted: Mapping[str, str]) -> dict[str, str]:
+def compute_part(specification: Specification, part: int, folder: str) -> dict[str, str]:
     """
     Compute the file of a part, unless it is in `folder`; return the runs that failed, and why.
 
     The file depends on the specification and the versions alone.
-
-    wanted : what `versions` must be
-
-    Raises EnsembleError for other versions; OSError if the file cannot be written.
+    Raises OSError if the file cannot be written.
     """
     import pyarrow as pa  # noqa: PLC0415
     from pyarrow import parquet  # noqa: PLC0415
 
-    if versions() != wanted:
-        raise EnsembleError(f'a worker has {versions()}, which gives other bytes than {wanted}')
     path = Path(folder, DATA, f'part-{part:06d}.parquet')
     with contextlib.suppress(OSError, ValueError, KeyError):    # it is missing, or not whole
         return dict(json.loads(parquet.read_metadata(path).metadata[FAILED]))
@@ -171,11 +163,10 @@ def compute_part(specification: Specification, part: int, folder: str,
     if tables:
         rows = pa.concat_tables(tables).replace_schema_metadata({FAILED: json.dumps(failed)})
         constant = ['run', *specification.drawn(0)]
-        with tempfile.TemporaryDirectory(dir=Path(folder, UNFINISHED)) as temporary:
-            written = Path(temporary, path.name)
-            parquet.write_table(
-                rows, written, compression='zstd', row_group_size=ROWS_IN_A_GROUP,
-                use_dictionary=constant, write_statistics=constant, use_byte_stream_split=[
-                    name for name in rows.column_names if name not in constant])
-            written.replace(path)
+        written = path.with_name(f'.{path.name}.{uuid4()}')     # readers of Parquet skip it
+        parquet.write_table(
+            rows, written, compression='zstd', row_group_size=ROWS_IN_A_GROUP,
+            use_dictionary=constant, write_statistics=constant, use_byte_stream_split=[
+                name for name in rows.column_names if name not in constant])
+        written.replace(path)
     return failed

@@ -10,6 +10,7 @@ formats").
 
 import argparse
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,9 @@ EUROC_HEAD = ('#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],
               'b_a_RS_S_x [m s^-2],b_a_RS_S_y [m s^-2],b_a_RS_S_z [m s^-2]\n')
 EUROC_IMU_HEAD = ('#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
                   'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n')
+FIX, VELOCITY = 'gnss/fix', 'gnss/velocity'
+FIX_HEAD = '#timestamp [ns],latitude [deg],longitude [deg],altitude [m]\n'
+VELOCITY_HEAD = '#timestamp [ns],v_east [m s^-1],v_north [m s^-1],v_up [m s^-1]\n'
 
 
 def add_argument(parser: argparse.ArgumentParser) -> None:
@@ -39,8 +43,9 @@ def add_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--export', type=_parse, metavar='KIND:FILE', action='append', default=[],
         help='write a file for other tools: tum or euroc, the true trajectory of the IMU; '
-        'euroc_imu, its readings (CSV); kalibr, its parameters (imu.yaml); may be repeated; an '
-        'existing file is never overwritten')
+        'euroc_imu, its readings (CSV); kalibr, its parameters (imu.yaml); gnss_fix and '
+        'gnss_velocity, what a receiver measures (CSV; nan: no fix); may be repeated; an existing '
+        'file is never overwritten')
 
 
 def _parse(text: str) -> tuple[str, Path]:
@@ -99,10 +104,12 @@ def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
                         np.column_stack(world), bias[newest])
 
 
-def _euroc_imu(reader: LogReader, run: RunDescription) -> Iterator[str]:
-    yield EUROC_IMU_HEAD
-    for stamps_ns, (_, rates, force) in _blocks(reader, run, RAW):
-        yield from _rows(',', stamps_ns, rates, force)
+def _csv(topic: str, head: str, first: int, reader: LogReader,
+         run: RunDescription) -> Iterator[str]:
+    """Yield the lines of a table of a topic, from that field of its messages on."""
+    yield head
+    for stamps_ns, fields in _blocks(reader, run, topic):
+        yield from _rows(',', stamps_ns, *fields[first:])
 
 
 def _rows(separator: str, stamps: Iterable[object],
@@ -131,4 +138,6 @@ def _blocks(reader: LogReader, run: RunDescription, topic: str,
 # Of each kind: the topics that it needs, and the generator of its text.
 KINDS: dict[str, tuple[Sequence[str], Callable[..., Iterator[str]]]] = {
     'tum': ((ODOMETRY,), _tum), 'euroc': ((ODOMETRY, BIAS), _euroc),
-    'euroc_imu': ((RAW,), _euroc_imu), 'kalibr': ((RAW,), _kalibr)}
+    'euroc_imu': ((RAW,), partial(_csv, RAW, EUROC_IMU_HEAD, 1)), 'kalibr': ((RAW,), _kalibr),
+    'gnss_fix': ((FIX,), partial(_csv, FIX, FIX_HEAD, 0)),
+    'gnss_velocity': ((VELOCITY,), partial(_csv, VELOCITY, VELOCITY_HEAD, 0))}

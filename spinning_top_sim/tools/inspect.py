@@ -136,7 +136,7 @@ def _as_json(found: Survey, verdict: Verdict | None) -> object:
         'orientation_error': {topic: {'max': error} for topic, error in found.errors.items()}}
     if run is not None:
         content['run'] = {'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
-                          **_fields_of(run, 'epoch_ns', 'begun_ns'), **run.surroundings}
+                          **_fields_of(run, 'epoch_ns', 'begun_ns'), **run.environment}
         content['events'] = [{'event': event.name, **_fields_of(event, 'stamp_ns', 't_ns'),
                               **event.details} for event in run.events]
     if verdict is not None:
@@ -165,7 +165,7 @@ def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
     solver = values['solver.method']
     if solver != 'exact':
         solver += f" ({values['solver.equations']}, rtol {values['solver.rtol']:g})"
-    yield f'spinning_top_sim {run.surroundings["version"]}, {solver}, seed {values["seed"]}'
+    yield f'spinning_top_sim {run.environment["version"]}, {solver}, seed {values["seed"]}'
     yield from _topics(found)
     yield _journal(run)
     yield from found.notes

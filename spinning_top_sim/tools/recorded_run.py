@@ -20,8 +20,8 @@ from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
 # What values raise that are not as this package writes them.
-ODD = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-LATEST_NS = 1 << 62         # of log times: the difference of any two of them fits into int64
+MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+LAST_LOG_TIME_NS = 1 << 62  # the difference of any two log times fits into int64
 MOST_TEXT = 300             # of a reason
 # What is computed for a log at most: for a small one, and more for each of its bytes.
 LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
@@ -82,7 +82,7 @@ class RunDescription:
     epoch_ns: int                         # stamp of t = 0 [ns]
     begun_ns: int                         # simulated time at which the recording began [ns]
     history: Sequence[Event]              # commands and states before that
-    surroundings: Mapping[str, str]       # version, platform and libraries
+    environment: Mapping[str, str]       # version, platform and libraries
     topics: Mapping[str, str]             # topic in the log by that of the stream, imu/data_raw
     commands_topic: str | None            # None where the log has none
     events_topic: str | None
@@ -111,17 +111,17 @@ def read_run_description(reader: LogReader) -> RunDescription:
         history = [_applied_before(epoch_ns, *entry) for entry in json.loads(metadata['history'])]
         times_ns = [0, *(operator.index(event.t_ns) for event in history), max(begun_ns, 0)]
         if times_ns != sorted(times_ns) or not 0 <= epoch_ns <= epoch_ns + times_ns[-1] <= min(
-                LATEST_NS, reader.span[1] or LATEST_NS):
+                LAST_LOG_TIME_NS, reader.span[1] or LAST_LOG_TIME_NS):
             raise ValueError('times are out of order or too late')
-        surroundings = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
+        environment = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
         topics = _topics(reader.topics, at_recording)
-    except ODD as error:
+    except MALFORMED as error:
         raise ForeignLogError(
             f'its metadata {METADATA_NAME!r} cannot be used: {reason_of(error)}') from error
     commands_topic = topics.pop(journal.COMMANDS, None)
     events_topic = topics.pop(journal.EVENTS, None)
     events, broken = _journal(reader, events_topic, epoch_ns)
-    return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history, surroundings,
+    return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history, environment,
                           topics, commands_topic, events_topic, events, broken, reader.size)
 
 
@@ -134,12 +134,12 @@ def _journal(reader: LogReader, topic: str | None, epoch_ns: int,
             event = _event(message.log_time, message.data)
             sent_ns = epoch_ns + event.sent_ns
             new_epoch_ns = event.details.get('epoch_ns', epoch_ns)
-            if not reached_ns <= sent_ns <= event.stamp_ns <= LATEST_NS or not (
+            if not reached_ns <= sent_ns <= event.stamp_ns <= LAST_LOG_TIME_NS or not (
                     epoch_ns <= new_epoch_ns <= event.stamp_ns):
                 raise ValueError(f'sent_ns = {event.sent_ns} is out of order or too late')
             epoch_ns, reached_ns = new_epoch_ns, max(sent_ns, new_epoch_ns - 1)
             events.append(event)
-        except ODD as error:
+        except MALFORMED as error:
             broken.append((message.log_time, reason_of(error)))
     return events, broken
 
@@ -194,30 +194,26 @@ def _event(stamp_ns: int, data: bytes) -> Event:
     return Event(name, stamp_ns, t_ns, sent_ns, details)
 
 
-def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
-          ) -> Iterator[tuple[Simulation, Event | Block]]:
+class Rerun:
     """
-    Compute the run of a log again; yield it at the start, after each event and after each block.
+    The computation of the run of a log, within limits that the size of the log sets.
 
-    end_ns : log time of the end [ns]
     samples : yield the messages of the log's streams in blocks; else only motions are computed
-
-    Raises one of ODD where there is no motion with these parameters and commands, or where it
-    takes far more work than a run that fits into the log.
     """
-    return _Rerun(run, samples).events(end_ns)
 
-
-class _Rerun:
-    """The computation of a run, within limits that the size of its log sets."""
-
-    def __init__(self, run: RunDescription, samples: bool) -> None:
+    def __init__(self, run: RunDescription, *, samples: bool = False) -> None:
         self._run, self._samples = run, samples
         self._most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
         self._samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
         self._simulation = Simulation(run.values_at_start, run.epoch_ns)
 
     def events(self, end_ns: int) -> Iterator[tuple[Simulation, Event | Block]]:
+        """
+        Yield the simulation at the start, after each event and after each block, up to a log time.
+
+        Raises one of MALFORMED where there is no motion with these parameters and commands, or
+        where it takes far more work than a run that fits into the log.
+        """
         simulation, run = self._simulation, self._run
         # Before the recording: the motion and its commands, no samples.
         for event in run.history:

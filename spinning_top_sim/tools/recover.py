@@ -14,7 +14,6 @@ exit codes:
 """
 
 import argparse
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,20 +21,15 @@ from pathlib import Path
 from spinning_top_sim.recording.damage import count
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.salvage import recover
+from spinning_top_sim.recording.recovery import recover
 from spinning_top_sim.tools import cli
 
-SOME_LOST, TERMINATED = 3, 143
+SOME_LOST = 3
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    # An exception, so that the unfinished output is removed.
-    previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
-    try:
-        return cli.run('recover', __doc__, argv, add_arguments, _run, (LogError,))
-    finally:
-        signal.signal(signal.SIGTERM, previous)
+    return cli.run('recover', __doc__, argv, add_arguments, _run, (LogError,))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

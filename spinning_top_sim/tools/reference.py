@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.simulation import Simulation
-from spinning_top_sim.streams.stream import Encoded, Samples, period_ns
+from spinning_top_sim.streams.stream import Samples, period_ns
 from spinning_top_sim.tools.models import FORMATS, model, start_of
 from spinning_top_sim.tools.table import UNITS, Table, write_csv, write_parquet
 
@@ -76,11 +77,10 @@ class _ReferenceTable(Table):
         super().__init__(period_ns(rate))
         self._imu = Imu(values)
 
-    def encode(self, samples: Samples) -> Encoded:
-        t_ns, rows = super().encode(samples)
+    def _rows(self, samples: Samples) -> NDArray[np.float64]:
         rates, force = self._imu.true(samples.states)
         added = (*rates, *force, *samples.pivot.acceleration)
-        return t_ns, np.column_stack((rows, *np.broadcast_arrays(*added)))
+        return np.column_stack((super()._rows(samples), *np.broadcast_arrays(*added)))
 
 
 def with_imu(given: Mapping[str, object]) -> dict[str, Any]:

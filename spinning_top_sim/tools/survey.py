@@ -28,7 +28,12 @@ from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured
-from spinning_top_sim.tools.recorded_run import LATEST_NS, ODD, RunDescription, reason_of
+from spinning_top_sim.tools.recorded_run import (
+    LAST_LOG_TIME_NS,
+    MALFORMED,
+    RunDescription,
+    reason_of,
+)
 
 MOST_GAPS = 10              # that are listed
 MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
@@ -144,7 +149,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
     """Compute the motions of a run; add notes about what cannot be followed."""
     motions = found.motions
     try:
-        for simulation, event in recorded_run.rerun(run, found.damage.end_ns):
+        for simulation, event in recorded_run.Rerun(run).events(found.damage.end_ns):
             if isinstance(event, Block):
                 continue
             if motions:
@@ -163,7 +168,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
                     Imu(simulation.values)))
             motions[-1].sections.append(Section(begin_ns, begin_ns, simulation.epoch_ns, {
                 topic: stream.period_ns for topic, stream in streams.items()}, streams))
-    except ODD as error:
+    except MALFORMED as error:
         found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
     if len(motions) > MOST_EXACT:
         found.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact one')
@@ -191,7 +196,7 @@ def _read_messages(found: Survey, reader: LogReader) -> dict[str, Stamps]:
 
 
 def _stamps(samples: Sequence[LogMessage]) -> Stamps:
-    return np.array([min(sample.log_time, LATEST_NS) for sample in samples], np.int64)
+    return np.array([min(sample.log_time, LAST_LOG_TIME_NS) for sample in samples], np.int64)
 
 
 def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogMessage]) -> None:
@@ -265,7 +270,7 @@ def _measure(found: Survey, motion: MotionReport) -> None:
     try:
         motion.measured = analysis.measure(
             data, motion.exact.nutation_period if motion.exact else None)
-    except ODD as error:
+    except MALFORMED as error:
         found.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
     else:
         found.shown = found.shown or (motion, data)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Reals = NDArray[np.float64]
-FLAT = 1e-6                     # least range of an axis / the greatest value
+FLAT = 1e-3                     # least range of an axis / the greatest value
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 340, 172, 46, 8, 38, 32       # [px]
 
 

@@ -29,13 +29,16 @@ class Table(Stream):
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
 
-    def encode(self, samples: Samples) -> Encoded:
+    def encode(self, *parts: Samples) -> Encoded:
+        return (np.concatenate([one.t_ns for one in parts]),
+                np.concatenate([self._rows(one) for one in parts]))
+
+    def _rows(self, samples: Samples) -> NDArray[np.float64]:
         states = samples.states
-        columns = np.broadcast_arrays(
+        return np.stack(np.broadcast_arrays(
             samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
             states.psi, states.psi_dot, *states.quaternion.T, *states.angular_velocity.T,
-            states.energy, states.l3, states.lz)
-        return samples.t_ns, np.stack(columns, axis=-1)
+            states.energy, states.l3, states.lz), axis=-1)
 
 
 class RideTable(Table):
@@ -44,10 +47,9 @@ class RideTable(Table):
     units = RIDE_UNITS
     size = 8 * len(RIDE_UNITS)
 
-    def encode(self, samples: Samples) -> Encoded:
-        t_ns, rows = super().encode(samples)
+    def _rows(self, samples: Samples) -> NDArray[np.float64]:
         position, velocity, _ = samples.pivot
-        return t_ns, np.column_stack((rows, *position, *velocity))
+        return np.column_stack((super()._rows(samples), *position, *velocity))
 
 
 def write_csv(path: Path, blocks: Iterable[NDArray[np.float64]],

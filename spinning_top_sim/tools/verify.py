@@ -14,7 +14,13 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.tools.recorded_run import ODD, RunDescription, field_names, reason_of, rerun
+from spinning_top_sim.tools.recorded_run import (
+    MALFORMED,
+    Rerun,
+    RunDescription,
+    field_names,
+    reason_of,
+)
 
 
 class Difference(NamedTuple):
@@ -81,7 +87,7 @@ class Comparison:
         """Compute the run; yield the log times before which all is computed, at last infinity."""
         topics, commands, computed = self._run.topics, self._run.commands_topic, self._computed
         try:
-            for simulation, event in rerun(self._run, end_ns, samples=True):
+            for simulation, event in Rerun(self._run, samples=True).events(end_ns):
                 if isinstance(event, Block):
                     for stream, times_ns, rows in event.parts:
                         for t_ns, row in zip(times_ns.tolist(), rows, strict=True):
@@ -94,7 +100,7 @@ class Comparison:
                 show(reached_ns)
                 # Not up to it: another command at this very time may follow.
                 yield reached_ns
-        except ODD as error:
+        except MALFORMED as error:
             self._verdict.stopped = reason_of(error)
         yield math.inf
 
@@ -141,5 +147,5 @@ def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
 
 
 def _warnings(run: RunDescription) -> list[str]:
-    return [f'{what} was {run.surroundings[what]}, is {here}'
-            for what, here in provenance.surroundings().items() if run.surroundings[what] != here]
+    return [f'{what} was {run.environment[what]}, is {here}'
+            for what, here in provenance.environment().items() if run.environment[what] != here]

@@ -17,16 +17,15 @@ BLUE, WHITE, GOLD, STEEL, GREY = (
 SPOKES, SMOOTH = 8, 96              # number of spokes and of the sides of a round
 
 
-class Part(NamedTuple):
-    """A mesh in the frame of the body; `opacity` as viser takes it."""
+class BodyPart(NamedTuple):
+    """A mesh in the frame of the body."""
 
     name: str
     mesh: trimesh.Trimesh
     colour: Colour
-    opacity: float | None = None
 
 
-def wheel(shape: Shape, length: float) -> list[Part]:
+def wheel(shape: Shape, length: float) -> list[BodyPart]:
     """Return a spoked wheel with a marked rim, on a tapered axle of a signed length."""
     radius, height, centre = shape.radius, shape.height, (0.0, 0.0, shape.centre)
     turns = [rotation_matrix(math.tau * k / SPOKES, (0, 0, 1)) for k in range(SPOKES)]
@@ -40,21 +39,21 @@ def wheel(shape: Shape, length: float) -> list[Part]:
     thick = abs(length) * np.array([(0, 0), (.024, .1), (.024, .8), (.012, .95), (0, 1)])
     axle = creation.revolve(np.column_stack((thick[:, 0], thick[:, 1] * np.sign(length))))
     parts = [
-        Part('rim', creation.annulus(0.82 * radius, radius, height, sections=SMOOTH), BLUE),
-        Part('marks', _joined(marks[1:]), WHITE),
-        Part('mark', _joined([marks[0], marked_spoke]), GOLD),
-        Part('spokes', _joined([hub, *(spoke.copy().apply_transform(turn)
+        BodyPart('rim', creation.annulus(0.82 * radius, radius, height, sections=SMOOTH), BLUE),
+        BodyPart('marks', _joined(marks[1:]), WHITE),
+        BodyPart('mark', _joined([marks[0], marked_spoke]), GOLD),
+        BodyPart('spokes', _joined([hub, *(spoke.copy().apply_transform(turn)
                                        for turn in turns[1:])]), STEEL)]
     for part in parts:
         part.mesh.apply_translation(centre)
-    return [*parts, Part('axle', axle, STEEL)]
+    return [*parts, BodyPart('axle', axle, STEEL)]
 
 
-def disc(shape: Shape, length: float) -> list[Part]:
+def disc(shape: Shape, length: float) -> list[BodyPart]:
     """Return a grey disc with a hole, for a body that is not known."""
     radius = abs(length)
     mesh = creation.annulus(0.25 * radius, 0.5 * radius, 0.03 * radius, sections=SMOOTH)
-    return [Part('disc', mesh.apply_translation((0.0, 0.0, shape.centre)), GREY)]
+    return [BodyPart('disc', mesh.apply_translation((0.0, 0.0, shape.centre)), GREY)]
 
 
 def stand(radius: float) -> trimesh.Trimesh:

@@ -43,17 +43,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     argv = sys.argv[1:] if argv is None else argv
     words = without_ros_arguments(argv)
-    arguments = _parser().parse_args(words)
+    parser = cli.Parser('view', DESCRIPTION)
+    add_arguments(parser)
+    arguments = parser.parse_args(words)
     if arguments.log:
         return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs, (LogError,))
     with contextlib.ExitStack() as stack:
         return run('view', argv, partial(_prepare, stack, arguments))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = cli.Parser('view', DESCRIPTION)
-    add_arguments(parser)
-    return parser
 
 
 @contextlib.contextmanager
@@ -137,6 +133,8 @@ def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, argv: l
     if arguments.html is not None:
         raise ValueError(f'--html {arguments.html}: must have a log')
     files = scene_file.chosen_files(arguments)
+    for path in files:
+        scene_file.read_scene(path)
     from spinning_top_sim.view.live import LiveView  # noqa: PLC0415
 
     def make_node() -> RunnableNode:

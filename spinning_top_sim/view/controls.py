@@ -5,7 +5,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import viser
 
@@ -20,19 +20,14 @@ PAD = {'−x': (-0.5, 0.0), '+x': (0.5, 0.0), '−y': (0.0, -0.5), '+y': (0.0, 0
 LEFT_ALONE_S = 1.0              # after that a slider follows the node again
 
 
-class Commands(Protocol):
-    """Requests to a node; each returns the message to show, or raises with the reason."""
-
-    def call(self, name: str, *on: bool) -> str: ...
-    def command(self, l3: float, lz: float) -> str: ...
-    def drive(self, x: float, y: float) -> str: ...
-    def choose(self, scene: str) -> str: ...
-
-
 class Controls:
-    """The controls.  Their callbacks run in threads of viser; only one at a time acts."""
+    """
+    The controls.  Their callbacks run in threads of viser; only one at a time acts.
 
-    def __init__(self, page: Page, node: Commands) -> None:
+    node : the `LiveView`, whose requests return the message to show, or raise with the reason
+    """
+
+    def __init__(self, page: Page, node: Any) -> None:
         self._page, self._node = page, node
         self._lock = threading.Lock()
         self._paused = False

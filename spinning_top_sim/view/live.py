@@ -54,7 +54,7 @@ KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom':
            'ground_truth/imu': Imu}
 
 
-class RefusedError(Exception):
+class RequestError(Exception):
     """The sim_node refuses or does not answer; the text is the reason."""
 
 
@@ -169,8 +169,8 @@ class LiveView(Node):
             row[0, [ENERGY_DRIFT, ORIENTATION_ERROR]] = self._errors
             track.add('~/invariants', Samples(np.array([newest_ns]), row))
             self._errors = None
-        track.forget(max(newest_ns - KEPT_NS, min(self._origin_ns or 0, newest_ns)))
-        track.follow()
+        track.drop_before(max(newest_ns - KEPT_NS, min(self._origin_ns or 0, newest_ns)))
+        track.detect_motion()
         if track.motions:
             self._controls.show_spin(track.motions[-1].l3, track.motions[-1].lz)
         self._page.draw(newest_ns, self._origin_ns or newest_ns)
@@ -187,7 +187,7 @@ class LiveView(Node):
             stamps_ns = [_stamp_ns(data) for data in messages]
             known_ns = self._track.samples[topic].stamps_ns
             if len(known_ns) and stamps_ns[-1] < known_ns[-1] - RESTART_NS:
-                self._track.forget(known_ns[-1] + 1)        # the sim_node was started again
+                self._track.drop_before(known_ns[-1] + 1)        # the sim_node was started again
             self._track.add(topic, self._track.decode(topic, stamps_ns, messages))
         for topic in KIND_OF.keys() - self._listeners.keys():   # these get old
             self._track.samples[topic] = empty(topic)
@@ -198,7 +198,7 @@ class LiveView(Node):
         names = [name for name in parameters.BY_NAME if name not in SPIN]
         try:
             answer = self._ask('get_parameters', GetParameters.Request(names=[*names, *SPIN]))
-        except RefusedError:
+        except RequestError:
             self._stale = True
             return
         shown = list(map(parameter_value_to_python, answer.values))
@@ -217,41 +217,41 @@ class LiveView(Node):
     # Called by the page's controls, in threads of their own.
 
     def _ask(self, name: str, request: object) -> Any:
-        """Return the answer of a service.  Raises RefusedError if there is none."""
+        """Return the answer of a service.  Raises RequestError if there is none."""
         client: Client = self._services_of_sim[name]
         if not client.service_is_ready():
-            raise RefusedError(f'there is no {self._sim}')
+            raise RequestError(f'there is no {self._sim}')
         future = client.call_async(request)
         end = time.monotonic() + ANSWER_S
         while not future.done():
             time.sleep(0.01)
             if time.monotonic() > end or self._stopped:
                 client.remove_pending_request(future)
-                raise RefusedError(f'{self._sim}/{name} has not answered')
+                raise RequestError(f'{self._sim}/{name} has not answered')
         return future.result()
 
     def call(self, name: str, *on: bool) -> str:
-        """Call a service of the sim_node; return its message.  Raises RefusedError."""
+        """Call a service of the sim_node; return its message.  Raises RequestError."""
         request = SetBool.Request(data=on[0]) if on else Trigger.Request()
         answer = self._ask(name, request)
         if not answer.success:
-            raise RefusedError(answer.message)
+            raise RequestError(answer.message)
         return f'{name.removeprefix("set_")}: {answer.message}'
 
     def command(self, l3: float, lz: float) -> str:
-        """Set L3 and Lz [kg m^2/s]; return them.  Raises RefusedError."""
+        """Set L3 and Lz [kg m^2/s]; return them.  Raises RequestError."""
         self._set(dict(zip(SPIN, (l3, lz), strict=True)))
         return f'spin.l3 = {l3:.4g}, spin.lz = {lz:.4g}'
 
     def drive(self, x: float, y: float) -> str:
-        """Send a velocity of the pivot [m/s]; return it.  Raises RefusedError."""
+        """Send a velocity of the pivot [m/s]; return it.  Raises RequestError."""
         if not self._velocity.get_subscription_count():
-            raise RefusedError(f'there is no {self._sim}')
+            raise RequestError(f'there is no {self._sim}')
         self._velocity.publish(Twist(linear=Vector3(x=x, y=y)))
         return f'pivot: {x:g}, {y:g} m/s'
 
     def choose(self, scene: str) -> str:
-        """Set the top and the start of an installed scene, and reset.  Raises RefusedError."""
+        """Set the top and the start of an installed scene, and reset.  Raises RequestError."""
         values = parameters.checked(read_scene(parameter_files('scene')[scene]))
         values['spin.lz'] = parameters.start_state(values).lz
         try:
@@ -263,12 +263,12 @@ class LiveView(Node):
             self._stale = True      # the node may do what it has not answered in time
 
     def _set(self, values: Mapping[str, object]) -> None:
-        """Set parameters of the sim_node.  Raises RefusedError."""
+        """Set parameters of the sim_node.  Raises RequestError."""
         result = self._ask('set_parameters_atomically', SetParametersAtomically.Request(
             parameters=[Parameter(name, value=value).to_parameter_msg()
                         for name, value in values.items()])).result
         if not result.successful:
-            raise RefusedError(result.reason)
+            raise RequestError(result.reason)
 
 
 def _stamp_ns(data: bytes) -> int:

@@ -45,7 +45,7 @@ def _read_log(path: Path, name: str) -> Track:
             _read_samples(reader, track, run.topics)
             try:
                 _follow_run(track, run, reader.span[1])
-            except recorded_run.ODD as error:
+            except recorded_run.MALFORMED as error:
                 notes.append(f'the run cannot be followed: {recorded_run.reason_of(error)}')
     if not len(track.attitudes.rows):
         raise LogError(f'{path}: no attitude in it ({", ".join(LAYOUTS)})')
@@ -67,7 +67,7 @@ def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) ->
 
 def _read_foreign(reader: LogReader, name: str) -> Track:
     """Read the attitudes in a log of another program, from its first topic that has some."""
-    track = Track(name, parameters.checked({}), known=False)
+    track = Track(name, parameters.checked({}), has_body=False)
     for topic in reader.topics:
         found: dict[int, NDArray[np.float64]] = {}
         for message in reader.messages([topic.name]) if topic.type_name in LAYOUTS else ():
@@ -86,13 +86,13 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
 
 
 def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> None:
-    for simulation, event in recorded_run.rerun(run, end_ns):
+    for simulation, event in recorded_run.Rerun(run).events(end_ns):
         if isinstance(event, Block) or event.name == 'parameters':
             continue
         begin_ns = simulation.epoch_ns + max(simulation.now_ns, 0)
         track.motions.append(DescribedMotion.of(
             begin_ns, track.top, simulation.segment.start, simulation.describe(),
-            rides=simulation.segment.ride is not None))
+            pivot_moves=simulation.segment.ride is not None))
         if event.name == 'command':
             track.commands_ns.append(begin_ns)
 

@@ -107,7 +107,7 @@ def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
     samples = {'specific force': track.samples['ground_truth/imu'],
                'torque': track.attitudes}.get(name, track.rates)
     sample = samples.at(stamp_ns)
-    if sample is None or not track.known:
+    if sample is None or not track.has_body:
         return None
     top, row, length = track.top, sample[1], abs(reach(track))
     if name == 'specific force':

@@ -58,12 +58,12 @@ class DrawnTop:
         self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
                                            opacity=0.12, side='back', cast_shadow=False,
                                            receive_shadow=False)
-        self._body = scene.add_frame(f'{name}/body', show_axes=not track.known,
+        self._body = scene.add_frame(f'{name}/body', show_axes=not track.has_body,
                                      axes_length=0.7 * radius, axes_radius=0.015 * radius)
-        for part in (body.wheel if track.known else body.disc)(track.shape, far):
+        for part in (body.wheel if track.has_body else body.disc)(track.shape, far):
             scene.add_mesh_simple(
                 f'{name}/body/{part.name}', part.mesh.vertices, part.mesh.faces,
-                color=part.colour, opacity=0.4 if number else part.opacity,
+                color=part.colour, opacity=0.4 if number else None,
                 flat_shading=part.name != 'axle', side='double')
         peg = body.stand(FOOT * radius)
         self._stand = scene.add_mesh_simple(f'{name}/stand', peg.vertices, peg.faces, color=STAND,
@@ -188,7 +188,7 @@ class Page:
         size = self._reach = max(abs(model.reach(track)) for track in tracks)
         self._over.visible = len(tracks) > 1
         self._bounds.visible = self._accuracy_folder.visible = any(
-            track.known for track in tracks)
+            track.has_body for track in tracks)
         for arrow in self.arrows:
             arrow.visible = self._bounds.visible
         self._ground = scene.add_grid(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.regimes import effective_potential
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools.svg import FLAT, Line, Plot
+from spinning_top_sim.tools.svg import Line, Plot
 from spinning_top_sim.view import model
 from spinning_top_sim.view.track import (
     ENERGY_DRIFT,
@@ -90,7 +90,7 @@ def _potential(top: Shown, dash: str) -> list[Line]:
     theta = np.linspace(1e-3, math.pi - 1e-3, 2000)
     values = effective_potential(axis, l3, lz, theta)
     depth = max(motion.energy - float(values.min()), 0.05 * abs(axis.gravity_torque),
-                FLAT * abs(motion.energy))
+                1e-6 * abs(motion.energy))
     shown = np.flatnonzero(values <= motion.energy + depth)
     theta = np.linspace(theta[shown[0]], theta[shown[-1]], POINTS // 2)
     bounds = np.array([motion.description.theta_min, motion.description.theta_max])

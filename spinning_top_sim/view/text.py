@@ -17,7 +17,7 @@ from spinning_top_sim.view.track import DescribedMotion, Track
 HERE = Path(__file__).parent
 STYLE, LIVE_STYLE = ((HERE / name).read_text('utf-8') for name in ('page.css', 'live.css'))
 BEYOND = 'No closed form is in reach of its numbers; the samples are shown as they are.'
-RIDE = 'The pivot moves: where it accelerates, the top moves about another vertical.'
+PIVOT_MOVES = 'The pivot moves: where it accelerates, the top moves about another vertical.'
 NEUTRAL = ('The body is not in this log, only its attitude: a grey disc shows it, with its axes '
            'x (red), y (green) and z (blue).')
 VERTICAL = 1e-6                 # tilt from a vertical up to which there is no precession [rad]
@@ -35,8 +35,8 @@ def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns:
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     description = motion.description if motion else None
     title, sentence = ((description.name, SENTENCES[description.name]) if description else
-                       ('motion', RIDE if motion.rides else BEYOND) if motion else
-                       ('attitude', '' if track.known else NEUTRAL))
+                       ('motion', PIVOT_MOVES if motion.pivot_moves else BEYOND) if motion else
+                       ('attitude', '' if track.has_body else NEUTRAL))
     rows = [*_rows(track.top, motion)] if motion else []
     place = track.places(np.array([stamp_ns]))[0]
     if place.any():
@@ -63,8 +63,8 @@ def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
                 f'mean; from {slow} to {fast}' if period else '')
             yield 'Spin ψ′', f'{number(moves.mean_spin_rate)} rad/s', 'mean' if period else ''
     yield 'Angular mo&shy;mentum', f'L₃ = {number(motion.l3)}' + (
-        '' if motion.rides else f', L<sub>z</sub> = {number(motion.lz)}'), (
-        'kg m²/s; axis' + ('' if motion.rides else ', vertical'))
+        '' if motion.pivot_moves else f', L<sub>z</sub> = {number(motion.lz)}'), (
+        'kg m²/s; axis' + ('' if motion.pivot_moves else ', vertical'))
     least = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))
     if least:
         yield 'Stable upright', f'if |L₃| &gt; {number(least)} kg m²/s', ''

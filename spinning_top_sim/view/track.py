@@ -76,7 +76,7 @@ class DescribedMotion:
 
     l3, lz, energy : constants [kg m^2/s], and the energy lambda1 theta'^2/2 + V(theta) [J]
     description : None if it has no closed form
-    rides : whether the pivot moves: then Lz and the energy are not constant
+    pivot_moves : whether the pivot moves: then Lz and the energy are not constant
     """
 
     begin_ns: int
@@ -84,15 +84,15 @@ class DescribedMotion:
     lz: float
     energy: float
     description: Description | None
-    rides: bool = False
+    pivot_moves: bool = False
 
     @classmethod
     def of(cls, begin_ns: int, top: Top, state: State,
-           description: Description | None, *, rides: bool = False) -> 'DescribedMotion':
+           description: Description | None, *, pivot_moves: bool = False) -> 'DescribedMotion':
         """Return the motion that begins in a state."""
         height = effective_potential(top, state.l3, state.lz, np.array([state.theta]))
-        return cls(begin_ns, state.l3, state.lz,
-                   0.5 * top.lambda1 * state.theta_dot ** 2 + float(height[0]), description, rides)
+        energy = 0.5 * top.lambda1 * state.theta_dot ** 2 + float(height[0])
+        return cls(begin_ns, state.l3, state.lz, energy, description, pivot_moves)
 
 
 class Track:
@@ -101,15 +101,15 @@ class Track:
 
     name : shown if there are several tracks
     values : checked parameters of the run
-    known : whether they are those of the body; in the logs of other programs they are not
+    has_body : whether they are those of the body; in the logs of other programs they are not
     samples : by topic
     motions : in the order of their begin
     origin_ns, commands_ns : of a log, stamps of t = 0 and of its commands [ns]
     note : what is missing in a log, '' if nothing is
     """
 
-    def __init__(self, name: str, values: Mapping[str, Any], known: bool = True) -> None:
-        self.name, self.values, self.known = name, values, known
+    def __init__(self, name: str, values: Mapping[str, Any], has_body: bool = True) -> None:
+        self.name, self.values, self.has_body = name, values, has_body
         self.top = parameters.top_of(values)
         self.shape = Shape(self.top)
         self.samples = {topic: empty(topic) for topic in WIDTHS}
@@ -148,7 +148,7 @@ class Track:
         """Add samples of a topic."""
         self.samples[topic] = joined([self.samples[topic], samples])
 
-    def forget(self, before_ns: int) -> None:
+    def drop_before(self, before_ns: int) -> None:
         """Drop the samples before a stamp."""
         self.samples = {topic: samples.part(before_ns, np.iinfo(np.int64).max)
                         for topic, samples in self.samples.items()}
@@ -191,23 +191,23 @@ class Track:
         begun = [motion for motion in self.motions if motion.begin_ns <= stamp_ns]
         return begun[-1] if begun else next(iter(self.motions), None)
 
-    def follow(self) -> None:
+    def detect_motion(self) -> None:
         """Begin a new motion if the newest sample has other constants than the last motion."""
         stamps_ns, rows = self.rates
         if not len(rows):
             return
         constants, state = state_of(self.top, rows[-1])
-        if rides := self.moves:     # L3 alone is constant
+        if pivot_moves := self.moves:     # L3 alone is constant
             constants = 0.0, constants[1], 0.0
         if self._constants is not None and _same(self.top, constants, self._constants):
             return
         self._constants = constants
         description = None
         with contextlib.suppress(ArithmeticError, ValueError):
-            description = None if rides else dataclasses.replace(
+            description = None if pivot_moves else dataclasses.replace(
                 ExactSolution(self.top, state).describe(), name=regime(self.top, state, SNAP))
         self.motions = [*self.motions[-MOST_MOTIONS:], DescribedMotion.of(
-            int(stamps_ns[-1]), self.top, state, description, rides=rides)]
+            int(stamps_ns[-1]), self.top, state, description, pivot_moves=pivot_moves)]
 
 
 def state_of(top: Top, row: NDArray[np.float64]) -> tuple[tuple[float, float, float], State]:

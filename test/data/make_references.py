@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Compute hard_cases.json and increments.json again, from the starts that are in them.
+Compute hard_cases.json, increments.json and ride.json again, from the starts that are in them.
 
     pip install mpmath;  PYTHONPATH=.:test python test/data/make_references.py
 
 Euler's equations and the quaternion are integrated by Taylor series in 60 digits, with none of the
-package's formulas.  phi and psi are quadratures beside them.  In half angles the rate of phi has
-no term that cancels:
+package's formulas.  In the frame of a pivot that moves the force m (g - a) acts at the centre of
+mass.  phi and psi are quadratures beside them.  In half angles the rate of phi has no term that
+cancels:
 
     phi' = ((Lz - L3)/(4 sin^2(theta/2)) + (Lz + L3)/(4 cos^2(theta/2)))/lambda1
 """
@@ -17,6 +18,7 @@ from pathlib import Path
 from helpers.reference import scene_parameters, start_of, top_of
 from mpmath import atan2, cos, cot, expj, fdot, mp, mpc, mpf, nstr, polyval, sin, tan
 
+from spinning_top_sim import State, Top
 from spinning_top_sim.streams import parameters
 
 mp.dps = 60
@@ -72,10 +74,11 @@ class Motion:
     rates: rates(q, omega) returns their series from those of q and omega
     """
 
-    def __init__(self, top, start, rates, count):
+    def __init__(self, top, start, rates=lambda q, omega: (), count=0):
         self.t, self.rates, self.quadratures = mpf(0), rates, count * [mpf(0)]
         self.lambda1, self.lambda3 = mpf(top.lambda1), mpf(top.lambda3)
-        self.torque = mpf(top.mass) * mpf(top.gravity) * mpf(top.com_distance)
+        self.moment, self.gravity = mpf(top.mass) * mpf(top.com_distance), mpf(top.gravity)
+        self.push((0, 0, 0))
         half, plus, minus = (mpf(start.theta) / 2, mpf(start.lz) + mpf(start.l3),
                              mpf(start.lz) - mpf(start.l3))
         across = ((plus * tan(half) if plus else 0) + (minus * cot(half) if minus else 0)) / (
@@ -84,12 +87,17 @@ class Motion:
         omega = mpc(-across, start.theta_dot) * expj(-mpf(start.psi))
         self.omega = [omega.real, omega.imag, mpf(start.l3) / self.lambda3]
 
+    def push(self, acceleration):
+        """Let the pivot accelerate so; keep the force times the distance of the mass."""
+        a, b, c = map(mpf, acceleration)
+        self.force = [-self.moment * part for part in (a, b, c + self.gravity)]
+
     def go_to(self, t):
         """Integrate forwards or backwards."""
         while self.t != t:
-            q, omega = self._series()
+            q, omega = self.series()
             rates = self.rates(q, omega)
-            step = SHARE * min(radius(group) for group in (q, omega, rates))
+            step = SHARE * min(radius(group) for group in (q, omega, rates) if group)
             step = t - self.t if step >= abs(t - self.t) else step if t > self.t else -step
             self.t = t if step == t - self.t else self.t + step
             self.q, self.omega = ([polyval(f[::-1], step) for f in group] for group in (q, omega))
@@ -97,7 +105,8 @@ class Motion:
                 [c / (k + 1) for k, c in enumerate(f)][::-1], step)
                 for value, f in zip(self.quadratures, rates, strict=True)]
 
-    def _series(self):
+    def series(self):
+        """Return the Taylor series of q and omega."""
         def term(f, g, k):
             return fdot(f[:k + 1], g[k::-1])
 
@@ -105,14 +114,18 @@ class Motion:
         o1, o2, o3 = omega = [[value] for value in self.omega]
         gyroscopic = (self.lambda1 - self.lambda3) * o3[0]
         for k in range(ORDER):
-            up1 = 2 * (term(x, z, k) - term(w, y, k))
-            up2 = 2 * (term(y, z, k) + term(w, x, k))
+            xx, yy, zz, ww = (term(f, f, k) for f in q)
+            xy, xz, xw = term(x, y, k), term(x, z, k), term(x, w, k)
+            yz, yw, zw = term(y, z, k), term(y, w, k), term(z, w, k)
+            # Components 1 and 2 in the body of the force at (0, 0, 1).
+            f1 = fdot(self.force, (ww + xx - yy - zz, 2 * (xy + zw), 2 * (xz - yw)))
+            f2 = fdot(self.force, (2 * (xy - zw), ww - xx + yy - zz, 2 * (yz + xw)))
             new = ((term(w, o1, k) + term(y, o3, k) - term(z, o2, k)) / 2,
                    (term(w, o2, k) + term(z, o1, k) - term(x, o3, k)) / 2,
                    (term(w, o3, k) + term(x, o2, k) - term(y, o1, k)) / 2,
                    -(term(x, o1, k) + term(y, o2, k) + term(z, o3, k)) / 2,
-                   (gyroscopic * o2[k] + self.torque * up2) / self.lambda1,
-                   -(gyroscopic * o1[k] + self.torque * up1) / self.lambda1, mpf(0))
+                   (gyroscopic * o2[k] - f2) / self.lambda1,
+                   (f1 - gyroscopic * o1[k]) / self.lambda1, mpf(0))
             for f, rate in zip((*q, *omega), new, strict=True):
                 f.append(rate / (k + 1))
         return q, omega
@@ -195,6 +208,31 @@ def increments(case):
         ('rates', rotated(of_body, means[:3])), ('force', rotated(of_body, means[3:])))}
 
 
+def ride(case):
+    """Return the states of a case with a moving pivot: q, omega, alpha, and where a point is."""
+    motion, found, now = Motion(Top(**case['top']), State(**case['start'])), [], 0
+    place, velocity = ([mpf(x) for x in case[name]] for name in ('position', 'velocity'))
+    for length, acceleration in (*case['pieces'], (10 ** 18, 3 * [0.0])):
+        motion.push(acceleration)
+        stops = [t for t in case['times_ns'] if now <= t < now + length]
+        for t in (*stops, now + length):
+            if len(found) == len(case['times_ns']):
+                return found
+            seconds, now = mpf(t - now) / 10 ** 9, t
+            motion.go_to(motion.t + seconds)
+            for k, a in enumerate(map(mpf, acceleration)):
+                place[k] += seconds * (velocity[k] + seconds * a / 2)
+                velocity[k] += seconds * a
+            if t in stops:
+                q, omega = motion.series()
+                point = rotated(motion.q, list(map(mpf, case['point'])))
+                found.append({name: [nstr(x, 30) for x in values] for name, values in (
+                    ('q', (motion.q[3], *motion.q[:3])), ('omega', motion.omega),
+                    ('alpha', [f[1] for f in omega]),
+                    ('position', [p + r for p, r in zip(place, point, strict=True)]))})
+    raise AssertionError('a time is behind the end')
+
+
 def write(name, head, rows, tail):
     lines = ',\n'.join(json.dumps(row, separators=(',', ':')) for row in rows)
     (HERE / name).write_text(f'{head}[\n{lines}\n]{tail}\n')
@@ -207,6 +245,9 @@ def main():
           '}')
     rows = json.loads((HERE / 'increments.json').read_text())
     write('increments.json', '', [{**row, **increments(row)} for row in rows], '')
+    rides = json.loads((HERE / 'ride.json').read_text())['cases']
+    write('ride.json', '{"note":"q is w x y z; made by make_references.py","cases":',
+          [{**case, 'states': ride(case)} for case in rides], '}')
 
 
 if __name__ == '__main__':

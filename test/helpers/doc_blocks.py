@@ -24,12 +24,14 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+import spinning_top_sim
 from helpers.reference import ROOT
 
 FENCE = re.compile(r'^(?:<!-- (?P<mark>[^\n]*?) -->\n)?'
                    r'^```(?P<language>[^\n]*)\n(?P<text>.*?)^```$', re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r'(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?(?![\w])')
 FILE = re.compile(r'# ([\w/]+\.(?:py|yaml))\n')
+SOURCE = str(Path(spinning_top_sim.__file__).parents[1])
 TIMEOUT = 600        # of a block [s], also under load
 
 
@@ -90,7 +92,7 @@ class Runner:
         self._environment = {**os.environ, 'PATH': os.pathsep.join(paths), 'COLUMNS': '118',
                              'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1',
                              'PYTHONPATH': os.pathsep.join(filter(None, (
-                                 os.environ.get('PYTHONPATH'), str(ROOT))))}
+                                 os.environ.get('PYTHONPATH'), SOURCE)))}
 
     def run(self, block):
         """Run a block; return what it printed, None if it is no code."""

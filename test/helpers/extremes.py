@@ -102,8 +102,12 @@ def _value(random_: random.Random, row: Parameter) -> object:
         return random_.random() < 0.5
     if isinstance(default, str):
         return random_.choice(row.choices or STRINGS)
+    return _numeric(random_, row)
+
+
+def _numeric(random_: random.Random, row: Parameter) -> float | int:
     bounds = [bound for bound in (row.minimum, row.maximum, row.above) if bound is not None]
-    if isinstance(default, int):
+    if isinstance(row.default, int):
         return random_.choice([*INTEGERS, *map(int, bounds)])
     if bounds and random_.random() < 0.3:
         return random_.choice([float(bound) for bound in bounds])

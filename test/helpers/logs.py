@@ -19,6 +19,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from helpers.recordings import METADATA
+from spinning_top_sim.recording import chunks
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
@@ -193,4 +194,5 @@ def without_sync(monkeypatch) -> None:
 
     monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
     monkeypatch.setattr(yaml, 'dump', dump_once)
+    monkeypatch.setattr(chunks, 'CHUNK_BYTES', 1 << 14)         # of memory that is taken
     monkeypatch.setattr(yaml, 'safe_load', functools.cache(yaml.safe_load))

@@ -345,11 +345,11 @@ class Diagnostics:
 
 
 class DrivenClock:
-    """A /clock [ns] that advances by 5 ms with each check of a condition."""
+    """A clock [ns] on a topic that advances by 5 ms with each check of a condition."""
 
-    def __init__(self, peer, now_ns):
+    def __init__(self, peer, topic, now_ns):
         self._peer, self.now_ns = peer, now_ns
-        self._publisher = peer.node.create_publisher(Clock, '/clock', 10)
+        self._publisher = peer.node.create_publisher(Clock, topic, 10)
 
     def publish(self, seconds, nanoseconds=0):
         message = Clock()

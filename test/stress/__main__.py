@@ -3,9 +3,8 @@
 Stress tests: random inputs and faults, for so long or so many.
 
     python test/stress tops --count 100000      both solvers on random tops
-    python test/stress logs --seconds 600       odd and damaged logs, and what reads them
+    python test/stress logs --seconds 600       damaged logs, and what reads them
     python test/stress nodes --seconds 600      extreme parameters and commands at a real node
-    python test/stress disk --seconds 600       recordings on a disk that fails
     python test/stress exam --count 20          the exam of a node, beside busy processes
     python test/stress grade --count 50         simulators with a defect, and right ones
     python test/stress fit --count 1000         fits of logs with noise: intervals and errors
@@ -25,8 +24,6 @@ from stress import fit, runner, tops  # noqa: E402
 
 
 def main():
-    if sys.argv[1:2] == ['--worker']:
-        return runner.serve(*sys.argv[2:])
     parser = argparse.ArgumentParser(
         prog='python test/stress', description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -56,8 +53,7 @@ def stress(options):
                         options.processes or 1, tell)
     outcomes = ', '.join(f'{name} {count}' for name, count in result.outcomes.most_common())
     print(f'\r{options.part}: seeds {options.first} to {options.first + result.seeds - 1}: '
-          f'{outcomes}; a worker had {result.peak_mb:.0f} MB at most; '
-          f'{len(result.failures)} failures')
+          f'{outcomes}; {len(result.failures)} failures')
     return 1 if result.failures else 0
 
 

@@ -55,7 +55,6 @@ def _recover(reader: LogReader, output: Path,
             _declare(scan, writer)
         if not writer.messages and not reader.whole:
             raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
-        os.chmod(output, reader.file.mode)
         writer.finish(bag=reader.profile == 'ros2' or BAG_METADATA in scan.metadata)
     progress(reader.size)
     return writer

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run without noise that shows one input at a time, and the answer to the gyroscope on it."""
+"""A run without noise that excites one input at a time, and the response to the gyroscope."""
 
 import itertools
 import math
@@ -22,18 +22,15 @@ TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), 
          (1, 110.0), (2, -120.0))
 TURN_RATE = 2.6                 # [rad/s]
 FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
-WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its answer; the longest delay
+WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
 KICK_S, KICK = 0.1, np.radians((0.7, 0.0, 0.7))     # of the gyroscope only; axes of the world
 
-# Limits of a right filter; docs/exam.md compares them with the values of filters.
-TILT, TILT_MOVING, HEADING = np.radians((0.3, 0.9, 0.8)).tolist()   # rms errors [rad]
 
-
-class Course(NamedTuple):
+class Excitation(NamedTuple):
     """
-    The run of this exam: rests between turns, the slow motion, and two kicks at rest.
+    Rests between turns, the slow motion, and two kicks of the gyroscope alone at rest.
 
     rests : index of the last sample of each rest (n,); the first and the last but one are equal
     turns : index of the first sample of each turn (n,)
@@ -48,7 +45,7 @@ class Course(NamedTuple):
     kicks: tuple[int, int]
 
 
-def course(imu: Mapping[str, Any], rate: float) -> Course:
+def excite(imu: Mapping[str, Any], rate: float) -> Excitation:
     """Return the run for the IMU's place and field, sampled at a rate [Hz]."""
     motion = scenarios.record(replace(scenarios.PIVOT, duration=MOTION_S, rate=rate), imu, 0)
     at = Rotation.identity()
@@ -56,7 +53,7 @@ def course(imu: Mapping[str, Any], rate: float) -> Course:
     ways = [math.radians(angle) * np.eye(3)[axis] for axis, angle in TURNS]
     ends = list(itertools.accumulate(map(Rotation.from_rotvec, ways), operator.mul))
     rests, turns = [len(path[0]) - 2], []
-    for goal in (*ends, at, Rotation.from_quat(motion.truth[0])):
+    for goal in (*ends, at, motion.start):
         way = (at.inv() * goal).as_rotvec()
         n = round(float(np.linalg.norm(way)) / TURN_RATE * rate) + 1
         turns.append(rests[-1] + 1)
@@ -68,19 +65,25 @@ def course(imu: Mapping[str, Any], rate: float) -> Course:
     n = round(ANSWER_S * rate)
     tail = scenarios.along('', Rotation.from_quat(np.tile(motion.truth[-1], (3 * n + 1, 1))), imu,
                            rate)
-    for sign, first in ((1.0, n), (-1.0, 2 * n)):
-        tail.gyroscope[first:first + round(KICK_S * rate)] += sign / KICK_S * Rotation.from_quat(
-            tail.truth[0]).inv().apply(KICK)
-    run = replace(tail.after(motion.after(lead)), name='course')
+    run = replace(tail.after(motion.after(lead)), name='excitation')
     run.gyroscope[:] += NEVER_ZERO
     end = len(lead.t) + len(motion.t)
-    return Course(run, np.array(rests), np.array(turns[:len(TURNS)]),
-                  slice(end - len(motion.t) // 2, end), (end + n, end + 2 * n))
+    return Excitation(run, np.array(rests), np.array(turns[:len(TURNS)]),
+                      slice(end - len(motion.t) // 2, end), (end + n, end + 2 * n))
+
+
+def with_kicks(given: Excitation) -> Run:
+    """Return the run with its kicks: to one side, then to the other."""
+    run = replace(given.run, gyroscope=given.run.gyroscope.copy())
+    kick = Rotation.from_quat(run.truth[-1]).inv().apply(KICK) / KICK_S
+    for sign, first in zip((1.0, -1.0), given.kicks, strict=True):
+        run.gyroscope[first:first + round(KICK_S / run.dt[-1])] += sign * kick
+    return run
 
 
 class Gyroscope(NamedTuple):
     """
-    The answer to the gyroscope: increments of the attitude over those of the sensor.
+    The response to the gyroscope: increments of the attitude over those of the sensor.
 
     matrix : (3, 3), the identity for a right filter
     late : delay in samples
@@ -97,34 +100,34 @@ class Gyroscope(NamedTuple):
         return float(np.max(np.abs(self.matrix - np.eye(3))))
 
 
-def increments(quaternions: Reals, of_world: bool = False) -> Reals:
-    """Return the rotation vectors of the steps (n, 3) about axes of the sensor or the world."""
+def increments(quaternions: Reals) -> Reals:
+    """Return the rotation vectors of the steps (n, 3) about axes of the sensor."""
     turns = Rotation.from_quat(quaternions)
-    steps = turns[1:] * turns[:-1].inv() if of_world else turns[:-1].inv() * turns[1:]
-    return np.concatenate((np.zeros((1, 3)), steps.as_rotvec()))
+    return np.concatenate((np.zeros((1, 3)), (turns[:-1].inv() * turns[1:]).as_rotvec()))
 
 
-def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp], length: int, latest: int = LATEST,
-                 of_world: bool = False) -> Gyroscope:
-    """Fit the answer to the first samples of turns, at the delay that leaves least."""
-    said, true = increments(outcome.estimates, of_world), increments(outcome.run.truth)
+def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp], length: int,
+                 latest: int = LATEST) -> Gyroscope:
+    """Fit the response to the first samples of turns, at the delay that leaves least."""
+    estimated, true = increments(outcome.estimates), increments(outcome.run.truth)
     fits = []
     for late in range(latest + 1):
         rows = (turns[:, np.newaxis] + np.arange(length)).ravel()
-        given, answer = np.roll(true, late, axis=0)[rows], said[rows]
-        matrix = np.linalg.lstsq(given, answer, rcond=None)[0]
+        given, response = np.roll(true, late, axis=0)[rows], estimated[rows]
+        matrix = np.linalg.lstsq(given, response, rcond=None)[0]
         fits.append(Gyroscope(matrix.T, late, float(
-            np.sum((answer - given @ matrix) ** 2) / max(np.sum(answer ** 2), 1e-12))))
+            np.sum((response - given @ matrix) ** 2) / max(np.sum(response ** 2), 1e-12))))
     return min(fits, key=lambda fit: fit.scatter)
 
 
 def words(matrix: Reals) -> str:
     """Return in words how a matrix (3, 3) of the gyroscope differs from the identity."""
+    off = 0.5 * np.max(np.abs(matrix - np.eye(3)))
     return '; '.join(
         f'a rate about {AXES[k]} turns it ' + (' and '.join(
-            f'{column[j]:+.2g} times about {AXES[j]}' for j in range(3)
-            if abs(column[j]) > 0.2 * np.max(np.abs(column))) or 'not at all')
-        for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) > 0.03)
+            f'{column[j]:+.3g} times about {AXES[j]}' for j in range(3)
+            if abs(column[j] - (j == k)) >= off and column[j]) or 'not at all')
+        for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) >= off)
 
 
 def axes(matrix: Reals) -> str:
@@ -133,10 +136,10 @@ def axes(matrix: Reals) -> str:
                      for row in matrix)
 
 
-def mapped(name: str, matrix: NDArray[np.floating[Any]]) -> ChangeReadings:
-    """Return the multiplication of the readings of a sensor by a matrix."""
+def mapped(name: str, matrix: NDArray[np.floating[Any]], offset: Any = 0.0) -> ChangeReadings:
+    """Return the multiplication of the readings of a sensor by a matrix; an offset is added."""
     def change(run: Run) -> Run:
-        readings: Any = {name: getattr(run, name) @ matrix.T}
+        readings: Any = {name: getattr(run, name) @ matrix.T + offset}
         return replace(run, **readings)
     return change
 
@@ -149,14 +152,23 @@ def shifted(names: Sequence[str], samples: int) -> ChangeReadings:
     return change
 
 
+def sharpened(names: Sequence[str], samples: float) -> ChangeReadings:
+    """Return the inverse of a low pass of first order with this time constant [samples]."""
+    def change(run: Run) -> Run:
+        readings: Any = {name: getattr(run, name) + samples * np.diff(
+            getattr(run, name), axis=0, prepend=getattr(run, name)[:1]) for name in names}
+        return replace(run, **readings)
+    return change
+
+
 def moved(rows: Reals, samples: int) -> Reals:
     """Return the rows so many samples later; the first or the last is repeated."""
     return rows[np.clip(np.arange(len(rows)) + samples, 0, len(rows) - 1)]
 
 
-def with_iron(iron: Reals, run: Run) -> Run:
-    """Return a field with this added [uT]."""
-    return replace(run, magnetometer=run.magnetometer + 1e-6 * iron)
+def with_steps(scale: float, run: Run) -> Run:
+    """Return steps so many times as long, by their stamps."""
+    return replace(run, dt=scale * run.dt)
 
 
 def of_world(run: Run) -> Run:
@@ -169,29 +181,3 @@ def untilted(run: Run) -> Run:
     true = Rotation.from_quat(run.truth)
     level = Rotation.from_euler('z', true.as_euler('ZYX')[:, :1])
     return replace(run, magnetometer=level.inv().apply(true.apply(run.magnetometer)))
-
-
-class Clean(NamedTuple):
-    """Errors without noise, rms [rad]: at rest, and in motion."""
-
-    tilt: float
-    heading: float
-    tilt_moving: float
-    heading_moving: float
-
-    @property
-    def wrong(self) -> bool:
-        """Whether one is larger than that of a right filter."""
-        return (self.tilt > TILT or self.tilt_moving > TILT_MOVING
-                or max(self.heading, self.heading_moving) > HEADING)
-
-
-def unit(quaternions: Reals) -> Reals:
-    """Return the quaternions (n, 4) with norm 1."""
-    scaled: Reals = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return scaled
-
-
-def rows_of(matrix: Reals) -> str:
-    """Return a matrix as text."""
-    return ' '.join('[' + ' '.join(f'{value:.2g}' for value in row) + ']' for row in matrix)

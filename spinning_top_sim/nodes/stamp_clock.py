@@ -13,7 +13,7 @@ from spinning_top_sim.nodes.tick_loop import EPOCH_GRID_NS
 PATIENCE_S = 2.0        # a /clock that does not change for longer has stopped
 
 
-class DateClock:
+class StampClock:
     """
     The clock of the system or, with `use_sim_time`, the /clock of another node.
 
