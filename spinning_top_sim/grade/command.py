@@ -25,9 +25,10 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.files import trajectory_of
-from spinning_top_sim.grade.fit import Fit, fit, near_start, start_of
+from spinning_top_sim.grade.fit import Fit, fit
 from spinning_top_sim.grade.grader import grade_trajectory
 from spinning_top_sim.grade.scenes import Body
+from spinning_top_sim.grade.start import near_start, start_of
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.solvers.exact import ExactSolution

@@ -21,13 +21,12 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.grade import guess
 from spinning_top_sim.grade import problem as unknowns
 from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Readings, turned
-from spinning_top_sim.grade.scenes import Body, Reals, Start
+from spinning_top_sim.grade.scenes import Body, Reals
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
 FEWEST = 32                 # attitudes that can be fitted
-BEGIN = 64                  # attitudes that tell a start, whatever follows
 GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
 LOST = 0.05                 # residual of a part that is too long to begin with [rad]
 FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
@@ -43,7 +42,6 @@ ONCE_IN = 1000.0            # noise that is called a residue of the motion
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
-OFF = 0.1                   # rad, or share of the rates: another start
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     ValueError
         If there are too few attitudes, no readings, or no motion of a top comes near.
     """
-    one, begin = _attitudes(parts)
+    one, begin = attitudes_of(parts)
     trials = []
     for trial in _trials(one, parts, gravity):
         trials.append(trial)
@@ -164,23 +162,7 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     return _conclude(best, begin, lambda1, gravity)
 
 
-def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> State:
-    """Return the start of a known top: the fitted one, or if none was found that of the begin."""
-    if found.reached:
-        start = Start.of(found.top, found.start)
-        return Start(start.attitude, start.rates).state_of(top)
-    one, _ = _attitudes(parts)
-    first = replace(one, times=one.times[:BEGIN], values=one.values[:, :BEGIN])
-    problem, (x, _) = Problem([first], one.values[:, 0], top.gravity), _first_values(one, parts)
-    x[P] = top.gravity_torque / top.lambda1
-    for _ in range(3):
-        x[L3] = top.lambda3 / top.lambda1 * x[SPIN]
-        x, _ = descend(problem, x, MOTION[:6])
-    _, state = problem.start(x)
-    return replace(state, l3=state.l3 * top.lambda1, lz=state.lz * top.lambda1)
-
-
-def _first_values(one: Readings, parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Reals, bool]:
+def first_values(one: Readings, parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Reals, bool]:
     """Return unknowns with the rates at the begin, and whether whole turns are known."""
     told = parts.get('rates', parts.get('gyroscope'))
     spin, sure = guess.spin_rate(one.times, one.values, told and float(np.median(told[1][:, 2])))
@@ -189,7 +171,7 @@ def _first_values(one: Readings, parts: Mapping[str, tuple[Reals, Reals]]) -> tu
     return x, sure
 
 
-def _attitudes(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
+def attitudes_of(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
     """Return attitudes from t = 0 on, and the time of the first."""
     times, attitudes = parts['attitudes']
     if len(times) < FEWEST:
@@ -203,7 +185,7 @@ def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
     """Yield fits from one guess after another."""
     times, q = one.times, one.values
     axis = np.stack(attitude.axis_in_world(tuple(q)))
-    first, sure = _first_values(one, parts)
+    first, sure = first_values(one, parts)
     weak, small = guess.weak(times, axis), list(guess.small_nutation(times, axis))
     seeds = [*weak[:1], *((0, *pair) for pair in small[:4]), *weak[1:2]]
     for size, l3, p in seeds:
@@ -421,21 +403,3 @@ def _scaled(values: Sequence[float], lambda1: float, gravity: float) -> tuple[To
               com_distance=distance, mass=mass)
     return top, State(theta=theta, theta_dot=theta_dot, phi=phi, psi=psi, l3=l3 * lambda1,
                       lz=lz * lambda1)
-
-
-def near_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) -> str:
-    """Return how far the attitudes are from a start at t = 0, '' if they are near it."""
-    one, begin = _attitudes(parts)
-    q = one.values
-    first = ExactSolution(top, start).states_at_seconds(np.array([begin]))
-    apart = float(attitude.angle_between(first.rows_quaternion, tuple(q[:, :1]))[0])
-    axis = np.stack(attitude.axis_in_world(tuple(q)))
-    w1, w2, error = guess.transverse_rates(one.times, q, axis)
-    right = first.angular_velocity[0]
-    spin, _ = guess.spin_rate(one.times, q, float(right[2]))
-    off = math.dist((w1, w2, spin), right)
-    noise = 6.0 * error
-    if apart <= OFF + noise * float(one.times[1]) and off <= OFF * np.linalg.norm(right) + noise:
-        return ''
-    return (f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates '
-            f'{off:.3g} rad/s')
