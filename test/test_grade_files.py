@@ -5,12 +5,14 @@ import json
 
 import numpy as np
 import pytest
+from helpers.faulty_simulators import Stepped
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.grade.command import main
 from spinning_top_sim.grade.files import trajectory_of
+from spinning_top_sim.grade.scenes import Start
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -66,6 +68,8 @@ TABLES = {
                       'pose.orientation.w', 'pose.orientation.x', 'pose.orientation.y',
                       'pose.orientation.z')}, ';', ''),
     'camel case': ({**wxyz('quatW', 'quatX', 'quatY', 'quatZ'), 'Time_ms': 1e3 * T}, '\t', ''),
+    'dates and numbers': ({'time': [f'{np.datetime64(ns, "ns")}' for ns in NS.tolist()],
+                           **wxyz('q0', 'q1', 'q2', 'q3')}, ',', ''),
     'angles': ({'time': T, **euler('')}, ',', ''),
     'degrees': ({**euler('_deg'), 'stamp_ns': NS}, ',', '')}
 
@@ -80,6 +84,12 @@ def test_columns_are_known_by_their_names(tmp_path, kind):
     turns = Rotation.from_quat(np.roll(attitudes, -1, axis=1))
     assert (turns.inv() * Rotation.from_quat(Q)).magnitude().max() < 1e-6
     assert len(trajectory_of(recorded, EXACT).t) == len(T)
+
+
+def test_a_trajectory_of_tum_needs_no_names(tmp_path):
+    path = table(tmp_path / 'a.tum', *TABLES['TUM'])
+    path.write_text(path.read_text().partition('\n')[2])
+    assert motion_files.read(path).parts['attitudes'][1] == pytest.approx(np.roll(Q, 1, axis=1))
 
 
 @pytest.mark.parametrize(('names', 'unit'), [
@@ -174,6 +184,28 @@ def test_faults_in_a_table_are_named_with_a_fitted_top(tmp_path, capsys, fault, 
     out = capsys.readouterr().out
     assert f'a.csv: {fault}\n' in out
     assert 'P/lambda1' in out
+
+
+def test_axes_that_are_turned_are_told(tmp_path, capsys):
+    turn = Rotation.from_rotvec((0.3, -0.2, 1.1)).inv().apply
+    path = table(tmp_path / 'a.csv', {'t': T, **wxyz('qw', 'qx', 'qy', 'qz'),
+                                      **imu(turn(RATES), turn(FORCE))})
+    assert main([str(path), *LOOPING]) == 1
+    out = capsys.readouterr().out
+    assert 'a.csv: mounting\n' in out
+    assert 'by (0.3, -0.2, 1.1) rad' in out
+
+
+def test_faults_of_the_motion_of_a_known_top_are_named_without_its_start(tmp_path, capsys):
+    start, times = Start.of(TOP, START), 0.005 * np.arange(500)
+    q, w, _ = Stepped(method='semi-implicit')(TOP, start, times, 0.005)
+    path = table(tmp_path / 'a.csv', {'t': times, **dict(zip(
+        ('qx', 'qy', 'qz', 'qw', 'wx', 'wy', 'wz'), np.hstack((q, w)).T, strict=True))})
+    top = [word for name, value in vars(TOP).items() for word in ('-p', f'top.{name}:={value}')]
+    assert main([str(path), '--fit', *top]) == 1
+    assert 'a.csv: explicit_gyroscopic_term\n' in capsys.readouterr().out
+    assert main([str(path), '--fit', '-p', 'initial.theta:=0.3']) == 2
+    assert 'initial.theta must not be given' in capsys.readouterr().err
 
 
 def test_a_log_of_this_package_brings_its_top(tmp_path, capsys):

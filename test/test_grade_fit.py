@@ -41,7 +41,7 @@ def parts_of(name, seconds, rate, sigma=1e-3, imu=False):
 
 def test_errors_are_those_of_the_cramer_rao_bound():
     """As a thousand logs of `test/stress fit` show: here the sum of few is not improbable."""
-    logs = [check(seed) for seed in range(3)]
+    logs = [check(seed) for seed in range(2)]
     assert all(np.isfinite(log.over_deviation).all() for log in logs)
     low, high = chi2.ppf((1e-4, 1.0 - 1e-4), 8 * len(logs))
     assert low < sum(log.squares for log in logs) < high
@@ -55,7 +55,7 @@ def test_errors_are_those_of_the_cramer_rao_bound():
     ('free_top', ('mass and com_distance, because no torque acts',)),
     ('looping', ('mass and com_distance, but for P = mass gravity com_distance',))])
 def test_what_the_data_cannot_tell_is_named(name, hidden):
-    found = fit(parts_of(name, 5.0, 100.0))
+    found = fit(parts_of(name, 5.0, 50.0))
     assert found.reached
     scale = 'the scale of lambda1, lambda3, mass, L3 and Lz'
     product = 'mass and com_distance, but for P = mass gravity com_distance'
@@ -70,7 +70,7 @@ def test_what_the_data_cannot_tell_is_named(name, hidden):
 def test_a_nutation_below_the_noise_is_found():
     """Of the fast gyroscope: 80 Hz, a sixth of the noise, and 191 turns in a second."""
     top, start = scene('fast_gyroscope')
-    found = fit(parts_of('fast_gyroscope', 20.0, 200.0, sigma=1e-3))
+    found = fit(parts_of('fast_gyroscope', 10.0, 200.0, sigma=1e-3))
     assert found.reached
     true = {'L3/lambda1': start.l3 / top.lambda1, 'lambda3/lambda1': top.lambda3 / top.lambda1,
             'P/lambda1': top.gravity_torque / top.lambda1, 'theta': start.theta}
@@ -80,8 +80,8 @@ def test_a_nutation_below_the_noise_is_found():
 
 def test_what_is_no_motion_of_a_top_is_not_said_to_be_one():
     """A top that slows down; noise does not hide it."""
-    times, attitudes = parts_of('cusp', 2.0, 100.0)['attitudes']
-    slows = Rotation.from_rotvec(np.outer(-0.2 * times ** 2, (0.0, 0.0, 1.0)))
+    times, attitudes = parts_of('cusp', 1.5, 50.0)['attitudes']
+    slows = Rotation.from_rotvec(np.outer(-0.4 * times ** 2, (0.0, 0.0, 1.0)))
     q = (Rotation.from_quat(np.roll(attitudes, -1, axis=1)) * slows).as_quat()
     found = fit({'attitudes': (times, np.roll(q, 1, axis=1))})
     assert not found.reached
@@ -90,7 +90,7 @@ def test_what_is_no_motion_of_a_top_is_not_said_to_be_one():
 
 
 def test_the_place_of_an_imu_is_fitted_to_its_readings():
-    found = fit(parts_of('looping', 4.0, 100.0, imu=True), imu=True)
+    found = fit(parts_of('looping', 3.0, 70.0, imu=True), imu=True)
     assert found.reached
     true = dict(zip(('mounting_x', 'mounting_y', 'mounting_z', 'lever_arm_x', 'lever_arm_y',
                      'lever_arm_z', 'stamp_offset'),
@@ -100,6 +100,11 @@ def test_the_place_of_an_imu_is_fitted_to_its_readings():
     assert np.allclose(found.lever_arm, LEVER_ARM, atol=1e-2)
     with pytest.raises(ValueError, match='no gyroscope'):
         fit(parts_of('looping', 1.0, 100.0), imu=True)
+
+
+def test_a_motion_near_the_separatrix_is_found():
+    found = fit(parts_of('near_separatrix', 8.0, 60.0))
+    assert found.reached
 
 
 def test_attitudes_without_noise_give_the_top_to_nine_digits():

@@ -220,7 +220,8 @@ class Responses:
                            'on the wrong side)', given=excitation.of_world)])
         for fit in (early, whole):
             scale = float(np.trace(fit.matrix)) / 3.0
-            if np.max(np.abs(fit.matrix - scale * np.eye(3))) < 0.3 * abs(scale - 1.0):
+            uniform = np.max(np.abs(fit.matrix - scale * np.eye(3))) < 0.3 * abs(scale - 1.0)
+            if uniform and scale > 1.0 / WORST:
                 yield from self._tried([Hypothesis(
                     ('gyroscope_wiring', 'time_step'), f'with steps {1.0 / scale:.4g} times as '
                     'long (scales of rates and steps cannot be told apart)',

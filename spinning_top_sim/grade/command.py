@@ -19,19 +19,23 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.files import trajectory_of
-from spinning_top_sim.grade.fit import Fit, fit, near_start
+from spinning_top_sim.grade.fit import Fit, fit
 from spinning_top_sim.grade.grader import grade_trajectory
 from spinning_top_sim.grade.scenes import Body
+from spinning_top_sim.grade.start import near_start, start_of
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, motion_files, scene_file
+
+DENSITIES = 'gyroscope_noise_density', 'accelerometer_noise_density'
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -44,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('file', type=Path, help='.mcap, .csv, .parquet or .npz')
     scene_file.add_parameters(parser)
-    add('--fit', action='store_true', help='fit top and start to the attitudes; the default '
-        'without --scene, --params, -p and parameters in the file')
+    add('--fit', action='store_true', help='fit top and start to the attitudes, or only the start '
+        'of a top that is given; the default where nothing is given and the file tells nothing')
     add('--fit-imu', action='store_true', help='the same, and mounting, place and stamps of the '
         'IMU to its readings')
     add('--lever-arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
@@ -69,22 +73,37 @@ def _run(arguments: argparse.Namespace) -> int:
     return cli.OK if report.passed and (found is None or found.reached) else cli.FAILED
 
 
+def _given(arguments: argparse.Namespace) -> dict[str, object]:
+    """Return the parameters that are given.  Raises ValueError for a start beside --fit."""
+    given = scene_file.given(arguments)
+    starts = [name for name in given if name.startswith(('initial.', 'spin.'))]
+    if starts and (arguments.fit or arguments.fit_imu):
+        raise ValueError(f'--fit finds the start: {", ".join(starts)} must not be given')
+    return given
+
+
 def _motion(arguments: argparse.Namespace,
             recorded: motion_files.Recorded) -> tuple[Body, State, Fit | None]:
     """Return top with IMU and start, as given or as fitted, and the fit."""
-    given, fits = scene_file.given(arguments), arguments.fit or arguments.fit_imu
-    if fits and given:
-        raise ValueError('give either --fit, or --scene, --params and -p')
+    given, fits = _given(arguments), arguments.fit or arguments.fit_imu
     known = None if given else recorded.parameters
     values = known or parameters.checked(given)
     x, y, z, w = Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()
     top, start = parameters.top_of(values), parameters.start_state(values)
-    body = Body.of(top, lever_arm=tuple(arguments.lever_arm or values['imu.lever_arm']),
-                   mounting=(w, x, y, z), field=tuple(values['mag.field']))
+    body = Body.of(
+        top, lever_arm=tuple(arguments.lever_arm or values['imu.lever_arm']),
+        mounting=(w, x, y, z), field=tuple(values['mag.field']),
+        **{name: given.get(f'imu.{name}') for name in DENSITIES})
     if fits or not (given or known):
         found = fit(recorded.parts, lambda1=top.lambda1, gravity=top.gravity,
                     imu=arguments.fit_imu)
-        return found.body(body), found.start, found
+        fitted, start = found.body(body), found.start
+        if arguments.lever_arm or 'imu.lever_arm' in given:
+            fitted = replace(fitted, lever_arm=body.lever_arm)
+        if {name.partition('.')[0] for name in given} >= {'top'}:
+            fitted = replace(fitted, **vars(top))
+            start = start_of(found, recorded.parts, top)
+        return fitted, start, found
     if off := near_start(recorded.parts, top, start):
         raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
                          '--fit finds top and start')

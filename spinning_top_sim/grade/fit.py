@@ -36,12 +36,12 @@ NAMES = {'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'psi': 'rad', 'L3/l
          'lever_arm_z': 'm', 'stamp_offset': 's'}
 ANGLES, RATIO = (2, 3), 6   # of NAMES: those that may change by a turn, lambda3/lambda1
 EXACT = 1e-7                # residual that needs no noise: quaternions in single precision [rad]
+NEGLIGIBLE = 1e-5           # of readings: errors of a simulator's steps
 LARGEST = 0.3               # noise [rad]
 ONCE_IN = 1000.0            # noise that is called a residue of the motion
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
-OFF = 0.1                   # rad, or share of the rates: another start
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     ValueError
         If there are too few attitudes, no readings, or no motion of a top comes near.
     """
-    one, begin = _attitudes(parts)
+    one, begin = attitudes_of(parts)
     trials = []
     for trial in _trials(one, parts, gravity):
         trials.append(trial)
@@ -162,7 +162,16 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     return _conclude(best, begin, lambda1, gravity)
 
 
-def _attitudes(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
+def first_values(one: Readings, parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Reals, bool]:
+    """Return unknowns with the rates at the begin, and whether whole turns are known."""
+    told = parts.get('rates', parts.get('gyroscope'))
+    spin, sure = guess.spin_rate(one.times, one.values, told and float(np.median(told[1][:, 2])))
+    axis, x = np.stack(attitude.axis_in_world(tuple(one.values))), np.zeros(unknowns.UNKNOWNS)
+    x[unknowns.RATES] = (*guess.transverse_rates(one.times, one.values, axis)[:2], spin)
+    return x, sure
+
+
+def attitudes_of(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
     """Return attitudes from t = 0 on, and the time of the first."""
     times, attitudes = parts['attitudes']
     if len(times) < FEWEST:
@@ -176,13 +185,11 @@ def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
     """Yield fits from one guess after another."""
     times, q = one.times, one.values
     axis = np.stack(attitude.axis_in_world(tuple(q)))
-    told = parts.get('rates', parts.get('gyroscope'))
-    spin, sure = guess.spin_rate(times, q, told and float(np.median(told[1][:, 2])))
+    first, sure = first_values(one, parts)
     weak, small = guess.weak(times, axis), list(guess.small_nutation(times, axis))
     seeds = [*weak[:1], *((0, *pair) for pair in small[:4]), *weak[1:2]]
     for size, l3, p in seeds:
-        x = np.zeros(unknowns.UNKNOWNS)
-        x[unknowns.RATES] = (*guess.transverse_rates(times, q, axis)[:2], spin)
+        x = first.copy()
         x[L3], x[P] = l3, p
         try:
             trial = _fit_from(one, x, size, gravity)
@@ -205,14 +212,14 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
         free = MOTION if count == last or 0 < 2 * size < count else MOTION[:6]
         precisely = (30, 1e-8) if count == last else (8, 1e-3)
         found, converged = descend(problem, x, free, *precisely)
-        rest = float(np.std(problem.residuals(found)))
-        if rest > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
+        left = float(np.std(problem.residuals(found)))
+        if left > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
             growth = math.sqrt(growth)
         else:
-            x, done, level, growth = found, count, rest, min(growth * growth, GROWTH)
-    left = problem.residuals(x).reshape(3, -1)
-    residual = math.sqrt(float(np.sum(left * left)) / (left.size - len(MOTION)))
-    noise, white = whiteness(left)
+            x, done, level, growth = found, count, left, min(growth * growth, GROWTH)
+    rest = problem.residuals(x).reshape(3, -1)
+    residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
+    noise, white = whiteness(rest)
     explained = residual <= EXACT or (white and residual < LARGEST)
     return _Trial(problem, x, residual, noise, explained,
                   explained and (converged or residual <= EXACT))
@@ -287,8 +294,10 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
     rests = [problem.residual(x, stream) for stream in problem.readings]
     noise, _ = whiteness(rests[0])
     residual = math.sqrt(float(np.mean(rests[0] ** 2)))
-    return trial._replace(x=x, residual=residual, noise=noise, reached=trial.reached and (
-        converged and all(whiteness(rest)[1] or np.std(rest) < EXACT for rest in rests)))
+    explained = all(whiteness(rest)[1] or np.std(rest) < EXACT + NEGLIGIBLE * np.std(stream.values)
+                    for stream, rest in zip(problem.readings, rests, strict=True))
+    return trial._replace(x=x, residual=residual, noise=noise,
+                          reached=trial.reached and converged and explained)
 
 
 def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fit:
@@ -394,21 +403,3 @@ def _scaled(values: Sequence[float], lambda1: float, gravity: float) -> tuple[To
               com_distance=distance, mass=mass)
     return top, State(theta=theta, theta_dot=theta_dot, phi=phi, psi=psi, l3=l3 * lambda1,
                       lz=lz * lambda1)
-
-
-def near_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) -> str:
-    """Return how far the attitudes are from a start at t = 0, '' if they are near it."""
-    one, begin = _attitudes(parts)
-    q = one.values
-    first = ExactSolution(top, start).states_at_seconds(np.array([begin]))
-    apart = float(attitude.angle_between(first.rows_quaternion, tuple(q[:, :1]))[0])
-    axis = np.stack(attitude.axis_in_world(tuple(q)))
-    w1, w2, error = guess.transverse_rates(one.times, q, axis)
-    right = first.angular_velocity[0]
-    spin, _ = guess.spin_rate(one.times, q, float(right[2]))
-    off = math.dist((w1, w2, spin), right)
-    noise = 6.0 * error
-    if apart <= OFF + noise * float(one.times[1]) and off <= OFF * np.linalg.norm(right) + noise:
-        return ''
-    return (f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates '
-            f'{off:.3g} rad/s')

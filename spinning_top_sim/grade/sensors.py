@@ -7,6 +7,7 @@ The error of the motion does not matter.
 """
 
 import math
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +28,7 @@ LATE = 0.75                 # steps
 STRANGE = {'rates': 2e-2, 'velocities': 5e-2}
 STRANGE_ELSE = 2e-3
 CONSISTENT = 1e-3           # of the reading: the lag is not looked for
+TURNED = 0.02               # of the discrepancy is left at most by a turn of the axes
 UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
 NOISY = 1e-4                # of the reading: smaller noise is rounding
 NOISE_BAND = 0.05           # of the noise, to either side of what is declared, beside its doubt
@@ -147,7 +149,8 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     Returns the faults and the measures.
     """
     lag = 0 if kind == 'velocities' else _lag(runs)
-    target, effects = _pooled([_discrepancy(kind, run, lag) for run in runs])
+    parts = [_discrepancy(kind, run, lag) for run in runs]
+    target, effects = _pooled(parts)
     noise = [_noise(run, lag) for run in runs]
     floor = rms(np.array(noise) / [run.size for run in runs])
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
@@ -159,13 +162,13 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     if abs(late) > LATE:
         faults.append(Fault('imu_one_step_late', f'{kind}: readings belong to the motion of '
                             f'{late:.3g} steps ({1e3 * late * runs[0].step:.3g} ms) before', late))
-    strange = STRANGE.get(kind, STRANGE_ELSE)
-    if derived:
-        strange += 0.25 * max((run.rotation[0].inv() * run.rotation[1]).magnitude() ** 2
-                              for run in runs)
+    strange = STRANGE.get(kind, STRANGE_ELSE) + (_half_step(runs) if derived else 0.0)
     if before > strange:
         causes = _causes(kind, effects, motion.body)
         found, residual, _ = explain(target, causes, math.hypot(floor, 0.5 * strange))
+        turned, left = _turned(kind, target, effects['total'])
+        if beyond(left, most) < min(TURNED * before, 0.1 * beyond(residual, most)):
+            found, residual = turned, left
         faults += found
         rest = beyond(residual, most)
         if rest > max(UNEXPLAINED * before, strange):
@@ -176,11 +179,28 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     scaled = {'units', 'reading_scale'} & {fault.name for fault in faults}
     if kind in ('gyroscope', 'accelerations') and not scaled:
         noises, ends = effects['size'] * residual, np.cumsum([
-            len(run.late(lag)[0]) for run in runs])
+            len(run.late(lag)[0]) for run in runs[:-1]])
         # A cause that is found has taken fast motion away, or has left some.
-        level = np.mean(np.minimum(noise, [*map(_white, np.split(noises, ends[:-1]))]))
-        faults += _noise_faults(kind, runs[0], float(level), noises, motion, NOISE_BAND + doubt)
+        level = float(np.mean(np.minimum(noise, [*map(_white, np.split(noises, ends))])))
+        faults += _noise_faults(kind, runs[0], level, motion, NOISE_BAND + doubt)
+        faults += _shape_fault(kind, level, noises, NOISY * runs[0].size)
     return faults, marks
+
+
+def _turned(kind: str, target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
+    """Return the fault that the axes are not those of the IMU, and what it leaves (m, 3)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')     # vectors along one line allow many turns
+        turn, _ = Rotation.align_vectors(target + total, total)
+    turns = ', '.join(f'{part:.3g}' for part in turn.inv().as_rotvec())
+    return [Fault('mounting', f'{kind}: the readings are in axes that are turned by ({turns}) rad '
+                  'from those of the IMU', turn.magnitude())], target + total - turn.apply(total)
+
+
+def _half_step(runs: Sequence[Readings]) -> float:
+    """Return the share of a reading by which rates half a step apart may change it."""
+    return 0.25 * max(float((run.rotation[0].inv() * run.rotation[1]).magnitude()) ** 2
+                      for run in runs)
 
 
 def _pooled(parts: Sequence[tuple[Reals, dict[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
@@ -199,7 +219,14 @@ def _fraction(kind: str, target: Reals, effects: Mapping[str, Reals]) -> float:
     return float(fractions[0]) if 1e-6 < rms(target) > 2.0 * rms(left) else 0.0
 
 
-def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motion: Motion,
+def _shape_fault(kind: str, level: float, noise: Reals, rounding: float) -> Iterator[Fault]:
+    kurtosis = float(np.mean(noise ** 4)) / (rms(noise) ** 4 or 1.0)
+    if level > rounding and rms(noise) < 1.05 * level and kurtosis < LEAST_KURTOSIS:
+        yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; normal '
+                    'noise has 3, uniform noise 1.8', kurtosis)
+
+
+def _noise_faults(kind: str, run: Readings, noise: float, motion: Motion,
                   band: float) -> Iterator[Fault]:
     """Compare the noise with what is declared; `band`: of the ratio, to either side of 1."""
     density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
@@ -214,15 +241,11 @@ def _noise_faults(kind: str, run: Readings, noise: float, residual: Reals, motio
     if declared == 0.0 and exists:
         yield Fault('noise_scale', f'{text}, it is declared as 0', math.inf)
     elif declared and abs((ratio := noise / declared) - 1.0) > band:
-        as_if = [f' ({name})' for name, factor in (
-            ('sqrt(2)', math.sqrt(2.0)), ('1/sqrt(2)', math.sqrt(0.5)), ('sqrt(dt)', root),
-            ('1/sqrt(dt)', 1.0 / root)) if abs(ratio / factor - 1.0) < band]
-        yield Fault('noise_scale', f'{text}, {ratio:.4g}{"".join(as_if)} times what is declared',
-                    ratio)
-    kurtosis = float(np.mean(residual ** 4)) / (rms(residual) ** 4 or 1.0)
-    if exists and rms(residual) < 1.05 * noise and kurtosis < LEAST_KURTOSIS:
-        yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; normal '
-                    'noise has 3, uniform noise 1.8', kurtosis)
+        factors = {'sqrt(2)': math.sqrt(2.0), '1/sqrt(2)': math.sqrt(0.5), 'sqrt(dt)': root,
+                   '1/sqrt(dt)': 1.0 / root}
+        as_if = min(factors, key=lambda name: abs(ratio / factors[name] - 1.0))
+        named = f' ({as_if})' if abs(ratio / factors[as_if] - 1.0) < band else ''
+        yield Fault('noise_scale', f'{text}, {ratio:.4g}{named} times what is declared', ratio)
 
 
 def _lag(runs: Sequence[Readings]) -> int:
@@ -263,7 +286,6 @@ def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, R
     total = run.total
     effects = {**run.terms, 'total': total, 'step': _rate(total),
                'size': run.size ** 2 + 0.0 * total,
-               'mounted': run.mounting.apply(total),
                'world': (world := run.rotation.apply(total)),
                'reversed': run.rotation.apply(world)}
     if kind in FORCES:
@@ -286,7 +308,6 @@ def _causes(kind: str, effects: Mapping[str, Reals], body: Body) -> list[Cause]:
     in_world = 'rates_in_world' if kind in ('gyroscope', 'rates') else 'reading_in_world'
     text = f'{kind}: the readings are in axes of '
     causes = [only(partial(_scale, kind), 'total'), only(lambda found: None, 'step'),
-              only(instead('mounting', f'{text}the body, not of the IMU'), 'total', 'mounted'),
               only(instead(in_world, f'{text}the world, not of the IMU'), 'total', 'world'),
               only(instead('rotation_reversed', f'{text}a sensor that turns against the IMU'),
                    'total', 'reversed')]

@@ -41,7 +41,7 @@ WORDS = {
     MAGNETOMETER: {'m', 'mag', 'magnetic', 'magnetometer'}}
 ANGLE_WORDS = {'phi': 'a', 'precession': 'a', 'theta': 'b', 'nutation': 'b', 'psi': 'c',
                'spin': 'c'}
-COMPONENTS = {'w': 'w', 'x': 'x', 'y': 'y', 'z': 'z', '1': 'x', '2': 'y', '3': 'z'}
+COMPONENTS = {'w': 'w', 'x': 'x', 'y': 'y', 'z': 'z', '0': 'w', '1': 'x', '2': 'y', '3': 'z'}
 OTHERS = {'dot', 'bias', 'b', 'covariance', 'cov', 'std', 'error'}
 TIMES = {'t', 'time', 'times', 'timestamp', 'stamp', 'sec', 'secs'}
 SECONDS = {'nanosec': '1e-9', 'nsec': '1e-9', 'ns': '1e-9', 'us': '1e-6', 'ms': '1e-3'}
@@ -230,10 +230,11 @@ def _number(cell: Any) -> float:
 
 
 def _decimal(cell: Any) -> Decimal:
-    try:
+    with contextlib.suppress(InvalidOperation):
         return Decimal(str(cell).strip())
-    except InvalidOperation:
-        return Decimal('NaN')
+    with contextlib.suppress(ValueError):       # a date as text
+        return Decimal(int(np.datetime64(str(cell).strip(), 'ns').astype(int))) / 10 ** 9
+    return Decimal('NaN')
 
 
 def _seconds(stamps: Mapping[str, Sequence[Any]]) -> NDArray[np.object_]:
@@ -269,13 +270,18 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
     chosen = sorted(tables, key=lambda one: (
         one[0] != wanted, MESSAGES.index(types[one[0]]), one))
     recorded.add({' '.join(filter(None, one)): tables[one] for one in chosen}, origin)
-    for kind, name in COVARIANCES.items():
-        for topic in [topic for topic in first if f'{kind} of {topic}' in recorded.notes]:
-            matrix = np.reshape(getattr(first[topic], name), (3, 3))
-            # -1: there are no such readings.  The smallest variance means exact, none of noise.
-            if matrix[0, 0] >= 0.0 and not 0.0 < np.max(matrix) <= EXACT_VARIANCE:
-                recorded.covariance[kind] = matrix
+    for topic, message in first.items():
+        recorded.covariance.update((kind, matrix) for kind, matrix in _covariances(message)
+                                   if f'{kind} of {topic}' in recorded.notes)
     return recorded
+
+
+def _covariances(message: Any) -> Iterator[tuple[str, Reals]]:
+    for kind, name in COVARIANCES.items():
+        matrix = np.reshape(getattr(message, name, -np.ones(9)), (3, 3))
+        # -1: there are no such readings.  The smallest variance means exact, none of noise.
+        if matrix[0, 0] >= 0.0 and not 0.0 < np.max(matrix) <= EXACT_VARIANCE:
+            yield kind, matrix
 
 
 def _log_tables(reader: LogReader, types: Mapping[str, str], end_ns: int,
