@@ -109,7 +109,7 @@ def main() -> None:
     report.write('broad.md', '\n'.join((
         report.preamble('Scenes of the field beside real data', PACKAGES),
         'Root mean squares of errors in motion [deg], means over the scenes of '
-        f'[the exam](../exam.md#scenes-of-the-field), seeds 0 to {arguments.seeds - 1}, and over '
+        f'[the exam](../exam.md#scenes-of-the-field) with {arguments.seeds} seed(s), and over '
         f'{len(paths)} trials of [BROAD](https://doi.org/10.3390/data6070072). The filters have '
         'the default settings of their packages but for those that are named.\n',
         report.table(('filter', 'field: whole', 'heading', 'tilt', 'real: whole', 'heading',

@@ -22,7 +22,8 @@ PACKAGES = 'numpy', 'scipy', 'heyoka', 'mujoco', 'jax', 'diffrax', 'matplotlib'
 
 def preamble(title: str, packages: Sequence[str] = PACKAGES) -> str:
     """Return the head of a page: title, command, date, commit, machine and versions."""
-    command = ' '.join(['python', os.path.relpath(sys.argv[0], ROOT), *sys.argv[1:]])
+    command = ' '.join(['python', os.path.relpath(sys.argv[0], ROOT), *(
+        os.path.basename(one) for one in sys.argv[1:])])
     now = datetime.datetime.now(datetime.UTC).strftime('%Y-%m-%d %H:%M UTC')
     return (f'# {title}\n\nWritten by `{command}` on {now}, commit {_commit()}: do not edit.\n\n'
             f'{_processor()}, {os.cpu_count()} cores, {platform.system()}; '
