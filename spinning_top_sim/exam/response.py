@@ -33,7 +33,8 @@ START = 50                      # samples after which a filter that starts has a
 SURE = 0.2                      # of the largest error that explains: nothing else is tried
 WORST = 30.0                    # condition of a matrix that can be inverted
 STAYS = 0.98                    # of a kick
-SMALL, STEPS = 0.02, 3          # of the Gauss-Newton method: differences, relative, and steps
+# Of the Gauss-Newton method: differences, relative; steps, and by what the error falls in one.
+SMALL, STEPS, LESS = 0.02, 4, 0.7
 # Of the effect of a bias is left in the same attitude, without and with a growing estimate.
 LEARNED, LEARNING, BIAS_FOUND = 0.5, 0.9, 0.05
 BIAS_OFF = 0.5                  # by which the reported bias differs, relative
@@ -266,7 +267,7 @@ class Responses:
         """Try delays and low passes of the sensors."""
         for names in (('gyroscope',), ('accelerometer',), ('magnetometer',),
                       ('accelerometer', 'magnetometer')):
-            derivatives = self._derivatives([excitation.sharpened(names, 1.0)])
+            derivatives = self._derivatives([excitation.sharpened(names, 1.0)], self._outcome)
             by, what = float(self._amounts(self._outcome, derivatives)[0]), ' and '.join(names)
             if by > 0.5:
                 yield from self._tried((
@@ -298,10 +299,13 @@ class Responses:
             return mapped(name, np.eye(3) + matrix, size * columns[:, 0])
 
         for fault, free in causes:
-            n = 3 * free
-            derivatives = self._derivatives([change(SMALL * one) for one in np.eye(n)]) / SMALL
-            outcome, amounts = self._outcome, np.zeros(n)
+            outcome, amounts, before = self._outcome, np.zeros(3 * free), math.inf
             for _ in range(STEPS):
+                if self._whole(outcome) > LESS * before:
+                    break
+                before = self._whole(outcome)
+                derivatives = self._derivatives([change(amounts + SMALL * one) for one in np.eye(
+                    len(amounts))], outcome) / SMALL
                 amounts = amounts + self._amounts(outcome, derivatives)
                 text = (f'with [offset, matrix] = {np.array2string(amounts, precision=3)} of the '
                         f'readings of the {name} added')
@@ -309,9 +313,9 @@ class Responses:
                 for _, outcome in self._tried((one,)):
                     yield one, outcome
 
-    def _derivatives(self, changes: Sequence[ChangeReadings]) -> Reals:
-        """Return how the attitudes at rest and in motion respond to small changes (m, n)."""
-        before = self._turns(self._outcome)
+    def _derivatives(self, changes: Sequence[ChangeReadings], outcome: Outcome) -> Reals:
+        """Return how the attitudes at rest and in motion differ after small changes (m, n)."""
+        before = self._turns(outcome)
         return np.stack([(self._turns(outcome) * before.inv()).as_rotvec().ravel()
                          for outcome in (self._respond((Hypothesis((), '', given=one),))
                                          for one in changes)], axis=1)
