@@ -307,9 +307,9 @@ def test_the_command_examines_a_published_filter(capsys):
 def test_the_command_examines_a_class_in_a_file(tmp_path, capsys):
     (tmp_path / 'neighbour.py').write_text('UP = [0.0, 0.0, 0.0, 1.0]\n')
     (tmp_path / 'mine.py').write_text('from neighbour import UP\n\n\nclass Still:\n'
-                                      '    def update(self, *readings):\n        return UP\n')
+                                      '    def update(self, *readings):\n        return UP[:3]\n')
     assert main(['--filter', f'{tmp_path}/mine.py:Still', '--seeds', '1']) == 1
-    assert capsys.readouterr().out.startswith('Still: ')
+    assert capsys.readouterr().out.startswith('Still: invalid_output')
     for given, code, says in (('mine.py:Other', 2, 'there is no Other in'),
                               ('mine:Still', 2, 'must be'), ('none.py:Still', 1, 'No such file')):
         assert main(['--filter', f'{tmp_path}/{given}']) == code

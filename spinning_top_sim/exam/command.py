@@ -108,8 +108,9 @@ def _report(arguments: argparse.Namespace) -> Report:
     if ([arguments.log, arguments.node, arguments.filter].count(None) < 2
             or arguments.filter is arguments.topic is None
             or arguments.filter is None is not arguments.data):
-        raise ValueError('give either a log and --topic, --node and --topic, --topic alone, '
-                         '--filter, or --filter and --data')
+        log = f'{arguments.log}: ' if arguments.log else ''
+        raise ValueError(f'{log}give either a log and --topic, --node and --topic, --topic '
+                         'alone, --filter, or --filter and --data')
     options = _options(arguments)
     if arguments.log is not None:
         options['north'] = options.pop('heading', None)

@@ -28,6 +28,7 @@ FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component
           'covariance_large', 'inaccurate', 'diverges', 'invalid_output')
 
 # Thresholds; docs/exam.md compares them with the values of filters.  Errors are in rad.
+TILT, HEADING = np.radians((0.3, 0.8)).tolist()         # rms of a right filter, no noise
 GROSS = np.radians(3.0)         # a smaller error is no misreading
 DIVERGED, GROWS = np.radians(10.0), 1.2     # from one quarter to the next
 EXPLAINED = 0.25                # of the error is left at most when its cause is undone
@@ -53,6 +54,26 @@ class Fault(NamedTuple):
 
     name: str
     evidence: str
+
+
+class Clean(NamedTuple):
+    """Errors without noise, rms [rad]: at rest, and in motion."""
+
+    tilt: float
+    heading: float
+    tilt_moving: float
+    heading_moving: float
+
+    @property
+    def wrong(self) -> bool:
+        """Whether one is larger than that of a right filter."""
+        return (max(self.tilt, self.tilt_moving) > TILT
+                or max(self.heading, self.heading_moving) > HEADING)
+
+    def __str__(self) -> str:
+        return (f'without noise the error at rest is {degrees(self.tilt)} of tilt and '
+                f'{degrees(self.heading)} of heading, in motion {degrees(self.tilt_moving)} and '
+                f'{degrees(self.heading_moving)}')
 
 
 def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0),

@@ -106,7 +106,10 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         """Start the node anew, or find the running one; return it as a filter."""
         self._end_process()
         if self._command is not None:
-            self._process = subprocess.Popen(self._command, start_new_session=True)
+            try:
+                self._process = subprocess.Popen(self._command, start_new_session=True)
+            except OSError as error:
+                raise NodeError(f'--node {self._command[0]}: {error.strerror}') from error
         there = self._wait(self.is_there, PATIENCE_S)
         if there and self._process is None:
             self._wait(lambda: False, DISCOVERY_S)

@@ -125,6 +125,8 @@ def _cannot_start(name: str, error: Exception) -> int:
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
                              f'{remedy("ros")}' + name.endswith('view') * (
                                  '; `view LOG` works without'))
+    elif isinstance(error, OSError) and error.filename is not None:
+        error = OSError(f'{error.filename}: {error.strerror}')
     expected = (isinstance(error, ValueError | RuntimeError | OSError | LogError | ImportError)
                 or kind.startswith('Invalid'))
     print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(error)}',

@@ -60,6 +60,7 @@ def _run(arguments: argparse.Namespace) -> int:
     scenes = {name: given} if files else {
         stem: {**scene_file.read_scene(path), **given}
         for stem, path in parameter_files('scene').items()}
+    cli.check_output(arguments.reference)
     reference.write(arguments.reference, {
         name: reference.with_imu(values) for name, values in scenes.items()},
         arguments.duration, arguments.rate)

@@ -189,12 +189,14 @@ OWN = {     # and these
     'mahony': {
         'wrong side': ({'advance': world}, GYROSCOPE),
         'Euler angles': ({'advance': euler}, GYROSCOPE),
-        'gain < 0': ({'up': -0.3}, f'gravity_sign {GRAVITY}'),
+        # It ends upside down, and its error grows until then.
+        'gain < 0': ({'up': -0.3}, f'gravity_sign {GRAVITY} diverges'),
         'no gravity': ({'up': 0.0}, GRAVITY), 'no field': ({'north': 0.0}, FIELD),
         'field of a level sensor': ({'level': False}, FIELD),
         'declination': ({'declination': np.radians(5.0)}, 'heading_offset'),
         'bias gain < 0': ({'learns': -0.15}, 'no_bias_estimate diverges'),
         'no bias': ({'learns': 0.0}, 'no_bias_estimate'),
+        'bias in deg/s': ({'report': np.degrees}, 'bias_report'),
         'bias clamped': ({'most': np.radians(0.1)}, 'no_bias_estimate'),
         'bias negated': ({'report': np.negative}, 'bias_report')},
     'complementary': {
