@@ -2,6 +2,7 @@
 """The start of a node: arguments, values given twice, refusals, and what a run of it says."""
 
 import re
+import subprocess
 import sys
 
 import pytest
@@ -108,6 +109,14 @@ def test_a_run_tells_where_its_log_is(main, monkeypatch, tmp_path):
     assert len(log_of(path)[0]['/pose']) == 31
     assert f'recording to {path}' in run.err
     assert ' s | cusps | theta' in run.out and '\x1b' not in run.out and '\r' not in run.out
+
+
+def test_a_node_without_standard_streams_leaves_a_whole_log(tmp_path):
+    command = (f'exec "{sys.executable}" -m spinning_top_sim node -p duration:=0.3 '
+               '-p record.enabled:=true <&- >&- 2>&-')
+    assert subprocess.run(['sh', '-c', command], cwd=tmp_path, timeout=60,
+                          check=False).returncode == 0
+    assert len(log_of(the_log(tmp_path))[0]['/pose']) == 31
 
 
 # ----------------------------------------------------------- values that are given twice

@@ -49,6 +49,7 @@ def run(name: str, argv: Sequence[str] | None,
     name = f'spinning-top {name}'
     # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
     _handle(signal.SIGINT, lambda *_: _exit(130))
+    _open_standard_streams()
     try:
         make_node = prepare(argv)
         interrupts = _initialize_ros([name, *argv])
@@ -93,6 +94,15 @@ def _initialize_ros(argv: list[str]) -> list[int]:
         _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
     rclpy.init(args=argv)
     return interrupts
+
+
+def _open_standard_streams() -> None:
+    """Open the streams that the shell has closed (2>&-); otherwise a log gets their number."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    if sys.stderr is None:
+        sys.stderr = open(2, 'w')       # noqa: SIM115 - rclpy needs it to the end
 
 
 def _handle(number: signal.Signals, handler: Callable[[int, object], object]) -> None:
