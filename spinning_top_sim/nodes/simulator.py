@@ -94,7 +94,13 @@ class Simulator(Node):
         if self.values['max_error'] > 0.0:
             _ = self.simulation.segment.exact    # its modules take a while to import
         now_ns = self._date.first_ns()
-        self.simulation.epoch_ns = next_epoch(now_ns)
+        try:
+            self.simulation.epoch_ns = next_epoch(now_ns)
+        except ValueError as error:
+            if not self._date.follows:
+                raise
+            self._log.warning(f'/clock: {error}', once=True)
+            return
         self.destroy_timer(self._begin_timer)
         if not self._date.follows:
             time.sleep((self.simulation.epoch_ns - now_ns) / NANOSECONDS)
