@@ -105,6 +105,20 @@ def test_readings_are_known_by_their_names(tmp_path, names, unit):
     assert parts['accelerations'][1] == pytest.approx(FORCE)
 
 
+def test_readings_of_a_fast_spin_are_compared(tmp_path, capsys):
+    """At 60 rad/s and 100 Hz, derivatives of the attitudes would be wrong by far."""
+    motion = solve(TOP, State(theta=0.5, theta_dot=0.3, l3=60.0 * TOP.lambda3, lz=8.0), 2.0 * T)
+    force = np.stack(np.broadcast_arrays(*motion.specific_force(ARM)), axis=1)
+    pose = dict(zip(('t', 'qw', 'qx', 'qy', 'qz'),
+                    (2.0 * T, *np.roll(motion.quaternion, 1, axis=1).T), strict=True))
+    names = 'gx', 'gy', 'gz', 'ax', 'ay', 'az'
+    for late, fault in ((0, 'passed'), (1, 'imu_one_step_late')):
+        readings = [np.roll(one, late, axis=0) for one in (motion.angular_velocity, force)]
+        path = table(tmp_path / f'{late}.csv', {**pose, **imu(*readings, names=names)})
+        assert main([str(path), '--fit', '--lever-arm', *map(str, ARM)]) == late
+        assert f'{late}.csv: {fault}\n' in capsys.readouterr().out
+
+
 def test_arrays_and_parquet_are_read(tmp_path):
     pa = pytest.importorskip('pyarrow')
     from pyarrow import parquet
