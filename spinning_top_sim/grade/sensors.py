@@ -182,8 +182,10 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
             len(run.late(lag)[0]) for run in runs[:-1]])
         # A cause that is found has taken fast motion away, or has left some.
         level = float(np.mean(np.minimum(noise, [*map(_white, np.split(noises, ends))])))
-        faults += _noise_faults(kind, runs[0], level, motion, NOISE_BAND + doubt)
-        faults += _shape_fault(kind, level, noises, NOISY * runs[0].size)
+        band = NOISE_BAND + doubt
+        faults += _noise_faults(kind, runs[0], level, motion, band)
+        if NOISY * runs[0].size < level > rms(noises) / (1.0 + band):
+            faults += _shape_fault(kind, noises)
     return faults, marks
 
 
@@ -219,9 +221,9 @@ def _fraction(kind: str, target: Reals, effects: Mapping[str, Reals]) -> float:
     return float(fractions[0]) if 1e-6 < rms(target) > 2.0 * rms(left) else 0.0
 
 
-def _shape_fault(kind: str, level: float, noise: Reals, rounding: float) -> Iterator[Fault]:
-    kurtosis = float(np.mean(noise ** 4)) / (rms(noise) ** 4 or 1.0)
-    if level > rounding and rms(noise) < 1.05 * level and kurtosis < LEAST_KURTOSIS:
+def _shape_fault(kind: str, noise: Reals) -> Iterator[Fault]:
+    kurtosis = float(np.mean(noise ** 4)) / rms(noise) ** 4
+    if kurtosis < LEAST_KURTOSIS:
         yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; normal '
                     'noise has 3, uniform noise 1.8', kurtosis)
 
