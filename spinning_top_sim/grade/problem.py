@@ -62,7 +62,8 @@ class Problem:
         self.readings, self.reference, self.gravity = readings, reference, gravity
         self.mounting = mounting
         self._steps = np.full(UNKNOWNS, 1e-6)
-        self._seen: dict[tuple[object, ...], tuple[States, Reals, Reals]] = {}
+        self._seen: dict[
+            tuple[object, ...], tuple[tuple[States, Reals, Reals], Reals]] = {}
 
     def start(self, x: Reals) -> tuple[Top, State]:
         """Return top and state with lambda1 = lambda3 = 1: its spin is L3, not omega_3."""
@@ -126,8 +127,9 @@ class Problem:
                 (w1, w2), sine, cosine = states.transverse_velocity, np.sin(angle), np.cos(angle)
                 w = np.stack((cosine * w1 + sine * w2, cosine * w2 - sine * w1,
                               np.full(len(t), x[SPIN])))
-            self._seen[key] = states, q, w
-        return self._seen[key]
+            # With the times, whose identity nothing else has as long as they are kept.
+            self._seen[key] = (states, q, w), times
+        return self._seen[key][0]
 
     def _force(self, x: Reals, q: Reals, w: Reals) -> Reals:
         """Return the specific force at the IMU, as `States.specific_force` for its own spin."""
