@@ -34,7 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if '_ARGCOMPLETE' in os.environ:
         _complete()
     # Ctrl-C ends it at once during imports, where a KeyboardInterrupt may be lost.
-    before = signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:        # not where it is ignored
+        signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
     try:
         name = _parser().parse_args(argv[:1]).command
         with needed('it'):

@@ -109,7 +109,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             try:
                 self._process = subprocess.Popen(self._command, start_new_session=True)
             except OSError as error:
-                raise NodeError(f'--node {self._command[0]}: {error.strerror}') from error
+                raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
         there = self._wait(self.is_there, PATIENCE_S)
         if there and self._process is None:
             self._wait(lambda: False, DISCOVERY_S)

@@ -100,7 +100,7 @@ def _motion(arguments: argparse.Namespace,
         fitted, start = found.body(body), found.start
         if arguments.lever_arm or 'imu.lever_arm' in given:
             fitted = replace(fitted, lever_arm=body.lever_arm)
-        if {name.partition('.')[0] for name in given} >= {'top'}:
+        if any(name.startswith('top.') for name in given):
             fitted = replace(fitted, **vars(top))
             start = start_of(found, recorded.parts, top)
         return fitted, start, found

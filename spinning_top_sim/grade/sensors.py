@@ -178,10 +178,12 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
             return faults, marks
     scaled = {'units', 'reading_scale'} & {fault.name for fault in faults}
     if kind in ('gyroscope', 'accelerations') and not scaled:
-        noises, ends = effects['size'] * residual, np.cumsum([
-            len(run.late(lag)[0]) for run in runs[:-1]])
+        ends = np.cumsum([len(one) for one, _ in parts])[:-1]
+        each = [run.size * one for run, one in zip(
+            runs, np.split(residual, ends), strict=True)]
+        noises = np.concatenate(each)
         # A cause that is found has taken fast motion away, or has left some.
-        level = float(np.mean(np.minimum(noise, [*map(_white, np.split(noises, ends))])))
+        level = float(np.mean(np.minimum(noise, [*map(_white, each)])))
         band = NOISE_BAND + doubt
         faults += _noise_faults(kind, runs[0], level, motion, band)
         if NOISY * runs[0].size < level > rms(noises) / (1.0 + band):
@@ -287,7 +289,6 @@ def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, R
     reading, part = run.late(lag)
     total = run.total
     effects = {**run.terms, 'total': total, 'step': _rate(total),
-               'size': run.size ** 2 + 0.0 * total,
                'world': (world := run.rotation.apply(total)),
                'reversed': run.rotation.apply(world)}
     if kind in FORCES:

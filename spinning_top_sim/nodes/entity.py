@@ -44,7 +44,7 @@ def fill_state(message: Message, states: States, pivot: Kinematics, stamp_ns: in
 
 
 def requested_state(request: Message, top: Top, frame: str, now: States,
-                pivot: Kinematics) -> State:
+                    pivot: Kinematics) -> State:
     """
     Return the state that a SetEntityState request asks for.
 

@@ -103,6 +103,19 @@ def chosen_files(arguments: argparse.Namespace) -> list[Path]:
     return paths
 
 
+def files_for_node(arguments: argparse.Namespace) -> list[Path]:
+    """
+    Return the parameter files of --scene and --imu for a node.
+
+    They are read here because rcl accepts a file that has no parameters of the node.  Raises as
+    `read_scene`.
+    """
+    paths = chosen_files(arguments)
+    for path in paths:
+        read_scene(path)
+    return paths
+
+
 def read_scene(path: str | Path) -> dict[str, object]:
     """
     Return the parameters of the node spinning_top in a ROS 2 parameter file, not checked.
