@@ -75,14 +75,9 @@ class Readings:
         return self.reading[begin + skip:end], slice(skip, end - begin)
 
 
-def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
-    """
-    Return the readings of a sensor, None if there are none.
-
-    kind : one of KINDS
-    w : rates (n - 6, 3), as `rates_of` returns them
-    """
-    said, body, inner = motion.trajectory, motion.body, slice(MARGIN, -MARGIN)
+def _readings_of(kind: str, motion: Motion) -> Readings | None:
+    """Return the readings of a sensor, None if there are none."""
+    said, body, inner, w = motion.trajectory, motion.body, slice(MARGIN, -MARGIN), motion.rates
     reading: Reals | None = getattr(said, 'increments' if kind in ('rotations', 'velocities')
                                     else kind)
     if reading is None:
@@ -99,7 +94,7 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
         reading, first = reading[:, :3] / said.step, first + 1
         terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
     else:
-        first, a, w = 2 * MARGIN, motion.accelerations(w), w[inner]
+        first, a, w = 2 * MARGIN, motion.accelerations, w[inner]
         axes = np.eye(3)[:, np.newaxis]
         tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
         arms = tangential + centripetal
@@ -116,38 +111,30 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
                     [to_imu(arm) for arm in arms])
 
 
-def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
-    """
-    Compare the rates that a simulator tells with its attitudes.
-
-    Returns body rates (n - 6, 3) of each motion: those told where they are right, or else those of
-    the attitudes; and the faults of those told.
-    """
-    derived = [motion.rates for motion in motions]
-    runs = [one for motion in motions if (one := readings_of('rates', motion, motion.rates))]
-    if not runs:
-        return derived, []
-    faults, _ = judge('rates', runs, motions[0])
-    told = [run.reading[MARGIN:-MARGIN] for run in runs]
-    if not faults or faults[0].name == 'rates_scale':
-        return told, faults
-    if faults[0].name != 'rates_in_world':
-        return derived, faults
-    return [run.rotation.inv().apply(one) for run, one in zip(runs, told, strict=True)], faults
+def faults_of_rates(motions: Sequence[Motion]) -> list[Fault]:
+    """Compare the rates that a simulator tells with its attitudes; mark those that are right."""
+    faults, _ = judge('rates', motions)
+    first = faults[0].name if faults else 'rates_scale'
+    for motion in motions:
+        said = motion.trajectory
+        if said.rates is not None and first in ('rates_scale', 'rates_in_world'):
+            motion.told = (said.rates if first == 'rates_scale' else
+                           said.rotation.inv().apply(said.rates))
+    return faults
 
 
-def judge(kind: str, runs: Sequence[Readings], motion: Motion,
-          derived: bool = False) -> tuple[list[Fault], dict[str, float]]:
+def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, float]]:
     """
-    Compare the readings of a sensor in several motions with what they should be.
+    Compare the readings of a sensor, if there are any, with what they should be.
 
     kind : one of KINDS, or 'rates'
-    motion : one of the motions
-    derived : whether the rates are those of the attitudes, which may be half a step apart from
-        those of the simulator
 
     Returns the faults and the measures.
     """
+    runs = [one for motion in motions if (one := _readings_of(kind, motion)) is not None]
+    if not runs:
+        return [], {}
+    motion = motions[0]
     lag = 0 if kind == 'velocities' else _lag(runs)
     parts = [_discrepancy(kind, run, lag) for run in runs]
     target, effects = _pooled(parts)
@@ -162,10 +149,14 @@ def judge(kind: str, runs: Sequence[Readings], motion: Motion,
     if abs(late) > LATE:
         faults.append(Fault('imu_one_step_late', f'{kind}: readings belong to the motion of '
                             f'{late:.3g} steps ({1e3 * late * runs[0].step:.3g} ms) before', late))
-    strange = STRANGE.get(kind, STRANGE_ELSE) + (_half_step(runs) if derived else 0.0)
+    strange = STRANGE.get(kind, STRANGE_ELSE)
+    if motion.told is None and kind != 'rates':
+        # Rates of the attitudes may be half a step apart from those of the simulator.
+        strange += 0.25 * max(float((run.rotation[0].inv() * run.rotation[1]).magnitude()) ** 2
+                              for run in runs)
     if before > strange:
         causes = _causes(kind, effects, motion.body)
-        found, residual, _ = explain(target, causes, math.hypot(floor, 0.5 * strange))
+        found, residual = explain(target, causes, math.hypot(floor, 0.5 * strange))
         turned, left = _turned(kind, target, effects['total'])
         if beyond(left, most) < min(TURNED * before, 0.1 * beyond(residual, most)):
             found, residual = turned, left
@@ -199,12 +190,6 @@ def _turned(kind: str, target: Reals, total: Reals) -> tuple[list[Fault], Reals]
     turns = ', '.join(f'{part:.3g}' for part in turn.inv().as_rotvec())
     return [Fault('mounting', f'{kind}: the readings are in axes that are turned by ({turns}) rad '
                   'from those of the IMU', turn.magnitude())], target + total - turn.apply(total)
-
-
-def _half_step(runs: Sequence[Readings]) -> float:
-    """Return the share of a reading by which rates half a step apart may change it."""
-    return 0.25 * max(float((run.rotation[0].inv() * run.rotation[1]).magnitude()) ** 2
-                      for run in runs)
 
 
 def _pooled(parts: Sequence[tuple[Reals, dict[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
