@@ -43,7 +43,7 @@ ONCE_IN = 1000.0            # noise that is called a residue of the motion
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
-BEGIN = 64                  # attitudes that tell the start of a known top, whatever follows
+BEGIN = 16, 32, 64          # attitudes that tell the start of a known top, whatever follows
 OFF = 0.1                   # rad, or share of the rates: another start
 
 
@@ -145,9 +145,8 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
         If there are too few attitudes, no readings, or no motion of a top comes near.
     """
     one, begin = _attitudes_of(parts)
-    (first, sure, _), trials = _first_values(one, _told(parts)), []
-    axis = np.stack(attitude.axis_in_world(tuple(one.values)))
-    small = [(0, *pair) for pair in guess.small_nutation(one.times, axis)]
+    (first, sure), trials = _first_values(one, parts), []
+    small = [(0, *pair) for pair in guess.small_nutation(one.times, one.values)]
     for size, l3, p in ((FIRST, first[SPIN], 0.0), *small[:4], (4 * FIRST, first[SPIN], 0.0)):
         first[[L3, P]] = l3, p
         with contextlib.suppress(ValueError):       # no motion begins so
@@ -163,7 +162,7 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     if best.reached:
         at, frozen = _without_unseen_nutation(best.problem, best.x, best.residual)
         free = [k for k in MOTION if k not in frozen]
-        best = best._replace(frozen=frozen, x=descend(best.problem, at, free)[0]
+        best = best._replace(frozen=frozen, x=_descend(best.problem, at, free)[0]
                              if frozen else best.x)
     if imu:
         best = _with_imu(best, parts, begin)
@@ -175,30 +174,34 @@ def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> 
     if found.reached:
         start = Start.of(found.top, found.start)
         return Start(start.attitude, start.rates).state_of(top)
-    one, _ = _attitudes_of(parts)
-    first = replace(one, times=one.times[:BEGIN], values=one.values[:, :BEGIN])
-    problem = Problem([first], one.values[:, 0], top.gravity)
-    x, _, _ = _first_values(one, _told(parts))
-    x[P] = top.gravity_torque / top.lambda1
-    for _ in range(3):
-        x[L3] = top.lambda3 / top.lambda1 * x[SPIN]
-        x, _ = descend(problem, x, MOTION[:6])
-    _, state = problem.start(x)
-    return replace(state, l3=state.l3 * top.lambda1, lz=state.lz * top.lambda1)
+    return _begin_of(parts, top)[0]
 
 
 def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) -> str:
     """Return how far the attitudes are from a start at t = 0, '' if they are near it."""
-    one, begin = _attitudes_of(parts)
-    right = ExactSolution(top, start).states_at_seconds(np.array([begin]))
-    apart = float(attitude.angle_between(right.rows_quaternion, tuple(one.values[:, :1]))[0])
-    x, _, error = _first_values(one, right.angular_velocity)
-    off, noise = float(np.linalg.norm(x[unknowns.RATES] - right.angular_velocity)), 6.0 * error
-    if (apart <= OFF + noise * one.times[1]
-            and off <= OFF * np.linalg.norm(right.angular_velocity) + noise):
+    right = ExactSolution(top, start).states_at_seconds(parts['attitudes'][0][:1])
+    state, noise = _begin_of({**parts, 'rates': (right.t, right.angular_velocity)}, top)
+    found = ExactSolution(top, state).states_at_seconds(np.zeros(1))
+    apart = float(attitude.angle_between(right.rows_quaternion, found.rows_quaternion)[0])
+    off = float(np.linalg.norm(found.angular_velocity - right.angular_velocity))
+    if apart <= OFF and off <= OFF * np.linalg.norm(right.angular_velocity) + noise:
         return ''
     return (f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates '
             f'{off:.3g} rad/s')
+
+
+def _begin_of(parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> tuple[State, float]:
+    """Return the state of a known top that the first attitudes tell, and doubt of its rates."""
+    one, _ = _attitudes_of(parts)
+    problem, (x, _) = Problem([], one.values[:, 0], top.gravity), _first_values(one, parts)
+    x[P] = top.gravity_torque / top.lambda1
+    for count in BEGIN:
+        problem.readings = [replace(one, times=one.times[:count], values=one.values[:, :count])]
+        x[L3] = top.lambda3 / top.lambda1 * x[SPIN]
+        x, _ = _descend(problem, x, MOTION[:6])
+    _, state = problem.start(x)
+    return (replace(state, l3=state.l3 * top.lambda1, lz=state.lz * top.lambda1),
+            6.0 * float(np.std(problem.residuals(x))) / problem.readings[0].times[-1])
 
 
 def _attitudes_of(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
@@ -210,20 +213,16 @@ def _attitudes_of(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, f
     return Readings('attitude', times - times[0], np.ascontiguousarray(q)), float(times[0])
 
 
-def _told(parts: Mapping[str, tuple[Reals, Reals]]) -> Reals | None:
-    """Return rates (n, 3) or readings of a gyroscope, None if there are none."""
-    _, told = parts.get('rates', parts.get('gyroscope', (None, None)))
-    return told
-
-
-def _first_values(one: Readings, told: Reals | None) -> tuple[Reals, bool, float]:
-    """Return unknowns with the first rates, whether whole turns are known, and the error."""
-    spin, sure = guess.spin_rate(one.times, one.values,
-                                 None if told is None else float(np.median(told[:, 2])))
-    axis, x = np.stack(attitude.axis_in_world(tuple(one.values))), np.zeros(unknowns.UNKNOWNS)
-    *across, error = guess.transverse_rates(one.times, one.values, axis)
-    x[unknowns.RATES] = (*across, spin)
-    return x, sure, error
+def _first_values(one: Readings,
+                  parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Reals, bool]:
+    """Return unknowns with the first rates, and whether whole turns are known."""
+    told, x = parts.get('rates', parts.get('gyroscope')), np.zeros(unknowns.UNKNOWNS)
+    spin, sure = guess.spin_rate(one.times, one.values, told and float(np.median(told[1][:, 2])))
+    first, second = np.stack(attitude.axis_in_world(tuple(one.values[:, :2])), axis=1)
+    x[unknowns.RATES] = Rotation.from_quat(one.values[:, 0]).inv().apply(
+        np.cross(first, second) / one.times[1])
+    x[SPIN] = spin
+    return x, sure
 
 
 def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
@@ -237,7 +236,7 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
         free = MOTION if size or count == last else MOTION[:6]
         precisely = (30, 1e-8) if count == last else (8, 1e-3)
-        found, converged = descend(problem, x, free, *precisely)
+        found, converged = _descend(problem, x, free, *precisely)
         left = float(np.std(problem.residuals(found)))
         if left > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
             growth = math.sqrt(growth)
@@ -253,7 +252,7 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
                   explained and (converged or residual <= EXACT))
 
 
-def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
+def _descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
             tolerance: float = 1e-8) -> tuple[Reals, bool]:
     """Return the unknowns at the least sum of squares, and whether it was reached."""
     chosen = [*free]
@@ -293,10 +292,9 @@ def _add_turns(x: Reals, times: Reals) -> None:
     """
     step = float(times[-1]) / (len(times) - 1)
     sign, turn = math.copysign(1.0, x[L3]), math.tau / step
-    spin = sign * x[SPIN]
-    if np.max(np.abs(np.diff(times) - step)) < 1e-5 * step and not (
-            0.0 < abs(x[L3]) <= 2.02 * spin):
-        x[SPIN] += sign * turn * math.ceil((0.5 * abs(x[L3]) - spin) / turn)
+    less = 0.5 * abs(x[L3]) - sign * x[SPIN]
+    if np.max(np.abs(np.diff(times) - step)) < 1e-5 * step and less > 0.01 * sign * x[SPIN]:
+        x[SPIN] += sign * turn * math.ceil(less / turn)
 
 
 def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: float) -> _Trial:
@@ -312,14 +310,14 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
     problem.mounting = Rotation.align_vectors(model.T, streams[0].values.T)[0].as_quat()
     for stream, own in zip(streams, ((8, 9, 10, unknowns.LATE), (11, 12, 13)), strict=True):
         problem.readings = [stream]
-        x, _ = descend(problem, x, own)
+        x, _ = _descend(problem, x, own)
     problem.readings = [one, *streams]
     free = [k for k in (*MOTION, *SENSOR) if k not in trial.frozen]
     for _ in range(2):          # noise of each, then all with it
         for stream in problem.readings:
             rest = problem.residual(x, stream)
             stream.sigma = max(math.sqrt(float(np.mean(rest * rest))), 1e-15)
-        x, converged = descend(problem, x, free)
+        x, converged = _descend(problem, x, free)
     rests = [problem.residual(x, stream) for stream in problem.readings]
     noise, _ = whiteness(rests[0])
     residual = math.sqrt(float(np.mean(rests[0] ** 2)))

@@ -34,13 +34,14 @@ def spin_rate(times: Reals, q: Reals, hint: float | None) -> tuple[float, bool]:
     return rate + float(np.sum(rest) / np.sum(dt)), sure
 
 
-def small_nutation(times: Reals, axis: Reals) -> Iterator[tuple[float, float]]:
+def small_nutation(times: Reals, q: Reals) -> Iterator[tuple[float, float]]:
     """
     Yield (L3/lambda1, P/lambda1) of a small nutation, from its strongest frequency.
 
     About a steady precession W at the tilt theta, W^2 sin^2 theta + (L3 - 2 W cos theta)^2 is the
     square of the frequency, and P = L3 W - W^2 cos theta.
     """
+    axis = attitude.axis_in_world(tuple(q))
     phi = np.unwrap(np.arctan2(axis[1], axis[0]))
     rate, first = np.polyfit(times, phi, 1)
     height = float(np.mean(axis[2]))
@@ -57,21 +58,3 @@ def small_nutation(times: Reals, axis: Reals) -> Iterator[tuple[float, float]]:
         for sign in (1.0, -1.0) if within > 0.0 else ():
             l3 = 2.0 * rate * height + sign * math.sqrt(within)
             yield l3, l3 * rate - rate * rate * height
-
-
-def transverse_rates(times: Reals, q: Reals, axis: Reals) -> tuple[float, float, float]:
-    """
-    Return omega_1 and omega_2 at the first time, and their standard deviation [rad/s].
-
-    They are those of a cubic through the first attitudes of the axis.
-    """
-    size = min(16, len(times))
-    t = times[:size] - times[0]
-    powers = np.vander(t / t[-1], 4, increasing=True)
-    found = np.linalg.lstsq(powers, axis[:, :size].T, rcond=None)[0]
-    rest = float(np.sqrt(np.mean((axis[:, :size].T - powers @ found) ** 2)))
-    slope = found[1] / t[-1]
-    error = rest * math.sqrt(float(np.linalg.inv(powers.T @ powers)[1, 1])) / float(t[-1])
-    x, y, z = np.cross(axis[:, 0], slope).tolist()
-    w1, w2, _ = attitude.in_body(tuple(q[:, :1]), (x, y, z))
-    return float(w1[0]), float(w2[0]), error

@@ -4,8 +4,9 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+from spinning_top_sim.tools.verdict import Verdict, number
 
 # docs/grade.md defines them.
 FAULTS = (
@@ -21,16 +22,9 @@ FAULTS = (
 
 class Fault(NamedTuple):
     """
-    A fault of a simulator.
+    A fault of a simulator: its name, one of FAULTS, and why it is reported.
 
-    Parameters
-    ----------
-    name : str
-        One of FAULTS.
-    evidence : str
-        Why it is reported.
-    number : float
-        What was measured, such as a lag or a coefficient; NaN where there is none.
+    number : what was measured, such as a lag or a coefficient; NaN where there is none
     """
 
     name: str
@@ -38,46 +32,32 @@ class Fault(NamedTuple):
     number: float = math.nan
 
 
-@dataclass(frozen=True)
-class Report:
+class Report(Verdict):
     """
     The result of grading a simulator; `str(report)` is readable.
 
-    Parameters
+    Attributes
     ----------
     subject : str
         Name of the simulator.
-    faults : sequence of Fault
-        The faults with their evidence.
+    faults, names : list
+        The faults with their evidence, and their names, each once.
+    passed : bool
+        Whether no fault was found.
     marks : mapping
         Measures by name, as docs/grade.md defines them; NaN: could not be measured.
     """
 
-    subject: str
-    faults: Sequence[Fault]
-    marks: Mapping[str, float]
+    @property
+    def faults(self) -> Sequence[Fault]:
+        return self.found
 
     @property
-    def passed(self) -> bool:
-        """Whether no fault was found."""
-        return not self.faults
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the faults, each once."""
-        return list(dict.fromkeys(fault.name for fault in self.faults))
-
-    def __str__(self) -> str:
-        lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.names)}']
-        lines += [f'  {fault.name}: {fault.evidence}' for fault in self.faults]
-        lines += [f'  {name:<40}{value:>12.4g}' for name, value in self.marks.items()
-                  if not math.isnan(value)]
-        return '\n'.join(lines)
+    def marks(self) -> Mapping[str, float]:
+        return self.measures
 
     def as_dict(self) -> dict[str, Any]:
         """Return subject, passed, faults (name, evidence, number) and marks; None: no number."""
-        def number(value: float) -> float | None:
-            return value if math.isfinite(value) else None
         return {'subject': self.subject, 'passed': self.passed,
                 'faults': [{**fault._asdict(), 'number': number(fault.number)}
                            for fault in self.faults],
