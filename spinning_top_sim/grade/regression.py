@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Explains a discrepancy by as few causes as possible: small least-squares fits."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,14 +22,9 @@ Judge = Callable[[Reals], Fault | None]
 
 
 class Cause(NamedTuple):
-    """
-    A possible cause of a discrepancy.
+    """A possible cause of a discrepancy: names of its k effects, and what names the fault."""
 
-    columns : (k, N, 3), the change of what is compared by each of k effects of size 1
-    judge : names the fault
-    """
-
-    columns: Sequence[Reals]
+    effects: Sequence[str]
     judge: Judge
 
 
@@ -40,11 +35,19 @@ def instead(name: str, evidence: str) -> Judge:
     return judge
 
 
-def explain(target: Reals, causes: Sequence[Cause],
+def pooled(parts: Iterable[tuple[Reals, Mapping[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
+    """Return the discrepancy and the effects of all parts."""
+    targets, effects = zip(*parts, strict=True)
+    return np.concatenate(targets), {name: np.concatenate([one[name] for one in effects])
+                                     for name in effects[0]}
+
+
+def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause],
             floor: float = 0.0) -> tuple[list[Fault], Reals]:
     """
     Explain a discrepancy (N, 3) by causes, the best one first.
 
+    effects : by name, change of what is compared by an effect of size 1 (N, 3)
     floor : rms of the noise in the target
 
     Returns the faults, and what they leave of the discrepancy.
@@ -54,17 +57,17 @@ def explain(target: Reals, causes: Sequence[Cause],
     enough = max(ENOUGH * beyond(target, floor), 0.1 * floor)
     others = [*causes]
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
-        tried = [least_squares(target, [column for cause in (*chosen, one)
-                                        for column in cause.columns]) for one in others]
+        tried = [least_squares(target, [effects[name] for cause in (*chosen, one)
+                                        for name in cause.effects]) for one in others]
         after = [beyond(left, floor) for _, left in tried]
         good = max(AS_GOOD * min(after), 0.02 * before)
-        _, left, best = min((len(one.columns), left, k) for k, (one, left) in enumerate(
+        _, left, best = min((len(one.effects), left, k) for k, (one, left) in enumerate(
             zip(others, after, strict=True)) if left <= good)
         if left > WORTHWHILE * before:
             break
         fitted, residual = tried[best]
         chosen.append(others.pop(best))
-    ends = np.cumsum([len(one.columns) for one in chosen], dtype=int)[:-1]
+    ends = np.cumsum([len(one.effects) for one in chosen], dtype=int)[:-1]
     judged = [one.judge(found) for one, found in zip(chosen, np.split(fitted, ends), strict=False)]
     return [fault for fault in judged if fault is not None], residual
 

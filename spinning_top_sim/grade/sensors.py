@@ -8,16 +8,24 @@ The error of the motion does not matter.
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade.motion import MARGIN, Motion
-from spinning_top_sim.grade.regression import NEAR, Cause, beyond, explain, instead, least_squares
+from spinning_top_sim.grade.regression import (
+    NEAR,
+    Cause,
+    beyond,
+    explain,
+    instead,
+    least_squares,
+    pooled,
+)
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
@@ -60,13 +68,14 @@ class Readings(NamedTuple):
     terms: Sequence[str]
     size: float
 
-    def late(self, lag: int) -> tuple[Reals, slice]:
-        """Return what is wrong `lag` samples after the effects, and the rows of the effects."""
+    def late(self, lag: int, names: Sequence[str] = ()) -> tuple[Reals, dict[str, Reals]]:
+        """Return what is wrong `lag` samples after the effects, and the effects there."""
         total, begin = self.effects['total'], self.first + lag
         end = min(begin + len(total), len(self.reading))
         skip = max(0, -begin)
         part = slice(skip, end - begin)
-        return self.reading[begin + skip:end] - total[part], part
+        return self.reading[begin + skip:end] - total[part], {
+            name: self.effects[name][part] for name in names or self.effects}
 
 
 def _readings_of(kind: str, motion: Motion) -> Readings | None:
@@ -141,7 +150,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     if not runs:
         return [], {}
     said, lag = motions[0].trajectory, 0 if kind == 'velocities' else _lag(runs)
-    target, effects = _pooled(runs, lag, runs[0].effects)
+    target, effects = pooled(run.late(lag) for run in runs)
     noise = np.array([_white(run.late(lag)[0]) for run in runs])
     sizes, floor = np.array([run.size for run in runs]), rms(noise)
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
@@ -160,7 +169,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
         strange += 0.25 * max(float((a.inv() * b).magnitude()) ** 2 for a, b in turns)
     rest = 0.0
     if before > strange:
-        found, residual = explain(target, _causes(kind, effects, motions[0].body),
+        found, residual = explain(target, effects, _causes(kind, motions[0].body),
                                   math.hypot(floor, 0.5 * strange))
         turned, left = _turned(target, effects['total'])
         if beyond(left, most) < min(TURNED * before, 0.1 * beyond(residual, most)):
@@ -180,14 +189,6 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
         faults += _noise_faults(kind, motions[0], level, level > NOISY * sizes[0],
                                 np.concatenate(noises), NOISE_BAND + doubt)
     return [fault._replace(evidence=f'{kind}: {fault.evidence}') for fault in faults], marks
-
-
-def _pooled(runs: Sequence[Readings], lag: int,
-            names: Iterable[str]) -> tuple[Reals, dict[str, Reals]]:
-    """Return what is wrong in all motions (N, 3), and effects."""
-    targets, parts = zip(*(run.late(lag) for run in runs), strict=True)
-    return np.concatenate(targets), {name: np.concatenate([
-        run.effects[name][part] for run, part in zip(runs, parts, strict=True)]) for name in names}
 
 
 def _turned(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
@@ -240,7 +241,7 @@ def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residua
 def _lag(runs: Sequence[Readings]) -> int:
     """Return the number of samples by which readings are late, with any size of their terms."""
     def left(lag: int) -> float:
-        target, effects = _pooled(runs, lag, (*runs[0].terms, 'step'))
+        target, effects = pooled(run.late(lag, (*run.terms, 'step')) for run in runs)
         return rms(least_squares(target, [*effects.values()])[1])
 
     floor, now = rms(np.array([_white(run.late(0)[0]) for run in runs])), left(0)
@@ -257,24 +258,24 @@ def _white(rows: Reals) -> float:
     return rms(np.diff(rows, 6, axis=0)) / math.sqrt(924.0)
 
 
-def _causes(kind: str, effects: Mapping[str, Reals], body: Body) -> list[Cause]:
+def _causes(kind: str, body: Body) -> list[Cause]:
     """Return what may be wrong with the readings of a sensor."""
-    def only(judge: Any, *names: str) -> Cause:
-        return Cause([effects[name] for name in names], judge)
-
     in_world = 'rates_in_world' if kind in ('gyroscope', 'rates') else 'reading_in_world'
     text = 'the readings are in axes of '
-    causes = [only(partial(_scale, kind), 'total'), only(lambda found: None, 'step'),
-              only(instead(in_world, f'{text}the world, not of the IMU'), 'total', 'world'),
-              only(instead('rotation_reversed', f'{text}a sensor that turns against the IMU'),
-                   'total', 'reversed')]
-    if kind in FORCES:
-        causes += [only(partial(_term, name), name) for name in _TERMS]
-        causes += [only(partial(_gravity_frame, body), 'gravity', 'fixed 0', 'fixed 1', 'fixed 2'),
-                   only(_difference, 'difference'), only(lambda found: None, 'tangential step'),
-                   only(lambda found: None, 'turned'),
-                   only(partial(_arm, body), 'arm 0', 'arm 1', 'arm 2')]
-    return causes
+    causes = [Cause(['total'], partial(_scale, kind)), Cause(['step'], _none), Cause(
+        ['total', 'world'], instead(in_world, f'{text}the world, not of the IMU')), Cause(
+        ['total', 'reversed'], instead('rotation_reversed', f'{text}a sensor that turns against '
+                                       'the IMU'))]
+    if kind not in FORCES:
+        return causes
+    return [*causes, *(Cause([name], partial(_term, name)) for name in _TERMS),
+            Cause(['gravity', 'fixed 0', 'fixed 1', 'fixed 2'], partial(_gravity_frame, body)),
+            Cause(['difference'], _difference), Cause(['tangential step'], _none),
+            Cause(['turned'], _none), Cause(['arm 0', 'arm 1', 'arm 2'], partial(_arm, body))]
+
+
+def _none(found: Reals) -> None:
+    """Name no fault: a lag has been judged before, and others are none."""
 
 
 def _scale(kind: str, found: Reals) -> Fault:
