@@ -7,7 +7,7 @@ its own attitudes and rates, would cause.  Errors do not add up there, so that t
 every motion, and for every size of the error.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -22,6 +22,7 @@ from spinning_top_sim.grade.scenes import Body, Reals
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
 UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
 EXPLAINED = 0.25    # of the discrepancy is left at most
+WRONG_ENERGY = 0.1  # of the change of the potential energy
 
 
 def faults_of(motions: Sequence[Motion], dt: float) -> list[Fault]:
@@ -44,6 +45,19 @@ def faults_of(motions: Sequence[Motion], dt: float) -> list[Fault]:
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
         Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
     return faults if rms(residual) < EXPLAINED * rms(target) else []
+
+
+def energy_fault(motion: Motion) -> Iterator[Fault]:
+    """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
+    if motion.trajectory.energy is None:
+        return
+    energy, _, _ = motion.data.constants(motion.body) or (0.0, 0.0, 0.0)
+    off = float(np.ptp(motion.trajectory.energy[MARGIN:-MARGIN] - energy))
+    share = off / (float(np.ptp(motion.body.gravity_torque * motion.data.height)) or 1.0)
+    if share > WRONG_ENERGY:
+        yield Fault('energy', f'{motion.name}: the energy told differs from that of attitude and '
+                    f'rates by up to {100.0 * share:.3g} % of the change of the potential energy',
+                    share)
 
 
 def _terms(motion: Motion, dt: float) -> tuple[Reals, Mapping[str, Reals]]:

@@ -8,7 +8,6 @@ long, so that no phase is ever off by half a turn.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,13 +18,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import guess
 from spinning_top_sim.grade import problem as unknowns
 from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Readings, turned
 from spinning_top_sim.grade.scenes import Body, Reals, Start
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.tools.verdict import number
 
 FEWEST = 32                 # attitudes that can be fitted
 GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
@@ -52,26 +51,16 @@ class Fit:
     """
     A fitted motion; `lines` tells it.
 
-    Attributes
-    ----------
-    top, start : Top, State
-        At the first attitude.  lambda1 is as given: attitudes tell ratios only.
-    mounting, lever_arm : tuple of float
-        Of the IMU, as `Body` has them.
-    begin : float
-        Time of the first attitude [s].
-    values, deviations : dict
-        Estimates and standard deviations by the names of NAMES; inf where the readings do not
-        tell the value.
-    covariance : (k, k) array
-        Of the values.
-    undetermined : tuple of str
-        What the readings cannot tell apart.
-    residual, noise : float
-        Root mean square of a component of the attitude residual, and of its white part [rad].
-    reached : bool
-        Whether the fit has converged and the residuals are noise.  If not, the intervals mean
-        nothing.
+    top, start : at the first attitude; lambda1 is as given: attitudes tell ratios only
+    mounting, lever_arm : of the IMU, as `Body` has them
+    begin : time of the first attitude [s]
+    values, deviations : estimates and standard deviations by the names of NAMES; inf where the
+        readings do not tell the value
+    covariance : (k, k), of the values
+    undetermined : what the readings cannot tell apart
+    residual, noise : rms of a component of the attitude residual, and of its white part [rad]
+    reached : whether the fit has converged and the residuals are noise; if not, the intervals
+        mean nothing
     """
 
     top: Top
@@ -97,8 +86,7 @@ class Fit:
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; null: not told by the readings."""
         return {'values': dict(self.values), 'undetermined': list(self.undetermined),
-                'deviations': {name: value if math.isfinite(value) else None
-                               for name, value in self.deviations.items()},
+                'deviations': {name: number(one) for name, one in self.deviations.items()},
                 'residual': self.residual, 'noise': self.noise, 'reached': self.reached}
 
     def lines(self) -> Iterator[str]:
@@ -146,15 +134,12 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     """
     one, begin = _attitudes_of(parts)
     (first, sure), trials = _first_values(one, parts), []
-    small = [(0, *pair) for pair in guess.small_nutation(one.times, one.values)]
+    small = [(0, *pair) for pair in unknowns.small_nutation(one.times, one.values)]
     for size, l3, p in ((FIRST, first[SPIN], 0.0), *small[:4], (4 * FIRST, first[SPIN], 0.0)):
         first[[L3, P]] = l3, p
-        with contextlib.suppress(ValueError):       # no motion begins so
-            trials.append(_fit_from(one, first, size, gravity))
-            if trials[-1].explained:                # another guess finds the same
-                break
-    if not trials:
-        raise ValueError('no motion of a top comes near the attitudes')
+        trials.append(_fit_from(one, first, size, gravity))
+        if trials[-1].explained:                # another guess finds the same
+            break
     best = min(trials, key=lambda trial: trial.residual)
     if not sure:
         _add_turns(best.x, one.times)
@@ -217,7 +202,8 @@ def _first_values(one: Readings,
                   parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Reals, bool]:
     """Return unknowns with the first rates, and whether whole turns are known."""
     told, x = parts.get('rates', parts.get('gyroscope')), np.zeros(unknowns.UNKNOWNS)
-    spin, sure = guess.spin_rate(one.times, one.values, told and float(np.median(told[1][:, 2])))
+    hint = told and float(np.median(told[1][:, 2]))
+    spin, sure = unknowns.spin_rate(one.times, one.values, hint)
     first, second = np.stack(attitude.axis_in_world(tuple(one.values[:, :2])), axis=1)
     x[unknowns.RATES] = Rotation.from_quat(one.values[:, 0]).inv().apply(
         np.cross(first, second) / one.times[1])
@@ -244,12 +230,21 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
         x, done, level, growth = found, count, left, min(growth * growth, GROWTH)
         if left > LARGEST:          # no motion of a top
             break
-    rest = problem.residuals(x).reshape(3, -1)
-    residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
-    noise, white = whiteness(rest)
-    explained = residual <= EXACT or (white and residual < LARGEST)
-    return _Trial(problem, x, residual, noise, explained,
-                  explained and (converged or residual <= EXACT))
+    return _judged(problem, x, converged)
+
+
+def _judged(problem: Problem, x: Reals, converged: bool,
+            frozen: tuple[int, ...] = ()) -> _Trial:
+    """Return unknowns with what the residuals show."""
+    rests = [problem.residual(x, one) for one in problem.readings]
+    levels, white = zip(*map(whiteness, rests), strict=True)
+    small = [np.std(rest) < EXACT + (NEGLIGIBLE * np.std(one.values) if one.kind != 'attitude'
+                                     else 0.0)
+             for rest, one in zip(rests, problem.readings, strict=True)]
+    residual = math.sqrt(float(np.sum(rests[0] ** 2)) / (rests[0].size - len(MOTION)))
+    explained = residual < LARGEST and all(np.logical_or(white, small))
+    return _Trial(problem, x, residual, levels[0], explained,
+                  explained and (converged or all(small)), frozen)
 
 
 def _descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
@@ -262,16 +257,9 @@ def _descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int =
         moved[chosen] = y
         return moved
 
-    def residuals(y: Reals) -> Reals:
-        try:
-            return problem.residuals(at(y))
-        except ValueError:          # no motion begins so: a shorter step
-            return far
-
-    far = np.full(len(problem.residuals(x)), 1e9)
     found = least_squares(
-        residuals, x[chosen], lambda y: problem.jacobian(at(y), chosen), method='lm',
-        x_scale='jac', max_nfev=evaluations, ftol=tolerance, xtol=1e-15, gtol=1e-15)
+        lambda y: problem.residuals(at(y)), x[chosen], lambda y: problem.jacobian(at(y), chosen),
+        method='lm', x_scale='jac', max_nfev=evaluations, ftol=tolerance, xtol=1e-15, gtol=1e-15)
     return at(found.x), found.status > 0
 
 
@@ -305,12 +293,11 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
             raise ValueError(f'the file has no {name}: the place of the IMU cannot be fitted')
         streams.append(Readings(kind, parts[name][0] - begin,
                                 np.ascontiguousarray(parts[name][1].T)))
-    (one,), problem.readings = problem.readings, streams[:1]
+        streams[-1].sigma = float(np.std(streams[-1].values)) or 1.0
+    (one,), problem.readings = problem.readings, streams
     _, model = problem.motion(x, streams[0])
     problem.mounting = Rotation.align_vectors(model.T, streams[0].values.T)[0].as_quat()
-    for stream, own in zip(streams, ((8, 9, 10, unknowns.LATE), (11, 12, 13)), strict=True):
-        problem.readings = [stream]
-        x, _ = _descend(problem, x, own)
+    x, _ = _descend(problem, x, SENSOR)
     problem.readings = [one, *streams]
     free = [k for k in (*MOTION, *SENSOR) if k not in trial.frozen]
     for _ in range(2):          # noise of each, then all with it
@@ -318,13 +305,7 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
             rest = problem.residual(x, stream)
             stream.sigma = max(math.sqrt(float(np.mean(rest * rest))), 1e-15)
         x, converged = _descend(problem, x, free)
-    rests = [problem.residual(x, stream) for stream in problem.readings]
-    noise, _ = whiteness(rests[0])
-    residual = math.sqrt(float(np.mean(rests[0] ** 2)))
-    explained = all(whiteness(rest)[1] or np.std(rest) < EXACT + NEGLIGIBLE * np.std(stream.values)
-                    for stream, rest in zip(problem.readings, rests, strict=True))
-    return trial._replace(x=x, residual=residual, noise=noise,
-                          reached=trial.reached and converged and explained)
+    return _judged(problem, x, trial.reached and converged, trial.frozen)
 
 
 def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fit:
@@ -338,7 +319,12 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     jacobian = problem.jacobian(at, free, central=True) * sizes
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
     told = singular > max(1.0 / VAGUE, (1e-6 if frozen else 1e-9) * singular[0])
-    values, slopes = _public(problem, x)[free], _slopes(problem, x, free, sizes)
+    values = _public(problem, x)[free]
+    steps = 1e-6 * sizes[:, np.newaxis] * np.eye(len(free), len(x))
+    slopes = np.stack([(_public(problem, x + step) - _public(problem, x - step))[free]
+                       for step in steps], axis=1)
+    slopes[[*ANGLES]] = np.remainder(slopes[[*ANGLES]] + math.pi, math.tau) - math.pi
+    slopes *= 0.5e6
     half = slopes @ (directions[told].T / singular[told])
     deviations = np.sqrt(np.sum(half * half, axis=1))
     allowed = VAGUE * np.array([1.0, rate, 1.0, 1.0, rate, rate, abs(values[RATIO]), rate * rate,
@@ -404,18 +390,6 @@ def _public(problem: Problem, x: Reals) -> Reals:
     return np.array([state.theta, state.theta_dot, state.phi, state.psi, state.l3, state.lz,
                      state.l3 / (float(x[SPIN]) or 1e-300), x[P], *mounting.as_rotvec(),
                      *x[unknowns.PLACE], x[unknowns.LATE]])
-
-
-def _slopes(problem: Problem, x: Reals, free: Sequence[int], sizes: Reals) -> Reals:
-    """Return the derivatives of the values of NAMES by the unknowns, in units of their sizes."""
-    columns = []
-    for k, size in zip(free, sizes, strict=True):
-        step = np.zeros(unknowns.UNKNOWNS)
-        step[k] = 1e-6 * size
-        change = (_public(problem, x + step) - _public(problem, x - step))[[*free]]
-        change[[*ANGLES]] = np.remainder(change[[*ANGLES]] + math.pi, math.tau) - math.pi
-        columns.append(change / 2e-6)
-    return np.stack(columns, axis=1)
 
 
 def _scaled(values: Sequence[float], lambda1: float, gravity: float) -> tuple[Top, State]:

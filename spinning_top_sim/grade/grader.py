@@ -9,17 +9,15 @@ import numpy as np
 
 from spinning_top_sim.exam.measures import convergence_order
 from spinning_top_sim.grade import dynamics, sensors
-from spinning_top_sim.grade.motion import MARGIN, Motion
+from spinning_top_sim.grade.motion import InvalidTrajectoryError, Motion, Trajectory, even_times
 from spinning_top_sim.grade.report import Fault, Report
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Reals, Scene, Start
-from spinning_top_sim.grade.trajectory import InvalidTrajectoryError, Trajectory, equally_spaced
 from spinning_top_sim.physics.top import State, Top
 
 Run = Callable[[Body, Start, Reals, float], Any]
 # The largest error of an attitude that is no fault [rad].
 TOLERANCE = math.radians(0.1)
 MOST = 0.7              # that the top turns in a step [rad]: in longer ones rates are not known
-WRONG_ENERGY = 0.1      # of the change of the potential energy
 
 
 def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[Scene] = SCENES,
@@ -37,10 +35,8 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
     dt : float
         The step [s].  Samples are dt apart, also where the order of convergence is measured with
         smaller steps.  A scene in which the top turns by more than 0.7 rad in a step is left out.
-    body : Body
-        The top and the IMU on it.
-    scenes : sequence of Scene
-        Motions to run.
+    body, scenes : Body, sequence of Scene
+        The top and the IMU on it, and the motions to run.
     seed : int
         Determines how the top is turned at the start.
     tolerance : float
@@ -48,17 +44,8 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
     subject : str, optional
         Name of the simulator; default: that of `run`.
 
-    Returns
-    -------
-    Report
-        The faults with their evidence, and the measures.
-
-    Raises
-    ------
-    TypeError
-        If `run` cannot be called.
-    ValueError
-        Naming the argument, its value and what is allowed.
+    Raises TypeError if `run` cannot be called, ValueError naming the argument, its value and what
+    is allowed.
     """
     if not callable(run):
         raise TypeError(f'run = {run!r}: must be run(top, start, times, dt)')
@@ -67,7 +54,7 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
     name = str(subject or getattr(run, '__name__', type(run).__name__))
     faults: list[Fault] = []
     motions: list[Motion] = []
-    orders: dict[str, float] = {}
+    orders = {}
     for scene in scenes:
         start = scene.start_of(body, seed)
         if dt * max(*map(abs, start.rates), abs(start.state_of(body).l3) / body.lambda1) > MOST:
@@ -108,17 +95,10 @@ def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
         Times [s], equally spaced; default: the `t` of the trajectory.
     dt : float, optional
         Step of the simulator [s]; default: the time between two samples.
-    tolerance : float
-        As of `grade`.
-    subject : str
-        As of `grade`.
-    **imu :
-        Parameters of `Body` beside those of the top: `lever_arm`, `mounting`, ...
+    tolerance, subject, **imu :
+        As of `grade`; parameters of `Body` beside those of the top: `lever_arm`, `mounting`, ...
 
-    Raises
-    ------
-    ValueError
-        Naming what is no motion, and why.
+    Raises ValueError naming what is no motion, and why.
     """
     body = Body.of(top, **imu)
     if isinstance(start, State):
@@ -128,7 +108,7 @@ def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
             trajectory, 't', None)
         if times is None:
             raise ValueError('times = None: must be given, the trajectory has no t')
-    motion = Motion(subject, body, start, Trajectory.of(trajectory, equally_spaced(times)))
+    motion = Motion(subject, body, start, Trajectory.of(trajectory, even_times(times)))
     return _judge(subject, [motion], {}, [], dt or motion.trajectory.step, tolerance)
 
 
@@ -152,7 +132,7 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
     marks.update({f'order: {name}': order for name, order in orders.items()})
     kinematic = any(fault.name == 'rates_scale' for fault in faults)
     faults += _motion_faults(motions, orders, dt, tolerance, kinematic)
-    faults += _energy_fault(motions[0])
+    faults += dynamics.energy_fault(motions[0])
     for kind in sensors.KINDS:
         more, found = sensors.judge(kind, motions)
         faults, marks = [*faults, *more], {**marks, **found}
@@ -175,16 +155,3 @@ def _motion_faults(motions: Sequence[Motion], orders: Mapping[str, float], dt: f
     yield from (fault._replace(evidence=f'{text}; {fault.evidence}') for fault in causes)
     if not (first or causes or kinematic):
         yield Fault('inaccurate', text, math.degrees(worst.worst))
-
-
-def _energy_fault(motion: Motion) -> Iterator[Fault]:
-    """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
-    if motion.trajectory.energy is None:
-        return
-    energy, _, _ = motion.data.constants(motion.body) or (0.0, 0.0, 0.0)
-    off = float(np.ptp(motion.trajectory.energy[MARGIN:-MARGIN] - energy))
-    share = off / (float(np.ptp(motion.body.gravity_torque * motion.data.height)) or 1.0)
-    if share > WRONG_ENERGY:
-        yield Fault('energy', f'{motion.name}: the energy told differs from that of attitude and '
-                    f'rates by up to {100.0 * share:.3g} % of the change of the potential energy',
-                    share)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The least-squares problem of the fit: readings against the exact motion of a top.
+The least-squares problem of the fit: readings against the exact motion of a top; first values.
 
 Attitudes do not depend on the scale of the inertia: the unknowns are those of a top with
 lambda1 = 1.  They are regular at the poles: attitude and angular velocity of the body at t = 0,
@@ -9,7 +9,8 @@ L3/lambda1 and P/lambda1; and of an IMU its mounting, its place and how late its
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,6 +29,7 @@ MOUNTING, PLACE, LATE = slice(8, 11), slice(11, 14), 14
 MOTION, SENSOR = range(8), range(8, 15)
 UNKNOWNS = 15
 ROUNDING = 1e-14            # of rates
+FAR = 1e9
 CHANGE = 1e-6               # of the readings by a step of finite differences [rad], [rad/s], ..
 
 
@@ -72,9 +74,12 @@ class Problem:
         return top, state_of(top, np.ravel(q), rates)
 
     def residuals(self, x: Reals) -> Reals:
-        """Return (readings - model)/sigma (m,).  Raises ValueError where there is no motion."""
-        return np.concatenate([self.residual(x, one).ravel() / one.sigma
-                               for one in self.readings])
+        """Return (readings - model)/sigma (m,); they are FAR where no motion begins so."""
+        try:
+            return np.concatenate([self.residual(x, one).ravel() / one.sigma
+                                   for one in self.readings])
+        except ValueError:
+            return np.full(3 * sum(len(one.times) for one in self.readings), FAR)
 
     def jacobian(self, x: Reals, free: Sequence[int], central: bool = False) -> Reals:
         """Return the derivatives of the residuals (m, len(free)), by finite differences."""
@@ -136,3 +141,49 @@ def turned(reference: Sequence[float] | Reals, vector: Reals) -> attitude.Quater
     a, b, c, d = np.reshape(reference, (4, 1))
     x, y, z = np.reshape(vector, (3, 1))
     return attitude.product((a, b, c, d), attitude.quaternion_of_vector((x, y, z)))
+
+
+def spin_rate(times: Reals, q: Reals, hint: float | None) -> tuple[float, bool]:
+    """
+    Return omega_3 [rad/s] from attitudes (4, n), and whether the hint tells its whole turns.
+
+    Evenly sampled attitudes tell it up to whole turns per sample: without a hint that is near
+    one of these values, the slowest is returned.
+    """
+    x, y, z, w = q[:, :-1]
+    _, _, dz, dw = attitude.product((-x, -y, -z, w), tuple(q[:, 1:]))
+    turn, dt = 2.0 * np.arctan2(dz, dw), np.diff(times)
+    step = float(np.median(dt))
+    usual = np.abs(dt - step) < 0.1 * step
+    rate = float(np.angle(np.mean(np.exp(1j * turn[usual])))) / step
+    turns = 0.0 if hint is None else (hint - rate) * step / math.tau
+    sure = hint is not None and abs(turns - round(turns)) < 0.1
+    rate += math.tau / step * round(turns) if sure else 0.0
+    rest = np.remainder(turn - rate * dt + math.pi, math.tau) - math.pi
+    return rate + float(np.sum(rest) / np.sum(dt)), sure
+
+
+def small_nutation(times: Reals, q: Reals) -> Iterator[tuple[float, float]]:
+    """
+    Yield (L3/lambda1, P/lambda1) of a small nutation, from its strongest frequency.
+
+    About a steady precession W at the tilt theta, W^2 sin^2 theta + (L3 - 2 W cos theta)^2 is the
+    square of the frequency, and P = L3 W - W^2 cos theta.
+    """
+    axis = attitude.axis_in_world(tuple(q))
+    phi = np.unwrap(np.arctan2(axis[1], axis[0]))
+    rate, first = np.polyfit(times, phi, 1)
+    height = float(np.mean(axis[2]))
+    sine = math.sqrt(max(1.0 - height * height, 0.0))
+    dt = float(np.median(np.diff(times)))
+    even = np.arange(times[0], times[-1], dt)
+    rest = (np.interp(even, times, height - axis[2]) / max(sine, 1e-3)
+            + 1j * sine * np.interp(even, times, phi - first - rate * times))
+    power = np.abs(np.fft.fft((rest - np.mean(rest)) * np.hanning(len(even)), 4 * len(even)))
+    frequency = math.tau * np.fft.fftfreq(len(power), dt)
+    best = abs(float(frequency[np.argmax(power)]))
+    for alias in (best, math.tau / dt - best, math.tau / dt + best):
+        within = alias * alias - (rate * sine) ** 2
+        for sign in (1.0, -1.0) if within > 0.0 else ():
+            l3 = 2.0 * rate * height + sign * math.sqrt(within)
+            yield l3, l3 * rate - rate * rate * height

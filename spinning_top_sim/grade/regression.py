@@ -22,10 +22,10 @@ Judge = Callable[[Reals], Fault | None]
 
 
 class Cause(NamedTuple):
-    """A possible cause of a discrepancy: names of its k effects, and what names the fault."""
+    """A possible cause of a discrepancy: names of its effects, and what names its fault."""
 
     effects: Sequence[str]
-    judge: Judge
+    judge: Judge | None = None
 
 
 def instead(name: str, evidence: str) -> Judge:
@@ -53,11 +53,11 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
     Returns the faults, and what they leave of the discrepancy.
     """
     chosen: list[Cause] = []
-    residual, fitted = target, np.empty(0)
+    residual, found = target, np.empty(0)
     enough = max(ENOUGH * beyond(target, floor), 0.1 * floor)
     others = [*causes]
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
-        tried = [least_squares(target, [effects[name] for cause in (*chosen, one)
+        tried = [fitted(target, [effects[name] for cause in (*chosen, one)
                                         for name in cause.effects]) for one in others]
         after = [beyond(left, floor) for _, left in tried]
         good = max(AS_GOOD * min(after), 0.02 * before)
@@ -65,14 +65,14 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
             zip(others, after, strict=True)) if left <= good)
         if left > WORTHWHILE * before:
             break
-        fitted, residual = tried[best]
+        found, residual = tried[best]
         chosen.append(others.pop(best))
     ends = np.cumsum([len(one.effects) for one in chosen], dtype=int)[:-1]
-    judged = [one.judge(found) for one, found in zip(chosen, np.split(fitted, ends), strict=False)]
-    return [fault for fault in judged if fault is not None], residual
+    return [fault for one, part in zip(chosen, np.split(found, ends), strict=False)
+            if one.judge is not None and (fault := one.judge(part)) is not None], residual
 
 
-def least_squares(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
+def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
     """
     Return the coefficients (k,) of columns (N, 3) by least squares, and the residual.
 

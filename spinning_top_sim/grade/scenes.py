@@ -24,17 +24,12 @@ class Body(Top):
     """
     A top with an IMU on it.  The pivot is the origin of the body frame, e3 the axis.
 
-    Parameters
-    ----------
-    lever_arm : (3,) float
-        Position of the IMU in the body frame [m].
-    mounting : (4,) float
-        q(body <- IMU) as w, x, y, z.
-    field : (3,) float
-        Magnetic field in the world [T].
-    gyroscope_noise_density, accelerometer_noise_density : float
-        Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
-        sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
+    lever_arm : position of the IMU in the body frame [m]
+    mounting : q(body <- IMU) as w, x, y, z
+    field : magnetic field in the world [T]
+    gyroscope_noise_density, accelerometer_noise_density : of white noise [rad/s/sqrt(Hz)],
+        [m/s^2/sqrt(Hz)]: a sample has the density over sqrt(interval between the samples) as its
+        standard deviation; 0: no noise, None: unknown
     """
 
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -60,10 +55,7 @@ class Body(Top):
     @classmethod
     def of(cls, top: Top, **imu: object) -> Self:
         """Return the body of a top; `imu` are the other parameters, by default those above."""
-        if isinstance(top, cls) and not imu:
-            return top
-        given = {one.name: getattr(top, one.name) for one in fields(top)}
-        return cls(**{**given, **imu})
+        return top if isinstance(top, cls) and not imu else cls(**{**vars(top), **imu})
 
     @property
     def inertia(self) -> tuple[float, float, float]:
@@ -86,14 +78,9 @@ class Start:
     """
     How the top starts.
 
-    Parameters
-    ----------
-    attitude : (4,) float
-        q(world <- body) as w, x, y, z; z of the world points up.
-    rates : (3,) float
-        Angular velocity in the body frame [rad/s].
-    state : State, optional
-        The same in Euler angles and momenta; `of` and `state_of` convert.
+    attitude : q(world <- body) as w, x, y, z; z of the world points up
+    rates : angular velocity in the body frame [rad/s]
+    state : the same in Euler angles and momenta; `of` and `state_of` convert
     """
 
     attitude: tuple[float, float, float, float]
@@ -104,16 +91,15 @@ class Start:
     def of(cls, top: Top, state: State) -> Self:
         """Return the start of a state."""
         first = ExactSolution(top, state).states_at_seconds(np.zeros(1))
-        x, y, z, w = first.quaternion[0].tolist()
-        return cls((w, x, y, z), tuple(first.angular_velocity[0].tolist()), state)
+        return cls(tuple(np.roll(first.quaternion[0], 1).tolist()),
+                   tuple(first.angular_velocity[0].tolist()), state)
 
     def state_of(self, top: Top) -> State:
         """Return the start as a state of `top`."""
         if self.state is not None:
             return self.state
-        w, x, y, z = self.attitude
-        return state_of(top, np.array((x, y, z, w)), Rotation.from_quat((x, y, z, w)).apply(
-            self.rates))
+        turn = Rotation.from_quat(np.roll(self.attitude, -1))
+        return state_of(top, turn.as_quat(), turn.apply(self.rates))
 
 
 @dataclass(frozen=True)

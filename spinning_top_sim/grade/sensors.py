@@ -17,15 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade.motion import MARGIN, Motion
-from spinning_top_sim.grade.regression import (
-    NEAR,
-    Cause,
-    beyond,
-    explain,
-    instead,
-    least_squares,
-    pooled,
-)
+from spinning_top_sim.grade.regression import NEAR, Cause, beyond, explain, fitted, instead, pooled
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
@@ -149,13 +141,14 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     runs = [one for motion in motions if (one := _readings_of(kind, motion)) is not None]
     if not runs:
         return [], {}
-    said, lag = motions[0].trajectory, 0 if kind == 'velocities' else _lag(runs)
+    said, means = motions[0].trajectory, kind == 'velocities'       # means over a step
+    lag = 0 if means else _lag(runs)
     target, effects = pooled(run.late(lag) for run in runs)
     noise = np.array([_white(run.late(lag)[0]) for run in runs])
     sizes, floor = np.array([run.size for run in runs]), rms(noise)
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
     most = floor * math.sqrt(1.05 + 2.0 * doubt)
-    before, late = beyond(target, most), lag - _fraction(kind, target, effects)
+    before, late = beyond(target, most), lag - (0.0 if means else _fraction(target, effects))
     marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(sizes * noise)),
              f'{kind}_discrepancy': before}
     faults, residual = [], target
@@ -201,12 +194,10 @@ def _turned(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
                   'those of the IMU', turn.magnitude())], target + total - turn.apply(total)
 
 
-def _fraction(kind: str, target: Reals, effects: Mapping[str, Reals]) -> float:
+def _fraction(target: Reals, effects: Mapping[str, Reals]) -> float:
     """Return by how many steps a reading is early, 0 if that does not explain it."""
-    if kind == 'velocities':
-        return 0.0
     # The acceleration of a step may be that of its begin, without a lag of the reading.
-    fractions, left = least_squares(target, [effects[name] for name in (
+    fractions, left = fitted(target, [effects[name] for name in (
         'step', 'tangential step') if name in effects])
     return float(fractions[0]) if 1e-6 < rms(target) > 2.0 * rms(left) else 0.0
 
@@ -216,7 +207,7 @@ def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residua
     """Compare noise with what is declared and with normal noise; `band`: of the ratio to 1."""
     density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
                motion.body.accelerometer_noise_density)
-    covariance = (motion.trajectory.covariance or {}).get(kind)
+    covariance = motion.trajectory.covariance.get(kind)
     root = math.sqrt(motion.trajectory.step)
     text = f'the noise has a standard deviation of {noise:.4g}'
     told = math.nan if covariance is None else math.sqrt(abs(np.trace(covariance)) / 3.0)
@@ -242,7 +233,7 @@ def _lag(runs: Sequence[Readings]) -> int:
     """Return the number of samples by which readings are late, with any size of their terms."""
     def left(lag: int) -> float:
         target, effects = pooled(run.late(lag, (*run.terms, 'step')) for run in runs)
-        return rms(least_squares(target, [*effects.values()])[1])
+        return rms(fitted(target, [*effects.values()])[1])
 
     floor, now = rms(np.array([_white(run.late(0)[0]) for run in runs])), left(0)
     if now ** 2 < 1.1 * floor ** 2 + CONSISTENT ** 2:
@@ -262,7 +253,7 @@ def _causes(kind: str, body: Body) -> list[Cause]:
     """Return what may be wrong with the readings of a sensor."""
     in_world = 'rates_in_world' if kind in ('gyroscope', 'rates') else 'reading_in_world'
     text = 'the readings are in axes of '
-    causes = [Cause(['total'], partial(_scale, kind)), Cause(['step'], _none), Cause(
+    causes = [Cause(['total'], partial(_scale, kind)), Cause(['step']), Cause(
         ['total', 'world'], instead(in_world, f'{text}the world, not of the IMU')), Cause(
         ['total', 'reversed'], instead('rotation_reversed', f'{text}a sensor that turns against '
                                        'the IMU'))]
@@ -270,12 +261,8 @@ def _causes(kind: str, body: Body) -> list[Cause]:
         return causes
     return [*causes, *(Cause([name], partial(_term, name)) for name in _TERMS),
             Cause(['gravity', 'fixed 0', 'fixed 1', 'fixed 2'], partial(_gravity_frame, body)),
-            Cause(['difference'], _difference), Cause(['tangential step'], _none),
-            Cause(['turned'], _none), Cause(['arm 0', 'arm 1', 'arm 2'], partial(_arm, body))]
-
-
-def _none(found: Reals) -> None:
-    """Name no fault: a lag has been judged before, and others are none."""
+            Cause(['difference'], _difference), Cause(['tangential step']), Cause(['turned']),
+            Cause(['arm 0', 'arm 1', 'arm 2'], partial(_arm, body))]
 
 
 def _scale(kind: str, found: Reals) -> Fault:
