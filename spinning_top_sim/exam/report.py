@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of an exam as text, JSON and JUnit XML."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 from xml.etree import ElementTree
 
 from spinning_top_sim.exam import diagnosis
@@ -59,12 +58,11 @@ class Report(Verdict):
         """Names of the faults found, from `diagnosis.FAULTS`."""
         return self.names
 
-    def as_json(self) -> str:
-        """Return JSON with subject, passed, faults, evidence and measures, null for NaN."""
-        return json.dumps({
-            'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
-            'evidence': dict(self.found),
-            'measures': {name: number(value) for name, value in self.measures.items()}}, indent=2)
+    def as_dict(self) -> dict[str, Any]:
+        """Return subject, passed, faults, evidence and measures; None: NaN."""
+        return {'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
+                'evidence': dict(self.found),
+                'measures': {name: number(value) for name, value in self.measures.items()}}
 
     def as_junit(self) -> str:
         """Return a test suite in JUnit XML with a test case for each fault of FAULTS."""

@@ -37,7 +37,6 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, motion_files, scene_file
 from spinning_top_sim.tools.motion_files import Recorded
 
-DENSITIES = 'gyroscope_noise_density', 'accelerometer_noise_density'
 SAME_S = 1e-6               # between two stamps of one time
 EVEN = 1e-4                 # share of the interval by which evenly spaced samples may be off
 GAP = 2.5                   # intervals that are a gap
@@ -74,8 +73,8 @@ def _run(arguments: argparse.Namespace) -> int:
         print(json.dumps({**report.as_dict(), 'notes': recorded.notes,
                           'fit': found and found.as_dict()}, indent=2))
     else:
-        fitted = found.lines() if found else ()
-        for line in (*recorded.notes, *fitted, *str(report).splitlines()):
+        for line in (*recorded.notes, *(found.lines() if found else ()),
+                     *str(report).splitlines()):
             cli.print_line(line)
     return cli.OK if report.passed and (found is None or found.reached) else cli.FAILED
 
@@ -84,8 +83,7 @@ def _motion(arguments: argparse.Namespace,
             recorded: Recorded) -> tuple[Body, State, fitting.Fit | None]:
     """Return top with IMU and start, as given or as fitted, and the fit."""
     given, fits = scene_file.given(arguments), arguments.fit or arguments.fit_imu
-    starts = [name for name in given if name.startswith(('initial.', 'spin.'))]
-    if starts and fits:
+    if fits and (starts := [name for name in given if name.startswith(('initial.', 'spin.'))]):
         raise ValueError(f'--fit finds the start: {", ".join(starts)} must not be given')
     known = None if given else recorded.parameters
     values = known or parameters.checked(given)
@@ -94,17 +92,17 @@ def _motion(arguments: argparse.Namespace,
     body = Body.of(
         top, lever_arm=tuple(arguments.lever_arm or values['imu.lever_arm']),
         mounting=(w, x, y, z), field=tuple(values['mag.field']),
-        **{name: given.get(f'imu.{name}') for name in DENSITIES})
+        **{name: given.get(f'imu.{name}') for name in (
+            'gyroscope_noise_density', 'accelerometer_noise_density')})
     if fits or not (given or known):
         found = fitting.fit(recorded.parts, lambda1=top.lambda1, gravity=top.gravity,
-                    imu=arguments.fit_imu)
-        fitted, start = found.body(body), found.start
-        if arguments.lever_arm or 'imu.lever_arm' in given:
-            fitted = replace(fitted, lever_arm=body.lever_arm)
+                            imu=arguments.fit_imu)
+        if arguments.fit_imu:
+            body = replace(body, mounting=found.mounting, lever_arm=body.lever_arm if (
+                arguments.lever_arm or 'imu.lever_arm' in given) else found.lever_arm)
         if any(name.startswith('top.') for name in given):
-            fitted = replace(fitted, **vars(top))
-            start = fitting.start_of(found, recorded.parts, top)
-        return fitted, start, found
+            return body, fitting.start_of(found, recorded.parts, top), found
+        return replace(body, **vars(found.top)), found.start, found
     if off := fitting.far_start(recorded.parts, top, start):
         raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
                          '--fit finds top and start')
@@ -140,7 +138,7 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
         found = found * (error if np.array_equal(even, times) else
                          RotationSpline(times, error)(even))
     angle = float(abs(motion.start.l3 / motion.top.lambda3)) * (even[1] - even[0])
-    readings = {}
+    readings = {'attitudes': np.roll(found.as_quat(), 1, axis=1)}
     for name, (at, values) in parts.items():
         if len(at) == len(even) and np.max(np.abs(at - even)) < SAME_S:
             readings[name] = values
@@ -149,8 +147,7 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
         else:
             notes.append(f'{name}: not at the times of the attitudes, and the spin is '
                          f'{angle:.2g} rad from one sample to the next: not compared')
-    return Trajectory.of({'attitudes': np.roll(found.as_quat(), 1, axis=1), **readings,
-                          'covariance': recorded.covariance or None}, even)
+    return Trajectory.of({**readings, 'covariance': recorded.covariance}, even)
 
 
 def _longest(name: str, at: Reals, values: Reals, notes: list[str]) -> tuple[Reals, Reals]:

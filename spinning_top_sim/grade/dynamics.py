@@ -14,7 +14,7 @@ import numpy as np
 
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade.motion import MARGIN, Motion
-from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, pooled
+from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, listed, pooled
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
@@ -51,9 +51,10 @@ def energy_fault(motion: Motion) -> Iterator[Fault]:
     """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
     if motion.trajectory.energy is None:
         return
-    energy, _, _ = motion.data.constants(motion.body) or (0.0, 0.0, 0.0)
-    off = float(np.ptp(motion.trajectory.energy[MARGIN:-MARGIN] - energy))
-    share = off / (float(np.ptp(motion.body.gravity_torque * motion.data.height)) or 1.0)
+    data, torque = motion.data, motion.body.gravity_torque
+    energy, _, _ = data.constants(motion.body) or (0.0, 0.0, 0.0)
+    share = float(np.ptp(motion.trajectory.energy[MARGIN:-MARGIN] - energy)) / (
+        float(np.ptp(torque * data.height)) or 1.0)
     if share > WRONG_ENERGY:
         yield Fault('energy', f'{motion.name}: the energy told differs from that of attitude and '
                     f'rates by up to {100.0 * share:.3g} % of the change of the potential energy',
@@ -110,8 +111,8 @@ def _damping(found: Reals) -> Fault:
 
 def _com(body: Body, found: Reals) -> Fault:
     com = found + body.com
-    text = f'the torque of gravity is that of a centre of mass at ({_listed(com)}) m, not at ' \
-        f'({_listed(body.com)}) m'
+    text = f'the torque of gravity is that of a centre of mass at ({listed(com)}) m, not at ' \
+        f'({listed(body.com)}) m'
     if np.linalg.norm(com + body.com) < 0.1 * abs(body.com_distance):
         return Fault('gravity_sign', f'{text}: gravity points upwards', -1.0)
     return Fault('com_offset', text, float(np.linalg.norm(found)))
@@ -126,9 +127,5 @@ def _inertia(body: Body, found: Reals) -> Fault | None:
     right = (body.lambda1 - body.lambda3) / body.lambda1
     third = 0.5 * (second - first * (right + found[2]) + first + second * (found[3] - right))
     return Fault('inertia', 'the motion is that of moments of inertia '
-                 f'{_listed((first, second, third))} kg m^2, not {_listed(body.inertia)}',
+                 f'{listed((first, second, third))} kg m^2, not {listed(body.inertia)}',
                  float(first))
-
-
-def _listed(values: Sequence[float] | Reals) -> str:
-    return ', '.join(f'{float(value):.4g}' for value in values)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade import problem as unknowns
 from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Readings, turned
-from spinning_top_sim.grade.scenes import Body, Reals, Start
+from spinning_top_sim.grade.scenes import Reals, Start
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -65,8 +65,8 @@ class Fit:
 
     top: Top
     start: State
-    mounting: tuple[float, ...]
-    lever_arm: tuple[float, ...]
+    mounting: tuple[float, float, float, float]
+    lever_arm: tuple[float, float, float]
     begin: float
     values: Mapping[str, float]
     deviations: Mapping[str, float]
@@ -75,13 +75,6 @@ class Fit:
     residual: float
     noise: float
     reached: bool
-
-    def body(self, given: Body) -> Body:
-        """Return the fitted top with the IMU of a body, or the fitted one."""
-        new: dict[str, Any] = dict(vars(self.top))
-        if 'stamp_offset' in self.values:
-            new.update(mounting=self.mounting, lever_arm=self.lever_arm)
-        return replace(given, **new)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; null: not told by the readings."""
@@ -92,8 +85,10 @@ class Fit:
     def lines(self) -> Iterator[str]:
         """Yield lines for a reader."""
         yield (f'fit: residual {self.residual:.3g} rad, noise {self.noise:.3g} rad' + (
-            '' if self.reached else ': the residual is not noise, or the fit has not converged. '
-            'No motion that was found explains the attitudes; what follows is of the nearest one'))
+            '' if self.reached else ': no motion of a top comes near the attitudes' if
+            self.residual > LARGEST else ': the residual is not noise, or the fit has not '
+            'converged. No motion that was found explains the attitudes; what follows is of the '
+            'nearest one'))
         for name, value in self.values.items():
             spread = INTERVAL * self.deviations[name]
             yield f'  {name:<16}{value:>16.9g} ' + (
@@ -108,7 +103,7 @@ class _Trial(NamedTuple):
     noise: float
     explained: bool                     # the residual is noise
     reached: bool                       # the same, and the fit has converged
-    frozen: tuple[int, ...] = ()        # unknowns that the attitudes cannot tell
+    frozen: Sequence[int] = ()          # unknowns that the attitudes cannot tell
 
 
 def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
@@ -127,13 +122,9 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     imu : bool
         Whether mounting, lever arm and offset of the stamps of the IMU are fitted.
 
-    Raises
-    ------
-    ValueError
-        If there are too few attitudes, no readings, or no motion of a top comes near.
+    Raises ValueError if there are too few attitudes, or no readings.
     """
-    one, begin = _attitudes_of(parts)
-    (first, sure), trials = _first_values(one, parts), []
+    (one, first, sure), trials = _begun(parts), []
     small = [(0, *pair) for pair in unknowns.small_nutation(one.times, one.values)]
     for size, l3, p in ((FIRST, first[SPIN], 0.0), *small[:4], (4 * FIRST, first[SPIN], 0.0)):
         first[[L3, P]] = l3, p
@@ -149,6 +140,7 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
         free = [k for k in MOTION if k not in frozen]
         best = best._replace(frozen=frozen, x=_descend(best.problem, at, free)[0]
                              if frozen else best.x)
+    begin = float(parts['attitudes'][0][0])
     if imu:
         best = _with_imu(best, parts, begin)
     return _conclude(best, begin, lambda1, gravity)
@@ -157,8 +149,7 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
 def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> State:
     """Return the start of a known top: the fitted one, or if none was found that of the begin."""
     if found.reached:
-        start = Start.of(found.top, found.start)
-        return Start(start.attitude, start.rates).state_of(top)
+        return replace(Start.of(found.top, found.start), state=None).state_of(top)
     return _begin_of(parts, top)[0]
 
 
@@ -177,8 +168,8 @@ def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) 
 
 def _begin_of(parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> tuple[State, float]:
     """Return the state of a known top that the first attitudes tell, and doubt of its rates."""
-    one, _ = _attitudes_of(parts)
-    problem, (x, _) = Problem([], one.values[:, 0], top.gravity), _first_values(one, parts)
+    one, x, _ = _begun(parts)
+    problem = Problem([], one.values[:, 0], top.gravity)
     x[P] = top.gravity_torque / top.lambda1
     for count in BEGIN:
         problem.readings = [replace(one, times=one.times[:count], values=one.values[:, :count])]
@@ -189,26 +180,19 @@ def _begin_of(parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> tuple[State
             6.0 * float(np.std(problem.residuals(x))) / problem.readings[0].times[-1])
 
 
-def _attitudes_of(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
-    """Return attitudes from t = 0 on, and the time of the first."""
+def _begun(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, Reals, bool]:
+    """Return attitudes from t = 0 on, unknowns with the first rates, and if turns are known."""
     times, attitudes = parts['attitudes']
     if len(times) < FEWEST:
         raise ValueError(f'{len(times)} attitudes: must be {FEWEST} at least for a fit')
-    q = np.roll(attitudes / np.linalg.norm(attitudes, axis=1)[:, np.newaxis], -1, axis=1).T
-    return Readings('attitude', times - times[0], np.ascontiguousarray(q)), float(times[0])
-
-
-def _first_values(one: Readings,
-                  parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Reals, bool]:
-    """Return unknowns with the first rates, and whether whole turns are known."""
-    told, x = parts.get('rates', parts.get('gyroscope')), np.zeros(unknowns.UNKNOWNS)
+    turns, x = Rotation.from_quat(np.roll(attitudes, -1, axis=1)), np.zeros(unknowns.UNKNOWNS)
+    one = Readings('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
+    told = parts.get('rates', parts.get('gyroscope'))
     hint = told and float(np.median(told[1][:, 2]))
     spin, sure = unknowns.spin_rate(one.times, one.values, hint)
-    first, second = np.stack(attitude.axis_in_world(tuple(one.values[:, :2])), axis=1)
-    x[unknowns.RATES] = Rotation.from_quat(one.values[:, 0]).inv().apply(
-        np.cross(first, second) / one.times[1])
-    x[SPIN] = spin
-    return x, sure
+    across = np.cross(*turns[:2].apply((0.0, 0.0, 1.0))) / one.times[1]
+    x[unknowns.RATES] = (*turns[0].inv().apply(across)[:2], spin)
+    return one, x, sure
 
 
 def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
@@ -221,8 +205,8 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
         chosen = slice(0, count, math.ceil(count / ENOUGH) if count < last else 1)
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
         free = MOTION if size or count == last else MOTION[:6]
-        precisely = (30, 1e-8) if count == last else (8, 1e-3)
-        found, converged = _descend(problem, x, free, *precisely)
+        found, converged = _descend(problem, x, free, *(
+            (30, 1e-8) if count == last else (8, 1e-3)))
         left = float(np.std(problem.residuals(found)))
         if left > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
             growth = math.sqrt(growth)
@@ -233,13 +217,11 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
     return _judged(problem, x, converged)
 
 
-def _judged(problem: Problem, x: Reals, converged: bool,
-            frozen: tuple[int, ...] = ()) -> _Trial:
+def _judged(problem: Problem, x: Reals, converged: bool, frozen: Sequence[int] = ()) -> _Trial:
     """Return unknowns with what the residuals show."""
     rests = [problem.residual(x, one) for one in problem.readings]
     levels, white = zip(*map(whiteness, rests), strict=True)
-    small = [np.std(rest) < EXACT + (NEGLIGIBLE * np.std(one.values) if one.kind != 'attitude'
-                                     else 0.0)
+    small = [np.std(rest) < EXACT + NEGLIGIBLE * (one.kind != 'attitude') * np.std(one.values)
              for rest, one in zip(rests, problem.readings, strict=True)]
     residual = math.sqrt(float(np.sum(rests[0] ** 2)) / (rests[0].size - len(MOTION)))
     explained = residual < LARGEST and all(np.logical_or(white, small))
@@ -273,11 +255,7 @@ def whiteness(rest: Reals) -> tuple[float, bool]:
 
 
 def _add_turns(x: Reals, times: Reals) -> None:
-    """
-    Make the spin the slowest with 0 < lambda3 <= 2 lambda1.
-
-    A spin that is faster by whole turns between evenly spaced attitudes passes through them all.
-    """
+    """Make the spin the slowest with 0 < lambda3 <= 2 lambda1, by whole turns per attitude."""
     step = float(times[-1]) / (len(times) - 1)
     sign, turn = math.copysign(1.0, x[L3]), math.tau / step
     less = 0.5 * abs(x[L3]) - sign * x[SPIN]
@@ -302,8 +280,7 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
     free = [k for k in (*MOTION, *SENSOR) if k not in trial.frozen]
     for _ in range(2):          # noise of each, then all with it
         for stream in problem.readings:
-            rest = problem.residual(x, stream)
-            stream.sigma = max(math.sqrt(float(np.mean(rest * rest))), 1e-15)
+            stream.sigma = max(float(np.std(problem.residual(x, stream))), 1e-15)
         x, converged = _descend(problem, x, free)
     return _judged(problem, x, trial.reached and converged, trial.frozen)
 
@@ -333,8 +310,9 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     deviations[np.any(hidden, axis=1) | ~(deviations < allowed)] = math.inf
     names = [list(NAMES)[k] for k in free]
     top, start = _scaled(values[:8].tolist(), lambda1, gravity)
-    mx, my, mz, mw = np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])).tolist()
-    return Fit(top, start, (mw, mx, my, mz), tuple(x[unknowns.PLACE].tolist()), begin,
+    mx, my, mz, mw = turned(problem.mounting, x[unknowns.MOUNTING]).as_quat().tolist()
+    arm_x, arm_y, arm_z = x[unknowns.PLACE].tolist()
+    return Fit(top, start, (mw, mx, my, mz), (arm_x, arm_y, arm_z), begin,
                dict(zip(names, values.tolist(), strict=True)),
                dict(zip(names, deviations.tolist(), strict=True)), half @ half.T,
                tuple(_not_told(names, values, deviations, hidden)), trial.residual, trial.noise,
@@ -361,9 +339,7 @@ def _without_unseen_nutation(problem: Problem, x: Reals,
                              residual: float) -> tuple[Reals, tuple[int, ...]]:
     """
     Return the steady or sleeping motion with lambda3 = lambda1 next to one whose nutation may be
-    noise, and the unknowns that such a motion does not tell.
-
-    If the nutation is not noise, the unknowns are returned as they are, and ().
+    noise, and the unknowns that it does not tell; the unknowns as they are and () if it is none.
     """
     motion = ExactSolution(*problem.start(x))
     low, high = motion.theta_min, motion.theta_max
@@ -386,7 +362,7 @@ def _without_unseen_nutation(problem: Problem, x: Reals,
 def _public(problem: Problem, x: Reals) -> Reals:
     """Return the values of NAMES."""
     _, state = problem.start(x)
-    mounting = Rotation.from_quat(np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])))
+    mounting = turned(problem.mounting, x[unknowns.MOUNTING])
     return np.array([state.theta, state.theta_dot, state.phi, state.psi, state.l3, state.lz,
                      state.l3 / (float(x[SPIN]) or 1e-300), x[P], *mounting.as_rotvec(),
                      *x[unknowns.PLACE], x[unknowns.LATE]])

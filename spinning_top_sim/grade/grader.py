@@ -9,7 +9,7 @@ import numpy as np
 
 from spinning_top_sim.exam.measures import convergence_order
 from spinning_top_sim.grade import dynamics, sensors
-from spinning_top_sim.grade.motion import InvalidTrajectoryError, Motion, Trajectory, even_times
+from spinning_top_sim.grade.motion import InvalidTrajectoryError, Motion, Trajectory
 from spinning_top_sim.grade.report import Fault, Report
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Reals, Scene, Start
 from spinning_top_sim.physics.top import State, Top
@@ -39,10 +39,8 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
         The top and the IMU on it, and the motions to run.
     seed : int
         Determines how the top is turned at the start.
-    tolerance : float
-        Largest error of an attitude that is no fault [rad].
-    subject : str, optional
-        Name of the simulator; default: that of `run`.
+    tolerance, subject : float, str
+        Largest error of an attitude that is no fault [rad]; name, by default that of `run`.
 
     Raises TypeError if `run` cannot be called, ValueError naming the argument, its value and what
     is allowed.
@@ -101,14 +99,8 @@ def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
     Raises ValueError naming what is no motion, and why.
     """
     body = Body.of(top, **imu)
-    if isinstance(start, State):
-        start = Start.of(body, start)
-    if times is None:
-        times = trajectory.get('t') if isinstance(trajectory, Mapping) else getattr(
-            trajectory, 't', None)
-        if times is None:
-            raise ValueError('times = None: must be given, the trajectory has no t')
-    motion = Motion(subject, body, start, Trajectory.of(trajectory, even_times(times)))
+    start = Start.of(body, start) if isinstance(start, State) else start
+    motion = Motion(subject, body, start, Trajectory.of(trajectory, times))
     return _judge(subject, [motion], {}, [], dt or motion.trajectory.step, tolerance)
 
 
@@ -130,8 +122,9 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
     marks = {f'{name}: {motion.name}': value for motion in motions
              for name, value in motion.marks.items()}
     marks.update({f'order: {name}': order for name, order in orders.items()})
-    kinematic = any(fault.name == 'rates_scale' for fault in faults)
-    faults += _motion_faults(motions, orders, dt, tolerance, kinematic)
+    known = any(fault.name == 'rates_scale' for fault in faults)
+    faults += [one for one in _motion_faults(motions, orders, dt, tolerance)
+               if not (known and one.name == 'inaccurate')]
     faults += dynamics.energy_fault(motions[0])
     for kind in sensors.KINDS:
         more, found = sensors.judge(kind, motions)
@@ -140,8 +133,8 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
 
 
 def _motion_faults(motions: Sequence[Motion], orders: Mapping[str, float], dt: float,
-                   tolerance: float, kinematic: bool) -> Iterator[Fault]:
-    """Yield what is wrong with the motions; `kinematic`: a fault of the rates explains it."""
+                   tolerance: float) -> Iterator[Fault]:
+    """Yield what is wrong with the motions."""
     worst = max(motions, key=lambda motion: motion.worst)
     if worst.worst <= tolerance:
         return
@@ -153,5 +146,5 @@ def _motion_faults(motions: Sequence[Motion], orders: Mapping[str, float], dt: f
     causes = [fault for fault in dynamics.faults_of(motions, dt)
               if not (first and fault.name == 'first_order')]
     yield from (fault._replace(evidence=f'{text}; {fault.evidence}') for fault in causes)
-    if not (first or causes or kinematic):
+    if not (first or causes):
         yield Fault('inaccurate', text, math.degrees(worst.worst))

@@ -4,7 +4,6 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -18,7 +17,7 @@ from spinning_top_sim.tools.analysis import Attitudes, measure
 # Columns of each part.
 _PARTS = {'attitudes': (4,), 'rates': (3,), 'accelerations': (3,), 'gyroscope': (3,),
           'magnetometer': (3,), 'increments': (6,), 'energy': ()}
-LEAST_SAMPLES = 50
+LEAST_SAMPLES = 20
 # Sixth-order central differences, for samples -3 .. 3.
 _WEIGHTS = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
 MARGIN = 3
@@ -28,7 +27,7 @@ class InvalidTrajectoryError(ValueError):
     """A simulator has returned no motion; the text names what and why."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Trajectory:
     """
     A motion at n equally spaced times t [s], as a simulator tells it; None: not told.
@@ -55,8 +54,8 @@ class Trajectory:
     covariance: Mapping[str, Reals] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, said: Any, times: Reals) -> Self:
-        """Return what a run has said.  Raises InvalidTrajectoryError if it is no motion."""
+    def of(cls, said: Any, times: Any = None) -> Self:
+        """Return what a run has said, by default at its `t`.  Raises InvalidTrajectoryError."""
         if hasattr(said, 'attitudes'):
             said = {name: getattr(said, name, None) for name in cls.__dataclass_fields__}
         elif not isinstance(said, Mapping):
@@ -64,7 +63,15 @@ class Trajectory:
         if 'attitudes' not in said:
             raise InvalidTrajectoryError(f'the mapping has {sorted(map(str, said))}: must have '
                                          'attitudes')
-        parts = {name: _numbers(name, said[name], (len(times), *columns))
+        times = said.get('t') if times is None else times
+        if times is None:
+            raise InvalidTrajectoryError('times = None: must be given, the trajectory has no t')
+        t = _numbers('times', times, (max(np.size(times), LEAST_SAMPLES),))
+        steps, usual = np.diff(t), np.median(np.diff(t))
+        for at in np.flatnonzero(~(np.abs(steps - usual) <= 1e-3 * usual))[:1]:
+            raise InvalidTrajectoryError(f'times[{at + 1}] - times[{at}] = {steps[at]:g} s after '
+                                         f'{usual:g} s: must be equally spaced')
+        parts = {name: _numbers(name, said[name], (len(t), *columns))
                  for name, columns in _PARTS.items() if said.get(name) is not None}
         attitudes = parts.pop('attitudes')
         norms = np.linalg.norm(attitudes, axis=1, keepdims=True)
@@ -77,19 +84,13 @@ class Trajectory:
         told = said.get('covariance')
         if not isinstance(told, Mapping):
             told = {} if told is None else {'gyroscope': told, 'accelerations': told}
-        return cls(times, attitudes, **parts, covariance={
+        return cls(t, attitudes, **parts, covariance={
             name: _numbers(f'covariance of {name}', matrix, (3, 3))
             for name, matrix in told.items()})
 
-    @property
-    def step(self) -> float:
-        """Time between two samples [s]."""
-        return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
-
-    @cached_property
-    def rotation(self) -> Rotation:
-        """Rotations world <- body."""
-        return Rotation.from_quat(self.attitudes[:, [1, 2, 3, 0]])
+    def __post_init__(self) -> None:
+        self.step = float(self.t[-1] - self.t[0]) / (len(self.t) - 1)       # [s]
+        self.rotation = Rotation.from_quat(self.attitudes[:, [1, 2, 3, 0]])
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
@@ -105,90 +106,59 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
     return numbers
 
 
-def even_times(times: Any) -> Reals:
-    """Return times (n,) [s].  Raises InvalidTrajectoryError unless they are equally spaced."""
-    t = np.array(times, dtype=float)
-    if t.ndim != 1 or len(t) < LEAST_SAMPLES:
-        raise InvalidTrajectoryError(f'times have shape {t.shape}: must be (n,), n >= '
-                                     f'{LEAST_SAMPLES}')
-    steps = np.diff(t)
-    for at in np.flatnonzero(~(np.abs(steps - np.median(steps)) <= 1e-3 * np.median(steps)))[:1]:
-        raise InvalidTrajectoryError(
-            f'times[{at + 1}] - times[{at}] = {steps[at]:g} s after {np.median(steps):g} s: must '
-            'be equally spaced')
-    return t
-
-
 def errors_of(rotation: Rotation, truth: Rotation) -> dict[str, Reals]:
     """
-    Split the rotation between two attitudes world <- body, simulated and exact (n,) [rad].
+    Return the angle between attitudes world <- body (n,), and its parts [rad].
 
-    A small rotation is split in directions that are regular at the poles: `precession` turns about
-    the vertical, times sin(theta); `nutation` is that of theta; `spin` turns about the axis.
-    `total` is the angle of the whole rotation.
+    precession : about the vertical, times sin(theta); nutation : of theta; spin : about the axis
     """
     axes = [one.apply((0.0, 0.0, 1.0)).T for one in (rotation, truth)]
     tip, right = (x + 1j * y for x, y, _ in axes)
     tilt, right_tilt = (np.arctan2(np.hypot(x, y), z) for x, y, z in axes)
     between = truth.inv() * rotation
     _, _, z, w = between.as_quat().T
-    return {'total': between.magnitude(), 'nutation': tilt - right_tilt,
+    return {'total': between.magnitude(),
             'precession': np.unwrap(np.angle(tip * np.conj(right))) * np.abs(right),
-            'spin': np.unwrap(2.0 * np.arctan2(z, w))}
+            'nutation': tilt - right_tilt, 'spin': np.unwrap(2.0 * np.arctan2(z, w))}
 
 
 @dataclass
 class Motion:
-    """A motion beside the exact one from the same state; `told`: rates (n, 3) that are right."""
+    """
+    A motion beside the exact one from the same state.
+
+    rates : body rates at all samples but `MARGIN` at each end (n - 6, 3), from the attitudes
+        unless those told are right
+    derived : whether they are from the attitudes
+    """
 
     name: str
     body: Body
     start: Start
     trajectory: Trajectory
-    told: Reals | None = None
+    derived: bool = True
 
-    @cached_property
-    def solution(self) -> ExactSolution:
-        return ExactSolution(self.body, self.start.state_of(self.body))
-
-    @cached_property
-    def truth(self) -> States:
-        """The exact states at the times of the samples."""
-        return self.solution.states_at_seconds(self.trajectory.t)
-
-    @cached_property
-    def errors(self) -> dict[str, Reals]:
-        """Errors of the attitude, as `errors_of` has them."""
-        return errors_of(self.trajectory.rotation, Rotation.from_quat(self.truth.quaternion))
-
-    @property
-    def worst(self) -> float:
-        """Largest error of the attitude [rad]."""
-        return float(np.max(self.errors['total']))
-
-    @property
-    def rates(self) -> Reals:
-        """Body rates at all samples but `MARGIN` at each end (n - 6, 3): told, or `derived`."""
-        return self.derived if self.told is None else self.told[MARGIN:-MARGIN]
-
-    @cached_property
-    def derived(self) -> Reals:
-        """Body rates, by differences of the rotation from the exact attitudes: it turns slowly."""
-        error = Rotation.from_quat(self.truth.quaternion).inv() * self.trajectory.rotation
-        inner, n = slice(MARGIN, -MARGIN), len(self.trajectory.t) - 2 * MARGIN
-        here = error[inner].inv()
-        total: Reals = sum(weight * (here * error[at:at + n]).as_rotvec()
-                           for at, weight in enumerate(_WEIGHTS) if weight)
-        return total / self.trajectory.step + here.apply(self.truth.angular_velocity[inner])
+    def __post_init__(self) -> None:
+        self.solution = ExactSolution(self.body, self.start.state_of(self.body))
+        self.truth: States = self.solution.states_at_seconds(self.trajectory.t)
+        right = Rotation.from_quat(self.truth.quaternion)
+        self.errors = errors_of(self.trajectory.rotation, right)
+        self.worst = float(np.max(self.errors['total']))        # [rad]
+        # The rotation from the exact attitudes turns slowly.
+        error, n = right.inv() * self.trajectory.rotation, len(self.trajectory.t) - 2 * MARGIN
+        here = error[MARGIN:-MARGIN].inv()
+        total = sum(weight * (here * error[at:at + n]).as_rotvec()
+                    for at, weight in enumerate(_WEIGHTS) if weight)
+        self.rates: Reals = total / self.trajectory.step + here.apply(
+            self.truth.angular_velocity[MARGIN:-MARGIN])
 
     @property
     def accelerations(self) -> Reals:
         """Angular accelerations (n - 12, 3)."""
         inner, n = slice(MARGIN, -MARGIN), len(self.trajectory.t) - 4 * MARGIN
         off = self.rates - self.truth.angular_velocity[inner]
-        total: Reals = sum(weight * off[at:at + n] for at, weight in enumerate(_WEIGHTS) if weight)
-        return (total / self.trajectory.step
-                + self.truth.angular_acceleration[2 * MARGIN:-2 * MARGIN])
+        total = sum(weight * off[at:at + n] for at, weight in enumerate(_WEIGHTS) if weight)
+        return total / self.trajectory.step + self.truth.angular_acceleration[inner][inner]
 
     @property
     def data(self) -> Attitudes:

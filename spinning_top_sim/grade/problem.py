@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.scenes import Reals
 from spinning_top_sim.physics import attitude
@@ -56,8 +57,7 @@ class Problem:
     """
     Residuals and Jacobian of readings.
 
-    reference, mounting : q(world <- body) at t = 0 and q(body <- IMU), from which the unknown
-        rotations count, as x, y, z, w
+    reference, mounting : q(world <- body) at t = 0 and q(body <- IMU) before the unknown turns
     """
 
     def __init__(self, readings: Sequence[Readings], reference: Reals, gravity: float) -> None:
@@ -67,11 +67,11 @@ class Problem:
 
     def start(self, x: Reals) -> tuple[Top, State]:
         """Return top and state with lambda1 = lambda3 = 1: its spin is L3, not omega_3."""
-        q = turned(self.reference, x[TURN])
-        rates = np.ravel(attitude.in_world(q, (x[3], x[4], x[L3])))
+        turn = turned(self.reference, x[TURN])
+        rates = turn.apply((x[3], x[4], x[L3]))
         rates[np.abs(rates) < ROUNDING * np.max(np.abs(rates))] = 0.0   # an upright top may rest
         top = Top(lambda1=1.0, lambda3=1.0, mass=1.0, com_distance=float(x[P]), gravity=1.0)
-        return top, state_of(top, np.ravel(q), rates)
+        return top, state_of(top, turn.as_quat(), rates)
 
     def residuals(self, x: Reals) -> Reals:
         """Return (readings - model)/sigma (m,); they are FAR where no motion begins so."""
@@ -103,8 +103,7 @@ class Problem:
             turn = np.stack(attitude.product((-a, -b, -c, d), tuple(one.values)))
             return np.stack(attitude.rotation_vector(tuple(np.where(turn[3] < 0.0, -turn, turn))))
         model = w if one.kind == 'rates' else self._force(x, q, w)
-        return one.values - np.stack(attitude.in_body(
-            turned(self.mounting, x[MOUNTING]), tuple(model)))
+        return one.values - turned(self.mounting, x[MOUNTING]).inv().apply(model.T).T
 
     def motion(self, x: Reals, one: Readings) -> tuple[Reals, Reals]:
         """Return attitudes (4, n), and for an IMU rates in the body (3, n), at its times."""
@@ -136,19 +135,16 @@ class Problem:
         return force + self.gravity * z
 
 
-def turned(reference: Sequence[float] | Reals, vector: Reals) -> attitude.Quaternion:
-    """Return the attitude after a rotation vector in the body, components (1,)."""
-    a, b, c, d = np.reshape(reference, (4, 1))
-    x, y, z = np.reshape(vector, (3, 1))
-    return attitude.product((a, b, c, d), attitude.quaternion_of_vector((x, y, z)))
+def turned(reference: Sequence[float] | Reals, vector: Reals) -> Rotation:
+    """Return the attitude after a rotation vector in the body."""
+    return Rotation.from_quat(reference) * Rotation.from_rotvec(vector)
 
 
 def spin_rate(times: Reals, q: Reals, hint: float | None) -> tuple[float, bool]:
     """
     Return omega_3 [rad/s] from attitudes (4, n), and whether the hint tells its whole turns.
 
-    Evenly sampled attitudes tell it up to whole turns per sample: without a hint that is near
-    one of these values, the slowest is returned.
+    If not, it is the slowest of those that pass through evenly sampled attitudes.
     """
     x, y, z, w = q[:, :-1]
     _, _, dz, dw = attitude.product((-x, -y, -z, w), tuple(q[:, 1:]))
@@ -173,9 +169,8 @@ def small_nutation(times: Reals, q: Reals) -> Iterator[tuple[float, float]]:
     axis = attitude.axis_in_world(tuple(q))
     phi = np.unwrap(np.arctan2(axis[1], axis[0]))
     rate, first = np.polyfit(times, phi, 1)
-    height = float(np.mean(axis[2]))
+    height, dt = float(np.mean(axis[2])), float(np.median(np.diff(times)))
     sine = math.sqrt(max(1.0 - height * height, 0.0))
-    dt = float(np.median(np.diff(times)))
     even = np.arange(times[0], times[-1], dt)
     rest = (np.interp(even, times, height - axis[2]) / max(sine, 1e-3)
             + 1j * sine * np.interp(even, times, phi - first - rate * times))

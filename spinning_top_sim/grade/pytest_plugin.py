@@ -12,10 +12,5 @@ from spinning_top_sim.tools.verdict import passing
 
 @pytest.fixture
 def pass_grade() -> Callable[..., Report]:
-    """
-    Return a function that grades a simulator and fails the test if it has faults.
-
-    The function takes the arguments of `grade`, and `known`, names of faults that are allowed.
-    It returns the report.
-    """
+    """Return `grade` as a function that fails the test if there are faults, but for `known`."""
     return passing(grade)

@@ -17,8 +17,7 @@ TINY = 1e-6             # rms of an effect that cannot be seen
 NEAR = 0.25             # of a coefficient to the value that it has for a fault
 AS_GOOD = 2.0           # a cause with fewer columns may leave so many times more
 
-# From the coefficients of a cause to the fault; None for what is no fault.
-Judge = Callable[[Reals], Fault | None]
+Judge = Callable[[Reals], Fault | None]     # of the coefficients of a cause; None: no fault
 
 
 class Cause(NamedTuple):
@@ -45,17 +44,14 @@ def pooled(parts: Iterable[tuple[Reals, Mapping[str, Reals]]]) -> tuple[Reals, d
 def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause],
             floor: float = 0.0) -> tuple[list[Fault], Reals]:
     """
-    Explain a discrepancy (N, 3) by causes, the best one first.
+    Explain a discrepancy (N, 3) by causes, the best one first; return faults and what is left.
 
     effects : by name, change of what is compared by an effect of size 1 (N, 3)
     floor : rms of the noise in the target
-
-    Returns the faults, and what they leave of the discrepancy.
     """
     chosen: list[Cause] = []
-    residual, found = target, np.empty(0)
+    residual, found, others = target, np.empty(0), [*causes]
     enough = max(ENOUGH * beyond(target, floor), 0.1 * floor)
-    others = [*causes]
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
         tried = [fitted(target, [effects[name] for cause in (*chosen, one)
                                         for name in cause.effects]) for one in others]
@@ -73,11 +69,7 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
 
 
 def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
-    """
-    Return the coefficients (k,) of columns (N, 3) by least squares, and the residual.
-
-    The coefficient of a column that is TINY is 0.
-    """
+    """Return the coefficients (k,) of columns (N, 3), 0 for a TINY one, and the residual."""
     matrix = np.stack([column.ravel() for column in columns], axis=1)
     size = np.sqrt(np.sum(matrix * matrix, axis=0))
     size[size <= TINY * np.sqrt(len(matrix))] = np.inf
@@ -88,3 +80,8 @@ def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
 def beyond(values: Reals, floor: float) -> float:
     """Return the rms beyond that of noise."""
     return float(np.sqrt(max(rms(values) ** 2 - floor ** 2, 0.0)))
+
+
+def listed(values: Iterable[float]) -> str:
+    """Return numbers for a reader."""
+    return ', '.join(f'{value:.4g}' for value in values)

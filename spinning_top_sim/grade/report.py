@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of grading a simulator, as text and JSON."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -21,11 +20,7 @@ FAULTS = (
 
 
 class Fault(NamedTuple):
-    """
-    A fault of a simulator: its name, one of FAULTS, and why it is reported.
-
-    number : what was measured, such as a lag or a coefficient; NaN where there is none
-    """
+    """A fault: its name, one of FAULTS, why it is reported, what was measured, such as a lag."""
 
     name: str
     evidence: str
@@ -34,18 +29,10 @@ class Fault(NamedTuple):
 
 class Report(Verdict):
     """
-    The result of grading a simulator; `str(report)` is readable.
+    The result of grading a simulator, the `subject`; `str(report)` is readable.
 
-    Attributes
-    ----------
-    subject : str
-        Name of the simulator.
-    faults, names : list
-        The faults with their evidence, and their names, each once.
-    passed : bool
-        Whether no fault was found.
-    marks : mapping
-        Measures by name, as docs/grade.md defines them; NaN: could not be measured.
+    passed, faults, names : whether none was found; with their evidence; their names, each once
+    marks : measures by name, as docs/grade.md defines them; NaN: could not be measured
     """
 
     @property
@@ -62,7 +49,3 @@ class Report(Verdict):
                 'faults': [{**fault._asdict(), 'number': number(fault.number)}
                            for fault in self.faults],
                 'marks': {name: number(value) for name, value in self.marks.items()}}
-
-    def as_json(self) -> str:
-        """Return `as_dict` as JSON."""
-        return json.dumps(self.as_dict(), indent=2)

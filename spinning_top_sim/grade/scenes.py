@@ -15,8 +15,6 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
 Reals = NDArray[np.float64]
-# What is no field of `Top`: numbers, and vectors with their length.
-_LENGTHS = {'lever_arm': 3, 'mounting': 4, 'field': 3}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +38,7 @@ class Body(Top):
 
     def __post_init__(self) -> None:
         Top(**{one.name: getattr(self, one.name) for one in fields(Top)})
-        for name, length in _LENGTHS.items():
+        for name, length in (('lever_arm', 3), ('mounting', 4), ('field', 3)):
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (length,) or not np.all(np.isfinite(value)):
                 raise ValueError(f'{name} = {getattr(self, name)!r}: must be {length} finite '
@@ -105,11 +103,8 @@ class Start:
 @dataclass(frozen=True)
 class Scene:
     """
-    A motion that is graded.
+    A motion that is graded, from l3, lz, theta and theta_dot of its start, for so long [s].
 
-    name : of the motion
-    start : l3, lz, theta and theta_dot of the start
-    duration : [s]
     divided : numbers by which dt is divided, 1 first; more than one give the order of convergence
     """
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What exam and grade share: a report of faults with evidence, and a fixture for pytest."""
 
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -43,6 +44,14 @@ class Verdict:
         lines += [f'  {fault.name}: {fault.evidence}' for fault in self.found]
         lines += [f'  {line}' for line in self.measure_lines()]
         return '\n'.join(lines)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what JSON can hold."""
+        raise NotImplementedError
+
+    def as_json(self) -> str:
+        """Return `as_dict` as JSON."""
+        return json.dumps(self.as_dict(), indent=2)
 
     def measure_lines(self) -> list[str]:
         """Return the measures, with what they mean, except those that could not be measured."""
