@@ -4,28 +4,32 @@
 import math
 from abc import ABC, abstractmethod
 from bisect import bisect_left
-from functools import cached_property
+from collections.abc import Callable
 from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers import dormand_prince
-from spinning_top_sim.solvers.dormand_prince import Equations, IntegrationError, Rows
-from spinning_top_sim.solvers.equations import (
-    POLE_SHARE,
-    EulerEquations,
-    Parts,
-    TransportEquations,
-    half_axis,
+from spinning_top_sim.solvers.dormand_prince import (
+    IntegrationError,
+    Rows,
+    Step,
+    Vector,
+    interpolate,
+    unrolled_step,
 )
 from spinning_top_sim.solvers.times import NANOSECONDS, Times
-from spinning_top_sim.solvers.unwrap import PhaseUnwrapper, turns_to_follow
 
+# Hairer et al. eq. (4.13): aim a little below the tolerance and change the step within limits.
+SAFETY = 0.9
+SHRINK, GROW = 0.2, 5.0
+# Doubles do not hold the powers of faster rates or longer steps.
+FASTEST_RATE, LONGEST_STEP = 1e100, 1e100       # [rad/s], [s]
+# A step of fewer units in the last place of t is a collapse, not progress.
+SMALLEST_STEP_ULPS = 16
 # A time that so many steps of the present size do not reach is refused: minutes of work.
 MOST_STEPS = 1e7
 # Steps that `states_at_seconds` takes and reads together; more would only take memory.
@@ -36,27 +40,78 @@ MOST_KEPT = 50_000
 
 class SteppedMotion(ABC):
     """
-    A motion by the steps of some equations, from its start at t = 0; every time counts from there.
+    A motion by steps of equations y' = f(y), from t = 0; every time counts from there.
+
+    A subclass has the equations: f, its derivative, the error that is tolerated, and the states.
 
     top, start : what moves, and from where
     ns_limit : the last time that it can give at all [ns]
+    steps, evaluations : counts
+
+    y : the unknowns at t = 0, all complex or all real
+    tolerance, fastest_rate : relative error of a step, and a bound on |y'|/|y| [1/s]: the first
+        step's length comes from these two
     """
 
+    derivative: Callable[..., Vector]   # f of the unknowns, which it takes one by one
     ns_limit = 2 ** 63 - 1              # steps go on for ever
 
-    def __init__(self, top: Top, start: State, equations: Equations) -> None:
-        self.top, self.start, self._equations = top, start, equations
-        self._integrator = dormand_prince.Integrator(equations)
-        # The steps that can still be read, in order.
-        self._kept = [self._integrator.newest]
+    def __init__(self, top: Top, start: State, y: Vector, tolerance: float,
+                 fastest_rate: float) -> None:
+        self.top, self.start = top, start
+        self._step = unrolled_step(len(y), isinstance(y[0], complex))
+        derivative = self.derivative(*y)
+        # The steps that can still be read, in order; the first one has no length.
+        self._kept = [Step(0.0, y, derivative, 0.0, y, derivative)]
+        if not fastest_rate <= FASTEST_RATE:
+            raise OverflowError(f'{fastest_rate:.3g} rad/s')
+        # A careful first step: the control finds the right one within a few.
+        self._next_step = 0.1 * math.pow(tolerance, 0.2) / (fastest_rate or 1.0)
+        self.steps, self.evaluations = 0, 1
 
-    @property
-    def steps(self) -> int:
-        return self._integrator.steps
+    @abstractmethod
+    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        """Return y'' from y and y': rows of components (k, n), real and imaginary parts apart."""
 
-    @property
-    def evaluations(self) -> int:
-        return self._integrator.evaluations
+    @abstractmethod
+    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
+        """Return each error estimate over what is tolerated: a step passes if all are <= 1."""
+
+    @abstractmethod
+    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+        """Return the end of a step, perhaps moved; IntegrationError if it cannot be trusted."""
+
+    @abstractmethod
+    def _states_of(self, t: Column, unknowns: Rows) -> States:
+        """Return the states at times [s] from what `_unknowns` returns."""
+
+    def _take_step(self) -> None:
+        """Take one accepted step.  Raises IntegrationError where none can be taken."""
+        newest = self._kept[-1]
+        t, y, derivative = newest.t1, newest.y1, newest.derivative1
+        grow = GROW
+        while True:
+            end = t + min(self._next_step, LONGEST_STEP)
+            h = end - t                         # what the sum really made of it
+            if not h > SMALLEST_STEP_ULPS * math.ulp(t):
+                raise IntegrationError(
+                    f'the step size collapsed to {self._next_step:.3g} s at t = {t:.9g} s')
+            y_new, derivative_new, difference = self._step(self.derivative, h, y, derivative)
+            self.evaluations += 6
+            errors = self.errors(y, y_new, difference)
+            # `max` may pass over a NaN.  An infinite error shrinks the step until that collapses.
+            error = max(errors) if sum(errors) < math.inf else math.inf
+            factor = max(SHRINK, SAFETY * error ** -0.2) if error else GROW
+            if error <= 1.0:
+                break
+            grow = 1.0
+            self._next_step = h * factor
+        y_new = self.accepted(y, y_new)
+        self._next_step = h * min(grow, factor)
+        self.steps += 1
+        # First same as last: the projection moves y by less than the step's own error, so the
+        # derivative at the unprojected end serves the next step too.
+        self._kept.append(Step(t, y, derivative, end, y_new, derivative_new))
 
     @property
     def reached_ns(self) -> int:
@@ -75,7 +130,7 @@ class SteppedMotion(ABC):
         while self.reached_ns < ns:
             if taken == max_steps:
                 return False
-            self._kept.append(self._integrator.step())
+            self._take_step()
             taken += 1
         return True
 
@@ -107,7 +162,7 @@ class SteppedMotion(ABC):
         parts, begin = [], 0
         while begin < len(t):
             while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_TOGETHER:
-                self._kept.append(self._integrator.step())
+                self._take_step()
             oldest, newest = self._kept[0], self._kept[-1]
             length = (newest.t1 - oldest.t0) / len(self._kept)
             if t[-1] - newest.t1 > MOST_STEPS * length:
@@ -123,157 +178,13 @@ class SteppedMotion(ABC):
         return self._states_of(t.copy(), unknowns)
 
     def _unknowns(self, t: Column) -> Rows:
-        """Return the rows that `_states_of` needs at times [s] within the steps that are kept."""
-        steps = np.array([step.t1 for step in self._kept]).searchsorted(t)
+        """Return the unknowns (k, n) at times [s] within the steps that are kept."""
+        return self._interpolated(self._steps_at(t), t)
+
+    def _steps_at(self, t: Column) -> NDArray[np.int64]:
+        """Return the numbers of the steps that are kept in which times [s] lie."""
+        return np.array([step.t1 for step in self._kept]).searchsorted(t)
+
+    def _interpolated(self, steps: NDArray[np.int64], t: Column) -> Rows:
         first, last = (int(steps[0]), int(steps[-1])) if len(t) else (0, 0)
-        interpolants = dormand_prince.Interpolants(self._kept[first:last + 1], self._equations)
-        return np.concatenate((interpolants.at(steps - first, t), self._phases_at(steps)))
-
-    def _phases_at(self, steps: NDArray[np.int64]) -> Rows:
-        """Return further rows per time, of the step that it lies in: none here."""
-        return np.empty((0, len(steps)))
-
-    @abstractmethod
-    def _states_of(self, t: Column, unknowns: Rows) -> States:
-        """Return the states at times [s]."""
-
-
-class EulerMotion(SteppedMotion):
-    """A motion by `EulerEquations`, for study."""
-
-    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
-        super().__init__(top, start, EulerEquations(top, start, rtol, atol))
-
-    def _states_of(self, t: Column, unknowns: Rows) -> States:
-        return _EulerStates(self.top, self.start, t, unknowns)
-
-
-class _EulerStates(States):
-    def __init__(self, top: Top, start: State, t: Column, unknowns: Rows) -> None:
-        super().__init__(top, start, len(t))
-        theta, theta_dot, phi, psi = unknowns
-        self.t, self.theta_dot, self.angles = t, theta_dot, (phi, theta, psi)
-
-    @cached_property
-    def rows_quaternion(self) -> Quaternion:
-        return attitude.quaternion_of_angles(*self.angles)
-
-    @cached_property
-    def transverse_velocity(self) -> tuple[Column, Column]:
-        """omega_1 + i omega_2 = (-phi' sin(theta) + i theta') exp(-i psi), eq. (4)."""
-        across = self.phi_dot * np.sin(self.theta)
-        cosine, sine = np.cos(self.psi), np.sin(self.psi)
-        return self.theta_dot * sine - across * cosine, self.theta_dot * cosine + across * sine
-
-
-class TransportMotion(SteppedMotion):
-    """A motion by the regular equations, its angles unwrapped from step to step."""
-
-    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
-        self._transport = TransportEquations(top, start, rtol, atol)
-        super().__init__(top, start, self._transport)
-        self._phases = PhaseUnwrapper(start, self._transport.uniform_rates[0])
-
-    def _forget(self, count: int) -> None:
-        self._unwrap()
-        super()._forget(count)
-        self._phases.forget(count)
-
-    def _unwrap(self) -> None:
-        """Follow the phases to the begins of all steps that are kept."""
-        new = self._kept[self._phases.begins.shape[1]:]
-        if new:
-            begins = np.array([step.y0 for step in new])
-            self._phases.extend(np.array([step.t0 for step in new]), begins[:, 0], begins[:, 1])
-
-    def _phases_at(self, steps: NDArray[np.int64]) -> Rows:
-        self._unwrap()
-        return self._phases.begins.take(steps, axis=1)
-
-    def _states_of(self, t: Column, unknowns: Rows) -> States:
-        return _TransportStates(self._transport, self._phases, self.start, t, unknowns)
-
-
-class _TransportStates(States):
-    """
-    States known by alpha, beta and the momentum.
-
-    rows : the six unknowns in the frame that is stepped, and `PhaseUnwrapper.begins` of the step
-        that a sample lies in
-    """
-
-    def __init__(self, equations: TransportEquations, phases: PhaseUnwrapper, start: State,
-                 t: Column, rows: Rows) -> None:
-        super().__init__(equations.top, start, len(t))
-        self.t, self._equations = t, equations
-        self._polar, self._momenta = phases.polar, phases.momenta
-        self._stepped: Parts = tuple(rows[:6])
-        self._begins = rows[6:]
-
-    @cached_property
-    def _projected(self) -> Parts:
-        """The unknowns on the invariants, in the body's own frame."""
-        equations, y, pole_share = self._equations, self._stepped, POLE_SHARE
-        if not all(self._momenta[:2]):  # the meridian of the axis is known
-            y, pole_share = self._on_lines(y, equations.uniform_rates[0] * self.t), 0.0
-        a, b, c, d, m_real, m_imag = equations.project_columns(y, pole_share)
-        spin = 0.5 * equations.spin_rate * self.t
-        cosine, sine = np.cos(spin), np.sin(spin)
-        return (a * cosine - b * sine, b * cosine + a * sine,
-                c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
-
-    def _on_lines(self, y: Parts, uniform: Column) -> Parts:
-        """Return y with alpha or beta moved onto the line through zero, and m turned with them."""
-        moved = list(y[:4])
-        moduli, phases = self._polar(y, uniform)
-        for k, part in enumerate((uniform, -uniform)):
-            if not self._momenta[k]:
-                moved[2 * k] = moduli[k] * np.cos(phases[k] + part)
-                moved[2 * k + 1] = moduli[k] * np.sin(phases[k] + part)
-        x, z = half_axis(*y[:4])
-        u, v = half_axis(*moved)
-        # Next to the pole m is known better than the axis.
-        away = x * x + z * z > POLE_SHARE
-        scale = np.where(away, np.hypot(x, z) * np.hypot(u, v), 1.0)
-        cosine = np.where(away, (x * u + z * v) / scale, 1.0)
-        sine = np.where(away, (x * v - z * u) / scale, 0.0)
-        return *moved, y[4] * cosine - y[5] * sine, y[4] * sine + y[5] * cosine
-
-    @cached_property
-    def rows_quaternion(self) -> Quaternion:
-        alpha_real, alpha_imag, beta_real, beta_imag, *_ = self._projected
-        return -beta_imag, beta_real, alpha_imag, alpha_real
-
-    @cached_property
-    def angles(self) -> tuple[Column, Column, Column]:
-        uniform = self._equations.uniform_rates[1] * self.t
-        _, phases = self._polar(self._projected, uniform)
-        # theta/2 turns by less than half a turn within a step.
-        half_sum, half_difference, half = (
-            phase + math.tau * turns_to_follow(phase, begin, momentum)
-            for phase, begin, momentum in zip(phases, self._begins, self._momenta, strict=True))
-        half_sum, half_difference = half_sum + uniform, half_difference - uniform
-        return half_sum + half_difference, 2.0 * half, half_sum - half_difference
-
-    @cached_property
-    def _momentum(self) -> tuple[Column, Column]:
-        """L_x and L_y in the world frame [kg m^2/s]."""
-        unit, (*_, m_real, m_imag) = 2.0 * self.top.lambda1, self._projected
-        return unit * m_imag, -unit * m_real
-
-    @cached_property
-    def theta_dot(self) -> Column:
-        """The momentum across the meridian plane, over lambda1."""
-        lx, ly = self._momentum
-        return (ly * np.cos(self.phi) - lx * np.sin(self.phi)) / self.top.lambda1
-
-    @cached_property
-    def transverse_velocity(self) -> tuple[Column, Column]:
-        first, second, _ = attitude.in_body(self.rows_quaternion, (*self._momentum, self._lz))
-        return first / self.top.lambda1, second / self.top.lambda1
-
-    @cached_property
-    def l3(self) -> Column:
-        x, y, z = self.rows_axis
-        lx, ly = self._momentum
-        return lx * x + ly * y + self._lz * z
+        return interpolate(self._kept[first:last + 1], self.second_derivative, steps - first, t)
