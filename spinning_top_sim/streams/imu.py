@@ -53,8 +53,8 @@ class Imu:
         bandwidth = values['imu.bandwidth']
         self._low_pass = (LowPass(bandwidth, values['imu.bandwidth_order']) if bandwidth
                           else None)
-        vibration = Vibration(values, self._low_pass.response if self._low_pass else np.ones_like)
-        self._vibration = None if vibration.is_off else vibration
+        self._vibration = Vibration(
+            values, self._low_pass.response if self._low_pass else np.ones_like)
 
     @property
     def keep_ns(self) -> int:
@@ -111,17 +111,16 @@ class Imu:
 
     def felt(self, samples: Samples) -> tuple[Vector, Vector]:
         """Return `sampled` with bandwidth and vibration of the sensor, before its errors."""
-        exact = self.sampled(samples) if self._low_pass is None else self._filtered(samples)
-        if self._vibration is None:
+        if self._low_pass is None:
+            exact = self.sampled(samples)
+        else:
+            w1, w2, w3, f1, f2, f3 = self._low_pass.filtered(
+                samples.segment, samples.times, self._signal)
+            exact = (w1, w2, w3), (f1, f2, f3)
+        if self._vibration.is_off:
             return exact
         return self._vibration.add(exact, samples.t_ns, self.intervals.lengths(samples.times)
                                    if self.takes_means else 0.0)
-
-    def _filtered(self, samples: Samples) -> tuple[Vector, Vector]:
-        assert self._low_pass is not None
-        w1, w2, w3, f1, f2, f3 = self._low_pass.filtered(
-            samples.segment, samples.times, self._signal)
-        return (w1, w2, w3), (f1, f2, f3)
 
     def _signal(self, states: States) -> NDArray[np.float64]:
         return np.stack(np.broadcast_arrays(*itertools.chain(*self.true(states))))
@@ -134,11 +133,10 @@ class Imu:
     def measured_increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
         """Return `increments` with the errors of the sensor and its vibration."""
         exact, sensor = self.increments(samples), self.present_sensor
-        if sensor.is_perfect and self._vibration is None:
+        if sensor.is_perfect and self._vibration.is_off:
             return exact
         means, seconds = samples.once(self.means), self.intervals.lengths(samples.times)
-        felt = means if self._vibration is None else self._vibration.add(
-            means, samples.t_ns, seconds)
+        felt = self._vibration.add(means, samples.t_ns, seconds)
         return sensor.disturb(exact, means, sensor.read(felt, samples.times), seconds)
 
     def increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
@@ -217,10 +215,15 @@ class Sensor:
             return exact
         white, bias = self._noise.at(times)
         # The chain of docs/sensor.md: matrices, g-sensitivity, bias, noise, rounding, range.
+        rates, force = exact
+        rates = transformed(self._rate_matrix, rates)
+        if any(self._g_sensitivity):
+            x, y, z = transformed(self._g_sensitivity, force)
+            rates = rates[0] + x, rates[1] + y, rates[2] + z
         w1, w2, w3, f1, f2, f3 = (
             converted(value + one_bias + one_white, resolution, largest)
             for value, one_bias, one_white, resolution, largest in zip(
-                itertools.chain(*self._distorted(*exact)), bias, white, self._resolutions,
+                (*rates, *transformed(self._force_matrix, force)), bias, white, self._resolutions,
                 self._ranges, strict=True))
         return (w1, w2, w3), (f1, f2, f3)
 
@@ -259,14 +262,6 @@ class Sensor:
     def bias(self, times: range) -> tuple[Vector, Vector]:
         _, (w1, w2, w3, f1, f2, f3) = self._noise.at(times)
         return (w1, w2, w3), (f1, f2, f3)
-
-    def _distorted(self, rates: Vector, force: Vector) -> tuple[Vector, Vector]:
-        """Return rates and force after matrices and g-sensitivity (kalibr's M and A)."""
-        read_rates = transformed(self._rate_matrix, rates)
-        if any(self._g_sensitivity):
-            x, y, z = transformed(self._g_sensitivity, force)
-            read_rates = read_rates[0] + x, read_rates[1] + y, read_rates[2] + z
-        return read_rates, transformed(self._force_matrix, force)
 
 
 def _six(values: Mapping[str, Any], error: str) -> tuple[float, ...]:
