@@ -16,7 +16,7 @@ import pytest
 from helpers.reference import CASES, angle, quaternion_of, scene_parameters, start_of, top_of
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.solvers import rk45
+from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import (
     ERROR,
     STAGES,
@@ -296,7 +296,7 @@ def test_steps_are_read_until_they_are_released():
 
 def test_so_many_steps_are_kept_at_most(monkeypatch):
     """Whatever is asked: a fast top between two samples of a slow IMU must not fill the memory."""
-    monkeypatch.setattr(rk45, 'MOST_KEPT', 50)
+    monkeypatch.setattr(dormand_prince, 'MOST_KEPT', 50)
     motion = looping_motion()
     motion.reach(60 * SECOND)
     expected = motion.states(range(60 * SECOND, 60 * SECOND + 1)).phi

@@ -10,8 +10,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import IntegrationError, Rows, Vector
-from spinning_top_sim.solvers.rk45 import SteppedMotion
+from spinning_top_sim.solvers.dormand_prince import IntegrationError, Rows, SteppedMotion, Vector
 
 # |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
 SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)

@@ -13,8 +13,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Rows, Vector, components
-from spinning_top_sim.solvers.rk45 import SteppedMotion
+from spinning_top_sim.solvers.dormand_prince import Rows, SteppedMotion, Vector, components
 
 # The energy corrects the nutation rate only where its square is at least this share of the
 # largest |m|^2: at a turning point the energy does not tell the rate.

@@ -19,8 +19,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.gnss import Fix, Velocity
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
-from spinning_top_sim.streams.stream import Samples, Stream
-from spinning_top_sim.streams.timing import Timing, faults_of
+from spinning_top_sim.streams.stream import Samples, Stream, Timing, faults_of
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
@@ -75,7 +74,7 @@ def _increment(imu: Imu, place: int, samples: Samples) -> Sequence[Field]:
 
 def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
     """Return stamp and true time of each sample of the IMU, and how often it was sent."""
-    t_ns, period_ns = samples.t_ns, imu.intervals.length_ns
+    t_ns, period_ns = samples.t_ns, imu.length_ns
     stamps_ns = timing.stamps_ns(samples.epoch_ns, t_ns, period_ns)
     true_ns = samples.epoch_ns + t_ns
     columns = (*np.divmod(stamps_ns, NANOSECONDS), *np.divmod(true_ns, NANOSECONDS),
