@@ -25,7 +25,7 @@ from spinning_top_sim.solvers.vertical import (
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.imu import LONGEST_NS, Imu
+from spinning_top_sim.streams.imu import LONGEST_NS
 from spinning_top_sim.streams.path import Path, Ride, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import ImuStream, all_streams
@@ -63,6 +63,7 @@ class Simulation:
         t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate), velocities of the
         pivot as `Drive`
     pivot : the path of the pivot; None while it rests at the origin
+    lz : as last commanded, about the vertical of the world [kg m^2/s]
     epoch_ns : stamp of t = 0 [ns]
     version : changes with all but `epoch_ns` that makes samples after `now_ns` other ones
 
@@ -96,19 +97,16 @@ class Simulation:
         segment = _segment(top, start, 0, values, pivot)
         streams = all_streams(values)
         self.values, self.top, self.streams = dict(values), top, streams
+        self.imu = next(stream.imu for stream in streams if isinstance(stream, ImuStream))
         self.history: list[tuple[Any, ...]] = []
         self.now_ns = -1
         # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
-        self.pivot, self._lz = pivot, start.lz
+        self.pivot, self.lz = pivot, start.lz
         self.path = Path(segment, self._follow, self.imu.carry,
                          keep_ns=max(trace_ns, LONGEST_NS, self.imu.keep_ns),
                          keep_steps_ns=self.imu.keep_ns)
         self.version += 1
-
-    @property
-    def imu(self) -> Imu:
-        return next(stream.imu for stream in self.streams if isinstance(stream, ImuStream))
 
     @property
     def segment(self) -> Segment:
@@ -119,11 +117,6 @@ class Simulation:
     def l3(self) -> float:
         """L3 as last commanded [kg m^2/s]."""
         return self.segment.l3
-
-    @property
-    def lz(self) -> float:
-        """Lz as last commanded, about the vertical of the world [kg m^2/s]."""
-        return self._lz
 
     @property
     def steps(self) -> int:
@@ -275,7 +268,7 @@ class Simulation:
         segment = _segment(self.top, start, self.now_ns, self.values, pivot)
         self.pivot = pivot
         if isinstance(start, State):
-            self._lz = start.lz
+            self.lz = start.lz
         self.path.go_on_with(segment)
         self.version += 1
 
