@@ -107,18 +107,19 @@ class Scan:
                 if opcode == Opcode.DATA_END and (
                         end == self._limit if end_is_known else end - offset == _DATA_END_SIZE):
                     break
-                self._take(opcode, offset, end)
+                end = self._take(opcode, offset, end)
             except DamagedError as damage:
                 end = self._skip(offset, damage)
             offset = end
         self._check_end(offset)
 
-    def _take(self, opcode: int, offset: int, end: int) -> None:
+    def _take(self, opcode: int, offset: int, end: int) -> int:
+        """Note what is in a record, and return where the next one begins."""
         record, messages = self._decode(opcode, offset, end)
-        self._check_length(record, offset, end)
+        end = self._true_end(record, offset, end)
         if isinstance(record, int):
             self._lost += 0 if self._behind_chunk else record
-            return
+            return end
         self._behind_chunk = opcode == Opcode.CHUNK
         if isinstance(record, Schema | Channel | Metadata):
             self._small_bytes += end - offset
@@ -135,6 +136,7 @@ class Scan:
             self._add(opcode, offset, end, messages)
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             self.parts.append(Part(opcode, offset, end))
+        return end
 
     def _decode(self, opcode: int, offset: int, end: int,
                 ) -> tuple[McapRecord | int | None, Messages]:
@@ -157,15 +159,22 @@ class Scan:
             return record, open_chunk(record, self._file.max_bytes)
         return record, nothing
 
-    def _check_length(self, record: McapRecord | int | None, offset: int, end: int) -> None:
-        """Raise DamagedError for a length that neither its fields nor the next record prove."""
+    def _true_end(self, record: McapRecord | int | None, offset: int, end: int) -> int:
+        """Return the end that its fields or the next record prove; else raise DamagedError."""
         if isinstance(record, McapRecord):
-            is_right = end - offset == size_of(record) or self._is_record(end) or (
+            own = offset + size_of(record)
+            # Such a length would take in the records that follow.
+            if own < end and isinstance(record, Schema | Channel) and self._is_record(own):
+                self._defects.append(f'{type(record).__name__.lower()} at byte {offset}: its '
+                                     'length is wrong')
+                return own
+            is_right = own == end or self._is_record(end) or (
                 end == self._limit and not self._summary.problem)
         else:
             is_right = end == self._limit or self._is_head(end)
         if not is_right:
             raise DamagedError('its length is not that of its content')
+        return end
 
     def _is_head(self, offset: int) -> bool:
         """Return whether a record seems to begin there, which may be truncated."""

@@ -44,10 +44,6 @@ LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_
 TimedColumns = tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]
 
 
-class EnsembleError(Exception):
-    """An ensemble cannot go on; the text says why, and what to do."""
-
-
 @cache
 def versions() -> dict[str, str]:
     """Return the versions on which the bytes of a dataset depend."""

@@ -46,7 +46,7 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('inspect', __doc__, argv, add_arguments, _run, (LogError,))
+    return cli.run('inspect', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -257,7 +257,3 @@ def _difference(expected: float | None, seen: float | None) -> str:
     if abs(difference) > abs(expected):         # also where that is 0
         return f'{difference:.1e} absolute'
     return f'{difference / abs(expected):.1e}' if difference else '0'
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
@@ -39,8 +38,7 @@ Stop = tuple[int, tuple[float, float] | None]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('simulate', __doc__, argv, add_arguments, _run,
-                   (RecordingError, IntegrationError))
+    return cli.run('simulate', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -194,7 +192,3 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
         finally:
             file.finish()
     return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -10,7 +10,6 @@ exit codes:
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -65,7 +64,3 @@ def _run(arguments: argparse.Namespace) -> int:
         name: reference.with_imu(values) for name, values in scenes.items()},
         arguments.duration, arguments.rate)
     return cli.OK
-
-
-if __name__ == '__main__':
-    sys.exit(main())
