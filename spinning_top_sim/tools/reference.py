@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reference trajectories of scenes, for programs in any language that check a simulator."""
 
+import itertools
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.simulation import Simulation
-from spinning_top_sim.streams.stream import Samples, period_ns
+from spinning_top_sim.streams.stream import period_ns
 from spinning_top_sim.tools.models import FORMATS, model, start_of
 from spinning_top_sim.tools.table import UNITS, Table, write_csv, write_parquet
 
@@ -68,21 +66,6 @@ MEANINGS = (
      'acceleration of the pivot in the world, of the piece that ends where two meet'))
 
 
-class _ReferenceTable(Table):
-    """The columns of `Table`, a perfect IMU, and the pivot."""
-
-    size = 8 * len(COLUMNS)
-
-    def __init__(self, values: Mapping[str, Any], rate: float) -> None:
-        super().__init__(period_ns(rate))
-        self._imu = Imu(values)
-
-    def _rows(self, samples: Samples) -> NDArray[np.float64]:
-        rates, force = self._imu.true(samples.states)
-        added = (*rates, *force, *samples.pivot.acceleration)
-        return np.column_stack((super()._rows(samples), *np.broadcast_arrays(*added)))
-
-
 def with_imu(given: Mapping[str, object]) -> dict[str, Any]:
     """Return the checked parameters of a scene for a reference: exact, with the IMU of PLACE."""
     return parameters.checked({**PLACE, **given, 'solver.method': 'exact'})
@@ -102,9 +85,10 @@ def write(folder: Path, scenes: Mapping[str, Mapping[str, Any]], duration: float
     folder.mkdir(parents=True)
     facts = {}
     for name, values in scenes.items():
-        simulation = Simulation(values)
-        rows = [rows for block in simulation.play(
-            [_ReferenceTable(values, rate)], round(duration * NANOSECONDS))
+        imu = Imu(values)
+        table = Table(period_ns(rate), COLUMNS, lambda samples, imu=imu: (  # type: ignore[misc]
+            *itertools.chain(*imu.true(samples.states)), *samples.pivot.acceleration))
+        rows = [rows for block in Simulation(values).play([table], round(duration * NANOSECONDS))
                 for _, _, rows in block.parts]
         write_parquet(folder / f'{name}.parquet', rows, COLUMNS)
         write_csv(folder / f'{name}.csv', rows, COLUMNS)

@@ -148,7 +148,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
     """Compute the motions of a run; add notes about what cannot be followed."""
     motions = found.motions
     try:
-        for simulation, event in recorded_run.Rerun(run).events(found.damage.end_ns):
+        for simulation, event in recorded_run.rerun(run, found.damage.end_ns):
             if isinstance(event, Block):
                 continue
             if motions:

@@ -16,10 +16,10 @@ from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools.recorded_run import (
     MALFORMED,
-    Rerun,
     RunDescription,
     field_names,
     reason_of,
+    rerun,
 )
 
 
@@ -87,7 +87,7 @@ class Comparison:
         """Compute the run; yield the log times before which all is computed, at last infinity."""
         topics, commands, computed = self._run.topics, self._run.commands_topic, self._computed
         try:
-            for simulation, event in Rerun(self._run, samples=True).events(end_ns):
+            for simulation, event in rerun(self._run, end_ns, samples=True):
                 if isinstance(event, Block):
                     for stream, times_ns, rows in event.parts:
                         for t_ns, row in zip(times_ns.tolist(), rows, strict=True):
