@@ -17,9 +17,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from spinning_top_sim.recording.damage import count
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recovery import recover
+from spinning_top_sim.recording.scan import count
 from spinning_top_sim.tools import cli
 
 SOME_LOST = 3

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.recording.damage import Damage, seconds
 from spinning_top_sim.recording.reader import LogMessage, LogReader
+from spinning_top_sim.recording.scan import Damage, seconds
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
