@@ -157,7 +157,7 @@ def _signed(sign: int, weights: Sequence[Decimal]) -> Sequence[Decimal]:
 
 def _weighted(weights: Sequence[Decimal], before: Decimal, value: Decimal,
               twice: Decimal) -> list[Decimal]:
-    """Return weights times sines or cosines of A, 3A, 5A ... or 0, 2A, 4A ..., from two of them."""
+    """Return weights times sines or cosines of A, 3A ..., or of 0, 2A ..., from two of them."""
     products = []
     for weight in weights:
         products.append(weight * value)
