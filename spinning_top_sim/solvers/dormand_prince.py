@@ -137,7 +137,6 @@ class SteppedMotion(ABC):
     def __init__(self, top: Top, start: State, y: Vector, tolerance: float,
                  fastest_rate: float) -> None:
         self.top, self.start = top, start
-        self._step = unrolled_step(len(y), isinstance(y[0], complex))
         derivative = self.derivative(*y)
         # The steps that can still be read, in order; the first one has no length.
         self._kept = [Step(0.0, y, derivative, 0.0, y, derivative)]
@@ -167,14 +166,14 @@ class SteppedMotion(ABC):
         """Take one accepted step.  Raises IntegrationError where none can be taken."""
         newest = self._kept[-1]
         t, y, derivative = newest.t1, newest.y1, newest.derivative1
-        grow = GROW
+        grow, step = GROW, unrolled_step(len(y), isinstance(y[0], complex))
         while True:
             end = t + min(self._next_step, LONGEST_STEP)
             h = end - t                         # what the sum really made of it
             if not h > SMALLEST_STEP_ULPS * math.ulp(t):
                 raise IntegrationError(
                     f'the step size collapsed to {self._next_step:.3g} s at t = {t:.9g} s')
-            y_new, derivative_new, difference = self._step(self.derivative, h, y, derivative)
+            y_new, derivative_new, difference = step(self.derivative, h, y, derivative)
             self.evaluations += 6
             errors = self.errors(y, y_new, difference)
             # `max` may pass over a NaN.  An infinite error shrinks the step until that collapses.
