@@ -2,7 +2,7 @@
 """A run: the parameters, the motion with its commands, and the samples of its streams."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple
 from functools import partial
 from typing import Any, NamedTuple
@@ -69,6 +69,8 @@ class Simulation:
 
     Raises ValueError where there is no motion from the start state.
     """
+
+    _begun: Callable[..., PivotPath]    # the path of the newest `Drive`, from its `stop_ns`
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         self.version = 0
@@ -236,7 +238,12 @@ class Simulation:
             stop_ns = self.now_ns + timeout_ns if timeout_ns else NEVER_NS
         last = self.history[-1] if self.history else None
         if isinstance(last, Drive) and last[1:4] == target and self.now_ns < last.stop_ns:
-            self._put_off(stop_ns)
+            # The motion up to now is the same.
+            self.pivot, segment = self._begun(stop_ns=stop_ns), self.segment
+            assert segment.ride is not None
+            segment.ride = segment.ride._replace(piece=self.pivot.lasting(segment.start_ns))
+            if self.path.end_after(self.now_ns):
+                self.version += 1
             self.history[-1] = last._replace(stop_ns=stop_ns)
             return stop_ns
         pivot = self.segment.pivot(np.array([self.now_ns]))
@@ -247,14 +254,6 @@ class Simulation:
         self._continue(self.segment.posture(self.now_ns), self._begun(stop_ns=stop_ns))
         self.history.append(Drive(self.now_ns, *target, stop_ns))
         return stop_ns
-
-    def _put_off(self, stop_ns: int) -> None:
-        """Let the velocity last until another time; the motion up to now is the same."""
-        self.pivot, segment = self._begun(stop_ns=stop_ns), self.segment
-        assert segment.ride is not None
-        segment.ride = segment.ride._replace(piece=self.pivot.lasting(segment.start_ns))
-        if self.path.end_after(self.now_ns):
-            self.version += 1
 
     def _settle(self) -> None:
         """Let the solver reach `now_ns`, and be at t = 0 at least."""
