@@ -25,10 +25,9 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.files import trajectory_of
-from spinning_top_sim.grade.fit import Fit, fit
+from spinning_top_sim.grade.fit import Fit, far_start, fit, start_of
 from spinning_top_sim.grade.grader import grade_trajectory
 from spinning_top_sim.grade.scenes import Body
-from spinning_top_sim.grade.start import near_start, start_of
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
@@ -103,7 +102,7 @@ def _motion(arguments: argparse.Namespace,
             fitted = replace(fitted, **vars(top))
             start = start_of(found, recorded.parts, top)
         return fitted, start, found
-    if off := near_start(recorded.parts, top, start):
+    if off := far_start(recorded.parts, top, start):
         raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
                          '--fit finds top and start')
     return body, start, None
