@@ -24,9 +24,9 @@ def test_gain_and_delay_are_those_of_the_analog_filter(order, corner):
     from scipy import signal  # takes long
 
     values = {**FREE, 'imu.bandwidth': corner, 'imu.bandwidth_order': order}
-    _, found = run(values, SECOND, 'imu/data_raw', 'ground_truth/imu')
+    _, found = run(values, 2 * SECOND, 'imu/data_raw', 'ground_truth/imu')
     (_, _, _, rates, _, *_), (_, _, _, exact, *_) = found.values()
-    read, true = (np.ravel([1.0, 1j] @ part[500:1000, :2].T) for part in (rates, exact))
+    read, true = (np.ravel([1.0, 1j] @ part[1000:2000, :2].T) for part in (rates, exact))
     turning = true * np.conj(np.roll(true, 1))
     frequency = np.angle(turning[1:]).mean() * 1000.0
     b, a = signal.butter(order, math.tau * corner, analog=True)
