@@ -171,17 +171,18 @@ class LiveSimulation(Simulation):
             self._work, self.computed_ns, self._block = None, self.now_ns, SMALLEST_BLOCK
 
     def _send(self, t_ns: int, publish_from_ns: int) -> None:
-        """Record and publish the messages of a time [ns], which are the next in the queue."""
-        queue, due = self._queue, []
+        """Send the first messages in the queue, those of one time, to the log before others."""
+        queue, stamp_ns = self._queue, self.epoch_ns + t_ns
+        instant = []
         while queue and queue[0][0] == t_ns:
-            due.append(queue.popleft())
-        entries = [(output.log_index, self.epoch_ns + t_ns, message)
-                   for _, output, message in due if output.log_index is not None]
+            instant.append(queue.popleft())
+        entries = [(output.log_index, stamp_ns, message) for _, output, message in instant
+                   if output.log_index is not None]
         if entries:
-            self._write(entries, sum(len(message) for _, _, message in entries))
+            self._write(entries, sum(len(message) for *_, message in entries))
         self.now_ns = t_ns
         if t_ns >= publish_from_ns:
-            for _, output, message in due:
+            for _, output, message in instant:
                 if output.publish is not None:
                     output.publish(message)
                     output.sent += 1
@@ -226,11 +227,11 @@ class LiveSimulation(Simulation):
         return True
 
     def _append(self, block: Block) -> None:
-        queued: list[tuple[int, Output, bytes]] = []
+        messages: list[tuple[int, Output, bytes]] = []
         for stream, times_ns, rows in block.parts:
             output = next(one for one in self.outputs if one.stream is stream)
             data, size = rows.tobytes(), stream.size
-            queued += [(t_ns, output, data[begin:begin + size]) for t_ns, begin in zip(
+            messages += [(t_ns, output, data[begin:begin + size]) for t_ns, begin in zip(
                 times_ns.tolist(), range(0, len(data), size), strict=True)]
-        self._queue.extend(sorted(queued, key=itemgetter(0)))
+        self._queue.extend(sorted(messages, key=itemgetter(0)))
         self.computed_ns = block.until_ns
