@@ -89,13 +89,17 @@ class Rates:
         # (k, 1) by unit: nearest doubles, their halves, and what they leave out
         self._constants: dict[str, tuple[NDArray[np.float64], ...]] = {}
 
+    def _add(self, unit: str) -> None:
+        with precision(DIGITS):
+            high, low = np.array([
+                double_double(rate * UNITS[unit]) for rate in self._per_second]).T
+        rates = high[:, np.newaxis]
+        self._constants[unit] = rates, *halves(rates), low[:, np.newaxis]
+
     def products(self, times: Times) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return rate * t, (k, n), as nearest doubles and what they leave out."""
         if times.unit not in self._constants:
-            with precision(DIGITS):
-                doubles = [double_double(rate * UNITS[times.unit]) for rate in self._per_second]
-            rates, low = np.array(doubles).T[:, :, np.newaxis]
-            self._constants[times.unit] = rates, *halves(rates), low
+            self._add(times.unit)
         rate, r1, r2, rate_low = self._constants[times.unit]
         t1, t2 = halves(times.high)
         high = rate * times.high
