@@ -184,6 +184,14 @@ class PivotPath:
                      (self._places[k] + cycle * self._per_cycle)[:, np.newaxis],
                      self._velocities[k][:, np.newaxis])
 
+    def lasting(self, t_ns: int) -> Piece:
+        """Return the piece from a time [ns] on with those that have the same acceleration."""
+        piece = self.piece(t_ns)
+        while piece.end_ns < NEVER_NS and (
+                after := self.piece(piece.end_ns)).acceleration == piece.acceleration:
+            piece = piece._replace(end_ns=after.end_ns)
+        return piece
+
 
 def _ramp(begin: Exact, end: Exact, most_acceleration: float) -> Iterator[tuple[int, Exact]]:
     """Yield the piece that leads from one velocity to another, none if they are equal."""

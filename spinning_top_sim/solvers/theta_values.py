@@ -282,10 +282,10 @@ def _check_amplitudes(motion: ThetaMotion) -> None:
 
 def _coefficients(rows: Sequence[Sequence[Series]], most: int) -> NDArray[np.float64]:
     """Return the polynomials' coefficients in doubles, highest of at least 2 powers first."""
-    size = max(2, *(len(x.polynomial[:most]) for row in rows for x in row))
-    doubles = [[[*map(float, x.polynomial[:most])] for x in row] for row in rows]
-    return np.array([[(size - len(x)) * [0.0] + x[::-1] for x in row] for row in doubles]
-                    ).transpose(2, 0, 1)
+    doubles = [[*map(float, x.polynomial[:most])] for row in rows for x in row]
+    size = max(2, *map(len, doubles))
+    return np.array([(size - len(x)) * [0.0] + x[::-1] for x in doubles]
+                    ).T.reshape(size, len(rows), -1)
 
 
 def _column(values: Iterable[float]) -> Matrix:

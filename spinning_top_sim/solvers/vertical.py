@@ -68,7 +68,7 @@ class Posture(NamedTuple):
     l3: float
 
 
-class Vertical:
+class Vertical(NamedTuple):
     """
     The line of effective gravity, and a frame with its z axis along it.
 
@@ -79,32 +79,12 @@ class Vertical:
     gravity : downwards along z positive [m/s^2]
     alpha, beta : Cayley-Klein parameters of the least rotation from the world to the frame
     rows : the same rotation, q(world <- frame), in doubles
-
-    Parameters
-    ----------
-    gravity : float
-        Of the world, downwards positive [m/s^2].
-    acceleration : (3,)
-        Of the pivot in the world [m/s^2].
-    posture : Posture
     """
 
-    def __init__(self, gravity: float, acceleration: Exact, posture: Posture) -> None:
-        x, y, z = (Decimal(a.numerator) / Decimal(a.denominator) for a in acceleration)
-        z += Decimal(gravity)
-        (w0, z0), (y0, minus_x0) = posture.alpha, posture.beta
-        n = (2 * (w0 * y0 - z0 * minus_x0), 2 * (y0 * z0 + w0 * minus_x0),
-             _square(posture.alpha) - _square(posture.beta))
-        size = (x * x + y * y + z * z).sqrt()
-        if not size:
-            z = ONE
-        side = ONE if n[0] * x + n[1] * y + n[2] * z >= 0 else -ONE
-        scale = side / (size or ONE)
-        self.gravity = side * size
-        self.alpha, self.beta = _least_rotation(scale * x, scale * y, scale * z)
-        parts = -self.beta[1], self.beta[0], self.alpha[1], self.alpha[0]
-        qx, qy, qz, qw = (np.array([float(part)]) for part in parts)
-        self.rows: Quaternion = qx, qy, qz, qw
+    gravity: Decimal
+    alpha: Complex
+    beta: Complex
+    rows: Quaternion
 
     def start(self, top: Top, posture: Posture) -> HalfAngles:
         """Return a posture as a state in this frame."""
@@ -193,6 +173,23 @@ class AcceleratedMotion(ExactSolution):
             return Posture(alpha, beta, across, self.start.l3)
 
 
+@lru_cache(64)
+def _verticals(gravity: float, acceleration: Exact,
+               ) -> tuple[tuple[Decimal, Decimal, Decimal], Vertical, Vertical]:
+    """Return the upward line of effective gravity, and the verticals along and against it."""
+    x, y, z = (Decimal(a.numerator) / Decimal(a.denominator) for a in acceleration)
+    z += Decimal(gravity)
+    size = (x * x + y * y + z * z).sqrt()
+    x, y, z = line = (x / size, y / size, z / size) if size else (ZERO, ZERO, ONE)
+    return line, _upright(size, x, y, z), _upright(-size, -x, -y, -z)
+
+
+def _upright(gravity: Decimal, x: Decimal, y: Decimal, z: Decimal) -> Vertical:
+    alpha, beta = _least_rotation(x, y, z)
+    qx, qy, qz, qw = (np.array([float(part)]) for part in (-beta[1], beta[0], alpha[1], alpha[0]))
+    return Vertical(gravity, alpha, beta, (qx, qy, qz, qw))
+
+
 @lru_cache(16)
 def _in_gravity(top: Top, gravity: float) -> Top:
     return replace(top, gravity=gravity)
@@ -202,7 +199,11 @@ def about_vertical(top: Top, posture: Posture, acceleration: Exact,
                    ) -> tuple[Vertical, HalfAngles]:
     """Return the vertical while the pivot accelerates so, and the state there."""
     with precision(MOST_DIGITS):
-        vertical = Vertical(top.gravity, acceleration, posture)
+        (x, y, z), up, down = _verticals(top.gravity, acceleration)
+        (w0, z0), (y0, minus_x0) = alpha, beta = posture[:2]
+        side = (2 * (x * (w0 * y0 - z0 * minus_x0) + y * (y0 * z0 + w0 * minus_x0))
+                + z * (_square(alpha) - _square(beta)))
+        vertical = up if side >= 0 else down
         return vertical, vertical.start(top, posture)
 
 

@@ -25,8 +25,7 @@ from spinning_top_sim.solvers.vertical import (
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.intervals import LONGEST_NS
+from spinning_top_sim.streams.imu import LONGEST_NS, Imu
 from spinning_top_sim.streams.path import Path, Ride, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import ImuStream, all_streams
@@ -260,7 +259,7 @@ class Simulation:
         """Let the velocity last until another time; the motion up to now is the same."""
         self.pivot, segment = self._begun(stop_ns=stop_ns), self.segment
         assert segment.ride is not None
-        segment.ride = segment.ride._replace(piece=self.pivot.piece(segment.start_ns))
+        segment.ride = segment.ride._replace(piece=self.pivot.lasting(segment.start_ns))
         if self.path.end_after(self.now_ns):
             self.version += 1
 
@@ -331,7 +330,7 @@ def _begun(top: Top, start: State | Posture, start_ns: int, values: Mapping[str,
     if pivot is None:
         assert isinstance(start, State)
         return Segment(step(top, start), start, start_ns)
-    posture, piece = start, pivot.piece(start_ns)
+    posture, piece = start, pivot.lasting(start_ns)
     if isinstance(posture, State):
         posture = posture_of(top, posture)
     solver: Propagator

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 from spinning_top_sim.installation import needed
 from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
-from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli, scene_file
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     arguments = parser.parse_args(words)
     if arguments.log:
-        return cli.run('view', DESCRIPTION, words, add_arguments, _show_log, (LogError,))
+        return cli.run('view', DESCRIPTION, words, add_arguments, _show_log)
     with contextlib.ExitStack() as stack:
         return run('view', argv, partial(_prepare, stack, arguments))
 
