@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 
 Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], its publish function, CDR
 
@@ -107,30 +107,26 @@ class DeadlineThread(threading.Thread):
             self.join(5.0)
 
 
-def read_ahead(messages: Iterable[Message]) -> Generator[Message]:
+def read_ahead(messages: Iterator[Message]) -> Generator[Message]:
     """Yield messages that a thread reads ahead; raise its error in their place."""
-    batches = _batches(messages)
+    def batch() -> list[Message]:
+        found: list[Message] = []
+        size = 0
+        while size < BATCH_BYTES and len(found) < BATCH_MESSAGES:
+            if (message := next(messages, None)) is None:
+                break
+            found.append(message)
+            size += len(message[2])
+        return found
+
     with ThreadPoolExecutor(1) as reader:
-        ahead: deque[Future[list[Message]]] = deque(
-            reader.submit(next, batches, []) for _ in range(BATCHES))
+        ahead = deque(reader.submit(batch) for _ in range(BATCHES))
         try:
-            while batch := ahead.popleft().result():
-                ahead.append(reader.submit(next, batches, []))
-                yield from batch
+            while found := ahead.popleft().result():
+                ahead.append(reader.submit(batch))
+                yield from found
         finally:
             reader.shutdown(wait=False, cancel_futures=True)
-
-
-def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    batch: list[Message] = []
-    size = 0
-    for message in messages:
-        batch.append(message)
-        size += len(message[2])
-        if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
-            yield batch
-            batch, size = [], 0
-    yield batch
 
 
 class Playback:
