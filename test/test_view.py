@@ -350,16 +350,15 @@ def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
     page.set_track(shown)
     page._trace.value = page._bounds.value = False
     page.draw(stamp_ns, shown.origin_ns)
-    top = page.top
     page.arrows[0].value = True
     page.draw(stamp_ns, shown.origin_ns)
-    assert top._arrows[0].points[0, 1] == pytest.approx(
+    assert page._arrow_lines[0].points[0, 1] == pytest.approx(
         model.arrow(shown, model.ARROWS[0], stamp_ns), abs=1e-6)
     page._bounds.value = True
     assert 'trace' not in page.legend() and 'angular momentum' in page.legend()
-    assert top._stand.wxyz == pytest.approx([1, 0, 0, 0])
+    assert page._stand.wxyz == pytest.approx([1, 0, 0, 0])
     page.draw(stamp_ns, shown.origin_ns)
-    for bound, theta in zip(top._bounds, top._limits, strict=True):
+    for bound, theta in zip(page._bound_lines, page._limits, strict=True):
         assert bound.visible
         assert (bound.points == model.circle(model.reach(shown), theta)).all()
 
