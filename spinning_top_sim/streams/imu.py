@@ -119,8 +119,9 @@ class Imu:
 
     def _filtered(self, samples: Samples) -> tuple[Vector, Vector]:
         assert self._low_pass is not None
-        w1, w2, w3, f1, f2, f3 = self._low_pass.filtered(
-            samples.segment, samples.times, self._signal)
+        w1, w2, w3, f1, f2, f3 = np.concatenate([
+            self._low_pass.filtered(segment, times, self._signal)
+            for segment, times in samples.parts], axis=1)
         return (w1, w2, w3), (f1, f2, f3)
 
     def _signal(self, states: States) -> NDArray[np.float64]:
@@ -151,14 +152,14 @@ class Imu:
         return (x, y, z, w), self.from_body((v1, v2, v3))
 
     def _body_increments(self, samples: Samples) -> Increments:
-        return self.intervals.increments(samples.path, samples.times, self._lever_arm)
+        return self.intervals.increments(samples.path, samples.parts, self._lever_arm)
 
     def motion(self, samples: Samples) -> tuple[Vector, Quaternion, Vector]:
         """Return position [m] and orientation in the world, velocity in the IMU's frame [m/s]."""
         states = samples.states
         x, y, z = attitude.in_world(states.rows_quaternion, self._lever_arm)
         v1, v2, v3 = states.velocity(self._lever_arm)
-        if samples.segment.ride:
+        if samples.pivot_moves:
             (a, b, c), (u, v, w), _ = samples.pivot
             x, y, z = x + a, y + b, z + c
             u, v, w = attitude.in_body(states.rows_quaternion, (u, v, w))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The time between two samples of the IMU, and what the top does in it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import Point
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
-from spinning_top_sim.streams.path import Path
+from spinning_top_sim.streams.path import Path, Segment
 
 LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
 
@@ -53,16 +54,19 @@ class Intervals:
         """Return the lengths (n,) [s] of the intervals that end at these times [ns]."""
         return np.array([time - self.begin_ns(time) for time in times]) * 1e-9
 
-    def increments(self, path: Path, times: range, point: Point) -> Increments:
-        """Return the increments over the intervals that end at these times [ns], n of each."""
-        # Those that may be shorter, or contain a command, are computed one by one.
-        since_ns = max(self.since_ns, path.after(times.start - 1).start_ns)
-        single = len(range(times.start, since_ns + self.length_ns + 1, times.step))
-        parts = [path.increments(self.begin_ns(end_ns), end_ns, point)
-                 for end_ns in times[:single]]
-        if single < len(times):
-            first_ns = times[single]
-            parts.append(path.increments(self.begin_ns(first_ns), first_ns, point,
-                                         len(times) - single, times.step))
-        return parts[0] if len(parts) == 1 else Increments(*(
-            np.concatenate(rows, axis=1) for rows in zip(*parts, strict=True)))
+    def increments(self, path: Path, parts: Sequence[tuple[Segment, range]],
+                   point: Point) -> Increments:
+        """Return the increments over the intervals that end at times in segments [ns]."""
+        found: list[Increments] = []
+        for segment, times in parts:
+            # Those that may be shorter, or contain a command, are computed one by one.
+            since_ns = max(self.since_ns, segment.start_ns)
+            single = len(range(times.start, since_ns + self.length_ns + 1, times.step))
+            found += [path.increments(self.begin_ns(end_ns), end_ns, point)
+                      for end_ns in times[:single]]
+            if single < len(times):
+                first_ns = times[single]
+                found.append(path.increments(self.begin_ns(first_ns), first_ns, point,
+                                             len(times) - single, times.step))
+        return found[0] if len(found) == 1 else Increments(*(
+            np.concatenate(rows, axis=1) for rows in zip(*found, strict=True)))
