@@ -242,8 +242,8 @@ def test_a_missing_definition_is_named(tmp_path, type_name):
 
 def test_messages_of_any_length_are_all_kept(tmp_path):
     """
-    Chunks stay of a size, and in the file the messages are in the order in which they were
-    handed over.
+    Chunks stay of a size, and in the file the messages of a topic are in the order in which they
+    were handed over.
     """
     rng = random.Random(5)
     wanted = [[], [], []]

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat
 
 from spinning_top_sim.exam import measures
 from spinning_top_sim.exam.diagnosis import Fault
@@ -43,9 +42,7 @@ class Trial(NamedTuple):
 
     def follow(self, make_filter: MakeFilter, feed: Feed = feed_apart) -> Outcome:
         """Return the outcome of a new filter, the samples that count.  Raises as `follow`."""
-        outcome, rows = follow(make_filter, self.run, (), feed), self.counts
-        return Outcome(self.run.part(rows), outcome.estimates[rows], outcome.covariances[rows],
-                       outcome.biases[rows])
+        return follow(make_filter, self.run, (), feed).part(self.counts)
 
 
 def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | None = None,
@@ -77,20 +74,24 @@ def judge(make_filter: MakeFilter, trials: Iterable[Trial], kind: str, subject: 
           feed: Feed = feed_apart, show: Callable[[float], object] = lambda done: None) -> Report:
     """Return the report on a filter in trials; the names of its measures begin with `kind`."""
     found: dict[str, list[measures.Rmse]] = {}
-    outcomes, failed = [], []
+    outcomes, failed, means = [], [], {}
     for number, trial in enumerate(trials, start=1):
         try:
-            outcome = trial.follow(make_filter, feed)
+            outcomes.append(outcome := trial.follow(make_filter, feed))
         except InvalidOutputError as error:
             failed.append(str(error))
         else:
-            outcomes.append(outcome)
-            found.setdefault(trial.run.name, []).append(
+            found.setdefault(f'{kind}_rms_{trial.run.name}_deg', []).append(
                 measures.rmse(outcome.estimates, outcome.run.truth))
         show(number)
+    if found:
+        names = (f'{kind}_rms_deg', f'{kind}_heading_rms_deg', f'{kind}_tilt_rms_deg')
+        means = dict(zip(names, np.mean([one for trials in found.values() for one in trials],
+                                        axis=0).tolist(), strict=True))
+        means |= {name: float(np.mean([one.total for one in same]))
+                  for name, same in found.items()}
     return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
-                  [Fault('invalid_output', '; '.join(failed))] if failed else [],
-                  measures.means(kind, found), outcomes)
+                  [Fault('invalid_output', '; '.join(failed))] if failed else [], means, outcomes)
 
 
 def trials_in(folder: str | Path) -> list[Path]:
@@ -105,6 +106,8 @@ def trials_in(folder: str | Path) -> list[Path]:
 
 def read_trial(path: Path) -> Trial:
     """Return the trial of a file.  Raises ValueError if it is none."""
+    from scipy.io import loadmat  # noqa: PLC0415 - slow
+
     try:
         data = loadmat(path) if path.suffix == '.mat' else _hdf5(path)
         rate = float(np.squeeze(data['sampling_rate']))

@@ -196,7 +196,6 @@ def _judge(subject: str, outcome: Outcome, heading: bool) -> Report:
                 **diagnosis.nees_marks(consistency)}
     faults += [late] if late is not None else []
     if not faults:      # the first of these that applies
-        faults += list(filter(None, (diagnosis.divergence(outcome, heading),
-                                     diagnosis.inaccuracy(outcome, heading),
-                                     diagnosis.covariance_fault(consistency))))[:1]
+        faults += filter(None, [diagnosis.inaccuracy(outcome, heading)
+                                or diagnosis.covariance_fault(consistency)])
     return Report(subject, list(diagnosis.one_of_each(faults)), measured, [corrected])

@@ -2,11 +2,10 @@
 """Error measures of an attitude filter; docs/exam.md has the definitions and their sources."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
@@ -62,18 +61,6 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
     return Rmse(*(math.degrees(rms(one)) for one in (total, errors.turned(True), errors.tilt)))
 
 
-def means(kind: str, found: Mapping[str, Sequence[Rmse]]) -> dict[str, float]:
-    """Return the means over all trials, and the whole error of each, by the names of measures."""
-    if not found:
-        return {}
-    total, heading, tilt = np.mean([one for trials in found.values() for one in trials],
-                                   axis=0).tolist()
-    return {f'{kind}_rms_deg': total, f'{kind}_heading_rms_deg': heading,
-            f'{kind}_tilt_rms_deg': tilt,
-            **{f'{kind}_rms_{name}_deg': float(np.mean([one.total for one in trials]))
-               for name, trials in found.items()}}
-
-
 def rms(values: Reals) -> float:
     """Return the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
@@ -86,23 +73,11 @@ def convergence_time(t: Reals, tilt: Reals) -> float:
     return float(t[end]) if end < len(t) else math.inf
 
 
-def drift(t: Reals, heading: Reals) -> float:
-    """Return the slope of the least-squares line [rad/s]."""
-    return float(np.polyfit(t - t[0], heading, 1)[0])
-
-
 def convergence_order(rates: Sequence[float], errors: Sequence[float]) -> float:
     """Return p where errors fall as rate^-p; NaN for one rate or errors of rounding size."""
     if len(rates) < 2 or min(errors) < 1e-9:
         return math.nan
     return float(-np.polyfit(np.log(rates), np.log(errors), 1)[0])
-
-
-def moved(estimates: Reals, truth: Reals) -> Reals:
-    """Return the angles (n,) [rad] between attitudes after the first ones are aligned."""
-    est, true = Rotation.from_quat(estimates), Rotation.from_quat(truth)
-    aligned: Reals = ((true[0] * est[0].inv()) * est * true.inv()).magnitude()
-    return aligned
 
 
 class Offset(NamedTuple):
@@ -165,11 +140,10 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
 
     Returns None if a covariance is singular, as that of a filter without heading.
     """
-    dimensions = 3 if absolute else 2
-    found = []
+    dimensions, found = 2 + absolute, []
     for in_sensor in (True, False):
         try:
-            parts = [_normalised_squares(*run, absolute, in_sensor) for run in runs]
+            parts = [_normalised_squares(*run, dimensions, in_sensor) for run in runs]
         except np.linalg.LinAlgError:
             continue
         shortest = min(len(squares) for squares, _ in parts)
@@ -188,20 +162,17 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
     return min(found)[1] if found else None
 
 
-def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, absolute: bool,
+def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, dimensions: int,
                         in_sensor: bool) -> tuple[Reals, float]:
     """Return e^T P^-1 e of the errors e (n,), and the mean log-determinant of P."""
-    est, true = Rotation.from_quat(estimates), Rotation.from_quat(truth)
+    est = Rotation.from_quat(estimates)
     if in_sensor:
         turn = est.as_matrix()
         covariances = turn @ covariances @ turn.transpose(0, 2, 1)
-    if absolute:
-        vector = (true * est.inv()).as_rotvec()
-    else:
-        # The true vertical in the estimated world frame, and the small turn that takes z there.
-        vertical = est.apply(true.inv().apply((0.0, 0.0, 1.0)))
-        vector = np.stack((-vertical[:, 1], vertical[:, 0]), axis=1)
-        covariances = covariances[:, :2, :2]
+    # The true vertical in the estimated world frame, and the small turn that takes z there.
+    x, y, _ = (est * Rotation.from_quat(truth).inv()).apply((0.0, 0.0, 1.0)).T
+    vector = np.stack((-y, x, -errors_of(estimates, truth).heading), axis=1)[:, :dimensions]
+    covariances = covariances[:, :dimensions, :dimensions]
     eigenvalues = np.linalg.eigvalsh(covariances)
     if np.any(eigenvalues[:, 0] <= 1e-12 * eigenvalues[:, -1]):
         raise np.linalg.LinAlgError('no inverse')
@@ -221,9 +192,8 @@ def autocorrelation_time(values: Reals) -> float:
         return 1.0
     n = values.shape[1]
     # Zero padding makes the circular correlation of the transform a linear one.
-    size = next_fast_len(2 * n - 1, real=True)
-    power = np.mean(np.abs(rfft(centred / largest, size)) ** 2, axis=0)     # no overflow
-    correlations = irfft(power, size)[:n] / np.arange(n, 0, -1)
+    power = np.mean(np.abs(np.fft.rfft(centred / largest, 2 * n)) ** 2, axis=0)     # no overflow
+    correlations = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
     times = 2.0 * np.cumsum(correlations / correlations[0]) - 1.0
     ends = np.flatnonzero(np.arange(n) >= 5.0 * times)
     return max(float(times[ends[0] if len(ends) else -1]), 1.0)

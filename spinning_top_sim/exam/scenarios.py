@@ -5,6 +5,7 @@ The motions of the exam, and what an IMU on them reads.
 Each motion shows a fault that the others hide.  A seed decides the noise, and varies the start.
 """
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -14,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.simulation import Simulation
 
@@ -132,18 +131,20 @@ def turning(imu: Mapping[str, Any], first: Rotation, last: Rotation, seconds: fl
     turns = (Slerp((0.0, 1.0), Rotation.concatenate((first, last)))(part)
              * Rotation.from_euler('zx', np.stack((
                  12.0 * np.pi * part, 0.7 * np.sin(6.0 * np.pi * part)), axis=1)))
-    return along('', turns, imu, SLOW.rate, declination)
+    return along('', turns, imu, declination)
 
 
-def along(name: str, turns: Rotation, imu: Mapping[str, Any], rate: float,
+def along(name: str, turns: Rotation, imu: Mapping[str, Any],
           declination: float | Reals = 0.0) -> Run:
     """
     Return the readings along attitudes q(world <- sensor), without noise and acceleration; t <= 0.
 
+    They have the rate of the slow motion.
+
     turns : n + 1 attitudes, between which the rate is constant
     declination : by which the field is turned to the west [rad], one or for each of n samples
     """
-    n = len(turns) - 1
+    n, rate = len(turns) - 1, SLOW.rate
     t: Reals = np.arange(1 - n, 1) / rate
     rates = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate
     to_sensor = turns[1:].inv()
@@ -174,42 +175,30 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
     given = imu if scenario.noisy else {name: imu[name] for name in OF_PLACE if name in imu}
     values = parameters.checked({
         'initial.phi': phi, 'initial.psi': psi, 'seed': seed, 'solver.method': 'exact',
-        'mag.field': FIELD, **given, **scenario.values})
+        'mag.field': FIELD, **given, **scenario.values, 'imu.rate': scenario.rate})
     values['mag.field'] = without_declination(values['mag.field'])
-    simulation, device = Simulation(values), Imu(values)
-    period_ns = 2 * round(0.5 * NANOSECONDS / scenario.rate)
+    simulation = Simulation(values)
+    device, period_ns = simulation.imu, simulation.imu.length_ns
     magnetometer = Magnetometer(values, period_ns)
-    end_ns = round(scenario.duration * scenario.rate) * period_ns
     parts, begin_ns = [], 0
-    for stop_ns in (*(round(t * scenario.rate) * period_ns for t in scenario.reversals), end_ns):
-        steps = range(begin_ns + period_ns, stop_ns + 1, period_ns)
-        halves = simulation.segment.states(range(begin_ns, stop_ns + 1, period_ns // 2))
-        parts.append(_readings(device, magnetometer, halves, steps))
-        if stop_ns < end_ns:
-            simulation.now_ns = stop_ns
+    for end in (*scenario.reversals, scenario.duration):
+        end_ns = round(end * scenario.rate) * period_ns
+        steps = range(begin_ns + period_ns, end_ns + 1, period_ns)
+        halves = simulation.segment.states(range(begin_ns, end_ns + 1, period_ns // 2))
+        signals: Any = np.stack(np.broadcast_arrays(
+            *itertools.chain(*device.true(halves)), *device.orientation(halves)))
+        ends = signals[:, 2::2]
+        # Simpson's rule.
+        mean = (signals[:3, :-2:2] + 4.0 * signals[:3, 1::2] + ends[:3]) / 6.0
+        parts.append(np.stack([
+            *itertools.chain(*device.sensor(period_ns).read((mean, ends[3:6]), steps)),
+            *magnetometer.read(magnetometer.true(ends[6:]), steps), *ends[6:], *ends[:3]]))
+        simulation.now_ns = begin_ns = end_ns
+        if end < scenario.duration:
             simulation.command(-simulation.l3, -simulation.lz)
-        begin_ns = stop_ns
     gyroscope, accelerometer, field, truth, rates = np.split(
         np.concatenate(parts, axis=1).T, (3, 6, 9, 13), axis=1)
     period = period_ns / NANOSECONDS
     t = period * np.arange(1.0, len(truth) + 1.0)
     return Run(f'{scenario.name} at {scenario.rate:g} Hz, seed {seed}', t,
                np.full(len(t), period), truth, rates, gyroscope, accelerometer, field)
-
-
-def _readings(device: Imu, magnetometer: Magnetometer, halves: States, steps: range) -> Reals:
-    """
-    Return what an IMU reads, attitude and rates at the ends of steps, (16, n).
-
-    halves : states at the begin, the middle and the end of each step
-    steps : their ends [ns]
-    """
-    rates, force = (np.stack(np.broadcast_arrays(*vector, np.empty(len(halves)))[:3])
-                    for vector in device.true(halves))
-    # Simpson's rule.
-    mean = (rates[:, :-2:2] + 4.0 * rates[:, 1::2] + rates[:, 2::2]) / 6.0
-    gyroscope, accelerometer = device.sensor(steps.step).read(
-        ((mean[0], mean[1], mean[2]), (force[0, 2::2], force[1, 2::2], force[2, 2::2])), steps)
-    x, y, z, w = (column[2::2] for column in device.orientation(halves))
-    field = magnetometer.read(magnetometer.true((x, y, z, w)), steps)
-    return np.stack([*gyroscope, *accelerometer, *field, x, y, z, w, *rates[:, 2::2]])

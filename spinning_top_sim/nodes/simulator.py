@@ -248,7 +248,7 @@ class Simulator(Node):
         """Return the error of an action, and its text; unexpected errors stop the motion."""
         try:
             return None, act() or ''
-        except (ValueError, RuntimeError, OSError, RecordingError) as error:
+        except (ValueError, RuntimeError, OSError) as error:
             return error, str(error)
         except Exception as error:
             self.fail(error)

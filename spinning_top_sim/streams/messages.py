@@ -31,9 +31,17 @@ EXACT = diagonal(0.0, 0.0, 0.0)
 
 
 @lru_cache(64)      # ensembles make it in every run
-def pose_stamped(frame_id: str) -> Template:
-    """geometry_msgs/PoseStamped; fields: position, orientation x, y, z, w."""
-    return Template(CdrWriter().header(frame_id).field(3).field(4))
+def stamped(frame_id: str, *counts: int) -> Template:
+    """
+    A header and fields with so many numbers.
+
+    geometry_msgs/PoseStamped (3, 4), Vector3Stamped (3) and QuaternionStamped (4), and
+    sensor_msgs/MagneticField (3, 9): the field and its covariance; quaternions are x, y, z, w.
+    """
+    writer = CdrWriter().header(frame_id)
+    for count in counts:
+        writer.field(count)
+    return Template(writer)
 
 
 @lru_cache(64)
@@ -56,12 +64,6 @@ def imu(frame_id: str, *covariances: tuple[float, ...]) -> Template:
 
 
 @lru_cache(64)
-def magnetic_field(frame_id: str) -> Template:
-    """sensor_msgs/MagneticField; fields: the magnetic field, its covariance."""
-    return Template(CdrWriter().header(frame_id).field(3).field(9))
-
-
-@lru_cache(64)
 def nav_sat_fix(frame_id: str, covariance: tuple[float, ...] | None) -> Template:
     """
     sensor_msgs/NavSatFix of GPS; fields: latitude and longitude [deg], altitude [m].
@@ -80,9 +82,8 @@ def twist_with_covariance(frame_id: str, variances: tuple[float, ...]) -> Templa
 
     variances : of the linear velocity; those of the angular one are -1, as ublox_gps has it
     """
-    covariance = list(diagonal(*variances, *3 * (-1.0,)))
-    writer = CdrWriter().header(frame_id).field(3).append('d', *ORIGIN, *covariance)
-    return Template(writer)
+    covariance = diagonal(*variances, *3 * (-1.0,))
+    return Template(CdrWriter().header(frame_id).field(3).append('d', *ORIGIN, *covariance))
 
 
 @lru_cache(64)
@@ -103,12 +104,6 @@ def transform(frame_id: str, child_frame_id: str) -> Template:
     """tf2_msgs/TFMessage with one transform; fields: translation, rotation x, y, z, w."""
     return Template(CdrWriter().append('I', 1).header(frame_id).string(child_frame_id)
                     .field(3).field(4))
-
-
-@lru_cache(64)
-def stamped(frame_id: str, count: int) -> Template:
-    """geometry_msgs/Vector3Stamped (count 3) or QuaternionStamped (4); fields: x, y, z(, w)."""
-    return Template(CdrWriter().header(frame_id).field(count))
 
 
 @lru_cache(64)

@@ -25,8 +25,7 @@ from spinning_top_sim.solvers.vertical import (
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.intervals import LONGEST_NS
+from spinning_top_sim.streams.imu import LONGEST_NS, Imu
 from spinning_top_sim.streams.path import Path, Ride, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import ImuStream, all_streams

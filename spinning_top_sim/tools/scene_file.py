@@ -122,28 +122,21 @@ def read_scene(path: str | Path) -> dict[str, object]:
 
     Raises OSError, or ValueError, which names the file.
     """
-    return known(parse_scene(Path(path).read_bytes(), str(path)), str(path))
-
-
-def parse_scene(text: str | bytes, source: str) -> dict[str, object]:
-    """
-    Return the parameters of the node spinning_top in the text of a file, whatever their names.
-
-    Raises ValueError, which names the source.
-    """
-    content = parse_yaml(text, source)
+    source = str(path)
+    content = parse_yaml(Path(path).read_bytes(), source)
     sections = [node['ros__parameters'] for name, node in content.items()
                 if name in NODES and isinstance(node, Mapping) and isinstance(
                     node.get('ros__parameters'), Mapping)] if isinstance(content, Mapping) else []
     if not sections:
         raise ValueError(f'{source} has no parameters for the node spinning_top: it must have '
                          "'/**:' or 'spinning_top:', and 'ros__parameters:' in it")
-    return {name: value for section in sections for name, value in _flatten(section)}
+    return {name: value for section in sections
+            for name, value in parse_section(section, source).items()}
 
 
 def parse_section(section: Mapping[object, object], source: str) -> dict[str, object]:
-    """Return the parameters in a mapping, not checked.  Raises ValueError, as `parse_scene`."""
-    return known(dict(_flatten(section)), source)
+    """Return the parameters in a mapping, not checked.  Raises ValueError, as `read_scene`."""
+    return _known(dict(_flatten(section)), source)
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
@@ -152,12 +145,12 @@ def parse_assignment(text: str) -> tuple[str, object]:
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
     value = parse_yaml(yaml_text, text)
-    known({name: value}, text)
+    _known({name: value}, text)
     return name, value
 
 
 def parse_yaml(text: str | bytes, source: str) -> object:
-    """Return the content of YAML with the types of rcl.  Raises ValueError, as `parse_scene`."""
+    """Return the content of YAML with the types of rcl.  Raises ValueError, as `read_scene`."""
     try:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -177,7 +170,7 @@ def is_of_ros(name: str) -> bool:
     return name.partition('.')[0] in ROS_PARAMETERS
 
 
-def known(values: Mapping[str, object], source: str) -> dict[str, object]:
+def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
     """Return the values without those of ROS.  Raises ValueError for unknown parameters."""
     ours = {name: value for name, value in values.items() if not is_of_ros(name)}
     for name, value in ours.items():
