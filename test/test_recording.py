@@ -227,7 +227,7 @@ def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
 
 
 def test_the_definitions_of_all_streams_are_those_of_jazzy():
-    assert json.loads(FILE.read_text('utf-8')) == {name: definition(name) for name in TYPES}
+    assert json.loads(FILE.read_bytes()) == {name: definition(name) for name in TYPES}
 
 
 @pytest.mark.parametrize('type_name', [

@@ -29,6 +29,7 @@ from spinning_top_sim.recording.records import (
     find_messages,
     index_entries,
     open_chunk,
+    parse,
     size_of,
 )
 
@@ -205,10 +206,10 @@ class Scan:
                 ) -> tuple[McapRecord | int | None, Messages]:
         """Return a record, of a message index the number of entries, and the messages in it."""
         nothing = Messages(b'')
-        check_size(end - offset - HEAD.size, self._file.max_bytes)
         if opcode > Opcode.DATA_END:    # of an application, or of a later version of the format
             if self._ours:
                 raise DamagedError('there is no such kind of record')
+            check_size(end - offset - HEAD.size, self._file.max_bytes)
             return None, nothing
         raw = self._file.raw(offset, end)
         if opcode == Opcode.MESSAGE_INDEX:
@@ -217,7 +218,7 @@ class Scan:
             if self._all_in_chunks:
                 raise DamagedError('all messages of the file are in chunks')
             return None, find_messages(raw)
-        record = self._file.record(offset, end)
+        record = parse(raw)
         if isinstance(record, Chunk):
             return record, open_chunk(record, self._file.max_bytes)
         return record, nothing

@@ -77,20 +77,20 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
 def given(arguments: argparse.Namespace) -> dict[str, object]:
     """Return the parameters that these options give, not checked.  Raises as `read_scene`."""
     values: dict[str, object] = {}
-    for path in (*chosen_files(arguments), *arguments.params):
-        values.update(read_scene(path))
+    for content in (*chosen_files(arguments).values(), *map(read_scene, arguments.params)):
+        values.update(content)
     values.update((name, value) for name, value in map(parse_assignment, arguments.param)
                   if not is_of_ros(name))
     return values
 
 
-def chosen_files(arguments: argparse.Namespace) -> list[Path]:
+def chosen_files(arguments: argparse.Namespace) -> dict[Path, dict[str, object]]:
     """
-    Return the parameter files of --scene and --imu.
+    Return the parameter files of --scene and --imu, and what is in them.
 
-    Raises ValueError for a name that is not there.
+    Raises ValueError for a name that is not there, or as `read_scene`.
     """
-    paths = []
+    found = {}
     for kind in ('scene', 'imu'):
         name = getattr(arguments, kind, None)
         if name is None:
@@ -99,21 +99,9 @@ def chosen_files(arguments: argparse.Namespace) -> list[Path]:
         if name not in files and '/' not in name and not name.endswith('.yaml'):
             raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
                              f'{", ".join(files)}')
-        paths.append(files.get(name, Path(name)))
-    return paths
-
-
-def files_for_node(arguments: argparse.Namespace) -> list[Path]:
-    """
-    Return the parameter files of --scene and --imu for a node.
-
-    They are read here because rcl accepts a file that has no parameters of the node.  Raises as
-    `read_scene`.
-    """
-    paths = chosen_files(arguments)
-    for path in paths:
-        read_scene(path)
-    return paths
+        path = files.get(name, Path(name))
+        found[path] = read_scene(path)
+    return found
 
 
 def read_scene(path: str | Path) -> dict[str, object]:

@@ -137,10 +137,11 @@ def _write_reference(folder: Path, scenes: Mapping[str, Mapping[str, Any]], dura
         for file_format, suffix in SUFFIXES.items():
             (folder / f'{name}.{suffix}').write_text(
                 models.model(values, file_format, name), encoding='utf-8')
-        quaternion, rates, _ = models.start_of(values)
+        start = models.start_of(values)
         facts[name] = {'top': vars(parameters.top_of(values)), 'start': {
-            **vars(parameters.start_state(values)), 'quaternion_xyzw': quaternion,
-            'angular_velocity_body': rates},
+            **vars(parameters.start_state(values)),
+            'quaternion_xyzw': start.quaternion[0].tolist(),
+            'angular_velocity_body': start.angular_velocity[0].tolist()},
             'imu': {'lever_arm': values['imu.lever_arm'], 'rpy': values['imu.rpy']},
             'pivot_moves': parameters.pivot_path(values) is not None}
     (folder / 'scenes.json').write_text(json.dumps(facts, indent=2) + '\n', encoding='utf-8')

@@ -128,7 +128,7 @@ def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, argv: l
     """Return what opens the page; a node of a scene or IMU runs until `stack` is closed."""
     if arguments.html is not None:
         raise ValueError(f'--html {arguments.html}: must have a log')
-    files = scene_file.files_for_node(arguments)
+    files = list(scene_file.chosen_files(arguments))
     from spinning_top_sim.view.live import LiveView  # noqa: PLC0415
 
     def make_node() -> RunnableNode:
