@@ -29,7 +29,7 @@ ARRAY, ODOMETRY = 'std_msgs/msg/Float64MultiArray', 'nav_msgs/msg/Odometry'
 
 
 def _place(samples: Samples) -> Sequence[Any]:
-    return tuple(samples.pivot.position) if samples.segment.ride else messages.ORIGIN
+    return tuple(samples.pivot.position) if samples.pivot_moves else messages.ORIGIN
 
 
 def _pose(samples: Samples) -> Sequence[Field]:
@@ -42,7 +42,7 @@ def _odometry(samples: Samples) -> Sequence[Field]:
 
 
 def _velocity(samples: Samples) -> Vector:
-    if not samples.segment.ride:
+    if not samples.pivot_moves:
         return messages.ORIGIN
     x, y, z = samples.pivot.velocity
     return attitude.in_body(samples.states.rows_quaternion, (x, y, z))
@@ -76,11 +76,10 @@ def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
 
 def _invariants(samples: Samples) -> Sequence[Field]:
     """Return the constants of the motion, drifts, and errors of norm and orientation."""
-    segment, states = samples.segment, samples.states
+    states = samples.states
     now = (states.energy, states.l3, states.lz)
-    drifts = map(relative_drift, now, (segment.energy, segment.l3, segment.lz))
-    error = segment.orientation_error(states, samples.times)
-    return ((*now, *drifts, states.norm_error, error),)
+    drifts = map(relative_drift, now, map(samples.at_start, ('energy', 'l3', 'lz')))
+    return ((*now, *drifts, states.norm_error, samples.orientation_error),)
 
 
 def _magnetic_field(imu: Imu, magnetometer: Callable[[int], Magnetometer], stream: Stream,
@@ -164,7 +163,7 @@ class Markers(Stream):
     @staticmethod
     def _point(samples: Samples, along: float) -> Vector:
         x, y, z = (along * part for part in samples.states.rows_axis)
-        if samples.segment.ride:
+        if samples.pivot_moves:
             a, b, c = samples.pivot.position
             x, y, z = x + a, y + b, z + c
         return x, y, z
