@@ -101,16 +101,15 @@ def test_one_command_is_on_path(empty):
 
 
 def test_without_ros_a_scene_is_simulated_and_verified_with_the_same_bytes(empty, tmp_path):
-    command = empty / 'bin/spinning-top'
     arguments = ['simulate', '--scene', 'wavy', '--imu', 'bmi088', '--duration', '1', '--quiet',
                  '-o']
-    code, _, err = run(command, *arguments, 'run.mcap', cwd=tmp_path)
+    code, _, err = run(empty / 'bin/spinning-top', *arguments, 'run.mcap', cwd=tmp_path)
     assert (code, err) == (0, '')
-    code, out, err = run(command, 'inspect', 'run.mcap', '--verify', cwd=tmp_path)
-    assert (code, err) == (0, '')
-    assert re.search(r'^verify: identical, all \d+ messages', out, re.MULTILINE)
-    code, out, err = run(command, 'grade', 'run.mcap', cwd=tmp_path)
-    assert (code, err) == (0, '') and 'run.mcap: passed' in out
+    inspected, graded = run_all(empty, tmp_path, [['inspect', 'run.mcap', '--verify'],
+                                                  ['grade', 'run.mcap']])
+    assert (inspected[0], graded[0], inspected[2], graded[2]) == (0, 0, '', '')
+    assert re.search(r'^verify: identical, all \d+ messages', inspected[1], re.MULTILINE)
+    assert 'run.mcap: passed' in graded[1]
     (tmp_path / 'ros').mkdir()
     here = tmp_path / 'ros/run.mcap'
     assert main([*arguments, str(here)]) == 0       # in this environment, with the files of ROS
