@@ -130,19 +130,6 @@ def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     assert len(model.trace(track, 3)) == 2
 
 
-def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
-    moved = solve(shown.top, parameters.start_state(shown.values), np.arange(20) * 0.04)
-    track = Track(shown.values)
-    track.add('joint_states', Samples(np.arange(20) * 40_000_000, np.column_stack(
-        (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
-    stamps_ns, axis, joined = model.path(track, 0, NANOSECONDS)
-    track.detect_motion()
-    assert track.motions[0].description.name == 'cusps'     # as at the start
-    assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
-    exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
-    assert axis == pytest.approx(np.column_stack(exact.rows_axis), abs=1e-4)
-
-
 def plotted(shown, stamp_ns):
     """Return the lines of the plots of 2.5 s, by plot and name."""
     top = plots.Shown(shown, stamp_ns, shown.origin_ns, stamp_ns, shown.origin_ns)
@@ -364,16 +351,15 @@ def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
     page.set_track(shown)
     page._trace.value = page._bounds.value = False
     page.draw(stamp_ns, shown.origin_ns)
-    top = page.top
     page.arrows[0].value = True
     page.draw(stamp_ns, shown.origin_ns)
-    assert top._arrows[0].points[0, 1] == pytest.approx(
+    assert page._arrow_lines[0].points[0, 1] == pytest.approx(
         model.arrow(shown, model.ARROWS[0], stamp_ns), abs=1e-6)
     page._bounds.value = True
     assert 'trace' not in page.legend() and 'angular momentum' in page.legend()
-    assert top._stand.wxyz == pytest.approx([1, 0, 0, 0])
+    assert page._stand.wxyz == pytest.approx([1, 0, 0, 0])
     page.draw(stamp_ns, shown.origin_ns)
-    for bound, theta in zip(top._bounds, top._limits, strict=True):
+    for bound, theta in zip(page._bound_lines, page._limits, strict=True):
         assert bound.visible
         assert (bound.points == model.circle(model.reach(shown), theta)).all()
 

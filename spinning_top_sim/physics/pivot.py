@@ -52,9 +52,19 @@ class Piece(NamedTuple):
 
     def at(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at times (n,) [ns]."""
-        t, a = (times_ns - self.start_ns) * 1e-9, _doubles([self.acceleration]).T
-        return Kinematics(self.position + t * (self.velocity + 0.5 * t * a),
-                          self.velocity + t * a, np.broadcast_to(a, (3, len(t))))
+        return kinematics([self], np.array([0]), times_ns)
+
+
+def kinematics(pieces: Sequence[Piece], where: NDArray[np.int64],
+               times_ns: NDArray[np.int64]) -> Kinematics:
+    """Return what the pivot does at times (n,) [ns], at time i in piece `where[i]`."""
+    starts_ns = np.array([piece.start_ns for piece in pieces])[where]
+    position, velocity, a = (np.hstack(rows)[:, where] for rows in zip(*(
+        (piece.position, piece.velocity, _doubles([piece.acceleration]).T)
+        for piece in pieces), strict=True))
+    t = (times_ns - starts_ns) * 1e-9
+    return Kinematics(position + t * (velocity + 0.5 * t * a), velocity + t * a,
+                      np.broadcast_to(a, (3, len(t))))
 
 
 class PivotPath:

@@ -15,9 +15,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.pivot import Exact
@@ -41,6 +42,8 @@ from spinning_top_sim.solvers.theta_setup import (
     ThetaMotion,
     set_up,
 )
+from spinning_top_sim.solvers.theta_values import ThetaFunctions
+from spinning_top_sim.solvers.times import Times
 
 MOST_DIGITS = DIGITS_TO_TRY[0]
 # An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
@@ -157,6 +160,18 @@ class AcceleratedMotion(ExactSolution):
         across: Column = np.where(cancels, one + two, bottom + top)
         return across
 
+    @property
+    def kind(self) -> tuple[object, ...] | None:
+        """What motions have in common that can be `chained`; None of one that cannot."""
+        return self._theta.kind
+
+    @property
+    def energy(self) -> float:
+        o1, o2 = map(float, self._posture.across)
+        top, start = self.top, self.start
+        return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
+                + top.gravity_torque * math.cos(start.theta))
+
     def posture(self, ns: int) -> Posture:
         """
         Return the posture in the world at a time [ns] since the start.
@@ -171,6 +186,26 @@ class AcceleratedMotion(ExactSolution):
             across = _across(Decimal(self.top.lambda1), *self._momenta, alpha, beta, u_dot)
             alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
             return Posture(alpha, beta, across, self.start.l3)
+
+
+class _Chain(AcceleratedMotion):
+    """Motions of one kind as one, at the i-th time motion `where[i]`."""
+
+    def __init__(self, motions: Sequence[AcceleratedMotion], where: NDArray[np.int64]) -> None:
+        self.top, self.start, self._turns = motions[0].top, motions[0].start, 0
+        self._theta = ThetaFunctions.chained([motion._theta for motion in motions], where)
+        rates: Any = np.array([(motion._bottom_rate, motion._top_rate) for motion in motions])
+        self._bottom_rate, self._top_rate = rates.T[:, where]
+
+
+def chained(motions: Sequence[AcceleratedMotion], where: NDArray[np.int64],
+            times_ns: NDArray[np.int64]) -> States:
+    """Return the states of motions of one kind, at the i-th time [ns] that of `where[i]`."""
+    states = _ExactStates(_Chain(motions, where), Times.from_ns(times_ns))
+    states._lz, states._gravity, states._torque = np.array([
+        (motion.start.lz, motion.top.gravity, motion.top.gravity_torque)
+        for motion in motions]).T[:, where]
+    return states
 
 
 @lru_cache(64)

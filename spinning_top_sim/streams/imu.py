@@ -135,8 +135,9 @@ class Imu:
         if self._low_pass is None:
             exact = self.sampled(samples)
         else:
-            w1, w2, w3, f1, f2, f3 = self._low_pass.filtered(
-                samples.segment, samples.times, self._signal)
+            w1, w2, w3, f1, f2, f3 = np.concatenate([
+                self._low_pass.filtered(segment, times, self._signal)
+                for segment, times in samples.parts], axis=1)
             exact = (w1, w2, w3), (f1, f2, f3)
         if self._vibration.is_off:
             return exact
@@ -171,25 +172,27 @@ class Imu:
 
     def _body_increments(self, samples: Samples) -> Increments:
         """Return the increments over the intervals that end at these samples, n of each."""
-        path, times, point = samples.path, samples.times, self._lever_arm
-        # Those that may be shorter, or contain a command, are computed one by one.
-        since_ns = max(self._since_ns, samples.segment.start_ns)
-        single = len(range(times.start, since_ns + self.length_ns + 1, times.step))
-        parts = [path.increments(self._begin_ns(end_ns), end_ns, point)
-                 for end_ns in times[:single]]
-        if single < len(times):
-            first_ns = times[single]
-            parts.append(path.increments(self._begin_ns(first_ns), first_ns, point,
-                                         len(times) - single, times.step))
-        return parts[0] if len(parts) == 1 else Increments(*(
-            np.concatenate(rows, axis=1) for rows in zip(*parts, strict=True)))
+        path, point = samples.path, self._lever_arm
+        found: list[Increments] = []
+        for segment, times in samples.parts:
+            # Those that may be shorter, or contain a command, are computed one by one.
+            since_ns = max(self._since_ns, segment.start_ns)
+            single = len(range(times.start, since_ns + self.length_ns + 1, times.step))
+            found += [path.increments(self._begin_ns(end_ns), end_ns, point)
+                      for end_ns in times[:single]]
+            if single < len(times):
+                first_ns = times[single]
+                found.append(path.increments(self._begin_ns(first_ns), first_ns, point,
+                                             len(times) - single, times.step))
+        return found[0] if len(found) == 1 else Increments(*(
+            np.concatenate(rows, axis=1) for rows in zip(*found, strict=True)))
 
     def motion(self, samples: Samples) -> tuple[Vector, Quaternion, Vector]:
         """Return position [m] and orientation in the world, velocity in the IMU's frame [m/s]."""
         states = samples.states
         x, y, z = attitude.in_world(states.rows_quaternion, self._lever_arm)
         v1, v2, v3 = states.velocity(self._lever_arm)
-        if samples.segment.ride:
+        if samples.pivot_moves:
             (a, b, c), (u, v, w), _ = samples.pivot
             x, y, z = x + a, y + b, z + c
             u, v, w = attitude.in_body(states.rows_quaternion, (u, v, w))

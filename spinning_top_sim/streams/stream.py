@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.pivot import Kinematics
+from spinning_top_sim.physics.pivot import Kinematics, kinematics
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, Field, Template
-from spinning_top_sim.streams.path import Path, Segment
+from spinning_top_sim.streams.path import Path, Segment, states_of
 
 # Jitter is cut at this share of the period, so that no stamp is before that of an earlier sample.
 MOST_JITTER = 0.45
@@ -23,39 +23,64 @@ FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_r
 Result = TypeVar('Result')
 # Messages as rows (n, size): bytes or, of a table, numbers.
 Rows = NDArray[Any]
+# A segment and times in it [ns].
+Part = tuple[Segment, range]
 # Times (n,) [ns] of messages, and the messages.
 Encoded = tuple[NDArray[np.int64], Rows]
 
 
 class Samples:
     """
-    The motion at the times of a block in one segment; the streams of one rate share it.
+    The motion at times of a block; the streams of one rate share it.
 
     path : the motion
+    parts : a segment and its times [ns], or several segments of one kind
     times : of the samples [ns]
     epoch_ns : stamp of t = 0 [ns]
     """
 
-    def __init__(self, path: Path, times: range, epoch_ns: int) -> None:
-        self.path, self.times, self.epoch_ns = path, times, epoch_ns
+    def __init__(self, path: Path, parts: Sequence[Part], epoch_ns: int) -> None:
+        self.path, self.parts, self.epoch_ns = path, parts, epoch_ns
+        self._segments = [segment for segment, _ in parts]
+        (_, first), (_, last) = parts[0], parts[-1]
+        self.times = range(first.start, last.stop, first.step)
+        self._counts = [len(times) for _, times in parts]
         self._results: dict[Callable[..., Any], Any] = {}
 
     @cached_property
     def t_ns(self) -> NDArray[np.int64]:
         return np.arange(self.times.start, self.times.stop, self.times.step)
 
-    @cached_property
-    def segment(self) -> Segment:
-        return self.path.after(self.times.start - 1)
+    @property
+    def pivot_moves(self) -> bool:
+        return self._segments[0].ride is not None
 
     @cached_property
     def states(self) -> States:
-        return self.segment.states(self.times)
+        if len(self.parts) == 1:
+            return self._segments[0].states(self.times)
+        return states_of(self._segments, self._where, self.t_ns)
 
     @cached_property
     def pivot(self) -> Kinematics:
         """Position, velocity and acceleration of the pivot in the world, (3, n) each."""
-        return self.segment.pivot(self.t_ns)
+        if len(self.parts) == 1:
+            return self._segments[0].pivot(self.t_ns)
+        return kinematics([segment.ride.piece for segment in self._segments if segment.ride],
+                          self._where, self.t_ns)
+
+    @cached_property
+    def _where(self) -> NDArray[np.int64]:
+        return np.repeat(np.arange(len(self.parts)), self._counts)
+
+    def at_start(self, name: str) -> NDArray[np.float64]:
+        """Return a constant of the motion, (n,), as it is at the start of each segment."""
+        return np.repeat([getattr(segment, name) for segment in self._segments], self._counts)
+
+    @property
+    def orientation_error(self) -> NDArray[np.float64]:
+        """The angles (n,) [rad] to the exact attitudes; NaN where these are not known."""
+        return self._segments[0].orientation_error(self.states, self.times)
 
     def once(self, compute: Callable[['Samples'], Result]) -> Result:
         """Return `compute(self)`, which is called for the first of the streams that ask for it."""

@@ -3,7 +3,6 @@
 
 import math
 import time
-from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -42,94 +41,15 @@ def set_content(handle: viser.GuiHtmlHandle | viser.GuiMarkdownHandle, content: 
         handle.content = content
 
 
-class DrawnTop:
-    """
-    The top in the scene.
-
-    drawn : stamp [ns] and row of the attitude that is drawn, None if there is none
-    """
-
-    def __init__(self, scene: viser.SceneApi, track: Track) -> None:
-        self.track, far = track, model.reach(track)
-        radius = abs(far)
-        self.root = scene.add_frame('/top', show_axes=False)
-        self._sphere = scene.add_icosphere('/top/sphere', radius, SPHERE, subdivisions=5,
-                                           opacity=0.12, side='back', cast_shadow=False,
-                                           receive_shadow=False)
-        self._body = scene.add_frame('/top/body', show_axes=not track.has_body,
-                                     axes_length=0.7 * radius, axes_radius=0.015 * radius)
-        for part in (body.wheel if track.has_body else body.disc)(track.shape, far):
-            scene.add_mesh_simple(
-                f'/top/body/{part.name}', part.mesh.vertices, part.mesh.faces, color=part.colour,
-                flat_shading=part.name != 'axle', side='double')
-        peg = body.stand(FOOT * radius)
-        self._stand = scene.add_mesh_simple('/top/stand', peg.vertices, peg.faces, color=STAND,
-                                            side='double')
-        self._trace = scene.add_line_segments('/top/trace', NO_LINES, TRACE,
-                                              thickness=0.018 * radius)
-        self._bounds = [scene.add_line_segments(
-            f'/top/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * radius, visible=False)
-            for k in range(2)]
-        self._arrows = [scene.add_arrows(
-            f'/top/{arrow.replace(" ", "_")}', NO_LINES, colour,
-            shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
-            visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
-        self._limits: tuple[float, float] | None = None         # that are drawn [rad]
-        self.drawn: tuple[int, model.Vectors] | None = None
-        self._shown: object = None                      # stamp and switches of the picture
-
-    def draw(self, stamp_ns: int, *, trace: bool, bounds: bool, arrows: Sequence[bool]) -> None:
-        """Draw the newest samples up to a stamp, with some of the parts."""
-        self.drawn = sample = self.track.attitudes.at(stamp_ns)
-        self.root.visible = sample is not None
-        shown = sample and (sample[0], trace, bounds, arrows)
-        if shown == self._shown:        # as while it is paused
-            return
-        self._shown = shown
-        if sample is None:
-            return
-        x, y, z, w = sample[1][:4].tolist()
-        self._body.wxyz = (w, x, y, z)
-        self._trace.visible = self._sphere.visible = trace
-        if trace:
-            self._draw_trace(model.trace(self.track, stamp_ns))
-        for name, arrow, on in zip(model.ARROWS, self._arrows, arrows, strict=True):
-            arrow.visible = on
-            vector = model.arrow(self.track, name, stamp_ns) if on else None
-            arrow.points = NO_LINES if vector is None else model.segments(
-                np.vstack((np.zeros(3), vector)))
-        self._draw_bounds(self.track.motion_at(stamp_ns), bounds)
-
-    def _draw_trace(self, lines: model.Lines) -> None:
-        """Draw a trace that fades with its age; the colours of a line's points are linear."""
-        lines = lines if len(lines) else NO_LINES
-        if len(lines) != len(self._trace.points):
-            share = np.linspace(0.35, 1.0, len(lines))[:, np.newaxis, np.newaxis]
-            self._trace.colors = np.broadcast_to(255 * (
-                1.0 + share * (np.array(TRACE) / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
-        self._trace.points = lines
-
-    def _draw_bounds(self, motion: DescribedMotion | None, on: bool) -> None:
-        moves = motion.description if motion else None
-        for bound in self._bounds:
-            bound.visible = on and moves is not None
-        if moves is None or self._limits == (moves.theta_min, moves.theta_max):
-            return
-        self._limits = moves.theta_min, moves.theta_max
-        for bound, theta in zip(self._bounds, self._limits, strict=True):
-            bound.points = model.circle(model.reach(self.track), theta)
-        # A top that comes low hangs from above.
-        self._stand.wxyz = (1, 0, 0, 0) if moves.theta_max < STANDS_TO else (0, 1, 0, 0)
-
-
 class Page:
     """
-    The page, with its own server.  One thread calls `set_track` and `draw`.
+    The page, with its own server.  One thread calls `set_track`, and then `draw`.
 
     title : such as the name of the log
     controls : the folder for the controls of the source of the samples
     message : what was done, or the reason why not
     arrows : the switches of model.ARROWS
+    drawn : stamp [ns] and row of the attitude that is drawn, None if there is none
     """
 
     def __init__(self, title: str, host: str, port: int | None) -> None:
@@ -159,7 +79,7 @@ class Page:
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)
         panel.expand()              # also on a phone, where it is below
-        self.top: DrawnTop | None = None
+        self._root: viser.FrameHandle | None = None
         self._number = 0            # of the picture
 
     def close(self) -> None:
@@ -170,14 +90,39 @@ class Page:
 
     def set_track(self, track: Track) -> None:
         """Show this top."""
-        if self.top is not None:
-            self.top.root.remove()
-        scene = self.server.scene
-        self.top = DrawnTop(scene, track)
-        size = self._reach = abs(model.reach(track))
+        if self._root is not None:
+            self._root.remove()
+        self._track, far = track, model.reach(track)
+        scene, size = self.server.scene, abs(far)
+        self._reach = size
         self._accuracy_folder.visible = track.has_body
         for switch in (self._bounds, *self.arrows):
             switch.visible = track.has_body
+        self._root = scene.add_frame('/top', show_axes=False)
+        self._sphere = scene.add_icosphere('/top/sphere', size, SPHERE, subdivisions=5,
+                                           opacity=0.12, side='back', cast_shadow=False,
+                                           receive_shadow=False)
+        self._body = scene.add_frame('/top/body', show_axes=not track.has_body,
+                                     axes_length=0.7 * size, axes_radius=0.015 * size)
+        for part in (body.wheel if track.has_body else body.disc)(track.shape, far):
+            scene.add_mesh_simple(
+                f'/top/body/{part.name}', part.mesh.vertices, part.mesh.faces, color=part.colour,
+                flat_shading=part.name != 'axle', side='double')
+        peg = body.stand(FOOT * size)
+        self._stand = scene.add_mesh_simple('/top/stand', peg.vertices, peg.faces, color=STAND,
+                                            side='double')
+        self._trace_lines = scene.add_line_segments('/top/trace', NO_LINES, TRACE,
+                                                    thickness=0.018 * size)
+        self._bound_lines = [scene.add_line_segments(
+            f'/top/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * size, visible=False)
+            for k in range(2)]
+        self._arrow_lines = [scene.add_arrows(
+            f'/top/{arrow.replace(" ", "_")}', NO_LINES, colour,
+            shaft_radius=0.014 * size, head_radius=0.04 * size, head_length=0.12 * size,
+            visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
+        self._limits: tuple[float, float] | None = None         # that are drawn [rad]
+        self.drawn: tuple[int, model.Vectors] | None = None
+        self._shown: object = None                      # stamp and switches of the picture
         self._ground = scene.add_grid(
             '/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
             cell_color=(238, 240, 244), section_color=(228, 231, 236), fade_distance=9 * size,
@@ -190,18 +135,12 @@ class Page:
 
     def draw(self, stamp_ns: int, origin_ns: int) -> None:
         """
-        Draw the top at a stamp [ns].
+        Draw the newest samples up to a stamp [ns].
 
         origin_ns : stamp of t = 0
         """
-        assert self.top is not None
         with self.server.atomic():
-            # The top stays in the picture: the ground moves.
-            x, y, z = self.top.track.place(stamp_ns)
-            self._ground.position = (-(x % self._reach), -(y % self._reach),
-                                     -FOOT * self._reach - z)
-            self.top.draw(stamp_ns, trace=self._trace.value, bounds=self._bounds.value,
-                          arrows=[switch.value for switch in self.arrows])
+            self._draw_top(stamp_ns)
         if self._number % PLOT_EVERY == 0:
             motion, accuracy = self.plots(stamp_ns, origin_ns, stamp_ns - WINDOW_NS, stamp_ns)
             set_content(self._plots, motion)
@@ -210,27 +149,72 @@ class Page:
             set_content(self._legend, self.legend())
         self._number += 1
 
+    def _draw_top(self, stamp_ns: int) -> None:
+        # The top stays in the picture: the ground moves.
+        x, y, z = self._track.place(stamp_ns)
+        self._ground.position = -(x % self._reach), -(y % self._reach), -FOOT * self._reach - z
+        self.drawn = sample = self._track.attitudes.at(stamp_ns)
+        assert self._root is not None
+        self._root.visible = sample is not None
+        trace, bounds = self._trace.value, self._bounds.value
+        arrows = [switch.value for switch in self.arrows]
+        shown = sample and (sample[0], trace, bounds, arrows)
+        if shown == self._shown:        # as while it is paused
+            return
+        self._shown = shown
+        if sample is None:
+            return
+        x, y, z, w = sample[1][:4].tolist()
+        self._body.wxyz = (w, x, y, z)
+        self._trace_lines.visible = self._sphere.visible = trace
+        if trace:
+            self._draw_trace(model.trace(self._track, stamp_ns))
+        for name, arrow, on in zip(model.ARROWS, self._arrow_lines, arrows, strict=True):
+            arrow.visible = on
+            vector = model.arrow(self._track, name, stamp_ns) if on else None
+            arrow.points = NO_LINES if vector is None else model.segments(
+                np.vstack((np.zeros(3), vector)))
+        self._draw_bounds(self._track.motion_at(stamp_ns), bounds)
+
+    def _draw_trace(self, lines: model.Lines) -> None:
+        """Draw a trace that fades with its age; the colours of a line's points are linear."""
+        lines = lines if len(lines) else NO_LINES
+        if len(lines) != len(self._trace_lines.points):
+            share = np.linspace(0.35, 1.0, len(lines))[:, np.newaxis, np.newaxis]
+            self._trace_lines.colors = np.broadcast_to(255 * (
+                1.0 + share * (np.array(TRACE) / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
+        self._trace_lines.points = lines
+
+    def _draw_bounds(self, motion: DescribedMotion | None, on: bool) -> None:
+        moves = motion.description if motion else None
+        for bound in self._bound_lines:
+            bound.visible = on and moves is not None
+        if moves is None or self._limits == (moves.theta_min, moves.theta_max):
+            return
+        self._limits = moves.theta_min, moves.theta_max
+        for bound, theta in zip(self._bound_lines, self._limits, strict=True):
+            bound.points = model.circle(model.reach(self._track), theta)
+        # A top that comes low hangs from above.
+        self._stand.wxyz = (1, 0, 0, 0) if moves.theta_max < STANDS_TO else (0, 1, 0, 0)
+
     def plots(self, stamp_ns: int, origin_ns: int, begin_ns: int, end_ns: int) -> tuple[str, str]:
         """Return the plots of a span of stamps, with a mark at one, and those of the accuracy."""
-        assert self.top is not None
-        shown = plots.Shown(self.top.track, stamp_ns, begin_ns, end_ns, origin_ns)
+        shown = plots.Shown(self._track, stamp_ns, begin_ns, end_ns, origin_ns)
         motion, accuracy = (''.join(map(svg.draw, found)) for found in (
             plots.motion_plots(shown), plots.accuracy_plots(shown)))
         return motion, accuracy
 
     def words(self, stamp_ns: int, origin_ns: int) -> str:
         """Return HTML about the motion and the sample that is drawn at a stamp."""
-        assert self.top is not None
-        track = self.top.track
+        track = self._track
         sample = track.attitudes.at(stamp_ns)
         return f'<p>{NO_SAMPLES}</p>' if sample is None else text.words(
             track, track.motion_at(stamp_ns), sample[0], sample[0] - origin_ns)
 
     def legend(self) -> str:
         """Return HTML about the colours of what is switched on."""
-        assert self.top is not None
         entries = [(TRACE, 'trace of the axis')] if self._trace.value else []
-        if self._bounds.value and self.top.track.motions:
+        if self._bounds.value and self._track.motions:
             entries.append((BOUNDS, 'bounds of θ'))
         entries += [(colour, name) for name, colour, switch in zip(
             model.ARROWS, ARROW_COLOURS, self.arrows, strict=True) if switch.value]

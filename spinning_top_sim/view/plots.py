@@ -34,24 +34,20 @@ class Shown(NamedTuple):
     end_ns: int
     origin_ns: int
 
-    def seconds(self, stamps_ns: NDArray[np.int64]) -> Reals:
-        return (stamps_ns - self.origin_ns) / NANOSECONDS
-
     @property
     def now(self) -> float:
         return (self.stamp_ns - self.origin_ns) / NANOSECONDS
 
     def part(self, samples: Samples) -> tuple[Reals, Reals]:
         stamps_ns, rows = samples.part(self.begin_ns, self.end_ns).thinned(POINTS)
-        return self.seconds(stamps_ns), rows
+        return (stamps_ns - self.origin_ns) / NANOSECONDS, rows
 
 
 def motion_plots(top: Shown) -> list[Plot]:
     """Return the plots of potential, energies, tilt and precession, as far as there are data."""
     potential = _potential(top)
-    stamps_ns, axis, _ = model.path(top.track, top.begin_ns, top.end_ns)
-    stamps_ns, axis = Samples(stamps_ns, axis).thinned(POINTS)
-    tilt = [Line('θ', RED, top.seconds(stamps_ns), model.tilt(axis))]
+    times, rows = top.part(top.track.attitudes)
+    tilt = [Line('θ', RED, times, model.tilt(model.axis_of(rows)))]
     energy, rate = list[Line](), list[Line]()
     times, rows = top.part(top.track.rates)
     if len(rows):
