@@ -205,13 +205,13 @@ class LiveView(Node):
         # The present spin is not checked: it need not be possible at the start.
         values = {**parameters.checked(dict(zip(names, shown, strict=False))),
                   **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
-        track = Track(values)
+        track = Track('', values)
         if self._track is not None:
             if all(values[name] == self._track.values[name] for name in names):
                 return
             track.samples = self._track.samples
         self._track = track
-        self._page.set_track(track)
+        self._page.set_tracks([track])
         self._controls.set_range(track.top, *(values[name] for name in SPIN))
 
     # Called by the page's controls, in threads of their own.
