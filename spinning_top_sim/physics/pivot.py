@@ -52,14 +52,14 @@ class Piece(NamedTuple):
 
     def at(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at times (n,) [ns]."""
-        return kinematics([self], np.array([0]), times_ns)
+        return kinematics([self], [1], times_ns)
 
 
-def kinematics(pieces: Sequence[Piece], where: NDArray[np.int64],
+def kinematics(pieces: Sequence[Piece], counts: Sequence[int],
                times_ns: NDArray[np.int64]) -> Kinematics:
-    """Return what the pivot does at times (n,) [ns], at time i in piece `where[i]`."""
-    starts_ns = np.array([piece.start_ns for piece in pieces])[where]
-    position, velocity, a = (np.hstack(rows)[:, where] for rows in zip(*(
+    """Return what the pivot does at times (n,) [ns], in each piece at so many of them."""
+    starts_ns = np.repeat([piece.start_ns for piece in pieces], counts)
+    position, velocity, a = (np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(*(
         (piece.position, piece.velocity, _doubles([piece.acceleration]).T)
         for piece in pieces), strict=True))
     t = (times_ns - starts_ns) * 1e-9

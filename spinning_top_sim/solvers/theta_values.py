@@ -98,22 +98,22 @@ class ThetaFunctions:
         return self.stretch is None, *self.prefactors
 
     @classmethod
-    def chained(cls, parts: Sequence[ThetaFunctions], where: NDArray[np.int64]) -> ThetaFunctions:
-        """Return the constants of motions of one kind, at the i-th time those of `where[i]`."""
+    def chained(cls, parts: Sequence[ThetaFunctions], counts: Sequence[int]) -> ThetaFunctions:
+        """Return the constants of motions of one kind, of each for so many times."""
         chain = copy(parts[0])
-        chain.rates = Rates.chained([part.rates for part in parts], where)
+        chain.rates = Rates.chained([part.rates for part in parts], counts)
         chain.offset, chain.offset_rest, chain.start_whole, chain.drifts = (
-            np.hstack(rows)[:, where] for rows in zip(*(
+            np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(*(
                 (part.offset, part.offset_rest, part.start_whole, part.drifts)
                 for part in parts), strict=True))
         if chain.stretch is not None:
-            chain.stretch = np.array([part.stretch for part in parts])[where]
+            chain.stretch = np.repeat([part.stretch for part in parts], counts)
         chain.coefficients = _side_by_side([part.coefficients for part in parts])
-        chain.u_dot_coefficients = _side_by_side([
-            part.u_dot_coefficients for part in parts])[:, where]
+        chain.u_dot_coefficients = np.repeat(_side_by_side([
+            part.u_dot_coefficients for part in parts]), counts, axis=1)
         chain.u_dot, chain.momentum, chain.swing = map(np.concatenate, zip(*(
             (part.u_dot, part.momentum, part.swing) for part in parts), strict=True))
-        chain.first = 2 * where
+        chain.first = np.repeat(np.arange(0, 2 * len(parts), 2), counts)
         return chain
 
     @property

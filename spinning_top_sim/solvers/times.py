@@ -90,10 +90,10 @@ class Rates:
         self._constants: dict[str, tuple[NDArray[np.float64], ...]] = {}
 
     @classmethod
-    def chained(cls, parts: Sequence[Rates], where: NDArray[np.int64]) -> Rates:
-        """Return rates for integer nanoseconds: at the i-th time those of part `where[i]`."""
+    def chained(cls, parts: Sequence[Rates], counts: Sequence[int]) -> Rates:
+        """Return rates for integer nanoseconds, those of each part for so many times."""
         chain = cls(())
-        chain._constants['ns'] = tuple(np.hstack(rows)[:, where] for rows in zip(
+        chain._constants['ns'] = tuple(np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(
             *(part._of('ns') for part in parts), strict=True))
         return chain
 

@@ -188,22 +188,22 @@ class AcceleratedMotion(ExactSolution):
 
 
 class _Chain(AcceleratedMotion):
-    """Motions of one kind as one, at the i-th time motion `where[i]`."""
+    """Motions of one kind as one, each at `counts` of the times."""
 
-    def __init__(self, motions: Sequence[AcceleratedMotion], where: NDArray[np.int64]) -> None:
+    def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int]) -> None:
         self.top, self.start, self._turns = motions[0].top, motions[0].start, 0
-        self._theta = ThetaFunctions.chained([motion._theta for motion in motions], where)
+        self._theta = ThetaFunctions.chained([motion._theta for motion in motions], counts)
         rates: Any = np.array([(motion._bottom_rate, motion._top_rate) for motion in motions])
-        self._bottom_rate, self._top_rate = rates.T[:, where]
+        self._bottom_rate, self._top_rate = np.repeat(rates.T, counts, axis=1)
 
 
-def chained(motions: Sequence[AcceleratedMotion], where: NDArray[np.int64],
+def chained(motions: Sequence[AcceleratedMotion], counts: Sequence[int],
             times_ns: NDArray[np.int64]) -> States:
-    """Return the states of motions of one kind, at the i-th time [ns] that of `where[i]`."""
-    states = _ExactStates(_Chain(motions, where), Times.from_ns(times_ns))
-    states._lz, states._gravity, states._torque = np.array([
+    """Return the states of motions of one kind, of each at so many of the times [ns]."""
+    states = _ExactStates(_Chain(motions, counts), Times.from_ns(times_ns))
+    states._lz, states._gravity, states._torque = np.repeat(np.array([
         (motion.start.lz, motion.top.gravity, motion.top.gravity_torque)
-        for motion in motions]).T[:, where]
+        for motion in motions]).T, counts, axis=1)
     return states
 
 

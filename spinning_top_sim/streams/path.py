@@ -156,17 +156,17 @@ class Segment:
         return x, y, z
 
 
-def states_of(segments: Sequence[Segment], where: NDArray[np.int64],
+def states_of(segments: Sequence[Segment], counts: Sequence[int],
               times_ns: NDArray[np.int64]) -> States:
-    """Return the states in the world in segments of one kind, at time i in that of `where[i]`."""
+    """Return the states in the world in segments of one kind, in each at so many times [ns]."""
     motions, rides = [], []
     for segment in segments:
         assert isinstance(segment.solver, AcceleratedMotion) and segment.ride
         motions.append(segment.solver)
         rides.append(segment.ride)
-    since_ns = times_ns - np.array([segment.start_ns for segment in segments])[where]
-    x, y, z, w = np.hstack([ride.vertical.rows for ride in rides])[:, where]
-    return WorldStates(rides[0].top, chained(motions, where, since_ns), (x, y, z, w))
+    since_ns = times_ns - np.repeat([segment.start_ns for segment in segments], counts)
+    x, y, z, w = np.repeat(np.hstack([ride.vertical.rows for ride in rides]), counts, axis=1)
+    return WorldStates(rides[0].top, chained(motions, counts, since_ns), (x, y, z, w))
 
 
 class Path:

@@ -59,7 +59,7 @@ class Samples:
     def states(self) -> States:
         if len(self.parts) == 1:
             return self._segments[0].states(self.times)
-        return states_of(self._segments, self._where, self.t_ns)
+        return states_of(self._segments, self._counts, self.t_ns)
 
     @cached_property
     def pivot(self) -> Kinematics:
@@ -67,11 +67,7 @@ class Samples:
         if len(self.parts) == 1:
             return self._segments[0].pivot(self.t_ns)
         return kinematics([segment.ride.piece for segment in self._segments if segment.ride],
-                          self._where, self.t_ns)
-
-    @cached_property
-    def _where(self) -> NDArray[np.int64]:
-        return np.repeat(np.arange(len(self.parts)), self._counts)
+                          self._counts, self.t_ns)
 
     def at_start(self, name: str) -> NDArray[np.float64]:
         """Return a constant of the motion, (n,), as it is at the start of each segment."""
