@@ -29,9 +29,8 @@ from pathlib import Path
 from spinning_top_sim.exam.adapters import FILTERS
 from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.trial import INTERRUPTED, Filter, NodeError
+from spinning_top_sim.exam.trial import INTERRUPTED, Filter
 from spinning_top_sim.installation import needed
-from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli, scene_file
 
 NORTHS = 'true', 'magnetic'
@@ -42,7 +41,7 @@ OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('examine', __doc__, argv, add_arguments, _run, (LogError, NodeError))
+    return cli.run('examine', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

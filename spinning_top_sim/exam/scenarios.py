@@ -162,7 +162,7 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
         'mag.field': FIELD, **given, **scenario.values, 'imu.rate': scenario.rate})
     values['mag.field'] = magnetic(values['mag.field'])
     simulation = Simulation(values)
-    device, period_ns = simulation.imu, simulation.imu.intervals.length_ns
+    device, period_ns = simulation.imu, simulation.imu.length_ns
     magnetometer = Magnetometer(values, period_ns)
     parts, begin_ns = [], 0
     for end in (*scenario.reversals, scenario.duration):

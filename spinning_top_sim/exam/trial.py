@@ -53,7 +53,7 @@ class InvalidOutputError(Exception):
     """The filter raised an error or returned something invalid; the text is one line."""
 
 
-class NodeError(Exception):
+class NodeError(RuntimeError):
     """A node cannot be examined; the text says why, and what to check."""
 
 

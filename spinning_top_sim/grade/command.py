@@ -25,12 +25,10 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.files import trajectory_of
-from spinning_top_sim.grade.fit import Fit, fit
+from spinning_top_sim.grade.fit import Fit, far_start, fit, start_of
 from spinning_top_sim.grade.grader import grade_trajectory
 from spinning_top_sim.grade.scenes import Body
-from spinning_top_sim.grade.start import near_start, start_of
 from spinning_top_sim.physics.top import State
-from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, motion_files, scene_file
@@ -40,7 +38,7 @@ DENSITIES = 'gyroscope_noise_density', 'accelerometer_noise_density'
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('grade', __doc__, argv, add_arguments, _run, (LogError,))
+    return cli.run('grade', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -104,7 +102,7 @@ def _motion(arguments: argparse.Namespace,
             fitted = replace(fitted, **vars(top))
             start = start_of(found, recorded.parts, top)
         return fitted, start, found
-    if off := near_start(recorded.parts, top, start):
+    if off := far_start(recorded.parts, top, start):
         raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
                          '--fit finds top and start')
     return body, start, None

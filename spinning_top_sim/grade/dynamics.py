@@ -23,9 +23,9 @@ UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
 EXPLAINED = 0.25    # of the discrepancy is left at most
 
 
-def faults_of(motions: Sequence[Motion], rates: Sequence[Reals], dt: float) -> list[Fault]:
-    """Return the causes of the error of motions; rates as `sensors.rates_of` returns them."""
-    blocks = [_terms(motion, w, dt) for motion, w in zip(motions, rates, strict=True)]
+def faults_of(motions: Sequence[Motion], dt: float) -> list[Fault]:
+    """Return the causes of the error of motions."""
+    blocks = [_terms(motion, dt) for motion in motions]
     # Motions count the same, unless what is not explained is small there.
     sizes = [rms(target) for target, _ in blocks]
     weights = [1.0 / max(size, 0.1 * max(sizes), UNIMPORTANT) for size in sizes]
@@ -38,18 +38,18 @@ def faults_of(motions: Sequence[Motion], rates: Sequence[Reals], dt: float) -> l
     body = motions[0].body
     if max(sizes) < UNIMPORTANT:
         return []
-    found = explain(target, [
+    faults, residual = explain(target, [
         Cause([gyroscopic], _gyroscopic), Cause([gyroscopic_step, gravity_step], _step),
         Cause([gyroscopic, in_world], instead('inertia_frame', 'the gyroscopic term is that of '
                                               'moments of inertia about axes of the world')),
         Cause([damping, axis_damping], _damping), Cause(arms, lambda found: _com(body, found)),
         Cause(euler, lambda found: _inertia(body, found))])
-    return found.faults if found.left < EXPLAINED else []
+    return faults if rms(residual) < EXPLAINED * rms(target) else []
 
 
-def _terms(motion: Motion, w: Reals, dt: float) -> tuple[Reals, Reals]:
+def _terms(motion: Motion, dt: float) -> tuple[Reals, Reals]:
     """Return the angular acceleration that is not explained (N, 3), and its causes (N, k, 3)."""
-    body, step = motion.body, motion.trajectory.step
+    body, step, w = motion.body, motion.trajectory.step, motion.rates
     rotation = motion.trajectory.rotation[MARGIN:-MARGIN]
     z = rotation.inv().apply((0.0, 0.0, 1.0))
     inertia = np.array(body.inertia)

@@ -8,6 +8,7 @@ long, so that no phase is ever off by half a turn.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.grade import guess
 from spinning_top_sim.grade import problem as unknowns
 from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Readings, turned
-from spinning_top_sim.grade.scenes import Body, Reals
+from spinning_top_sim.grade.scenes import Body, Reals, Start
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -42,6 +43,8 @@ ONCE_IN = 1000.0            # noise that is called a residue of the motion
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
+BEGIN = 64                  # attitudes that tell the start of a known top, whatever follows
+OFF = 0.1                   # rad, or share of the rates: another start
 
 
 @dataclass(frozen=True)
@@ -141,19 +144,24 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     ValueError
         If there are too few attitudes, no readings, or no motion of a top comes near.
     """
-    one, begin = attitudes_of(parts)
-    trials = []
-    for trial in _trials(one, parts, gravity):
-        trials.append(trial)
-        if trial.explained:         # another guess finds the same
-            break
+    one, begin = _attitudes_of(parts)
+    (first, sure, _), trials = _first_values(one, _told(parts)), []
+    axis = np.stack(attitude.axis_in_world(tuple(one.values)))
+    small = [(0, *pair) for pair in guess.small_nutation(one.times, axis)]
+    for size, l3, p in ((FIRST, first[SPIN], 0.0), *small[:4], (4 * FIRST, first[SPIN], 0.0)):
+        first[[L3, P]] = l3, p
+        with contextlib.suppress(ValueError):       # no motion begins so
+            trials.append(_fit_from(one, first, size, gravity))
+            if trials[-1].explained:                # another guess finds the same
+                break
     if not trials:
         raise ValueError('no motion of a top comes near the attitudes')
     best = min(trials, key=lambda trial: trial.residual)
+    if not sure:
+        _add_turns(best.x, one.times)
     best.problem.readings = [replace(one, sigma=max(best.residual, 1e-15))]
     if best.reached:
-        # lambda3 = lambda1 if there is no nutation that would tell L3 and P.
-        at, frozen = without_unseen_nutation(best.problem, best.x, best.residual, settle=True)
+        at, frozen = _without_unseen_nutation(best.problem, best.x, best.residual)
         free = [k for k in MOTION if k not in frozen]
         best = best._replace(frozen=frozen, x=descend(best.problem, at, free)[0]
                              if frozen else best.x)
@@ -162,16 +170,38 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     return _conclude(best, begin, lambda1, gravity)
 
 
-def first_values(one: Readings, parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Reals, bool]:
-    """Return unknowns with the rates at the begin, and whether whole turns are known."""
-    told = parts.get('rates', parts.get('gyroscope'))
-    spin, sure = guess.spin_rate(one.times, one.values, told and float(np.median(told[1][:, 2])))
-    axis, x = np.stack(attitude.axis_in_world(tuple(one.values))), np.zeros(unknowns.UNKNOWNS)
-    x[unknowns.RATES] = (*guess.transverse_rates(one.times, one.values, axis)[:2], spin)
-    return x, sure
+def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> State:
+    """Return the start of a known top: the fitted one, or if none was found that of the begin."""
+    if found.reached:
+        start = Start.of(found.top, found.start)
+        return Start(start.attitude, start.rates).state_of(top)
+    one, _ = _attitudes_of(parts)
+    first = replace(one, times=one.times[:BEGIN], values=one.values[:, :BEGIN])
+    problem = Problem([first], one.values[:, 0], top.gravity)
+    x, _, _ = _first_values(one, _told(parts))
+    x[P] = top.gravity_torque / top.lambda1
+    for _ in range(3):
+        x[L3] = top.lambda3 / top.lambda1 * x[SPIN]
+        x, _ = descend(problem, x, MOTION[:6])
+    _, state = problem.start(x)
+    return replace(state, l3=state.l3 * top.lambda1, lz=state.lz * top.lambda1)
 
 
-def attitudes_of(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
+def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) -> str:
+    """Return how far the attitudes are from a start at t = 0, '' if they are near it."""
+    one, begin = _attitudes_of(parts)
+    right = ExactSolution(top, start).states_at_seconds(np.array([begin]))
+    apart = float(attitude.angle_between(right.rows_quaternion, tuple(one.values[:, :1]))[0])
+    x, _, error = _first_values(one, right.angular_velocity)
+    off, noise = float(np.linalg.norm(x[unknowns.RATES] - right.angular_velocity)), 6.0 * error
+    if (apart <= OFF + noise * one.times[1]
+            and off <= OFF * np.linalg.norm(right.angular_velocity) + noise):
+        return ''
+    return (f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates '
+            f'{off:.3g} rad/s')
+
+
+def _attitudes_of(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
     """Return attitudes from t = 0 on, and the time of the first."""
     times, attitudes = parts['attitudes']
     if len(times) < FEWEST:
@@ -180,43 +210,41 @@ def attitudes_of(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, fl
     return Readings('attitude', times - times[0], np.ascontiguousarray(q)), float(times[0])
 
 
-def _trials(one: Readings, parts: Mapping[str, tuple[Reals, Reals]],
-            gravity: float) -> Iterator[_Trial]:
-    """Yield fits from one guess after another."""
-    times, q = one.times, one.values
-    axis = np.stack(attitude.axis_in_world(tuple(q)))
-    first, sure = first_values(one, parts)
-    weak, small = guess.weak(times, axis), list(guess.small_nutation(times, axis))
-    seeds = [*weak[:1], *((0, *pair) for pair in small[:4]), *weak[1:2]]
-    for size, l3, p in seeds:
-        x = first.copy()
-        x[L3], x[P] = l3, p
-        try:
-            trial = _fit_from(one, x, size, gravity)
-        except ValueError:          # no motion begins so
-            continue
-        if not sure:
-            _add_turns(trial.x, times)
-        yield trial
+def _told(parts: Mapping[str, tuple[Reals, Reals]]) -> Reals | None:
+    """Return rates (n, 3) or readings of a gyroscope, None if there are none."""
+    _, told = parts.get('rates', parts.get('gyroscope', (None, None)))
+    return told
+
+
+def _first_values(one: Readings, told: Reals | None) -> tuple[Reals, bool, float]:
+    """Return unknowns with the first rates, whether whole turns are known, and the error."""
+    spin, sure = guess.spin_rate(one.times, one.values,
+                                 None if told is None else float(np.median(told[:, 2])))
+    axis, x = np.stack(attitude.axis_in_world(tuple(one.values))), np.zeros(unknowns.UNKNOWNS)
+    *across, error = guess.transverse_rates(one.times, one.values, axis)
+    x[unknowns.RATES] = (*across, spin)
+    return x, sure, error
 
 
 def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
-    """Fit longer and longer parts; L3 and P beyond 2 `size` attitudes, with 0 in the last."""
+    """Fit longer and longer parts from `size` attitudes on; with 0, L3 and P in the last only."""
     problem = Problem([one], one.values[:, 0], gravity)
-    done, growth, level, last = FIRST / GROWTH, GROWTH, math.inf, len(one.times)
+    done, growth, level, last = (size or FIRST) / GROWTH, GROWTH, math.inf, len(one.times)
     converged = False
     while done < last:
         count = min(math.ceil(done * growth), last)
         chosen = slice(0, count, math.ceil(count / ENOUGH) if count < last else 1)
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
-        free = MOTION if count == last or 0 < 2 * size < count else MOTION[:6]
+        free = MOTION if size or count == last else MOTION[:6]
         precisely = (30, 1e-8) if count == last else (8, 1e-3)
         found, converged = descend(problem, x, free, *precisely)
         left = float(np.std(problem.residuals(found)))
         if left > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
             growth = math.sqrt(growth)
-        else:
-            x, done, level, growth = found, count, left, min(growth * growth, GROWTH)
+            continue
+        x, done, level, growth = found, count, left, min(growth * growth, GROWTH)
+        if left > LARGEST:          # no motion of a top
+            break
     rest = problem.residuals(x).reshape(3, -1)
     residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
     noise, white = whiteness(rest)
@@ -264,10 +292,11 @@ def _add_turns(x: Reals, times: Reals) -> None:
     A spin that is faster by whole turns between evenly spaced attitudes passes through them all.
     """
     step = float(times[-1]) / (len(times) - 1)
+    sign, turn = math.copysign(1.0, x[L3]), math.tau / step
+    spin = sign * x[SPIN]
     if np.max(np.abs(np.diff(times) - step)) < 1e-5 * step and not (
-            0.0 < x[L3] <= 2.02 * x[SPIN] or 0.0 > x[L3] >= 2.02 * x[SPIN]):
-        sign, turn = math.copysign(1.0, x[L3]), math.tau / step
-        x[SPIN] += sign * turn * math.ceil((0.5 * abs(x[L3]) - sign * x[SPIN]) / turn)
+            0.0 < abs(x[L3]) <= 2.02 * spin):
+        x[SPIN] += sign * turn * math.ceil((0.5 * abs(x[L3]) - spin) / turn)
 
 
 def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: float) -> _Trial:
@@ -279,7 +308,7 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
         streams.append(Readings(kind, parts[name][0] - begin,
                                 np.ascontiguousarray(parts[name][1].T)))
     (one,), problem.readings = problem.readings, streams[:1]
-    model = problem.rates(x, streams[0].times)
+    _, model = problem.motion(x, streams[0])
     problem.mounting = Rotation.align_vectors(model.T, streams[0].values.T)[0].as_quat()
     for stream, own in zip(streams, ((8, 9, 10, unknowns.LATE), (11, 12, 13)), strict=True):
         problem.readings = [stream]
@@ -306,7 +335,7 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     free = [*MOTION, *SENSOR] if len(problem.readings) > 1 else [*MOTION]
     rate = float(max(np.linalg.norm(x[unknowns.RATES]), abs(x[L3]), math.sqrt(abs(x[P]))))
     sizes = np.array([1.0] * 3 + [rate] * 4 + [rate * rate] + [1.0] * 6 + [1.0 / rate])[free]
-    at, frozen = without_unseen_nutation(problem, x, trial.residual)
+    at, frozen = _without_unseen_nutation(problem, x, trial.residual)
     problem.jacobian(at, free)          # sets the steps
     jacobian = problem.jacobian(at, free, central=True) * sizes
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
@@ -344,15 +373,13 @@ def _not_told(names: Sequence[str], values: Reals, deviations: Reals,
     yield 'the scale of lambda1, lambda3, mass, L3 and Lz'
 
 
-def without_unseen_nutation(problem: Problem, x: Reals, residual: float,
-                            settle: bool = False) -> tuple[Reals, tuple[int, ...]]:
+def _without_unseen_nutation(problem: Problem, x: Reals,
+                             residual: float) -> tuple[Reals, tuple[int, ...]]:
     """
-    Return the steady or sleeping motion next to one whose nutation may be noise.
+    Return the steady or sleeping motion with lambda3 = lambda1 next to one whose nutation may be
+    noise, and the unknowns that such a motion does not tell.
 
-    settle : with lambda3 = lambda1
-
-    Returns the unknowns, and those of them that such a motion does not tell: () if the nutation
-    is none of noise, and the unknowns are as they were.
+    If the nutation is not noise, the unknowns are returned as they are, and ().
     """
     motion = ExactSolution(*problem.start(x))
     low, high = motion.theta_min, motion.theta_max
@@ -367,7 +394,7 @@ def without_unseen_nutation(problem: Problem, x: Reals, residual: float,
     x = x.copy()
     x[unknowns.TURN] = (Rotation.from_quat(problem.reference).inv() * q).as_rotvec()
     x[unknowns.RATES] = (*(rate * q.inv().apply((0.0, 0.0, 1.0))[:2]), x[SPIN])
-    x[L3] = x[SPIN] if settle else x[L3]
+    x[L3] = x[SPIN]
     x[P] = x[L3] * rate - rate * rate * math.cos(theta)
     return x, (L3, P) if upright else (L3,)
 

@@ -146,26 +146,21 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
     """Return the report on these motions, and orders of convergence by the name of the scene."""
     if not motions:
         return Report(subject, faults, {})
-    rates, more = sensors.rates_of(motions)
-    faults += more
-    marks = {f'{name}: {motion.name}': value for motion, w in zip(motions, rates, strict=True)
-             for name, value in motion.marks(w).items()}
+    faults += sensors.faults_of_rates(motions)
+    marks = {f'{name}: {motion.name}': value for motion in motions
+             for name, value in motion.marks.items()}
     marks.update({f'order: {name}': order for name, order in orders.items()})
-    kinematic = any(fault.name == 'rates_scale' for fault in more)
-    faults += _motion_faults(motions, rates, orders, dt, tolerance, kinematic)
-    faults += list(_energy_fault(motions[0], rates[0]))
-    derived = rates[0] is motions[0].rates
+    kinematic = any(fault.name == 'rates_scale' for fault in faults)
+    faults += _motion_faults(motions, orders, dt, tolerance, kinematic)
+    faults += _energy_fault(motions[0])
     for kind in sensors.KINDS:
-        runs = [one for motion, w in zip(motions, rates, strict=True)
-                if (one := sensors.readings_of(kind, motion, w)) is not None]
-        if runs:
-            more, found = sensors.judge(kind, runs, motions[0], derived)
-            faults, marks = [*faults, *more], {**marks, **found}
+        more, found = sensors.judge(kind, motions)
+        faults, marks = [*faults, *more], {**marks, **found}
     return Report(subject, faults, marks)
 
 
-def _motion_faults(motions: Sequence[Motion], rates: Sequence[Reals], orders: Mapping[str, float],
-                   dt: float, tolerance: float, kinematic: bool) -> Iterator[Fault]:
+def _motion_faults(motions: Sequence[Motion], orders: Mapping[str, float], dt: float,
+                   tolerance: float, kinematic: bool) -> Iterator[Fault]:
     """Yield what is wrong with the motions; `kinematic`: a fault of the rates explains it."""
     worst = max(motions, key=lambda motion: motion.worst)
     if worst.worst <= tolerance:
@@ -175,21 +170,20 @@ def _motion_faults(motions: Sequence[Motion], rates: Sequence[Reals], orders: Ma
     if first:
         name, order = next(iter(first.items()))
         yield Fault('first_order', f'{text}; {name}: the error falls as dt^{order:.2f}', order)
-    causes = [fault for fault in dynamics.faults_of(motions, rates, dt)
+    causes = [fault for fault in dynamics.faults_of(motions, dt)
               if not (first and fault.name == 'first_order')]
     yield from (fault._replace(evidence=f'{text}; {fault.evidence}') for fault in causes)
     if not (first or causes or kinematic):
         yield Fault('inaccurate', text, math.degrees(worst.worst))
 
 
-def _energy_fault(motion: Motion, w: Reals) -> Iterator[Fault]:
+def _energy_fault(motion: Motion) -> Iterator[Fault]:
     """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
     if motion.trajectory.energy is None:
         return
-    data, torque = motion.data(w), motion.body.gravity_torque
-    energy, _, _ = data.constants(motion.body) or (0.0, 0.0, 0.0)
+    energy, _, _ = motion.data.constants(motion.body) or (0.0, 0.0, 0.0)
     off = float(np.ptp(motion.trajectory.energy[MARGIN:-MARGIN] - energy))
-    share = off / (float(np.ptp(torque * data.height)) or 1.0)
+    share = off / (float(np.ptp(motion.body.gravity_torque * motion.data.height)) or 1.0)
     if share > WRONG_ENERGY:
         yield Fault('energy', f'{motion.name}: the energy told differs from that of attitude and '
                     f'rates by up to {100.0 * share:.3g} % of the change of the potential energy',

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""First values of the fit, from attitudes alone or with rates: balance laws that are linear."""
+"""First values of the fit, from attitudes alone or with rates."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
@@ -33,62 +32,6 @@ def spin_rate(times: Reals, q: Reals, hint: float | None) -> tuple[float, bool]:
     rate += math.tau / step * round(turns) if sure else 0.0
     rest = np.remainder(turn - rate * dt + math.pi, math.tau) - math.pi
     return rate + float(np.sum(rest) / np.sum(dt)), sure
-
-
-def weak(times: Reals, axis: Reals) -> list[tuple[int, float, float]]:
-    """
-    Return estimates (samples, L3/lambda1, P/lambda1), the best determined first.
-
-    The balance of angular momentum over lambda1, (L3 n + n x n')' = P z x n with the axis n, is
-    multiplied by functions of compact support and integrated by parts: no derivative of a reading
-    is left, and a and P are linear in it.  Odd samples are the instruments of even ones, which
-    removes the bias by noise in the regressors.
-    """
-    found = []
-    size = 12
-    while size <= len(times) // 2:
-        halves = [_balance(times[first::2], axis[:, first::2], size // 2) for first in (0, 1)]
-        rows = min(len(half) for half in halves)
-        (a, y), (b, _) = ((half[:rows, :2], half[:rows, 2]) for half in halves)
-        scale = np.linalg.norm(a, axis=0) + 1e-300
-        normal = (b / scale).T @ (a / scale)
-        solution = np.linalg.lstsq(normal, (b / scale).T @ y, rcond=1e-12)[0]
-        rest = y - a / scale @ solution
-        with np.errstate(all='ignore'):
-            spread = np.linalg.pinv(normal) @ ((b / scale).T @ (b / scale)) @ np.linalg.pinv(
-                normal).T * np.mean(rest * rest)
-            error = math.sqrt(abs(float(np.trace(spread)))) / (
-                float(np.linalg.norm(solution)) + 1e-300)
-        l3, p = (solution / scale).tolist()
-        found.append((error, size, l3, p))
-        size = math.ceil(1.5 * size)
-    return [(size, l3, p) for _, size, l3, p in sorted(found)]
-
-
-def _balance(times: Reals, axis: Reals, size: int) -> Reals:
-    """Return the integrals (rows, 3) of the balance against bumps of `size` samples."""
-    stride = max(1, size // 4)
-    t = sliding_window_view(times, size)[::stride]
-    n = sliding_window_view(axis, size, axis=1)[:, ::stride]
-    begin, end = t[:, :1], t[:, -1:]
-    half = 0.5 * (end - begin)
-    weights = np.gradient(t, axis=1)
-
-    def bump(at: Reals) -> tuple[Reals, Reals]:
-        s = (at - begin) / half - 1.0
-        return (1.0 - s * s) ** 3, -6.0 * s * (1.0 - s * s) ** 2 / half
-
-    value, slope = bump(t)
-    _, middle = bump(0.5 * (t[:, 1:] + t[:, :-1]))
-    turned = np.cross(n[:, :, :-1], n[:, :, 1:], axis=0)
-    sine = np.linalg.norm(turned, axis=0)
-    cosine = np.sum(n[:, :, :-1] * n[:, :, 1:], axis=0)
-    turned = turned * np.arctan2(sine, cosine) / np.where(sine > 1e-12, sine, 1.0)
-    torque = np.stack((-n[1], n[0]))
-    return np.stack([np.concatenate(part) for part in (
-        np.sum(slope * weights * n, axis=2), (*np.sum(value * weights * torque, axis=2),
-                                              np.zeros(len(t))),
-        -np.sum(middle * turned, axis=2))], axis=1)
 
 
 def small_nutation(times: Reals, axis: Reals) -> Iterator[tuple[float, float]]:

@@ -39,21 +39,19 @@ def errors_of(rotation: Rotation, truth: Rotation) -> dict[str, Reals]:
             'nutation': tilts[0] - tilts[1], 'spin': np.unwrap(2.0 * np.arctan2(z, w))}
 
 
-def derivative(values: Reals, step: float) -> Reals:
-    """Return the derivative of rows (n, k) at all samples but `MARGIN` at each end."""
-    n = len(values) - 2 * MARGIN
-    total: Reals = sum(weight * values[at:at + n] for at, weight in enumerate(_WEIGHTS) if weight)
-    return total / step
-
-
-@dataclass(frozen=True)
+@dataclass
 class Motion:
-    """A motion of a scene, and the exact one that starts in the same state."""
+    """
+    A motion of a scene, and the exact one that starts in the same state.
+
+    told : rates (n, 3) that the simulator tells, where they are right
+    """
 
     name: str
     body: Body
     start: Start
     trajectory: Trajectory
+    told: Reals | None = None
 
     @cached_property
     def solution(self) -> ExactSolution:
@@ -74,10 +72,15 @@ class Motion:
         """Largest error of the attitude [rad]."""
         return float(np.max(self.errors['total']))
 
-    @cached_property
+    @property
     def rates(self) -> Reals:
+        """Body rates at all samples but `MARGIN` at each end (n - 6, 3): told, or `derived`."""
+        return self.derived if self.told is None else self.told[MARGIN:-MARGIN]
+
+    @cached_property
+    def derived(self) -> Reals:
         """
-        Body rates at all samples but `MARGIN` at each end, from the attitudes (n - 6, 3).
+        Body rates from the attitudes.
 
         What is differentiated is the rotation from the exact attitudes, which turns slowly.
         """
@@ -88,29 +91,34 @@ class Motion:
                            for at, weight in enumerate(_WEIGHTS) if weight)
         return total / self.trajectory.step + here.apply(self.truth.angular_velocity[inner])
 
-    def accelerations(self, rates: Reals) -> Reals:
-        """Return angular accelerations (n - 12, 3), given rates as `rates` has them."""
-        inner, twice = slice(MARGIN, -MARGIN), slice(2 * MARGIN, -2 * MARGIN)
-        return (derivative(rates - self.truth.angular_velocity[inner], self.trajectory.step)
-                + self.truth.angular_acceleration[twice])
+    @property
+    def accelerations(self) -> Reals:
+        """Angular accelerations (n - 12, 3)."""
+        inner, n = slice(MARGIN, -MARGIN), len(self.trajectory.t) - 4 * MARGIN
+        off = self.rates - self.truth.angular_velocity[inner]
+        total: Reals = sum(weight * off[at:at + n] for at, weight in enumerate(_WEIGHTS) if weight)
+        return (total / self.trajectory.step
+                + self.truth.angular_acceleration[2 * MARGIN:-2 * MARGIN])
 
-    def data(self, rates: Reals) -> Attitudes:
-        """Return attitudes and rates, given rates as `rates` has them."""
+    @property
+    def data(self) -> Attitudes:
+        """Attitudes and rates."""
         part = self.trajectory.attitudes[MARGIN:-MARGIN, [1, 2, 3, 0]]
         stamps = np.rint(1e9 * self.trajectory.t[MARGIN:-MARGIN]).astype(np.int64)
-        return Attitudes(stamps, np.vstack((part.T, rates.T)))
+        return Attitudes(stamps, np.vstack((part.T, self.rates.T)))
 
-    def marks(self, rates: Reals) -> dict[str, float]:
-        """Return the measures, given rates as `rates` has them; docs/grade.md defines them."""
+    @property
+    def marks(self) -> dict[str, float]:
+        """The measures; docs/grade.md defines them."""
         marks = {f'{name}_error_deg': math.degrees(float(np.max(np.abs(values))))
                  for name, values in self.errors.items()}
-        first, data = self.solution.states_at_seconds(np.zeros(1)), self.data(rates)
-        for name, values in zip(('energy', 'l3', 'lz'), data.constants(self.body) or (),
+        first = self.solution.states_at_seconds(np.zeros(1))
+        for name, values in zip(('energy', 'l3', 'lz'), self.data.constants(self.body) or (),
                                 strict=True):
             marks[f'{name}_drift'] = float(np.max(np.abs(relative_drift(
                 values, float(getattr(first, name)[0])))))
         exact = self.solution.describe()
-        found = measure(data, exact.nutation_period)
+        found = measure(self.data, exact.nutation_period)
         for name in ('nutation_period', 'mean_precession_rate'):
             value, right = getattr(found, name), getattr(exact, name)
             marks[f'{name}_error'] = value / right - 1.0 if value and right else math.nan

@@ -10,14 +10,13 @@ L3/lambda1 and P/lambda1; and of an IMU its mounting, its place and how late its
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from spinning_top_sim.grade.scenes import Reals
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.placement import state_of
-from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
@@ -41,12 +40,14 @@ class Readings:
     times : (n,), ascending [s]
     values : (4, n) or (3, n), [rad/s] or [m/s^2]
     sigma : standard deviation of a component
+    motions : attitudes (4, n) and rates (3, n) of the last unknowns
     """
 
     kind: str
     times: Reals
     values: Reals
     sigma: float = 1.0
+    motions: dict[bytes, tuple[Reals, Reals]] = field(default_factory=dict, init=False)
 
 
 class Problem:
@@ -57,13 +58,10 @@ class Problem:
         rotations count, as x, y, z, w
     """
 
-    def __init__(self, readings: Sequence[Readings], reference: Reals, gravity: float,
-                 mounting: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> None:
+    def __init__(self, readings: Sequence[Readings], reference: Reals, gravity: float) -> None:
         self.readings, self.reference, self.gravity = readings, reference, gravity
-        self.mounting = mounting
+        self.mounting: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
         self._steps = np.full(UNKNOWNS, 1e-6)
-        self._seen: dict[
-            tuple[object, ...], tuple[tuple[States, Reals, Reals], Reals]] = {}
 
     def start(self, x: Reals) -> tuple[Top, State]:
         """Return top and state with lambda1 = lambda3 = 1: its spin is L3, not omega_3."""
@@ -86,50 +84,41 @@ class Problem:
             step = np.zeros(UNKNOWNS)
             step[k] = self._steps[k]
             ahead = self.residuals(x + step)
-            behind = self.residuals(x - step) if base is None else base
-            columns.append((ahead - behind) / ((1.0 if central is False else 2.0) * step[k]))
+            change = 0.5 * (ahead - self.residuals(x - step)) if base is None else ahead - base
+            columns.append(change / step[k])
             largest = float(np.max(np.abs(columns[-1]))) * sigma
             self._steps[k] = min(max(CHANGE / max(largest, 1e-300), 1e-12), 1e-4)
         return np.stack(columns, axis=1)
 
-    def rates(self, x: Reals, times: Reals) -> Reals:
-        """Return the angular velocity in the body (3, n) at the times of readings of an IMU."""
-        return self._motion(x, times, float(x[LATE]))[2]
-
     def residual(self, x: Reals, one: Readings) -> Reals:
         """Return readings - model (3, n)."""
-        late = 0.0 if one.kind == 'attitude' else float(x[LATE])
-        states, q, w = self._motion(x, one.times, late)
+        q, w = self.motion(x, one)
         if one.kind == 'attitude':
             a, b, c, d = q
-            x1, y1, z1, w1 = attitude.product((-a, -b, -c, d), tuple(one.values))
-            sign = np.where(w1 < 0.0, -1.0, 1.0)
-            return np.stack(attitude.rotation_vector((sign * x1, sign * y1, sign * z1, sign * w1)))
+            turn = np.stack(attitude.product((-a, -b, -c, d), tuple(one.values)))
+            return np.stack(attitude.rotation_vector(tuple(np.where(turn[3] < 0.0, -turn, turn))))
         model = w if one.kind == 'rates' else self._force(x, q, w)
         return one.values - np.stack(attitude.in_body(
             turned(self.mounting, x[MOUNTING]), tuple(model)))
 
-    def _motion(self, x: Reals, times: Reals, late: float) -> tuple[States, Reals, Reals]:
-        """Return states, and attitudes (4, n) and angular velocities (3, n) of the true spin."""
-        key = (x[:8].tobytes(), late, id(times))
-        if key not in self._seen:
-            if len(self._seen) > 2:
-                self._seen.pop(next(iter(self._seen)))      # the oldest
-            t = times - late
+    def motion(self, x: Reals, one: Readings) -> tuple[Reals, Reals]:
+        """Return attitudes (4, n), and for an IMU rates in the body (3, n), at its times."""
+        late = 0.0 if one.kind == 'attitude' else float(x[LATE])
+        key = x[:8].tobytes() + np.float64(late).tobytes()
+        if key not in one.motions:
+            if len(one.motions) > 1:
+                one.motions.pop(next(iter(one.motions)))        # the older one
+            t = one.times - late
             states = ExactSolution(*self.start(x)).states_at_seconds(t)
-            angle = (x[SPIN] - x[L3]) * t
-            sine, cosine = np.sin(0.5 * angle), np.cos(0.5 * angle)
-            qx, qy, qz, qw = states.rows_quaternion
-            q = np.stack((qx * cosine + qy * sine, qy * cosine - qx * sine,
-                          qz * cosine + qw * sine, qw * cosine - qz * sine))
-            w = np.empty((3, 0))
-            if any(one.kind != 'attitude' and one.times is times for one in self.readings):
+            angle, zero = (x[SPIN] - x[L3]) * t, np.zeros(1)
+            q = np.stack(attitude.product(states.rows_quaternion, (
+                zero, zero, np.sin(0.5 * angle), np.cos(0.5 * angle))))
+            w = np.full((3, len(t)), x[SPIN])
+            if one.kind != 'attitude':
                 (w1, w2), sine, cosine = states.transverse_velocity, np.sin(angle), np.cos(angle)
-                w = np.stack((cosine * w1 + sine * w2, cosine * w2 - sine * w1,
-                              np.full(len(t), x[SPIN])))
-            # With the times, whose identity nothing else has as long as they are kept.
-            self._seen[key] = (states, q, w), times
-        return self._seen[key][0]
+                w[:2] = cosine * w1 + sine * w2, cosine * w2 - sine * w1
+            one.motions[key] = q, w
+        return one.motions[key]
 
     def _force(self, x: Reals, q: Reals, w: Reals) -> Reals:
         """Return the specific force at the IMU, as `States.specific_force` for its own spin."""
@@ -144,6 +133,6 @@ class Problem:
 
 def turned(reference: Sequence[float] | Reals, vector: Reals) -> attitude.Quaternion:
     """Return the attitude after a rotation vector in the body, components (1,)."""
-    a, b, c, d = (np.array([part]) for part in reference)
-    x, y, z = (np.array([part]) for part in vector)
+    a, b, c, d = np.reshape(reference, (4, 1))
+    x, y, z = np.reshape(vector, (3, 1))
     return attitude.product((a, b, c, d), attitude.quaternion_of_vector((x, y, z)))

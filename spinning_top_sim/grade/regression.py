@@ -40,26 +40,22 @@ def instead(name: str, evidence: str) -> Judge:
     return judge
 
 
-class Explained(NamedTuple):
-    """Faults that explain a discrepancy, what is left of it (N, 3), and its share of the rms."""
-
-    faults: list[Fault]
-    residual: Reals
-    left: float
-
-
-def explain(target: Reals, causes: Sequence[Cause], floor: float = 0.0) -> Explained:
+def explain(target: Reals, causes: Sequence[Cause],
+            floor: float = 0.0) -> tuple[list[Fault], Reals]:
     """
     Explain a discrepancy (N, 3) by causes, the best one first.
 
     floor : rms of the noise in the target
+
+    Returns the faults, and what they leave of the discrepancy.
     """
     chosen: list[Cause] = []
     residual, fitted = target, np.empty(0)
     enough = max(ENOUGH * beyond(target, floor), 0.1 * floor)
     others = [*causes]
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
-        tried = [least_squares(target, _columns(*chosen, one)) for one in others]
+        tried = [least_squares(target, [column for cause in (*chosen, one)
+                                        for column in cause.columns]) for one in others]
         after = [beyond(left, floor) for _, left in tried]
         good = max(AS_GOOD * min(after), 0.02 * before)
         _, left, best = min((len(one.columns), left, k) for k, (one, left) in enumerate(
@@ -70,12 +66,7 @@ def explain(target: Reals, causes: Sequence[Cause], floor: float = 0.0) -> Expla
         chosen.append(others.pop(best))
     ends = np.cumsum([len(one.columns) for one in chosen], dtype=int)[:-1]
     judged = [one.judge(found) for one, found in zip(chosen, np.split(fitted, ends), strict=False)]
-    return Explained([fault for fault in judged if fault is not None], residual,
-                     beyond(residual, floor) / (beyond(target, floor) or 1.0))
-
-
-def _columns(*causes: Cause) -> list[Reals]:
-    return [column for one in causes for column in one.columns]
+    return [fault for fault in judged if fault is not None], residual
 
 
 def least_squares(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:

@@ -8,9 +8,9 @@ The error of the motion does not matter.
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -42,47 +42,36 @@ FORCES = ('accelerations', 'velocities')
 _rate = partial(np.gradient, axis=0)        # change per step of values (m, 3)
 
 
-@dataclass
-class Readings:
+class Readings(NamedTuple):
     """
-    What a sensor reads in one motion, and what it should read.
+    What a sensor reads in one motion, and what it should read, over its `size`.
 
     reading : (n, 3)
-    first : index of the reading that `terms` begin with
-    terms : terms of the right reading by name, (m, k) x 3
-    step : time between samples [s]
-    rotation, mounting : world <- IMU (m), body <- IMU
-    arms : of an accelerometer, the acceleration (m, 3) at 1 m along each axis of the body
-    size, total : rms of the reading, and the sum of the terms (m, 3)
+    first : index of the reading that the effects begin with
+    effects : by name (m, 3): terms of the right reading, their sum `total`, and its change by
+        causes of size 1
+    terms : names of the terms
+    size : rms of the reading
     """
 
     reading: Reals
     first: int
-    terms: Mapping[str, Reals]
-    step: float
-    rotation: Rotation
-    mounting: Rotation
-    arms: Sequence[Reals] = ()
-
-    def __post_init__(self) -> None:
-        self.size, self.total = rms(self.reading) or 1.0, np.sum([*self.terms.values()], axis=0)
+    effects: Mapping[str, Reals]
+    terms: Sequence[str]
+    size: float
 
     def late(self, lag: int) -> tuple[Reals, slice]:
-        """Return the readings `lag` samples after the terms, and the rows of the terms."""
-        m = len(self.total)
-        begin, end = self.first + lag, min(self.first + lag + m, len(self.reading))
+        """Return what is wrong `lag` samples after the effects, and the rows of the effects."""
+        total, begin = self.effects['total'], self.first + lag
+        end = min(begin + len(total), len(self.reading))
         skip = max(0, -begin)
-        return self.reading[begin + skip:end], slice(skip, end - begin)
+        part = slice(skip, end - begin)
+        return self.reading[begin + skip:end] - total[part], part
 
 
-def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
-    """
-    Return the readings of a sensor, None if there are none.
-
-    kind : one of KINDS
-    w : rates (n - 6, 3), as `rates_of` returns them
-    """
-    said, body, inner = motion.trajectory, motion.body, slice(MARGIN, -MARGIN)
+def _readings_of(kind: str, motion: Motion) -> Readings | None:
+    """Return the readings of a sensor, None if there are none."""
+    said, body, inner, w = motion.trajectory, motion.body, slice(MARGIN, -MARGIN), motion.rates
     reading: Reals | None = getattr(said, 'increments' if kind in ('rotations', 'velocities')
                                     else kind)
     if reading is None:
@@ -99,7 +88,7 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
         reading, first = reading[:, :3] / said.step, first + 1
         terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
     else:
-        first, a, w = 2 * MARGIN, motion.accelerations(w), w[inner]
+        first, a, w = 2 * MARGIN, motion.accelerations, w[inner]
         axes = np.eye(3)[:, np.newaxis]
         tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
         arms = tangential + centripetal
@@ -110,107 +99,105 @@ def readings_of(kind: str, motion: Motion, w: Reals) -> Readings | None:
             reading, first = reading[:, 3:] / said.step, first + 1
             arms = 0.5 * (arms[:, :-1] + arms[:, 1:])
             terms = {name: 0.5 * (term[:-1] + term[1:]) for name, term in terms.items()}
-    to_imu, m = mounting.inv().apply, len(next(iter(terms.values())))
-    return Readings(reading, first, {name: to_imu(term) for name, term in terms.items()},
-                    said.step, said.rotation[first:first + m] * mounting, mounting,
-                    [to_imu(arm) for arm in arms])
+    effects = {name: mounting.inv().apply(term) for name, term in terms.items()}
+    effects['total'] = total = sum(effects.values(), np.zeros(1))
+    turn = said.rotation[first:first + len(total)] * mounting
+    effects |= {'step': _rate(total), 'world': (world := turn.apply(total)),
+                'reversed': turn.apply(world)}
+    if kind in FORCES:
+        kinematic = total - effects['gravity']
+        back, forth = turn.inv().apply, turn.apply
+        effects |= {'kinematic': kinematic, 'difference': back(_rate(forth(kinematic))),
+                    'turned': back(_rate(world)) - effects['step'],
+                    'tangential step': _rate(effects['tangential']),
+                    **{f'fixed {k}': 0.0 * total + axis for k, axis in enumerate(np.eye(3))},
+                    **{f'arm {k}': mounting.inv().apply(arm) for k, arm in enumerate(arms)}}
+    size = rms(reading) or 1.0
+    return Readings(reading / size, first, {name: effect / size for name, effect in
+                                            effects.items()}, [*terms], size)
 
 
-def rates_of(motions: Sequence[Motion]) -> tuple[list[Reals], list[Fault]]:
+def faults_of_rates(motions: Sequence[Motion]) -> list[Fault]:
+    """Compare the rates that a simulator tells with its attitudes; mark those that are right."""
+    faults, _ = judge('rates', motions)
+    first = faults[0].name if faults else 'rates_scale'
+    for motion in motions:
+        said = motion.trajectory
+        if said.rates is not None and first in ('rates_scale', 'rates_in_world'):
+            motion.told = (said.rates if first == 'rates_scale' else
+                           said.rotation.inv().apply(said.rates))
+    return faults
+
+
+def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, float]]:
     """
-    Compare the rates that a simulator tells with its attitudes.
-
-    Returns body rates (n - 6, 3) of each motion: those told where they are right, or else those of
-    the attitudes; and the faults of those told.
-    """
-    derived = [motion.rates for motion in motions]
-    runs = [one for motion in motions if (one := readings_of('rates', motion, motion.rates))]
-    if not runs:
-        return derived, []
-    faults, _ = judge('rates', runs, motions[0])
-    told = [run.reading[MARGIN:-MARGIN] for run in runs]
-    if not faults or faults[0].name == 'rates_scale':
-        return told, faults
-    if faults[0].name != 'rates_in_world':
-        return derived, faults
-    return [run.rotation.inv().apply(one) for run, one in zip(runs, told, strict=True)], faults
-
-
-def judge(kind: str, runs: Sequence[Readings], motion: Motion,
-          derived: bool = False) -> tuple[list[Fault], dict[str, float]]:
-    """
-    Compare the readings of a sensor in several motions with what they should be.
+    Compare the readings of a sensor, if there are any, with what they should be.
 
     kind : one of KINDS, or 'rates'
-    motion : one of the motions
-    derived : whether the rates are those of the attitudes, which may be half a step apart from
-        those of the simulator
 
     Returns the faults and the measures.
     """
-    lag = 0 if kind == 'velocities' else _lag(runs)
-    parts = [_discrepancy(kind, run, lag) for run in runs]
-    target, effects = _pooled(parts)
-    noise = [_noise(run, lag) for run in runs]
-    floor = rms(np.array(noise) / [run.size for run in runs])
+    runs = [one for motion in motions if (one := _readings_of(kind, motion)) is not None]
+    if not runs:
+        return [], {}
+    said, lag = motions[0].trajectory, 0 if kind == 'velocities' else _lag(runs)
+    target, effects = _pooled(runs, lag, runs[0].effects)
+    noise = np.array([_white(run.late(lag)[0]) for run in runs])
+    sizes, floor = np.array([run.size for run in runs]), rms(noise)
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
     most = floor * math.sqrt(1.05 + 2.0 * doubt)
     before, late = beyond(target, most), lag - _fraction(kind, target, effects)
-    marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(noise)),
+    marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(sizes * noise)),
              f'{kind}_discrepancy': before}
     faults, residual = [], target
     if abs(late) > LATE:
-        faults.append(Fault('imu_one_step_late', f'{kind}: readings belong to the motion of '
-                            f'{late:.3g} steps ({1e3 * late * runs[0].step:.3g} ms) before', late))
-    strange = STRANGE.get(kind, STRANGE_ELSE) + (_half_step(runs) if derived else 0.0)
+        faults.append(Fault('imu_one_step_late', f'readings belong to the motion of {late:.3g} '
+                            f'steps ({1e3 * late * said.step:.3g} ms) before', late))
+    strange = STRANGE.get(kind, STRANGE_ELSE)
+    if motions[0].told is None and kind != 'rates':
+        # Rates of the attitudes may be half a step apart from those of the simulator.
+        turns = (one.trajectory.rotation[:2] for one in motions)
+        strange += 0.25 * max(float((a.inv() * b).magnitude()) ** 2 for a, b in turns)
+    rest = 0.0
     if before > strange:
-        causes = _causes(kind, effects, motion.body)
-        found, residual, _ = explain(target, causes, math.hypot(floor, 0.5 * strange))
-        turned, left = _turned(kind, target, effects['total'])
+        found, residual = explain(target, _causes(kind, effects, motions[0].body),
+                                  math.hypot(floor, 0.5 * strange))
+        turned, left = _turned(target, effects['total'])
         if beyond(left, most) < min(TURNED * before, 0.1 * beyond(residual, most)):
             found, residual = turned, left
         faults += found
         rest = beyond(residual, most)
-        if rest > max(UNEXPLAINED * before, strange):
-            name = 'rates_scale' if kind == 'rates' else 'inconsistent_reading'
-            faults.append(Fault(name, f'{kind}: {100.0 * rest:.3g} % of the reading is not that '
-                                'of the motion', rest))
-            return faults, marks
     scaled = {'units', 'reading_scale'} & {fault.name for fault in faults}
-    if kind in ('gyroscope', 'accelerations') and not scaled:
-        ends = np.cumsum([len(one) for one, _ in parts])[:-1]
-        each = [run.size * one for run, one in zip(
-            runs, np.split(residual, ends), strict=True)]
-        noises = np.concatenate(each)
+    if rest > max(UNEXPLAINED * before, strange):
+        name = 'rates_scale' if kind == 'rates' else 'inconsistent_reading'
+        faults.append(Fault(name, f'{100.0 * rest:.3g} % of the reading is not that of the '
+                            'motion', rest))
+    elif kind in ('gyroscope', 'accelerations') and not scaled:
+        ends = np.cumsum([len(run.late(lag)[0]) for run in runs])[:-1]
+        noises = [size * one for size, one in zip(sizes, np.split(residual, ends), strict=True)]
         # A cause that is found has taken fast motion away, or has left some.
-        level = float(np.mean(np.minimum(noise, [*map(_white, each)])))
-        band = NOISE_BAND + doubt
-        faults += _noise_faults(kind, runs[0], level, motion, band)
-        if NOISY * runs[0].size < level > rms(noises) / (1.0 + band):
-            faults += _shape_fault(kind, noises)
-    return faults, marks
+        level = float(np.mean(np.minimum(sizes * noise, [*map(_white, noises)])))
+        faults += _noise_faults(kind, motions[0], level, level > NOISY * sizes[0],
+                                np.concatenate(noises), NOISE_BAND + doubt)
+    return [fault._replace(evidence=f'{kind}: {fault.evidence}') for fault in faults], marks
 
 
-def _turned(kind: str, target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
+def _pooled(runs: Sequence[Readings], lag: int,
+            names: Iterable[str]) -> tuple[Reals, dict[str, Reals]]:
+    """Return what is wrong in all motions (N, 3), and effects."""
+    targets, parts = zip(*(run.late(lag) for run in runs), strict=True)
+    return np.concatenate(targets), {name: np.concatenate([
+        run.effects[name][part] for run, part in zip(runs, parts, strict=True)]) for name in names}
+
+
+def _turned(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
     """Return the fault that the axes are not those of the IMU, and what it leaves (m, 3)."""
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')     # vectors along one line allow many turns
         turn, _ = Rotation.align_vectors(target + total, total)
     turns = ', '.join(f'{part:.3g}' for part in turn.inv().as_rotvec())
-    return [Fault('mounting', f'{kind}: the readings are in axes that are turned by ({turns}) rad '
-                  'from those of the IMU', turn.magnitude())], target + total - turn.apply(total)
-
-
-def _half_step(runs: Sequence[Readings]) -> float:
-    """Return the share of a reading by which rates half a step apart may change it."""
-    return 0.25 * max(float((run.rotation[0].inv() * run.rotation[1]).magnitude()) ** 2
-                      for run in runs)
-
-
-def _pooled(parts: Sequence[tuple[Reals, dict[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
-    targets, effects = zip(*parts, strict=True)
-    return np.concatenate(targets), {name: np.concatenate([one[name] for one in effects])
-                                     for name in effects[0]}
+    return [Fault('mounting', f'the readings are in axes that are turned by ({turns}) rad from '
+                  'those of the IMU', turn.magnitude())], target + total - turn.apply(total)
 
 
 def _fraction(kind: str, target: Reals, effects: Mapping[str, Reals]) -> float:
@@ -223,21 +210,14 @@ def _fraction(kind: str, target: Reals, effects: Mapping[str, Reals]) -> float:
     return float(fractions[0]) if 1e-6 < rms(target) > 2.0 * rms(left) else 0.0
 
 
-def _shape_fault(kind: str, noise: Reals) -> Iterator[Fault]:
-    kurtosis = float(np.mean(noise ** 4)) / rms(noise) ** 4
-    if kurtosis < LEAST_KURTOSIS:
-        yield Fault('uniform_noise', f'{kind}: the noise has a kurtosis of {kurtosis:.3g}; normal '
-                    'noise has 3, uniform noise 1.8', kurtosis)
-
-
-def _noise_faults(kind: str, run: Readings, noise: float, motion: Motion,
+def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residual: Reals,
                   band: float) -> Iterator[Fault]:
-    """Compare the noise with what is declared; `band`: of the ratio, to either side of 1."""
+    """Compare noise with what is declared and with normal noise; `band`: of the ratio to 1."""
     density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
                motion.body.accelerometer_noise_density)
     covariance = (motion.trajectory.covariance or {}).get(kind)
-    exists, root = noise > NOISY * run.size, math.sqrt(run.step)
-    text = f'{kind}: the noise has a standard deviation of {noise:.4g}'
+    root = math.sqrt(motion.trajectory.step)
+    text = f'the noise has a standard deviation of {noise:.4g}'
     told = math.nan if covariance is None else math.sqrt(abs(np.trace(covariance)) / 3.0)
     if told == 0.0 and exists:
         yield Fault('covariance_zero', f'{text}, its covariance is told as 0', noise)
@@ -250,33 +230,26 @@ def _noise_faults(kind: str, run: Readings, noise: float, motion: Motion,
         as_if = min(factors, key=lambda name: abs(ratio / factors[name] - 1.0))
         named = f' ({as_if})' if abs(ratio / factors[as_if] - 1.0) < band else ''
         yield Fault('noise_scale', f'{text}, {ratio:.4g}{named} times what is declared', ratio)
+    if exists and noise > rms(residual) / (1.0 + band):
+        kurtosis = float(np.mean(residual ** 4)) / rms(residual) ** 4
+        if kurtosis < LEAST_KURTOSIS:
+            yield Fault('uniform_noise', f'the noise has a kurtosis of {kurtosis:.3g}; normal '
+                        'noise has 3, uniform noise 1.8', kurtosis)
 
 
 def _lag(runs: Sequence[Readings]) -> int:
     """Return the number of samples by which readings are late, with any size of their terms."""
     def left(lag: int) -> float:
-        rows, columns = [], []
-        for run in runs:
-            reading, part = run.late(lag)
-            rows.append(reading / run.size)
-            columns.append(np.stack([values[part] / run.size for values in
-                                     (*run.terms.values(), _rate(run.total))]))
-        target = np.concatenate(rows)
-        return rms(least_squares(target, list(np.concatenate(columns, axis=1)))[1])
+        target, effects = _pooled(runs, lag, (*runs[0].terms, 'step'))
+        return rms(least_squares(target, [*effects.values()])[1])
 
-    floor = rms(np.array([_noise(run, 0) / run.size for run in runs]))
-    now = left(0)
+    floor, now = rms(np.array([_white(run.late(0)[0]) for run in runs])), left(0)
     if now ** 2 < 1.1 * floor ** 2 + CONSISTENT ** 2:
         return 0
-    found = {0: now} | {lag: left(lag) for lag in LAGS if lag < len(runs[0].total) // 4}
+    found = {0: now} | {lag: left(lag) for lag in LAGS if lag < len(
+        runs[0].effects['total']) // 4}
     best = min(found, key=lambda lag: found[lag])
     return best if found[best] < 0.5 * now else 0
-
-
-def _noise(run: Readings, lag: int) -> float:
-    """Return the standard deviation of the white noise of a reading."""
-    reading, part = run.late(lag)
-    return _white(reading - run.total[part])
 
 
 def _white(rows: Reals) -> float:
@@ -284,54 +257,33 @@ def _white(rows: Reals) -> float:
     return rms(np.diff(rows, 6, axis=0)) / math.sqrt(924.0)
 
 
-def _discrepancy(kind: str, run: Readings, lag: int) -> tuple[Reals, dict[str, Reals]]:
-    """Return reading minus right reading (m, 3) and effects of causes, relative to the reading."""
-    reading, part = run.late(lag)
-    total = run.total
-    effects = {**run.terms, 'total': total, 'step': _rate(total),
-               'world': (world := run.rotation.apply(total)),
-               'reversed': run.rotation.apply(world)}
-    if kind in FORCES:
-        kinematic = total - run.terms['gravity']
-        back, forth = run.rotation.inv().apply, run.rotation.apply
-        effects |= {'kinematic': kinematic, 'difference': back(_rate(forth(kinematic))),
-                    'turned': back(_rate(forth(total))) - _rate(total),
-                    'tangential step': _rate(run.terms['tangential']),
-                    **{f'fixed {k}': 0.0 * total + axis for k, axis in enumerate(np.eye(3))},
-                    **{f'arm {k}': arm for k, arm in enumerate(run.arms)}}
-    return (reading - total[part]) / run.size, {
-        name: values[part] / run.size for name, values in effects.items()}
-
-
 def _causes(kind: str, effects: Mapping[str, Reals], body: Body) -> list[Cause]:
     """Return what may be wrong with the readings of a sensor."""
-    def only(judge: object, *names: str) -> Cause:
-        return Cause([effects[name] for name in names], judge)      # type: ignore[arg-type]
+    def only(judge: Any, *names: str) -> Cause:
+        return Cause([effects[name] for name in names], judge)
 
     in_world = 'rates_in_world' if kind in ('gyroscope', 'rates') else 'reading_in_world'
-    text = f'{kind}: the readings are in axes of '
+    text = 'the readings are in axes of '
     causes = [only(partial(_scale, kind), 'total'), only(lambda found: None, 'step'),
               only(instead(in_world, f'{text}the world, not of the IMU'), 'total', 'world'),
               only(instead('rotation_reversed', f'{text}a sensor that turns against the IMU'),
                    'total', 'reversed')]
     if kind in FORCES:
-        causes += [only(partial(_term, kind, name), name) for name in _TERMS]
-        causes += [only(partial(_gravity_frame, kind, body), 'gravity', *(
-            f'fixed {k}' for k in range(3))), only(partial(_difference, kind), 'difference'),
-            only(lambda found: None, 'tangential step'), only(lambda found: None, 'turned'),
-            only(partial(_arm, kind, body), 'arm 0', 'arm 1', 'arm 2')]
+        causes += [only(partial(_term, name), name) for name in _TERMS]
+        causes += [only(partial(_gravity_frame, body), 'gravity', 'fixed 0', 'fixed 1', 'fixed 2'),
+                   only(_difference, 'difference'), only(lambda found: None, 'tangential step'),
+                   only(lambda found: None, 'turned'),
+                   only(partial(_arm, body), 'arm 0', 'arm 1', 'arm 2')]
     return causes
 
 
 def _scale(kind: str, found: Reals) -> Fault:
     factor = 1.0 + float(found[0])
-    text = f'{kind}: the readings are {factor:.4g} times what they should be'
-    if any(abs(abs(factor) / unit - 1.0) < 0.01 for unit in UNITS[kind]):
-        return Fault('units', text, factor)
-    if kind == 'rates':
-        return Fault('rates_scale', text, factor)
-    return Fault('reading_sign' if factor < 0.0 else 'acceleration_scale' if
-                 kind == 'accelerations' else 'reading_scale', text, factor)
+    unit = any(abs(abs(factor) / unit - 1.0) < 0.01 for unit in UNITS[kind])
+    return Fault('units' if unit else 'rates_scale' if kind == 'rates' else 'reading_sign'
+                 if factor < 0.0 else 'acceleration_scale' if kind == 'accelerations' else
+                 'reading_scale', f'the readings are {factor:.4g} times what they should be',
+                 factor)
 
 
 # Terms of a specific force: what each is, and the fault where it is missing.
@@ -340,39 +292,36 @@ _TERMS = {'gravity': ('gravity', 'no_gravity'), 'tangential': ('a x r', 'no_tang
           'kinematic': ('motion', 'no_lever_arm')}
 
 
-def _term(kind: str, term: str, found: Reals) -> Fault:
+def _term(term: str, found: Reals) -> Fault:
     share = 1.0 + float(found[0])
     what, missing = _TERMS[term]
-    text = f'{kind}: the term of {what} has {share:.3g} times its size'
-    if abs(share) < NEAR:
-        return Fault(missing, text, share)
-    if share < 0.0:
-        return Fault('gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
-    return Fault('acceleration_scale', text, share)
+    return Fault(missing if abs(share) < NEAR else 'acceleration_scale' if share > 0.0 else
+                 'gravity_sign' if term == 'gravity' else 'reading_sign',
+                 f'the term of {what} has {share:.3g} times its size', share)
 
 
-def _gravity_frame(kind: str, body: Body, found: Reals) -> Fault | None:
+def _gravity_frame(body: Body, found: Reals) -> Fault | None:
     fixed = float(np.linalg.norm(found[1:]))
     other = abs(found[0] + 1.0) > NEAR or abs(fixed / body.gravity - 1.0) > NEAR
-    return None if other else Fault('gravity_frame', f'{kind}: gravity, {fixed:.4g} m/s^2, does '
-                                    'not turn with the IMU', fixed)
+    return None if other else Fault('gravity_frame', f'gravity, {fixed:.4g} m/s^2, does not turn '
+                                    'with the IMU', fixed)
 
 
-def _difference(kind: str, found: Reals) -> Fault | None:
+def _difference(found: Reals) -> Fault | None:
     delay = -float(found[0])
     return None if not 0.25 < delay < 0.8 else Fault(
-        'finite_differences', f'{kind}: the acceleration, without gravity, is that of {delay:.3g} '
-        'steps before, as a difference of two velocities', delay)
+        'finite_differences', f'the acceleration, without gravity, is that of {delay:.3g} steps '
+        'before, as a difference of two velocities', delay)
 
 
-def _arm(kind: str, body: Body, found: Reals) -> Fault:
+def _arm(body: Body, found: Reals) -> Fault:
     arm, point = np.array(body.lever_arm), found + body.lever_arm
     size = float(np.linalg.norm(arm))
     share = float(point @ arm) / (size * size or 1.0)
     if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * share * size:
-        return _term(kind, 'kinematic', np.array([share - 1.0]))
+        return _term('kinematic', np.array([share - 1.0]))
     of = ', the centre of mass' if np.linalg.norm(point - body.com) < 0.1 * max(
         size, abs(body.com_distance)) else ''
     shown = [', '.join(f'{x:.3g}' for x in one) for one in (point, arm)]
-    return Fault('no_lever_arm', f'{kind}: the readings are those at ({shown[0]}) m{of}, not at '
+    return Fault('no_lever_arm', f'the readings are those at ({shown[0]}) m{of}, not at '
                  f'({shown[1]}) m', float(np.linalg.norm(found)))

@@ -14,11 +14,9 @@ from spinning_top_sim.view.track import Track
 TRACE_NS = 10 * NANOSECONDS     # length of the trace of the tip
 TRACE_POINTS = 1500             # samples in the trace at most
 REACH = 1.6                     # radius of the sphere of the trace / distance of the tip
-LONGEST_CHORD = 0.5             # of a step of the trace / its radius; a longer step is a jump
-TRACE_STEP_NS, MOST_STEPS = 10_000_000, 4       # interpolation of the trace between two samples
+LONGEST_CHORD = 1.0             # of a step of the trace / its radius; a longer step is a jump
 STEPS = 48                      # of a full circle
 ARROWS = ('angular momentum', 'angular velocity', 'torque', 'specific force')
-Stamps = NDArray[np.int64]
 Vectors = NDArray[np.float64]
 Lines = NDArray[np.float32]     # (n, 2, 3), as viser takes them
 
@@ -43,36 +41,11 @@ def circle(radius: float, theta: float) -> Lines:
 
 def trace(track: Track, stamp_ns: int) -> Lines:
     """Return the lines along which the tip has moved, up to a stamp, from where the pivot is."""
-    stamps_ns, axis, joined = path(track, stamp_ns - TRACE_NS, stamp_ns)
-    moved = track.places(stamps_ns) - track.places(np.array([stamp_ns]))
-    return segments(reach(track) * axis + moved)[joined]
-
-
-def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDArray[np.bool_]]:
-    """
-    Return stamps (n,) [ns] and the axis (n, 3) between two stamps, and which steps are no jumps.
-
-    The third array, (n - 1,), is about the steps from one point to the next.  If samples are far
-    apart, points between them are those of the cubic Hermite spline.
-    """
-    stamps_ns, rows = track.attitudes.part(begin_ns, end_ns).thinned(TRACE_POINTS)
+    stamps_ns, rows = track.attitudes.part(stamp_ns - TRACE_NS, stamp_ns).thinned(TRACE_POINTS)
     axis = axis_of(rows)
-    steps = np.diff(axis, axis=0)
-    longest_ns = int(np.max(np.diff(stamps_ns), initial=0))
-    count = min(-(-longest_ns // TRACE_STEP_NS), MOST_STEPS)
-    if count < 2 or rows.shape[1] < 8:          # close together, or without a velocity
-        return stamps_ns, axis, np.linalg.norm(steps, axis=1) < LONGEST_CHORD
-    velocity = np.cross(in_world(rows[:, :4].T, rows[:, 4:7].T), axis, axisa=0)
-    span = 1e-9 * np.diff(stamps_ns)[:, np.newaxis]
-    before, after = span * velocity[:-1], span * velocity[1:]
-    joined = np.linalg.norm(steps - 0.5 * (before + after), axis=1) < LONGEST_CHORD
-    s = np.arange(count)[:, np.newaxis, np.newaxis] / count
-    between = (axis[:-1] + s * s * (3.0 - 2.0 * s) * steps
-               + s * (1.0 - s) * ((1.0 - s) * before - s * after))
-    fine_ns = stamps_ns[:-1] + (np.arange(count)[:, np.newaxis] * np.diff(stamps_ns)) // count
-    return (np.append(fine_ns.T.ravel(), stamps_ns[-1]),
-            np.vstack((between.transpose(1, 0, 2).reshape(-1, 3), axis[-1:])),
-            np.repeat(joined, count))
+    moved = track.places(stamps_ns) - track.place(stamp_ns)
+    is_step = np.linalg.norm(np.diff(axis, axis=0), axis=1) < LONGEST_CHORD
+    return segments(reach(track) * axis + moved)[is_step]
 
 
 def axis_of(rows: Vectors) -> Vectors:

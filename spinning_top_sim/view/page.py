@@ -3,7 +3,6 @@
 
 import math
 import time
-from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -23,8 +22,8 @@ WINDOW_NS = 10 * NANOSECONDS    # of the plots
 PANEL_WIDTH = 330               # [px]
 VIEW_ANGLE = math.radians(35.0)
 STANDS_TO = math.radians(100.0)     # tilt up to which the pivot stands on a peg; else it hangs
-TRACES = ((217, 72, 43), (30, 138, 76))
-BOUNDS, SPHERE, STAND, FOOT = (122, 82, 179), (190, 200, 215), (120, 126, 136), 0.8
+TRACE, BOUNDS = (217, 72, 43), (122, 82, 179)
+SPHERE, STAND, FOOT = (190, 200, 215), (120, 126, 136), 0.8
 ARROW_COLOURS = ((20, 120, 70), (196, 50, 150), (20, 150, 180), (230, 130, 20))
 NO_LINES = np.zeros((1, 2, 3), np.float32)
 NO_SAMPLES = 'no samples yet'
@@ -42,103 +41,15 @@ def set_content(handle: viser.GuiHtmlHandle | viser.GuiMarkdownHandle, content: 
         handle.content = content
 
 
-class DrawnTop:
-    """
-    One top in the scene.
-
-    shift_ns : added to the stamp of the page
-    drawn : stamp [ns] and row of the attitude that is drawn, None if there is none
-    """
-
-    def __init__(self, scene: viser.SceneApi, number: int, track: Track, shift_ns: int) -> None:
-        self.track, self.shift_ns = track, shift_ns
-        name, far = f'/top{number}', model.reach(track)
-        radius = abs(far)
-        self.root = scene.add_frame(name, show_axes=False)
-        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
-                                           opacity=0.12, side='back', cast_shadow=False,
-                                           receive_shadow=False)
-        self._body = scene.add_frame(f'{name}/body', show_axes=not track.has_body,
-                                     axes_length=0.7 * radius, axes_radius=0.015 * radius)
-        for part in (body.wheel if track.has_body else body.disc)(track.shape, far):
-            scene.add_mesh_simple(
-                f'{name}/body/{part.name}', part.mesh.vertices, part.mesh.faces,
-                color=part.colour, opacity=0.4 if number else None,
-                flat_shading=part.name != 'axle', side='double')
-        peg = body.stand(FOOT * radius)
-        self._stand = scene.add_mesh_simple(f'{name}/stand', peg.vertices, peg.faces, color=STAND,
-                                            side='double')
-        self._trace = scene.add_line_segments(
-            f'{name}/trace', NO_LINES, TRACES[number], thickness=0.018 * radius)
-        self._bounds = [scene.add_line_segments(
-            f'{name}/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * radius, visible=False)
-            for k in range(2)]
-        self._arrows = [scene.add_arrows(
-            f'{name}/{arrow.replace(" ", "_")}', NO_LINES, colour,
-            shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
-            visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
-        self._colour = np.array(TRACES[number])
-        self._limits: tuple[float, float] | None = None         # that are drawn [rad]
-        self.drawn: tuple[int, model.Vectors] | None = None
-        self._shown: object = None                      # stamp and switches of the picture
-
-    def motion(self, page_ns: int) -> DescribedMotion | None:
-        """Return the motion at a stamp of the page."""
-        return self.track.motion_at(page_ns + self.shift_ns)
-
-    def draw(self, page_ns: int, *, trace: bool, bounds: bool, arrows: Sequence[bool]) -> None:
-        """Draw the newest samples up to a stamp of the page, with some of the parts."""
-        stamp_ns = page_ns + self.shift_ns
-        self.drawn = sample = self.track.attitudes.at(stamp_ns)
-        self.root.visible = sample is not None
-        shown = sample and (sample[0], trace, bounds, arrows)
-        if shown == self._shown:        # as while it is paused
-            return
-        self._shown = shown
-        if sample is None:
-            return
-        x, y, z, w = sample[1][:4].tolist()
-        self._body.wxyz = (w, x, y, z)
-        self._trace.visible = self._sphere.visible = trace
-        if trace:
-            self._draw_trace(model.trace(self.track, stamp_ns))
-        for name, arrow, on in zip(model.ARROWS, self._arrows, arrows, strict=True):
-            arrow.visible = on
-            vector = model.arrow(self.track, name, stamp_ns) if on else None
-            arrow.points = NO_LINES if vector is None else model.segments(
-                np.vstack((np.zeros(3), vector)))
-        self._draw_bounds(self.motion(page_ns), bounds)
-
-    def _draw_trace(self, lines: model.Lines) -> None:
-        """Draw a trace that fades with its age; the colours of a line's points are linear."""
-        lines = lines if len(lines) else NO_LINES
-        if len(lines) != len(self._trace.points):
-            share = np.linspace(0.35, 1.0, len(lines))[:, np.newaxis, np.newaxis]
-            self._trace.colors = np.broadcast_to(255 * (
-                1.0 + share * (self._colour / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
-        self._trace.points = lines
-
-    def _draw_bounds(self, motion: DescribedMotion | None, on: bool) -> None:
-        moves = motion.description if motion else None
-        for bound in self._bounds:
-            bound.visible = on and moves is not None
-        if moves is None or self._limits == (moves.theta_min, moves.theta_max):
-            return
-        self._limits = moves.theta_min, moves.theta_max
-        for bound, theta in zip(self._bounds, self._limits, strict=True):
-            bound.points = model.circle(model.reach(self.track), theta)
-        # A top that comes low hangs from above.
-        self._stand.wxyz = (1, 0, 0, 0) if moves.theta_max < STANDS_TO else (0, 1, 0, 0)
-
-
 class Page:
     """
-    The page, with its own server.  One thread calls `set_tracks` and `draw`.
+    The page, with its own server.  One thread calls `set_track`, and then `draw`.
 
     title : such as the name of the log
     controls : the folder for the controls of the source of the samples
     message : what was done, or the reason why not
     arrows : the switches of model.ARROWS
+    drawn : stamp [ns] and row of the attitude that is drawn, None if there is none
     """
 
     def __init__(self, title: str, host: str, port: int | None) -> None:
@@ -159,7 +70,6 @@ class Page:
             self._trace = gui.add_checkbox('trace of the axis', True)
             self._bounds = gui.add_checkbox('bounds of θ', True)
             self.arrows = [gui.add_checkbox(name, False) for name in model.ARROWS]
-            self._over = gui.add_checkbox('one over the other', False, visible=False)
         self._accuracy_folder = gui.add_folder('Accuracy', expand_by_default=False)
         with self._accuracy_folder:
             self._accuracy = gui.add_html('')
@@ -169,7 +79,7 @@ class Page:
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)
         panel.expand()              # also on a phone, where it is below
-        self._tops: list[DrawnTop] = []
+        self._root: viser.FrameHandle | None = None
         self._number = 0            # of the picture
 
     def close(self) -> None:
@@ -178,77 +88,133 @@ class Page:
         time.sleep(LAST_WORDS_S)
         self.server.stop()
 
-    def set_tracks(self, tracks: Sequence[Track], shifts_ns: Sequence[int] = (0,)) -> None:
-        """Show these tops; a shift is added to a stamp of the page to get the track's."""
-        for top in self._tops:
-            top.root.remove()
-        scene = self.server.scene
-        self._tops = [DrawnTop(scene, number, track, shift_ns) for number, (track, shift_ns)
-                      in enumerate(zip(tracks, shifts_ns, strict=True))]
-        size = self._reach = max(abs(model.reach(track)) for track in tracks)
-        self._over.visible = len(tracks) > 1
-        self._bounds.visible = self._accuracy_folder.visible = any(
-            track.has_body for track in tracks)
-        for arrow in self.arrows:
-            arrow.visible = self._bounds.visible
+    def set_track(self, track: Track) -> None:
+        """Show this top."""
+        if self._root is not None:
+            self._root.remove()
+        self._track, far = track, model.reach(track)
+        scene, size = self.server.scene, abs(far)
+        self._reach = size
+        self._accuracy_folder.visible = track.has_body
+        for switch in (self._bounds, *self.arrows):
+            switch.visible = track.has_body
+        self._root = scene.add_frame('/top', show_axes=False)
+        self._sphere = scene.add_icosphere('/top/sphere', size, SPHERE, subdivisions=5,
+                                           opacity=0.12, side='back', cast_shadow=False,
+                                           receive_shadow=False)
+        self._body = scene.add_frame('/top/body', show_axes=not track.has_body,
+                                     axes_length=0.7 * size, axes_radius=0.015 * size)
+        for part in (body.wheel if track.has_body else body.disc)(track.shape, far):
+            scene.add_mesh_simple(
+                f'/top/body/{part.name}', part.mesh.vertices, part.mesh.faces, color=part.colour,
+                flat_shading=part.name != 'axle', side='double')
+        peg = body.stand(FOOT * size)
+        self._stand = scene.add_mesh_simple('/top/stand', peg.vertices, peg.faces, color=STAND,
+                                            side='double')
+        self._trace_lines = scene.add_line_segments('/top/trace', NO_LINES, TRACE,
+                                                    thickness=0.018 * size)
+        self._bound_lines = [scene.add_line_segments(
+            f'/top/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * size, visible=False)
+            for k in range(2)]
+        self._arrow_lines = [scene.add_arrows(
+            f'/top/{arrow.replace(" ", "_")}', NO_LINES, colour,
+            shaft_radius=0.014 * size, head_radius=0.04 * size, head_length=0.12 * size,
+            visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
+        self._limits: tuple[float, float] | None = None         # that are drawn [rad]
+        self.drawn: tuple[int, model.Vectors] | None = None
+        self._shown: object = None                      # stamp and switches of the picture
         self._ground = scene.add_grid(
             '/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
             cell_color=(238, 240, 244), section_color=(228, 231, 236), fade_distance=9 * size,
             fade_from='origin', shadow_opacity=0.1, position=(0.0, 0.0, -FOOT * size))
         camera = self.server.initial_camera
-        away = size * (5.2 if len(tracks) == 1 else 10.5)
         camera.fov = VIEW_ANGLE
-        camera.position = (0.0, -0.92 * away, 0.39 * away)
+        camera.position = (0.0, -4.8 * size, 2.0 * size)
         camera.look_at = (0.0, 0.0, 0.1 * size)
         camera.near, camera.far = 0.01 * size, 100.0 * size
 
-    def draw(self, page_ns: int, origin_ns: int) -> None:
+    def draw(self, stamp_ns: int, origin_ns: int) -> None:
         """
-        Draw all tops at a stamp of the page [ns].
+        Draw the newest samples up to a stamp [ns].
 
         origin_ns : stamp of t = 0
         """
-        arrows = [switch.value for switch in self.arrows]
-        side = 0.0 if self._over.value else 1.3 * self._reach
-        places = [top.track.places(np.array([page_ns + top.shift_ns]))[0] for top in self._tops]
         with self.server.atomic():
-            if places:          # the picture follows the first top: the ground moves
-                x, y, z = places[0]
-                self._ground.position = (-(x % self._reach), -(y % self._reach),
-                                         -FOOT * self._reach - z)
-            for k, (top, place) in enumerate(zip(self._tops, places, strict=True)):
-                top.root.position = place - places[0] + (
-                    side * (2 * k - len(self._tops) + 1), 0.0, 0.0)
-                top.draw(page_ns, trace=self._trace.value, bounds=self._bounds.value,
-                         arrows=arrows)
+            self._draw_top(stamp_ns)
         if self._number % PLOT_EVERY == 0:
-            tops = self.shown(page_ns, origin_ns, page_ns - WINDOW_NS, page_ns)
-            set_content(self._plots, ''.join(map(svg.draw, plots.motion_plots(tops))))
-            set_content(self._accuracy, ''.join(map(svg.draw, plots.accuracy_plots(tops))))
-            set_content(self._words, self.words(page_ns, origin_ns))
+            motion, accuracy = self.plots(stamp_ns, origin_ns, stamp_ns - WINDOW_NS, stamp_ns)
+            set_content(self._plots, motion)
+            set_content(self._accuracy, accuracy)
+            set_content(self._words, self.words(stamp_ns, origin_ns))
             set_content(self._legend, self.legend())
         self._number += 1
 
-    def shown(self, page_ns: int, origin_ns: int, begin_ns: int,
-              end_ns: int) -> list[plots.Shown]:
-        """Return what is plotted of the tops at a stamp, for a span of stamps of the page."""
-        return [plots.Shown(top.track, *(stamp_ns + top.shift_ns for stamp_ns in (
-            page_ns, begin_ns, end_ns, origin_ns))) for top in self._tops]
+    def _draw_top(self, stamp_ns: int) -> None:
+        # The top stays in the picture: the ground moves.
+        x, y, z = self._track.place(stamp_ns)
+        self._ground.position = -(x % self._reach), -(y % self._reach), -FOOT * self._reach - z
+        self.drawn = sample = self._track.attitudes.at(stamp_ns)
+        assert self._root is not None
+        self._root.visible = sample is not None
+        trace, bounds = self._trace.value, self._bounds.value
+        arrows = [switch.value for switch in self.arrows]
+        shown = sample and (sample[0], trace, bounds, arrows)
+        if shown == self._shown:        # as while it is paused
+            return
+        self._shown = shown
+        if sample is None:
+            return
+        x, y, z, w = sample[1][:4].tolist()
+        self._body.wxyz = (w, x, y, z)
+        self._trace_lines.visible = self._sphere.visible = trace
+        if trace:
+            self._draw_trace(model.trace(self._track, stamp_ns))
+        for name, arrow, on in zip(model.ARROWS, self._arrow_lines, arrows, strict=True):
+            arrow.visible = on
+            vector = model.arrow(self._track, name, stamp_ns) if on else None
+            arrow.points = NO_LINES if vector is None else model.segments(
+                np.vstack((np.zeros(3), vector)))
+        self._draw_bounds(self._track.motion_at(stamp_ns), bounds)
 
-    def words(self, page_ns: int, origin_ns: int) -> str:
-        """Return HTML about the motions and the samples that are drawn."""
-        drawn = [(top, top.track.attitudes.at(page_ns + top.shift_ns)) for top in self._tops]
-        return ''.join(text.words(top.track, top.motion(page_ns), sample[0],
-                                  sample[0] - top.shift_ns - origin_ns) if sample else
-                       f'<p>{top.track.name} {NO_SAMPLES}</p>' for top, sample in drawn)
+    def _draw_trace(self, lines: model.Lines) -> None:
+        """Draw a trace that fades with its age; the colours of a line's points are linear."""
+        lines = lines if len(lines) else NO_LINES
+        if len(lines) != len(self._trace_lines.points):
+            share = np.linspace(0.35, 1.0, len(lines))[:, np.newaxis, np.newaxis]
+            self._trace_lines.colors = np.broadcast_to(255 * (
+                1.0 + share * (np.array(TRACE) / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
+        self._trace_lines.points = lines
+
+    def _draw_bounds(self, motion: DescribedMotion | None, on: bool) -> None:
+        moves = motion.description if motion else None
+        for bound in self._bound_lines:
+            bound.visible = on and moves is not None
+        if moves is None or self._limits == (moves.theta_min, moves.theta_max):
+            return
+        self._limits = moves.theta_min, moves.theta_max
+        for bound, theta in zip(self._bound_lines, self._limits, strict=True):
+            bound.points = model.circle(model.reach(self._track), theta)
+        # A top that comes low hangs from above.
+        self._stand.wxyz = (1, 0, 0, 0) if moves.theta_max < STANDS_TO else (0, 1, 0, 0)
+
+    def plots(self, stamp_ns: int, origin_ns: int, begin_ns: int, end_ns: int) -> tuple[str, str]:
+        """Return the plots of a span of stamps, with a mark at one, and those of the accuracy."""
+        shown = plots.Shown(self._track, stamp_ns, begin_ns, end_ns, origin_ns)
+        motion, accuracy = (''.join(map(svg.draw, found)) for found in (
+            plots.motion_plots(shown), plots.accuracy_plots(shown)))
+        return motion, accuracy
+
+    def words(self, stamp_ns: int, origin_ns: int) -> str:
+        """Return HTML about the motion and the sample that is drawn at a stamp."""
+        track = self._track
+        sample = track.attitudes.at(stamp_ns)
+        return f'<p>{NO_SAMPLES}</p>' if sample is None else text.words(
+            track, track.motion_at(stamp_ns), sample[0], sample[0] - origin_ns)
 
     def legend(self) -> str:
         """Return HTML about the colours of what is switched on."""
-        entries = []
-        if self._trace.value:
-            entries += [(TRACES[k], f'trace of the axis {top.track.name}'.rstrip()
-                         + k * ' (plots: dashed)') for k, top in enumerate(self._tops)]
-        if self._bounds.value and any(top.track.motions for top in self._tops):
+        entries = [(TRACE, 'trace of the axis')] if self._trace.value else []
+        if self._bounds.value and self._track.motions:
             entries.append((BOUNDS, 'bounds of θ'))
         entries += [(colour, name) for name, colour, switch in zip(
             model.ARROWS, ARROW_COLOURS, self.arrows, strict=True) if switch.value]
