@@ -145,6 +145,9 @@ def test_a_filter_without_faults_passes(report):
     marks = found.measures
     assert marks['tilt_rms_deg'] < 0.03 and marks['convergence_s'] < 1.0
     assert marks['bias_found'] == pytest.approx(1.0, abs=0.01)
+    # The bound is that of white noise alone, in the settled half.
+    assert 0.7 < marks['tilt_to_bound'] < 1.3 and 0.7 < marks['heading_to_bound'] < 2.0
+    assert marks['tilt_to_gyroscope'] < 0.6
     assert marks['nees_low'] < marks['nees'] < marks['nees_high']
     explained = {name for name in MEANINGS if not name.startswith(('data_', 'field_'))}
     assert {*explained, 'nees_low', 'nees_high', 'nees_attitude_low', 'nees_attitude_high'} == {
