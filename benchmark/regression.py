@@ -34,7 +34,7 @@ from report import table
 LIMIT = 1.10
 NOW, PARENT, RELEASE = 'now', 'parent', 'release'
 STREAMS = ('pose', 'joint_states', 'imu')
-SIMULATE = 'spinning_top_sim.tools.simulate'
+AT_REST = ('-p', 'pivot.path:=[0.0, 0.0, 0.0, 0.0]', '-p', 'pivot.waypoints:=[0.0, 0.0, 0.0]')
 ENSEMBLE = """
 runs: 200
 duration: 1.0
@@ -48,13 +48,30 @@ Checkouts = Mapping[str, Path]
 Costs = dict[str, list[float]]
 
 
-def simulate(method: str, duration: float) -> Callable[[Path, Path], float]:
+def simulate(duration: float, *arguments: str) -> Callable[[Path, Path], float]:
     """Return what measures `simulate` of three streams at 1 kHz."""
     def cost(checkout: Path, folder: Path) -> float:
-        return run_module(SIMULATE, (
-            '-o', str(folder / 'run.mcap'), '--duration', str(duration), '--quiet',
-            '-p', f'solver.method:={method}', '-p', f'record.streams:=[{", ".join(STREAMS)}]',
+        return run_module('spinning_top_sim', (
+            'simulate', '-o', str(folder / 'run.mcap'), '--duration', str(duration), '--quiet',
+            *arguments,
+            '-p', f'record.streams:=[{", ".join(STREAMS)}]',
             *(item for name in STREAMS for item in ('-p', f'{name}.rate:=1000.0'))), checkout)
+    return cost
+
+
+def over_rest(scene: str) -> Callable[[Path, Path], float]:
+    """Return what measures a scene with a moving pivot over the same with its pivot at rest."""
+    params = '--params', str(ROOT / 'config' / f'{scene}.yaml')
+    moving, resting = simulate(300.0, *params), simulate(300.0, *params, *AT_REST)
+
+    def cost(checkout: Path, folder: Path) -> float:
+        if not (checkout / 'config' / f'{scene}.yaml').exists():
+            return float('nan')
+        costs = []
+        for k, one in enumerate((resting, moving, moving, resting)):
+            (folder / str(k)).mkdir()
+            costs.append(one(checkout, folder / str(k)))
+        return (costs[1] + costs[2]) / (costs[0] + costs[3])
     return cost
 
 
@@ -74,9 +91,9 @@ def ensemble(checkout: Path, folder: Path) -> float:
     if not (checkout / 'scripts/ensemble').exists():
         return float('nan')
     (folder / 'spec.yaml').write_text(ENSEMBLE.format(config=ROOT / 'config'))
-    return run_module('spinning_top_sim.tools.ensemble', (
-        str(folder / 'spec.yaml'), '-o', str(folder / 'runs'), '--workers', '1', '--quiet'),
-        checkout)
+    return run_module('spinning_top_sim', (
+        'ensemble', str(folder / 'spec.yaml'), '-o', str(folder / 'runs'), '--workers', '1',
+        '--quiet'), checkout)
 
 
 def in_turns(cost: Callable[[Path, Path], float]) -> Callable[[Checkouts, int], Costs]:
@@ -146,8 +163,10 @@ class Row(NamedTuple):
 
 
 ROWS = {
-    'simulate, exact': Row(in_turns(simulate('exact', 300.0)), 15, 's'),
-    'simulate, rk45': Row(in_turns(simulate('rk45', 40.0)), 15, 's'),
+    'simulate, exact': Row(in_turns(simulate(300.0, '-p', 'solver.method:=exact')), 15, 's'),
+    'simulate, rk45': Row(in_turns(simulate(40.0, '-p', 'solver.method:=rk45')), 15, 's'),
+    'shuttle, moving over resting pivot': Row(in_turns(over_rest('shuttle')), 3, ''),
+    'free fall, moving over resting pivot': Row(in_turns(over_rest('free_fall')), 3, ''),
     'set-up of an exact motion': Row(arrays('set-up'), 4, 'ms', 1e3),
     'solve 10 s at 512 Hz, exact': Row(arrays('exact'), 4, 'ms', 1e3),
     'solve 10 s at 512 Hz, rk45': Row(arrays('rk45'), 4, 'ms', 1e3),

@@ -149,9 +149,17 @@ class Error(NamedTuple):
     heading: float
 
 
-def error_of(estimate: Rotation, truth: Rotation) -> tuple[float, float]:
+def product(one: Sequence[float], other: Sequence[float]) -> tuple[float, float, float, float]:
+    """Return the Hamilton product of quaternions x, y, z, w: of two, faster than `Rotation`."""
+    (a, b, c, d), (x, y, z, w) = one, other
+    return (d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
+            d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z)
+
+
+def error_of(estimate: Sequence[float], truth: Sequence[float]) -> tuple[float, float]:
     """Return tilt and heading of an estimate relative to the truth, in the world frame [rad]."""
-    x, y, z, w = (estimate * truth.inv()).as_quat()
+    a, b, c, d = truth
+    x, y, z, w = product(estimate, (-a, -b, -c, d))
     return 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w)), 2.0 * math.atan2(z, w)
 
 
@@ -172,13 +180,14 @@ class Comparison:
         self.name = name
         self.has_mag = name in NINE_AXES
         # The world, from a frame whose y axis is magnetic north.
-        self._north = Rotation.from_euler('z', -declination if self.has_mag else 0.0)
+        self._north = Rotation.from_euler(
+            'z', -declination if self.has_mag else 0.0).as_quat().tolist()
         self._mag_stamps: list[int] = []
         # The newest field: it may come before or after the sample of the IMU.
         self._field: tuple[int, np.ndarray] = -1, np.zeros(3)
         self.errors: list[Error] = []
         self.lost = self.restarts = 0
-        self._mounting = Rotation.from_euler('xyz', rpy)
+        self._mounting = Rotation.from_euler('xyz', rpy).as_quat().tolist()
         self._first: list[tuple[int, np.ndarray, np.ndarray]] = []
         self._period_ns = 0
         self._step: Step
@@ -263,8 +272,8 @@ class Comparison:
         if stamp_ns in self._estimates and stamp_ns in self._truths:
             w, x, y, z = self._estimates.pop(stamp_ns)
             self.errors.append(Error(stamp_ns, *error_of(
-                self._north * Rotation.from_quat((x, y, z, w)),
-                Rotation.from_quat(self._truths.pop(stamp_ns)) * self._mounting)))
+                product(self._north, (x, y, z, w)),
+                product(self._truths.pop(stamp_ns), self._mounting))))
         for waiting in (self._estimates, self._truths):
             while waiting and (oldest := next(iter(waiting))) < stamp_ns - KEPT_NS:
                 del waiting[oldest]

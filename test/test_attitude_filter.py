@@ -17,7 +17,7 @@ from spinning_top_sim.tools.simulate import main as simulate
 EXAMPLE = ROOT / 'examples/attitude_filter.py'
 SETTLE = 15.0
 LOGS = {
-    'pivot': ['--duration', '30'],
+    'pivot': ['--duration', '24'],
     'lever arm': ['--duration', '18', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.0]'],
     'nine axes': ['--duration', '18', '-p', 'mag.enabled:=true'],
 }
@@ -58,7 +58,7 @@ def summaries(example, logs):
 
 def test_at_the_pivot_a_perfect_imu_leaves_the_filters_own_error(summaries):
     found = summaries('pivot', 'vqf', 'madgwick', 'ekf')
-    assert found['vqf'].compared == 3000
+    assert found['vqf'].compared == 2400
     assert found['vqf'].tilt_rms < 0.03 and found['vqf'].converged < 1.0
     assert abs(found['vqf'].heading_rate) < 0.045
     assert found['ekf'].tilt_rms < 0.06

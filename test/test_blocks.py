@@ -51,11 +51,15 @@ SCENES = {
     'a filtered sensor': {
         'pivot.path': (0.1, 2.0, 0.0, 0.0, 0.0123, 0.0, 0.0, -9.80665, 0.1, -2.0, 0.0, 0.0),
         **MOUNTED, **FILTERED},
+    'many changes': {
+        'pivot.path': (0.012, 2.0, 0.0, 0.0, 0.017, 0.0, 3.0, -9.80665, 0.011, -2.0, 0.0, -25.0,
+                       0.023, 9.0, 0.0, -20.0, 0.02, 0.0, 0.0, 0.0, 0.015, -9.0, 0.0, 55.0),
+        **MOUNTED},
     'through a pole': {'initial.theta': 0.5, 'spin.l3': 0.2, 'spin.lz': 0.2},
     'planar rotation': scene_parameters('planar_pendulum'),
 }
 CASES = (('a sensor elsewhere', 'exact'), ('planar rotation', 'exact'),
-         ('a filtered sensor', 'rk45'),
+         ('a filtered sensor', 'rk45'), ('many changes', 'exact'),
          ('cusps', 'euler'), ('a sensor elsewhere', 'rk45'), ('through a pole', 'rk45'))
 DURATION_NS = 500_000_000
 # Commands, changes of rates, a velocity of the pivot and a state, and when they come [ns].

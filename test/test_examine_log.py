@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from helpers.definitions import add_definitions
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
@@ -22,6 +23,7 @@ from spinning_top_sim.tools.simulate import main as simulate
 IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (
     'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped', 'geometry_msgs/msg/PoseStamped',
     'geometry_msgs/msg/PoseWithCovarianceStamped', 'nav_msgs/msg/Odometry')
+add_definitions(POSE_COVARIANCE)
 
 
 def write(path, topics, rows, metadata=None):

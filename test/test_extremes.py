@@ -19,7 +19,7 @@ from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS
-from spinning_top_sim.streams.intervals import LONGEST_NS
+from spinning_top_sim.streams.imu import LONGEST_NS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.stream import Samples
 from spinning_top_sim.tools.simulate import main
@@ -165,7 +165,7 @@ def short_life(rng):
     def streams():
         """Return all streams but those of intervals longer than intervals may be."""
         return [one for one in simulation.streams if one.parameter != 'increments'
-                or simulation.imu.intervals.length_ns <= LONGEST_NS]
+                or simulation.imu.length_ns <= LONGEST_NS]
 
     for _ in range(3):
         simulation.log_to(lambda entries, size: None, streams())

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.reference import scene_parameters
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 from stress.fit import check
 
 from spinning_top_sim import solve
@@ -43,7 +43,7 @@ def test_errors_are_those_of_the_cramer_rao_bound():
     """As a thousand logs of `test/stress fit` show: here the sum of few is not improbable."""
     logs = [check(seed) for seed in range(2)]
     assert all(np.isfinite(log.over_deviation).all() for log in logs)
-    low, high = chi2.ppf((1e-4, 1.0 - 1e-4), 8 * len(logs))
+    low, high = chdtri(8 * len(logs), (1.0 - 1e-4, 1e-4))
     assert low < sum(log.squares for log in logs) < high
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers.readings import command, run
 from helpers.simulations import MILLISECOND, SECOND
-from scipy import signal
 
 from spinning_top_sim.streams import parameters
 
@@ -22,6 +21,8 @@ STANDING = {'initial.theta': 0.0, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method
 @pytest.mark.parametrize(('order', 'corner'), [(1, 20.0), (2, 7.0), (2, 150.0)])
 def test_gain_and_delay_are_those_of_the_analog_filter(order, corner):
     """In the transverse rate: a sine at |1 - lambda3/lambda1| omega3, the frequency TURNS."""
+    from scipy import signal  # takes long
+
     values = {**FREE, 'imu.bandwidth': corner, 'imu.bandwidth_order': order}
     _, found = run(values, 2 * SECOND, 'imu/data_raw', 'ground_truth/imu')
     (_, _, _, rates, _, *_), (_, _, _, exact, *_) = found.values()
@@ -40,6 +41,8 @@ def test_gain_and_delay_are_those_of_the_analog_filter(order, corner):
 
 def test_a_command_gives_the_step_response_of_the_filter():
     """The rate about the axis is a step."""
+    from scipy import signal
+
     values = {**STANDING, 'spin.l3': 1.0, 'spin.lz': 1.0, 'imu.rate': 1000.0}
     for order in (1, 2):
         _, found = run({**values, 'imu.bandwidth': 10.0, 'imu.bandwidth_order': order}, SECOND,
@@ -56,6 +59,8 @@ PROFILE = (20.0, 0.1, 80.0, 0.4, 350.0, 0.4, 800.0, 0.07)
 
 
 def test_noise_has_the_power_of_the_profile_and_the_filter_acts_on_it():
+    from scipy import signal
+
     values = {**STANDING, 'imu.vibration.force_psd': PROFILE, 'imu.rate': 2000.0}
     frequencies = np.linspace(20.0, 800.0, 200_001)
     density = np.exp(np.interp(np.log(frequencies), np.log(PROFILE[::2]), np.log(PROFILE[1::2])))

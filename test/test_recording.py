@@ -227,7 +227,7 @@ def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
 
 
 def test_the_definitions_of_all_streams_are_those_of_jazzy():
-    assert json.loads(FILE.read_text('utf-8')) == {name: definition(name) for name in TYPES}
+    assert json.loads(FILE.read_bytes()) == {name: definition(name) for name in TYPES}
 
 
 @pytest.mark.parametrize('type_name', [
@@ -242,8 +242,8 @@ def test_a_missing_definition_is_named(tmp_path, type_name):
 
 def test_messages_of_any_length_are_all_kept(tmp_path):
     """
-    Chunks stay of a size, and in the file the messages are in the order in which they were
-    handed over.
+    Chunks stay of a size, and in the file the messages of a topic are in the order in which they
+    were handed over.
     """
     rng = random.Random(5)
     wanted = [[], [], []]

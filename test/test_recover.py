@@ -181,6 +181,13 @@ def start_of(log, opcode, number=0):
     return [start for kind, start, _ in log.records if kind == opcode][number]
 
 
+def longer(log):
+    """Return the log with a channel whose length takes in the records up to the second chunk."""
+    start = start_of(log, Opcode.CHANNEL, 1)
+    length = struct.pack('<Q', log.chunks[1][1] - start - 9)
+    return log.content[:start + 1] + length + log.content[start + 9:]
+
+
 # What is done to the bytes; the chunks that are kept, or the topic that is; the exit code; what
 # is said.
 DAMAGE = {
@@ -208,6 +215,8 @@ DAMAGE = {
     'the same without a summary': (
         lambda log: flipped(torn(log), start_of(log, Opcode.CHANNEL, 1), 0),
         '/top/point', SOME_LOST, 'lost: 12 messages at byte 0'),
+    'a channel that takes in the chunk behind it': (
+        longer, (0, 1, 2), ALL_KEPT, 'found: channel at byte'),
     'a chunk with a wrong checksum in the place of another': (
         lambda log: torn(log, log.content[:log.chunks[0][1]] + bytes(50) + flipped(
             log.content, log.chunks[1][2] - 6, 0)[log.chunks[1][1]:log.chunks[1][2]]

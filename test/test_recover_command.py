@@ -30,7 +30,7 @@ def log(tmp_path_factory):
 
 def run_process(*argv, **options) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, '-m', 'spinning_top_sim.tools.recover', *map(str, argv)],
+        [sys.executable, '-m', 'spinning_top_sim', 'recover', *map(str, argv)],
         env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60,
         check=False, **options)
 

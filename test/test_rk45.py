@@ -16,18 +16,17 @@ import pytest
 from helpers.reference import CASES, angle, quaternion_of, scene_parameters, start_of, top_of
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.solvers import rk45
+from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import (
     ERROR,
     STAGES,
     IntegrationError,
-    Integrator,
-    Interpolants,
     unrolled_step,
 )
-from spinning_top_sim.solvers.equations import EulerEquations, TransportEquations
+from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.solvers.transport import TransportMotion
 from spinning_top_sim.streams import parameters
 
 NODES = tuple(map(Fraction, ['0', '1/5', '3/10', '4/5', '8/9', '1', '1']))
@@ -47,41 +46,40 @@ SECOND = 1_000_000_000
 LOOPING = CASES['loop-a']
 
 
-def fixed_steps(equations, count, t_end):
+def fixed_steps(motion, count, t_end):
     """Return y after `count` equal steps, without step control or projection."""
-    step = unrolled_step(len(equations.start), isinstance(equations.start[0], complex))
-    y, derivative = equations.start, equations.derivative(*equations.start)
+    y = motion._kept[0].y0
+    step, derivative = unrolled_step(len(y), isinstance(y[0], complex)), motion.derivative(*y)
     for _ in range(count):
-        y, derivative, _ = step(equations.derivative, t_end / count, y, derivative)
+        y, derivative, _ = step(motion.derivative, t_end / count, y, derivative)
     return y
 
 
-both_equations = pytest.mark.parametrize('equations_type', [TransportEquations, EulerEquations])
+both_equations = pytest.mark.parametrize('motion_type', [TransportMotion, EulerMotion])
 
 
 @both_equations
-def test_global_error_falls_with_the_fifth_power_of_the_step(equations_type):
-    equations = equations_type(top_of(LOOPING), start_of(LOOPING), 1e-9, 0.0)
-    truth = np.array(fixed_steps(equations, 12800, 4.0))
+def test_global_error_falls_with_the_fifth_power_of_the_step(motion_type):
+    motion = motion_type(top_of(LOOPING), start_of(LOOPING), 1e-9, 0.0)
+    truth = np.array(fixed_steps(motion, 12800, 4.0))
     counts = np.array([100, 200, 400, 800, 1600])
-    errors = [np.abs(np.array(fixed_steps(equations, n, 4.0)) - truth).max() for n in counts]
+    errors = [np.abs(np.array(fixed_steps(motion, n, 4.0)) - truth).max() for n in counts]
     slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
     assert -5.2 <= slope <= -4.8
 
 
 @both_equations
-def test_dense_output_is_as_good_as_the_steps(equations_type):
+def test_dense_output_is_as_good_as_the_steps(motion_type):
     """Its own error falls with the sixth power of the step, as the error of a step does."""
     case = CASES['loop-c-thd+']
-    equations = equations_type(top_of(case), start_of(case), 1e-9, 0.0)
-    equations.errors = lambda y, y_new, difference: (0.9 ** 5,)   # accept, keep the step
     errors = []
     for h in (0.08, 0.04, 0.02):
-        integrator = Integrator(equations)
-        integrator._next_step = h
-        interpolants = Interpolants([integrator.step()], equations)
-        middle = interpolants.at(np.array([0]), np.array([0.37 * h]))[:, 0]
-        truth = np.array(fixed_steps(equations, 64, 0.37 * h)).view(float)
+        motion = motion_type(top_of(case), start_of(case), 1e-9, 0.0)
+        motion.errors = lambda y, y_new, difference: (0.9 ** 5,)    # accept, keep the step
+        motion._next_step = h
+        truth = np.array(fixed_steps(motion, 64, 0.37 * h)).view(float)
+        motion._take_step()
+        middle = motion._interpolated(np.array([0.37 * h]))[1][:, 0]
         errors.append(np.abs(middle - truth).max())
     ratios = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert np.all(ratios > 5.5)
@@ -298,7 +296,7 @@ def test_steps_are_read_until_they_are_released():
 
 def test_so_many_steps_are_kept_at_most(monkeypatch):
     """Whatever is asked: a fast top between two samples of a slow IMU must not fill the memory."""
-    monkeypatch.setattr(rk45, 'MOST_KEPT', 50)
+    monkeypatch.setattr(dormand_prince, 'MOST_KEPT', 50)
     motion = looping_motion()
     motion.reach(60 * SECOND)
     expected = motion.states(range(60 * SECOND, 60 * SECOND + 1)).phi
@@ -348,15 +346,16 @@ def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
 
 
 @both_equations
-def test_an_error_that_is_no_number_is_no_small_error(equations_type):
-    integrator = Integrator(equations_type(top_of(LOOPING), start_of(LOOPING), 1e-9, 1e-10))
-    y = integrator.equations.start
+def test_an_error_that_is_no_number_is_no_small_error(motion_type, monkeypatch):
+    motion = motion_type(top_of(LOOPING), start_of(LOOPING), 1e-9, 1e-10)
+    y = motion._kept[0].y0
     for place in range(len(y)):
         difference = [0.0 * unknown for unknown in y]
         difference[place] = math.nan + 0.0 * y[place]
-        integrator._step = lambda f, h, y, k1, rest=tuple(difference): (y, k1, rest)
+        monkeypatch.setattr(dormand_prince, 'unrolled_step', lambda size, is_complex, rest=tuple(
+            difference): lambda f, h, y, k1: (y, k1, rest))
         with pytest.raises(IntegrationError, match='collapsed'):
-            integrator.step()
+            motion._take_step()
 
 
 @pytest.mark.parametrize('equations', ['transport', 'euler'])

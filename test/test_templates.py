@@ -85,7 +85,7 @@ def with_header(frame, stamp_ns):
     message, (a, b, c) = PoseStamped(), (numbers(4), numbers(3), numbers(5)[2:])
     set_axes(message.pose.position, b)
     set_axes(message.pose.orientation, a)
-    yield messages.pose_stamped(frame), (b, a), message
+    yield messages.stamped(frame, 3, 4), (b, a), message
     for orientation in (messages.UNKNOWN_ORIENTATION, messages.EXACT, DIAGONAL):
         message = Imu(orientation_covariance=orientation, angular_velocity_covariance=DIAGONAL,
                       linear_acceleration_covariance=messages.EXACT)
@@ -95,7 +95,7 @@ def with_header(frame, stamp_ns):
         yield messages.imu(frame, orientation, DIAGONAL, messages.EXACT), (a, b, c), message
     message = MagneticField(magnetic_field_covariance=DIAGONAL)
     set_axes(message.magnetic_field, b)
-    yield messages.magnetic_field(frame), (b, DIAGONAL), message
+    yield messages.stamped(frame, 3, 9), (b, DIAGONAL), message
     for child in ('', 'frame', 'a'):
         message = Odometry(child_frame_id=child)
         message.pose.covariance = message.twist.covariance = messages.diagonal(*6 * (0.0,))

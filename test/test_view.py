@@ -5,6 +5,8 @@ import importlib
 import math
 import socket
 import urllib.request
+from importlib import metadata
+from importlib.util import find_spec
 from xml.etree import ElementTree
 
 import numpy as np
@@ -27,10 +29,22 @@ from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import command, model, plots, text
 from spinning_top_sim.view.track import Samples, Track, state_of
 
-viser = pytest.importorskip('viser')
-body, logs, pages, server, controls_of = (
-    importlib.import_module(f'spinning_top_sim.view.{name}')
-    for name in ('body', 'log', 'page', 'server', 'controls'))
+pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')
+
+
+class Later:
+    """A module that is imported where it is used: viser takes a second."""
+
+    def __init__(self, name):
+        self._name = name
+
+    def __getattr__(self, name):
+        if name[0] == '_':              # pytest looks whether it is a fixture
+            raise AttributeError(name)
+        return getattr(importlib.import_module(self._name), name)
+
+
+logs, pages = Later('spinning_top_sim.view.log'), Later('spinning_top_sim.view.page')
 COMMAND_S = 3.0
 
 
@@ -390,7 +404,7 @@ def test_a_page_of_another_site_is_refused(page):
             (f'LOCALHOST:{port}', f'http://localhost:{port}', 101)):
         lines = ['GET / HTTP/1.1', f'Host: {host}', 'Upgrade: websocket', 'Connection: Upgrade',
                  'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==', 'Sec-WebSocket-Version: 13',
-                 f'Sec-WebSocket-Protocol: viser-v{viser.__version__}',
+                 'Sec-WebSocket-Protocol: viser-v' + metadata.version('viser'),
                  *([f'Origin: {origin}'] if origin else []), '', '']
         with socket.create_connection(('127.0.0.1', port), 30.0) as connection:
             connection.sendall('\r\n'.join(lines).encode())

@@ -3,6 +3,7 @@
 
 import re
 import signal
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.view import command
 
-pytest.importorskip('viser')
+pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')
 VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
 STAMP = r'stamp (\d+)\.(\d{9})'
 

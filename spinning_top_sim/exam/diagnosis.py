@@ -8,18 +8,15 @@ disappears, it was the cause.
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import measures
-from spinning_top_sim.exam.excitation import axes, mapped, moved, shifted
+from spinning_top_sim.exam import measures, scenarios
 from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.exam.scenarios import Reals, Run
-from spinning_top_sim.exam.trial import ChangeAttitudes, Hypothesis, Outcome
+from spinning_top_sim.exam.trial import ChangeRows, Hypothesis, Outcome, changed
 
 FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component_order',
           'frame_ned', 'gravity_sign', 'gyroscope_wiring', 'accelerometer_wiring',
@@ -29,7 +26,6 @@ FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component
 
 # Thresholds; docs/exam.md compares them with the values of filters.  Errors are in rad.
 TILT, HEADING = np.radians((0.3, 0.8)).tolist()         # rms of a right filter, no noise
-GROSS = np.radians(3.0)         # a smaller error is no misreading
 DIVERGED, GROWS = np.radians(10.0), 1.2     # from one quarter to the next
 EXPLAINED = 0.25                # of the error is left at most when its cause is undone
 FIRST_ORDER = np.radians(0.2)   # on the fast motion
@@ -41,63 +37,25 @@ CONSISTENT = 0.9999             # probability of the NEES band
 
 
 class Fault(NamedTuple):
-    """
-    A fault of a filter.
-
-    Parameters
-    ----------
-    name : str
-        One of FAULTS.
-    evidence : str
-        Why the exam reports it.
-    """
+    """A fault of a filter: its name, one of FAULTS, and why the exam reports it."""
 
     name: str
     evidence: str
 
 
-class Clean(NamedTuple):
-    """Errors without noise, rms [rad]: at rest, and in motion."""
-
-    tilt: float
-    heading: float
-    tilt_moving: float
-    heading_moving: float
-
-    @property
-    def wrong(self) -> bool:
-        """Whether one is larger than that of a right filter."""
-        return (max(self.tilt, self.tilt_moving) > TILT
-                or max(self.heading, self.heading_moving) > HEADING)
-
-    def __str__(self) -> str:
-        return (f'without noise the error at rest is {degrees(self.tilt)} of tilt and '
-                f'{degrees(self.heading)} of heading, in motion {degrees(self.tilt_moving)} and '
-                f'{degrees(self.heading_moving)}')
-
-
 def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
-            ) -> ChangeAttitudes:
+            ) -> ChangeRows:
     """Return the multiplication of attitudes by quaternions x, y, z, w on both sides."""
     return lambda estimates: (Rotation.from_quat(left) * Rotation.from_quat(estimates)
                               * Rotation.from_quat(right)).as_quat()
-
-
-def for_first_order(run: Run) -> Run:
-    """Return the rates for which the normalised first-order step q + q w dt/2 is exact."""
-    half = 0.5 * run.dt * np.linalg.norm(run.gyroscope, axis=1)
-    longer = np.tan(np.minimum(half, 1.5)) / np.where(half > 0.0, half, 1.0)
-    return replace(run, gyroscope=run.gyroscope * np.where(
-        half > 0.0, longer, 1.0)[:, np.newaxis])
 
 
 _HALF = 0.5 ** 0.5
 _CONJUGATE, _W_LAST = np.array((-1.0, -1.0, -1.0, 1.0)), [1, 2, 3, 0]
 NED_WORLD = Hypothesis(('frame_ned',), 'read as attitude in a world north-east-down',
                        read=_turned((_HALF, _HALF, 0.0, 0.0)))
-GRAVITY_SIGN = Hypothesis(
-    ('gravity_sign',), 'with the sign of the accelerometer changed',
-    given=lambda run: replace(run, accelerometer=-run.accelerometer))
+GRAVITY_SIGN = Hypothesis(('gravity_sign',), 'with the sign of the accelerometer changed',
+                          given=changed(('accelerometer',), np.negative))
 # These need the attitudes only.
 READINGS = (
     Hypothesis(('component_order',), 'read as w, x, y, z', read=lambda q: q[:, _W_LAST]),
@@ -109,25 +67,6 @@ READINGS = (
                read=_turned((0.0, 0.0, _HALF, _HALF))),
     Hypothesis(('conjugated', 'component_order'), 'read as w, x, y, z and conjugated',
                read=lambda q: q[:, _W_LAST] * _CONJUGATE))
-LIKELY = 6                      # signed permutations of a sensor that are tried
-SIGNED = [np.array(signs)[:, np.newaxis] * np.eye(3)[list(order)]
-          for order in itertools.permutations(range(3))
-          for signs in itertools.product((1.0, -1.0), repeat=3)][1:]
-ONE_STEP = (        # no fault: the filter corrects before it takes the step
-    Hypothesis((), 'corrected before the step',
-               given=shifted(('accelerometer', 'magnetometer'), -1)),
-    Hypothesis((), 'a step ahead', read=lambda q: moved(q, -1)))
-
-
-def wired(sensor: str, text: str, matrix: Any) -> Hypothesis:
-    """Return the hypothesis that the readings of a sensor need this matrix."""
-    return Hypothesis((f'{sensor}_wiring',), text, given=mapped(sensor, matrix))
-
-
-def permuted(sensor: str, fit: Callable[[Reals], float], count: int = LIKELY) -> list[Hypothesis]:
-    """Return the hypotheses that the filter has those signed permutations that fit best."""
-    return [wired(sensor, f'with {axes(one.T)} of the {sensor} for its x, y, z', one.T)
-            for one in sorted(SIGNED, key=fit, reverse=True)[:count]]
 
 
 def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
@@ -142,26 +81,38 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
         'convergence_s': max(measures.convergence_time(outcome.run.t, outcome.errors.tilt)
                              for outcome in outcomes),
         'heading_drift_deg_per_s': math.degrees(float(np.mean([
-            abs(measures.drift(outcome.run.t, one.heading))
+            abs(np.polyfit(outcome.run.t - outcome.run.t[0], one.heading, 1)[0])
             for outcome, one in zip(settled, errors, strict=True)])))}
+
+
+def quality(outcomes: Sequence[Outcome], unaided: Sequence[measures.Rmse],
+            imu: Mapping[str, Any], absolute: bool) -> dict[str, float]:
+    """
+    Return ratios of errors to the least that white noise allows, and to those without a filter.
+
+    A Kalman filter of a random walk of density q, read with noise of density r, has the variance
+    sqrt(q r) (Bar-Shalom et al. 2001, 4.5).
+    """
+    rate, force, field = (imu.get(f'{name}noise_density', 0.0)
+                          for name in ('imu.gyroscope_', 'imu.accelerometer_', 'mag.'))
+    horizontal = math.hypot(*imu.get('mag.field', scenarios.FIELD)[:2])
+    found: dict[str, float] = {}
+    for what, variance in (('tilt', 2.0 * rate * force / scenarios.GRAVITY), (
+            'heading', rate * field / max(horizontal, 1e-12)))[:1 + absolute]:
+        errors = np.array([getattr(measures.rmse(one.estimates, one.run.truth), what)
+                           for one in (outcome.last() for outcome in outcomes)])
+        least = math.degrees(math.sqrt(variance)) or math.nan
+        found |= {f'{what}_to_bound': float(np.mean(errors)) / least,
+                  f'{what}_to_bound_spread': float(np.std(errors, ddof=1)) / least
+                  if len(errors) > 1 else math.nan,
+                  f'{what}_to_gyroscope': float(np.mean(errors / [
+                      max(getattr(one, what), 1e-9) for one in unaided]))}
+    return found
 
 
 def error_of(outcome: Outcome, absolute: bool) -> float:
     """Return the rms attitude error [rad]."""
     return rms(outcome.errors.attitude(absolute))
-
-
-def explain(outcome: Outcome, absolute: bool) -> Hypothesis | None:
-    """Return the misreading of attitudes that explains the error of a settled filter, or None."""
-    before = error_of(outcome, absolute)
-    after, best = min((
-        (error_of(replace(outcome, estimates=one.read(outcome.estimates)), absolute), one)
-        for one in READINGS), key=lambda pair: pair[0])
-    if before < GROSS or after > EXPLAINED * before:
-        return None
-    text = (f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
-            'measures are those after this correction')
-    return ambiguous(best._replace(text=text), absolute)
 
 
 def ambiguous(one: Hypothesis, absolute: bool) -> Hypothesis:
@@ -191,11 +142,8 @@ def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measur
     runs = [(one.estimates[known], one.run.truth[known], one.covariances[known])
             for one in (outcome.last(0.75) for outcome in outcomes)
             if np.any(known := np.all(np.isfinite(one.covariances), axis=(1, 2)))]
-    if not runs:
-        return {}
-    found = {what: measures.nees_of(runs, whole)
-             for what, whole in (('tilt', False), ('attitude', True))[:1 + absolute]}
-    return {what: nees for what, nees in found.items() if nees is not None}
+    return {what: nees for what, whole in (('tilt', False), ('attitude', True))[:1 + absolute]
+            if runs and (nees := measures.nees_of(runs, whole)) is not None}
 
 
 def nees_marks(found: Mapping[str, measures.Nees]) -> dict[str, float]:
@@ -217,25 +165,17 @@ def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
     return None
 
 
-def divergence(outcome: Outcome, absolute: bool) -> Fault | None:
-    """Judge whether the error grows from quarter to quarter."""
+def inaccuracy(outcome: Outcome, absolute: bool) -> Fault | None:
+    """Judge the error in the last quarter, and whether it grows from quarter to quarter."""
     error = outcome.errors.attitude(True) if absolute else outcome.errors.tilt
     quarters = [rms(part) for part in np.array_split(error, 4)]
-    if quarters[-1] < DIVERGED or any(
-            later < GROWS * earlier for earlier, later in itertools.pairwise(quarters[1:])):
+    if quarters[-1] < DIVERGED:
         return None
-    return Fault('diverges', f'{outcome.run.name}: the error grows from quarter to quarter: '
-                 f'{", ".join(map(degrees, quarters))}')
-
-
-def inaccuracy(outcome: Outcome, absolute: bool) -> Fault | None:
-    """Judge the error in the last quarter, for which there is no other reason."""
-    last = outcome.last(0.25)
-    error = error_of(last, True) if absolute else rms(last.errors.tilt)
-    if error < DIVERGED:
-        return None
-    return Fault('inaccurate', f'{last.run.name}: the error in the last quarter is '
-                 f'{degrees(error)}, for no reason that is known')
+    if all(later >= GROWS * one for one, later in itertools.pairwise(quarters[1:])):
+        return Fault('diverges', f'{outcome.run.name}: the error grows from quarter to quarter: '
+                     f'{", ".join(map(degrees, quarters))}')
+    return Fault('inaccurate', f'{outcome.run.name}: the error in the last quarter is '
+                 f'{degrees(quarters[-1])}, for no reason that is known')
 
 
 def one_of_each(faults: Sequence[Fault]) -> Iterator[Fault]:

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exam of a filter in Python: the runs that it consists of, and the report on them."""
 
-import contextlib
 import math
 import operator
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -15,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import diagnosis, measures, scenarios
 from spinning_top_sim.exam.diagnosis import Fault, degrees
-from spinning_top_sim.exam.excitation import increments
-from spinning_top_sim.exam.field import examine_field
+from spinning_top_sim.exam.excitation import off, words
 from spinning_top_sim.exam.isolation import feed_apart
-from spinning_top_sim.exam.measures import rms
+from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.response import Responses
 from spinning_top_sim.exam.scenarios import Run, Scenario
 from spinning_top_sim.exam.trial import (
+    WITHOUT_FIELD,
     ChangeReadings,
     Feed,
     Hypothesis,
@@ -30,9 +29,7 @@ from spinning_top_sim.exam.trial import (
     MakeFilter,
     Outcome,
     feed,
-    follow,
     one_line,
-    without_field,
 )
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
@@ -52,6 +49,7 @@ SHOW_ELSEWHERE = ('inaccurate', 'lever_arm', 'no_bias_estimate', 'bias_report', 
 # When the lever arm comes, and until when its effect is measured [s].  Later the estimate of a
 # bias would have adapted to the force.
 ARM_S = 13.33, 14.33, 19.33
+SLIGHT = 0.01                   # by which the gyroscope's matrix differs where an error grows
 STEP = 0.05                     # by which the response to a rate depends on the step, relative
 
 
@@ -62,44 +60,19 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     """
     Examine an attitude filter.
 
-    The filter has a method ``update(gyroscope, accelerometer, magnetometer, dt)``: the mean
-    angular velocity over the step [rad/s], specific force [m/s^2, +g upwards at rest] and field
-    [T, or None] at its end, in the frame of the sensor, and the length of the step [s].  It
-    returns the attitude at the end of the step, q(world <- sensor) in the order x, y, z, w; x of
-    the world is east, y north and z up.  Attributes `covariance` and `bias` are optional, see
-    `trial.Filter`.
+    make_filter : returns a new filter, for every run: its class, a function, or one of
+        `adapters.FILTERS`; it has the method ``update`` of `trial.Filter`
+    level : 'quick'; 'full' has more seeds, and a seed of the scenes of 'field'
+    imu : parameters imu.* and mag.* by name, or the path of a parameter file such as those in
+        config/imu; by default `scenarios.CALIBRATED`, the noise of a calibrated device
+    seeds : of the noisy runs, or their number; by default SEEDS of the level
+    subject : name in the report; by default that of the filter's class
+    isolated : False runs the filter in this process, where a debugger can reach it; one that
+        crashes or never returns then ends the exam
+    restart : False makes one filter, in this process, and uses it for all runs
 
-    Parameters
-    ----------
-    make_filter : callable
-        Returns a new filter: its class, a function, or one of `adapters.FILTERS`.  It is called
-        for every run.
-    level : {'quick', 'full', 'field'}
-        'full' has more seeds, and a seed of the scenes of 'field'.
-    imu : mapping or path, optional
-        Parameters imu.* and mag.* by name, or the path of a parameter file such as those in
-        config/imu.  The default, `scenarios.CALIBRATED`, is the noise of a calibrated device.
-    seeds : int or iterable of int, optional
-        Seeds of the noisy runs, or their number.  The default, SEEDS, depends on the level.
-    subject : str, optional
-        Name in the report.  The default is the name of the filter's class.
-    isolated : bool, optional
-        If False, the filter runs in this process, where a debugger can reach it.  A filter that
-        crashes or never returns then ends the exam.
-    restart : bool, optional
-        If False, one filter is made, in this process, and used for all runs.
-
-    Returns
-    -------
-    Report
-        Faults with their evidence, and measures.
-
-    Raises
-    ------
-    TypeError
-        If `make_filter` cannot be called, such as a filter itself.
-    ValueError
-        If the level, a parameter or a seed is not allowed.
+    Returns faults with their evidence, and measures.  Raises TypeError if `make_filter` cannot be
+    called, such as a filter itself, and ValueError if level, parameter or seed is not allowed.
     """
     if not callable(make_filter):
         raise TypeError(f'make_filter = {one_line(repr(make_filter))}: pass the class of the '
@@ -112,8 +85,13 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     if level == 'field' and not restart:
         raise ValueError("level = 'field': the filter must be made anew for each scene")
     run_feed = feed_apart if isolated and restart else feed
-    in_field = partial(examine_field, make_filter, subject=subject,
-                       imu=None if imu is None else values, feed=run_feed)
+
+    def in_field(seeds: Iterable[int]) -> Report:
+        from spinning_top_sim.exam.field import examine_field  # noqa: PLC0415 - slow
+
+        return examine_field(make_filter, seeds, subject=subject,
+                             imu=None if imu is None else values, feed=run_feed)
+
     if level == 'field':
         return in_field(numbers)
     exam = (_Exam(make_filter, run_feed, values, numbers) if restart else
@@ -147,65 +125,49 @@ def _seed_numbers(seeds: int | Iterable[int]) -> list[int]:
     return numbers
 
 
-class _Exam:
-    """The runs of one exam, and what they show."""
+class _Exam(Responses):
+    """The runs of one exam."""
 
     finer: Sequence[float] = FINER
-    judges_covariance = restarts = True
 
     def __init__(self, make_filter: MakeFilter, feed: Feed, imu: Mapping[str, Any],
                  seeds: Sequence[int]) -> None:
-        self._make_filter, self._feed, self._imu, self._seeds = make_filter, feed, imu, seeds
-        self._absolute = False
-        self._responses: Responses | None = None
-        self.faults: list[Fault] = []
-        self.measures: dict[str, float] = {}
+        super().__init__(make_filter, feed, imu)
+        self._seeds = seeds
         self.outcomes: list[Outcome] = []
+        self._unaided: list[measures.Rmse] = []
 
     def sit(self) -> None:
         """Do all runs."""
-        with self._guarded():
-            self._ask_for_field()
+        self._do(self._ask_for_field)
         if self.faults:
             return
-        with self._guarded():
-            self._identify()
-        self._do_noisy_runs()
+        identified = self._do(self._identify)
+        for seed in self._seeds:        # those for which the filter fails are dropped
+            self._do(partial(self._do_noisy_run, seed))
         if not self.outcomes:
             return
         self.measures = diagnosis.marks(self.outcomes, self._absolute) | self.measures
-        clear = self._responses is None or not self._responses.unclear
-        for part in (self._judge_integration, self._judge_lever_arm, self._judge_bias)[
-                :3 if clear else 1]:
-            with self._guarded():
-                part()
+        self._do(self._judge_integration)
+        if not self.unclear:
+            self._do(self._judge_lever_arm)
+            if identified:
+                self._do(self._judge_bias)
         self._judge_noisy_runs()
 
-    def _add(self, fault: Fault | None) -> None:
-        if fault is not None:
-            self.faults.append(fault)
-
-    @contextlib.contextmanager
-    def _guarded(self) -> Iterator[None]:
-        """End a part of the exam where the filter fails in it, and report that."""
+    def _do(self, part: Callable[[], object]) -> bool:
+        """Do a part of the exam; return False where the filter fails, which is reported."""
         try:
-            yield
+            part()
         except InvalidOutputError as error:
-            self._add(Fault('invalid_output', str(error)))
+            self.faults.append(Fault('invalid_output', str(error)))
+            return False
+        return True
 
-    def _follow(self, run: Run, undone: Sequence[Hypothesis] = ()) -> Outcome:
-        """Return the outcome of a run, fed to a new filter."""
-        return follow(self._make_filter, run, undone, self._feed)
-
-    def _run(self, scenario: Scenario, *changes: ChangeReadings, seed: int | None = None,
-             ) -> Outcome:
-        """Return the outcome of a scenario, by default with the first seed."""
-        return self._corrected(self._record(scenario, seed), *changes)
-
-    def _corrected(self, run: Run, *changes: ChangeReadings) -> Outcome:
+    def _run(self, run: Run, *changes: ChangeReadings) -> Outcome:
         """Return the outcome of a run; causes that have been found are undone."""
-        return self._follow(run, [*(Hypothesis((), '', given=one) for one in changes), *(
-            self._responses.undone if self._responses is not None else ())])
+        return self._follow(run, [*(Hypothesis((), '', given=one) for one in changes),
+                                  *self.undone])
 
     def _record(self, scenario: Scenario, seed: int | None = None) -> Run:
         return scenarios.record(scenario, self._imu, self._seeds[0] if seed is None else seed)
@@ -220,86 +182,70 @@ class _Exam:
             if self._absolute:
                 break
 
-    def _identify(self) -> None:
-        """Name the causes that show in the responses to single inputs; they are undone then."""
-        self._responses = found = Responses(
-            self._follow, self._imu, self._absolute, self.restarts)
-        try:
-            found.identify()
-        finally:
-            self.faults += found.faults
-        clean = found.clean
-        self.measures |= {'tilt_clean_deg': math.degrees(max(clean.tilt, clean.tilt_moving)),
-                          'heading_clean_deg': math.degrees(max(
-                              clean.heading, clean.heading_moving))}
-
-    def _do_noisy_runs(self) -> None:
-        """Follow the slow motion; drop the seeds for which the filter fails."""
-        done = {}
-        for seed in self._seeds:
-            with self._guarded():
-                done[seed] = self._run(scenarios.SLOW, seed=seed)
-        self._seeds, self.outcomes = list(done), list(done.values())
+    def _do_noisy_run(self, seed: int) -> None:
+        run = self._record(scenarios.SLOW, seed)
+        self.outcomes.append(self._run(run))
+        self._unaided.append(measures.unaided(run, slice(len(run.t) // 2, None)))
 
     def _judge_noisy_runs(self) -> None:
         first = self.outcomes[0]
+        self.measures |= diagnosis.quality(self.outcomes, self._unaided, self._imu, self._absolute)
         self.measures['stamp_offset_s'] = diagnosis.stamp_fault(
             first.last(), self._absolute)[0].seconds
-        self._add(diagnosis.divergence(first, self._absolute))
-        if not self.faults:
-            self._add(diagnosis.inaccuracy(first, self._absolute))
+        large = diagnosis.inaccuracy(first, self._absolute)
+        if large and not self.faults and off(self._early) > SLIGHT:
+            large = Fault('gyroscope_wiring', f'{words(self._early)}; {large.evidence}')
+        if large and (large.name == 'diverges' or not self.faults):
+            self.faults.append(large)
         if any(fault.name not in SHOW_ELSEWHERE for fault in self.faults):
             self.faults = [fault for fault in self.faults if fault.name != 'inaccurate']
         consistency = diagnosis.consistency(self.outcomes, self._absolute)
         self.measures |= diagnosis.nees_marks(consistency)
         # Faults are another reason for errors; without noise there is nothing random to judge by.
-        if self.judges_covariance and not self.faults and any(
+        # After minutes of learning the bias, a filter that goes on is too sure of it.
+        if self.restarts and not self.faults and any(
                 self._imu.get(f'imu.{sensor}_noise_density')
                 for sensor in ('gyroscope', 'accelerometer')):
-            self._add(diagnosis.covariance_fault(consistency))
+            self.faults += filter(None, [diagnosis.covariance_fault(consistency)])
 
     def _judge_integration(self) -> None:
         """Compare sampling rates on the fast motion, if possible without the magnetometer."""
-        changes: tuple[ChangeReadings, ...] = (without_field,)
+        runs = [self._record(replace(scenarios.FAST, rate=factor * scenarios.FAST.rate))
+                for factor in self.finer]
+        changes: tuple[ChangeReadings, ...] = (WITHOUT_FIELD,)
         try:
-            self._run(replace(scenarios.FAST, duration=0.1, reversals=()), *changes)
+            self._run(runs[0].part(slice(10)), *changes)
         except InvalidOutputError:
             changes = ()
-        finer = [replace(scenarios.FAST, rate=factor * scenarios.FAST.rate)
-                 for factor in self.finer]
-        outcomes = [self._run(scenario, *changes).last() for scenario in finer]
-        moved = [rms(measures.moved(outcome.estimates, outcome.run.truth))
-                 for outcome in outcomes]
+        outcomes = [self._run(run, *changes).last() for run in runs]
+        moved, gains = [], []
+        for outcome in outcomes:
+            one, true = map(Rotation.from_quat, (outcome.estimates, outcome.run.truth))
+            moved.append(rms(((true[0] * one[0].inv()) * one * true.inv()).magnitude()))
+            steps, right = map(increments, (outcome.estimates, outcome.run.truth))
+            gains.append(float(np.sum(steps * right) / np.sum(right * right)))
         self.measures['order'] = measures.convergence_order(self.finer, moved)
         self.measures['integration_error_deg'] = math.degrees(moved[0])
-        self._judge_step(outcomes)
+        # A filter that does not use the step turns by the number of samples.
+        off = abs(gains[-1] - gains[0]) / max(abs(gains[0]), STEP)
+        if off > STEP and abs(gains[-1] / self.finer[-1] - gains[0]) < 0.25 * abs(gains[0]):
+            # A wrong step turns up as a wrong scale at one rate.
+            self.faults = [fault for fault in self.faults if not (
+                fault.name == 'gyroscope_wiring' and 'time_step' in dict(self.faults))]
+            self.faults.append(Fault(
+                'time_step', f'at {" and ".join(run.name for run in runs)} turns move it '
+                f'{" and ".join(f"{gain:.3g}" for gain in gains)} times as far as the sensor: the '
+                'step is not used'))
         absolute = self._absolute and not changes
         before = diagnosis.error_of(outcomes[0], absolute)
-        if before > diagnosis.FIRST_ORDER:
-            corrected = self._run(finer[0], diagnosis.for_first_order, *changes).last()
-            after = diagnosis.error_of(corrected, absolute)
+        # An error of the scale does not fall with the rate.
+        if before > diagnosis.FIRST_ORDER and not self.measures['order'] < 1.0:
+            after = diagnosis.error_of(self._run(runs[0], for_first_order, *changes).last(),
+                                       absolute)
             if after < diagnosis.FIRST_ORDER_LEFT * before:
-                self._add(Fault('first_order_integration', 'integration is first order: '
-                                'correcting it reduces the error on the fast motion from '
-                                f'{degrees(before)} to {degrees(after)}'))
-
-    def _judge_step(self, outcomes: Sequence[Outcome]) -> None:
-        """Compare the responses to the same rates in steps of different lengths."""
-        found = []
-        for outcome in outcomes:
-            estimated, true = map(increments, (outcome.estimates, outcome.run.truth))
-            found.append(float(np.sum(estimated * true) / np.sum(true * true)))
-        # A filter that does not use the step turns by the number of samples.
-        samples = outcomes[0].run.dt[0] / outcomes[-1].run.dt[0]
-        if abs(found[-1] - found[0]) < STEP * max(abs(found[0]), STEP) or (
-                abs(found[-1] / samples - found[0]) > 0.25 * abs(found[0])):
-            return
-        # A wrong step turns up as a wrong scale at one rate.
-        self.faults = [fault for fault in self.faults if not (
-            fault.name == 'gyroscope_wiring' and 'time_step' in dict(self.faults))]
-        self._add(Fault('time_step', f'at {" and ".join(f"{one.run.name}" for one in outcomes)} '
-                        f'turns move it {" and ".join(f"{one:.3g}" for one in found)} times as '
-                        'far as the sensor: the step is not used'))
+                self.faults.append(Fault(
+                    'first_order_integration', 'integration is first order: correcting it reduces '
+                    f'the error on the fast motion from {degrees(before)} to {degrees(after)}'))
 
     def _judge_lever_arm(self) -> None:
         """Compare the attitudes with and without a lever arm."""
@@ -308,42 +254,31 @@ class _Exam:
         begin, first, end = (round(t * scenarios.SLOW.rate) for t in ARM_S)
         with_arm = replace(still, accelerometer=np.concatenate(
             (still.accelerometer[:begin], moving.accelerometer[begin:])))
-        arm, pivot = (self._corrected(run).estimates[first:end] for run in (with_arm, still))
+        arm, pivot = (self._run(run).estimates[first:end] for run in (with_arm, still))
         effect = rms(measures.errors_of(arm, pivot).tilt)
         self.measures['lever_arm_deg'] = math.degrees(effect)
         if effect > diagnosis.LEVER_ARM:
-            self._add(Fault('lever_arm', f'10 cm off the axis adds {degrees(effect)}: motion is '
-                            'mistaken for gravity'))
-
-    def _judge_bias(self) -> None:
-        """Compare two runs with and without a gyroscope bias."""
-        if self._responses is not None:
-            measured, fault = self._responses.bias()
-            self.measures |= measured
-            self._add(fault)
-
+            self.faults.append(Fault('lever_arm', f'10 cm off the axis adds {degrees(effect)}: '
+                                     'motion is mistaken for gravity'))
 
 class _OneFilterExam(_Exam):
     """The runs of an exam of one filter that is never restarted, at the one rate of its IMU."""
 
     finer = FINER[:1]
-    # After minutes of learning the bias the filter is too sure of it when the motion changes.
-    judges_covariance = restarts = False
+    restarts = False
     _attitude = Rotation.identity()
 
     def sit(self) -> None:
         """Do all runs."""
         super().sit()
         if self.outcomes:
-            with self._guarded():
-                self._measure_convergence()
+            self._do(self._measure_convergence)
 
     def _follow(self, run: Run, undone: Sequence[Hypothesis] = ()) -> Outcome:
         """Return the outcome of a run, before which the sensor turns to where it begins."""
         lead = scenarios.turning(self._imu, self._attitude, run.start, TURN_S)
-        outcome = super()._follow(run.after(lead), undone).since(len(lead.t))
         self._attitude = Rotation.from_quat(run.truth[-1])
-        return outcome
+        return super()._follow(run.after(lead), undone).part(slice(len(lead.t), None))
 
     def _ask_for_field(self) -> None:
         """Turn the field to and fro: if the attitude follows, the heading can be judged."""
@@ -363,6 +298,14 @@ class _OneFilterExam(_Exam):
         """Measure the convergence time after a jump of the true attitude by 90 degrees of tilt."""
         run = self._record(scenarios.SLOW)
         tilted = Rotation.from_euler('x', 90.0, degrees=True) * run.start
-        lead = scenarios.turning(self._imu, tilted, tilted, TURN_S)
-        outcome = self._follow(run.after(lead)).since(len(lead.t))
-        self.measures['convergence_s'] = measures.convergence_time(run.t, outcome.errors.tilt)
+        tilt = self._follow(run.after(scenarios.turning(
+            self._imu, tilted, tilted, TURN_S))).errors.tilt[-len(run.t):]
+        self.measures['convergence_s'] = measures.convergence_time(run.t, tilt)
+
+
+def for_first_order(run: Run) -> Run:
+    """Return the rates for which the normalised first-order step q + q w dt/2 is exact."""
+    half = 0.5 * run.dt * np.linalg.norm(run.gyroscope, axis=1)
+    longer = np.tan(np.minimum(half, 1.5)) / np.where(half > 0.0, half, 1.0)
+    return replace(run, gyroscope=run.gyroscope * np.where(
+        half > 0.0, longer, 1.0)[:, np.newaxis])

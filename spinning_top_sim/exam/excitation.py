@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import scenarios
+from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.scenarios import Reals, Run
-from spinning_top_sim.exam.trial import ChangeReadings, Outcome
+from spinning_top_sim.exam.trial import Outcome
 
 AXES = 'xyz'
 # Turns about an axis of the sensor [deg], each followed by a rest; the last one leads back.
@@ -32,28 +33,32 @@ class Excitation(NamedTuple):
     """
     Rests between turns, the slow motion, and two kicks of the gyroscope alone at rest.
 
+    run : with the kicks
+    still : without them
     rests : index of the last sample of each rest (n,); the first and the last but one are equal
     turns : index of the first sample of each turn (n,)
     motion : where the slow motion is judged
-    kicks : index of the first sample of each kick
+    kicks : index of the first sample of each kick; the second one is opposite
     """
 
     run: Run
+    still: Run
     rests: NDArray[np.intp]
     turns: NDArray[np.intp]
     motion: slice
     kicks: tuple[int, int]
 
 
-def excite(imu: Mapping[str, Any], rate: float) -> Excitation:
-    """Return the run for the IMU's place and field, sampled at a rate [Hz]."""
-    motion = scenarios.record(replace(scenarios.PIVOT, duration=MOTION_S, rate=rate), imu, 0)
+def excite(imu: Mapping[str, Any]) -> Excitation:
+    """Return the run for the IMU's place and field, sampled at the rate of the slow motion."""
+    rate = scenarios.SLOW.rate
+    motion = scenarios.record(replace(scenarios.PIVOT, duration=MOTION_S), imu, 0)
     at = Rotation.identity()
     path = [np.tile(at.as_quat(), (round(FIRST_S * rate) + 1, 1))]
-    ways = [math.radians(angle) * np.eye(3)[axis] for axis, angle in TURNS]
-    ends = list(itertools.accumulate(map(Rotation.from_rotvec, ways), operator.mul))
+    goals = list(itertools.accumulate((Rotation.from_rotvec(
+        math.radians(angle) * np.eye(3)[axis]) for axis, angle in TURNS), operator.mul))
     rests, turns = [len(path[0]) - 2], []
-    for goal in (*ends, at, motion.start):
+    for goal in (*goals, at, motion.start):
         way = (at.inv() * goal).as_rotvec()
         n = round(float(np.linalg.norm(way)) / TURN_RATE * rate) + 1
         turns.append(rests[-1] + 1)
@@ -61,63 +66,68 @@ def excite(imu: Mapping[str, Any], rate: float) -> Excitation:
                  np.tile(goal.as_quat(), (round(REST_S * rate), 1))]
         rests.append(rests[-1] + n + round(REST_S * rate))
         at = goal
-    lead = scenarios.along('', Rotation.from_quat(np.concatenate(path)), imu, rate)
-    n = round(ANSWER_S * rate)
-    tail = scenarios.along('', Rotation.from_quat(np.tile(motion.truth[-1], (3 * n + 1, 1))), imu,
-                           rate)
-    run = replace(tail.after(motion.after(lead)), name='excitation')
-    run.gyroscope[:] += NEVER_ZERO
-    end = len(lead.t) + len(motion.t)
-    return Excitation(run, np.array(rests), np.array(turns[:len(TURNS)]),
-                      slice(end - len(motion.t) // 2, end), (end + n, end + 2 * n))
+    lead = scenarios.along('', Rotation.from_quat(np.concatenate(path)), imu)
+    end, n = len(lead.t) + len(motion.t), round(ANSWER_S * rate)
+    last = np.tile(motion.truth[-1], (3 * n + 1, 1))
+    still = replace(scenarios.along('', Rotation.from_quat(last), imu).after(motion.after(lead)),
+                    name='excitation')
+    still.gyroscope[:] += NEVER_ZERO
+    run = replace(still, gyroscope=still.gyroscope.copy())
+    kick = Rotation.from_quat(last[0]).inv().apply(KICK) / KICK_S
+    for number, first in enumerate(kicks := (end + n, end + 2 * n)):
+        run.gyroscope[first:first + round(KICK_S * rate)] += (-1.0) ** number * kick
+    return Excitation(run, still, np.array(rests), np.array(turns[:len(TURNS)]),
+                      slice(end - len(motion.t) // 2, end), kicks)
 
 
-def with_kicks(given: Excitation) -> Run:
-    """Return the run with its kicks: to one side, then to the other."""
-    run = replace(given.run, gyroscope=given.run.gyroscope.copy())
-    kick = Rotation.from_quat(run.truth[-1]).inv().apply(KICK) / KICK_S
-    for sign, first in zip((1.0, -1.0), given.kicks, strict=True):
-        run.gyroscope[first:first + round(KICK_S / run.dt[-1])] += sign * kick
-    return run
-
-
-class Gyroscope(NamedTuple):
+def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Reals, int]:
     """
-    The response to the gyroscope: increments of the attitude over those of the sensor.
+    Fit the response to the gyroscope: increments of the attitude over those of the sensor.
 
-    matrix : (3, 3), the identity for a right filter
-    late : delay in samples
-    scatter : share of the squared increments that the matrix leaves
+    Returns two matrices (3, 3) from whole turns and from their begins, the identity for a right
+    filter, and the delay in samples that leaves least of whole turns.
     """
-
-    matrix: Reals
-    late: int
-    scatter: float
-
-    @property
-    def off(self) -> float:
-        """The largest deviation of the matrix from the identity."""
-        return float(np.max(np.abs(self.matrix - np.eye(3))))
-
-
-def increments(quaternions: Reals) -> Reals:
-    """Return the rotation vectors of the steps (n, 3) about axes of the sensor."""
-    turns = Rotation.from_quat(quaternions)
-    return np.concatenate((np.zeros((1, 3)), (turns[:-1].inv() * turns[1:]).as_rotvec()))
-
-
-def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp], length: int,
-                 latest: int = LATEST) -> Gyroscope:
-    """Fit the response to the first samples of turns, at the delay that leaves least."""
     estimated, true = increments(outcome.estimates), increments(outcome.run.truth)
-    fits = []
-    for late in range(latest + 1):
+
+    def fit(length: int, late: int) -> tuple[Reals, float]:
         rows = (turns[:, np.newaxis] + np.arange(length)).ravel()
-        given, response = np.roll(true, late, axis=0)[rows], estimated[rows]
+        given, response = true[rows - late], estimated[rows]
         matrix = np.linalg.lstsq(given, response, rcond=None)[0]
-        fits.append(Gyroscope(matrix.T, late, float(
-            np.sum((response - given @ matrix) ** 2) / max(np.sum(response ** 2), 1e-12))))
-    return min(fits, key=lambda fit: fit.scatter)
+        return matrix.T, rms(response - given @ matrix)
+
+    fits = [fit(WHOLE, late) for late in range(LATEST + 1)]
+    late = int(np.argmin([left for _, left in fits]))
+    return fits[late][0], fit(EARLY, 0)[0], late
+
+
+def off(*matrices: Reals) -> float:
+    """Return how far the nearest of some matrices is from the identity."""
+    return float(min(np.max(np.abs(matrix - np.eye(3))) for matrix in matrices))
+
+
+def affine_of(readings: Reals, estimated: Rotation, level: Sequence[int],
+              first: int) -> tuple[Reals, float]:
+    """
+    Fit the affine change of readings (n, 3) that attitudes at rest show.
+
+    level : axes of the world along which changed readings are zero
+    first : of the entries of matrix and offset that differ from the identity's
+
+    Returns the change (4, 4) in homogeneous coordinates, and the share of the error that is left.
+    """
+    across = np.concatenate([estimated.inv().apply(np.eye(3)[axis]) for axis in level])
+    readings = np.tile(readings, (len(level), 1))
+    matrix = np.hstack(((across[:, :, np.newaxis] * readings[:, np.newaxis]).reshape(-1, 9),
+                        across))
+    wanted = -np.sum(across * readings, axis=1)
+    # The readings have no scale: the trace remains.
+    rows = np.vstack((matrix, 10.0 * np.append(np.eye(3), np.zeros(3))))[:, first:]
+    found = np.linalg.lstsq(rows, np.append(wanted, 0.0), rcond=1e-3)[0]
+    entries = np.append(np.zeros(first), found)
+    change = np.eye(4)
+    change[:3] += np.hstack((entries[:9].reshape(3, 3), entries[9:, np.newaxis]))
+    change[:3] /= np.median(np.diag(change)[:3])    # most axes are right
+    return change, rms(matrix @ entries - wanted) / max(rms(wanted), 1e-6)
 
 
 def words(matrix: Reals) -> str:
@@ -136,39 +146,9 @@ def axes(matrix: Reals) -> str:
                      for row in matrix)
 
 
-def mapped(name: str, matrix: NDArray[np.floating[Any]], offset: Any = 0.0) -> ChangeReadings:
-    """Return the multiplication of the readings of a sensor by a matrix; an offset is added."""
-    def change(run: Run) -> Run:
-        readings: Any = {name: getattr(run, name) @ matrix.T + offset}
-        return replace(run, **readings)
-    return change
-
-
-def shifted(names: Sequence[str], samples: int) -> ChangeReadings:
-    """Return what gives the readings of sensors so many samples earlier."""
-    def change(run: Run) -> Run:
-        readings: Any = {name: moved(getattr(run, name), samples) for name in names}
-        return replace(run, **readings)
-    return change
-
-
-def sharpened(names: Sequence[str], samples: float) -> ChangeReadings:
-    """Return the inverse of a low pass of first order with this time constant [samples]."""
-    def change(run: Run) -> Run:
-        readings: Any = {name: getattr(run, name) + samples * np.diff(
-            getattr(run, name), axis=0, prepend=getattr(run, name)[:1]) for name in names}
-        return replace(run, **readings)
-    return change
-
-
 def moved(rows: Reals, samples: int) -> Reals:
     """Return the rows so many samples later; the first or the last is repeated."""
     return rows[np.clip(np.arange(len(rows)) + samples, 0, len(rows) - 1)]
-
-
-def with_steps(scale: float, run: Run) -> Run:
-    """Return steps so many times as long, by their stamps."""
-    return replace(run, dt=scale * run.dt)
 
 
 def of_world(run: Run) -> Run:

@@ -10,7 +10,7 @@ moves.  Rates, accelerations, their frequencies and lever arms are those of the 
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,7 +20,6 @@ from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import GRAVITY, Reals, Run
 from spinning_top_sim.exam.trial import Feed, MakeFilter
-from spinning_top_sim.physics.attitude import Vector
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
@@ -101,15 +100,6 @@ def examine_field(make_filter: MakeFilter, seeds: Iterable[int], *, subject: str
                                for scene in SCENES), 'field', subject, feed)
 
 
-class Motion(NamedTuple):
-    """Of a sensor at n half steps: attitude, rates and specific force in its frame, activity."""
-
-    turns: Rotation
-    rates: Reals
-    force: Reals
-    moves: Reals
-
-
 def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> Trial:
     """Return a scene as an IMU reads it.  Raises ValueError for parameters not allowed."""
     random = np.random.default_rng((seed, *scene.name.encode()))
@@ -122,18 +112,7 @@ def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> Trial:
     values = parameters.checked({
         **DEVICE, **left, 'mag.disturbance.world': events.ravel().tolist(),
         'seed': int(random.integers(2 ** 31)), **imu, **scene.values})
-    motion = _motion(scene, random)
-    bias = random.standard_normal(3)
-    readings = _readings(values, motion, BIAS * bias / np.linalg.norm(bias))
-    n = len(motion.moves) // 2
-    step = np.full(n, 1e-9 * PERIOD_NS)
-    run = Run(scene.name, np.cumsum(step), step,
-              motion.turns[1::2].as_quat(), motion.rates[1::2], *readings)
-    return Trial(run, np.flatnonzero(motion.moves[1::2] > 0.5))
-
-
-def _motion(scene: Scene, random: np.random.Generator) -> Motion:
-    # The first and the last are for differences only.
+    # The first and the last half step are for differences only.
     n = 2 * round(1e9 * (scene.motions[-1][1] + RAMP) / PERIOD_NS) + 2
     t = HALF * np.arange(n, dtype=np.float64)
     moves = np.sum([_step((t - begin) / RAMP) * _step((end - t) / RAMP)
@@ -151,8 +130,12 @@ def _motion(scene: Scene, random: np.random.Generator) -> Motion:
         acceleration[k] += blow
         acceleration[k + 1] -= blow
     rates = (turns[:-2].inv() * turns[2:]).as_rotvec() / (2.0 * HALF)
-    turns = turns[1:-1]
-    return Motion(turns, rates, turns.inv().apply(acceleration + UP), moves[1:-1])
+    turns, moves, bias = turns[1:-1], moves[1:-1], random.standard_normal(3)
+    readings = _readings(values, turns, rates + BIAS * bias / np.linalg.norm(bias),
+                         turns.inv().apply(acceleration + UP))
+    step = np.full(len(moves) // 2, 1e-9 * PERIOD_NS)
+    return Trial(Run(scene.name, np.cumsum(step), step, turns[1::2].as_quat(), rates[1::2],
+                     *readings), np.flatnonzero(moves[1::2] > 0.5))
 
 
 def _step(x: Reals) -> Reals:
@@ -174,35 +157,24 @@ def _waves(random: np.random.Generator, n: int, frequency: float, order: int,
     return waves
 
 
-def _readings(values: Mapping[str, Any], motion: Motion, bias: Reals) -> list[Reals]:
+def _readings(values: Mapping[str, Any], turns: Rotation, rates: Reals, force: Reals,
+              ) -> list[Reals]:
     """Return what gyroscope, accelerometer and magnetometer read at the steps, (n, 3) each."""
-    t_ns = HALF_NS * np.arange(1, len(motion.moves) + 1)
+    t_ns = HALF_NS * np.arange(1, len(rates) + 1)
     steps = range(PERIOD_NS, int(t_ns[-1]) + 1, PERIOD_NS)
-    signals = np.concatenate([np.stack(felt) for felt in Vibration(values, np.ones_like).add(
-        (_columns(motion.rates + bias), _columns(motion.force)), t_ns)])
-    signals = _low_pass(signals, values['imu.bandwidth'])
-    rates, force = _columns(signals[:3, 1::2].T), _columns(signals[3:, 1::2].T)
+    exact: Any = rates.T, force.T
+    signals: Any = np.concatenate([np.stack(felt) for felt in Vibration(
+        values, np.ones_like).add(exact, t_ns)])
+    if 0.0 < values['imu.bandwidth'] < 0.5 / HALF:
+        from scipy.signal import butter, lfilter, lfilter_zi  # noqa: PLC0415 - slow
+
+        low_pass = butter(1, 2.0 * HALF * values['imu.bandwidth'])
+        signals = lfilter(*low_pass, signals, zi=lfilter_zi(*low_pass) * signals[:, :1])[0]
     late = np.maximum(np.arange(1, len(t_ns), 2) - MAG_LATE, 0)
-    x, y, z, w = motion.turns[late].as_quat().T
+    x, y, z, w = turns[late].as_quat().T
     magnetometer = Magnetometer(values, PERIOD_NS)
-    outside = magnetometer.true((x, y, z, w))
     field = magnetometer.read(magnetometer.disturbed(
-        outside, (x, y, z, w), lambda of_body: of_body, t_ns[late]), steps)
+        magnetometer.true((x, y, z, w)), (x, y, z, w), lambda of_body: of_body, t_ns[late]), steps)
+    felt = signals[:3, 1::2], signals[3:, 1::2]
     return [np.stack(reading, axis=1) for reading in (
-        *Imu(values).sensor(PERIOD_NS).read((rates, force), steps), field)]
-
-
-def _low_pass(signals: Reals, frequency: float) -> Reals:
-    """Return signals after a low pass of first order, by the trapezoidal rule."""
-    if not 0.0 < frequency < 0.5 / HALF:
-        return signals
-    from scipy.signal import lfilter, lfilter_zi  # noqa: PLC0415 - slow; --help needs none
-    k = math.tan(math.pi * frequency * HALF)
-    b, a = [k / (1.0 + k)] * 2, [1.0, (k - 1.0) / (k + 1.0)]
-    filtered: Reals = lfilter(b, a, signals, zi=lfilter_zi(b, a) * signals[:, :1])[0]
-    return filtered
-
-
-def _columns(rows: Reals) -> Vector:
-    x, y, z = rows.T
-    return x, y, z
+        *Imu(values).sensor(PERIOD_NS).read(felt, steps), field)]

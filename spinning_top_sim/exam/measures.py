@@ -2,15 +2,15 @@
 """Error measures of an attitude filter; docs/exam.md has the definitions and their sources."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
-from spinning_top_sim.exam.scenarios import Reals
+from spinning_top_sim.exam.scenarios import Reals, Run
 
 CONVERGED_DEG = 1.0
 # Runs from which their spread is known, and how much of it has another reason than chance.
@@ -62,16 +62,19 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
     return Rmse(*(math.degrees(rms(one)) for one in (total, errors.turned(True), errors.tilt)))
 
 
-def means(kind: str, found: Mapping[str, Sequence[Rmse]]) -> dict[str, float]:
-    """Return the means over all trials, and the whole error of each, by the names of measures."""
-    if not found:
-        return {}
-    total, heading, tilt = np.mean([one for trials in found.values() for one in trials],
-                                   axis=0).tolist()
-    return {f'{kind}_rms_deg': total, f'{kind}_heading_rms_deg': heading,
-            f'{kind}_tilt_rms_deg': tilt,
-            **{f'{kind}_rms_{name}_deg': float(np.mean([one.total for one in trials]))
-               for name, trials in found.items()}}
+def unaided(run: Run, rows: slice | NDArray[np.intp]) -> Rmse:
+    """Return the errors, if small, of the gyroscope integrated from the truth without a filter."""
+    apart = run.dt[:, np.newaxis] * run.gyroscope - increments(run.truth)
+    error = np.cumsum(Rotation.from_quat(run.truth[1:]).apply(apart[1:]), axis=0)
+    error = np.concatenate((np.zeros((1, 3)), error))[rows]
+    return Rmse(*(math.degrees(rms(np.linalg.norm(part, axis=1)))
+                  for part in (error, error[:, 2:], error[:, :2])))
+
+
+def increments(quaternions: Reals) -> Reals:
+    """Return the rotation vectors of the steps (n, 3) about axes of the sensor."""
+    turns = Rotation.from_quat(quaternions)
+    return np.concatenate((np.zeros((1, 3)), (turns[:-1].inv() * turns[1:]).as_rotvec()))
 
 
 def rms(values: Reals) -> float:
@@ -86,23 +89,11 @@ def convergence_time(t: Reals, tilt: Reals) -> float:
     return float(t[end]) if end < len(t) else math.inf
 
 
-def drift(t: Reals, heading: Reals) -> float:
-    """Return the slope of the least-squares line [rad/s]."""
-    return float(np.polyfit(t - t[0], heading, 1)[0])
-
-
 def convergence_order(rates: Sequence[float], errors: Sequence[float]) -> float:
     """Return p where errors fall as rate^-p; NaN for one rate or errors of rounding size."""
     if len(rates) < 2 or min(errors) < 1e-9:
         return math.nan
     return float(-np.polyfit(np.log(rates), np.log(errors), 1)[0])
-
-
-def moved(estimates: Reals, truth: Reals) -> Reals:
-    """Return the angles (n,) [rad] between attitudes after the first ones are aligned."""
-    est, true = Rotation.from_quat(estimates), Rotation.from_quat(truth)
-    aligned: Reals = ((true[0] * est[0].inv()) * est * true.inv()).magnitude()
-    return aligned
 
 
 class Offset(NamedTuple):
@@ -124,14 +115,11 @@ def time_offset(estimates: Reals, truth: Reals, rates: Reals, absolute: bool) ->
     absolute : True fixes h to 0; False is for a filter without a heading reference
     """
     true, est = Rotation.from_quat(truth), Rotation.from_quat(estimates)
-    columns = [-rates.ravel()]
-    if not absolute:
-        heading = errors_of(estimates, truth).heading
-        mean = math.atan2(np.mean(np.sin(heading)), np.mean(np.cos(heading)))
-        est = Rotation.from_rotvec((0.0, 0.0, -mean)) * est
-        columns.append(true.inv().apply((0.0, 0.0, 1.0)).ravel())
-    vector = (true.inv() * est).as_rotvec().ravel()
-    matrix = np.stack(columns, axis=1)
+    heading = errors_of(estimates, truth).heading
+    mean = 0.0 if absolute else math.atan2(np.mean(np.sin(heading)), np.mean(np.cos(heading)))
+    vector = (true.inv() * Rotation.from_rotvec((0.0, 0.0, -mean)) * est).as_rotvec().ravel()
+    vertical = true.inv().apply((0.0, 0.0, 1.0)).ravel()
+    matrix = np.stack((-rates.ravel(), vertical)[:2 - absolute], axis=1)
     found = np.linalg.lstsq(matrix, vector, rcond=None)[0]
     before, after = vector - matrix[:, 1:] @ found[1:], vector - matrix @ found
     return Offset(float(found[0]), math.sqrt(3.0) * rms(before), math.sqrt(3.0) * rms(after))
@@ -165,11 +153,10 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
 
     Returns None if a covariance is singular, as that of a filter without heading.
     """
-    dimensions = 3 if absolute else 2
-    found = []
+    dimensions, found = 2 + absolute, []
     for in_sensor in (True, False):
         try:
-            parts = [_normalised_squares(*run, absolute, in_sensor) for run in runs]
+            parts = [_normalised_squares(*run, dimensions, in_sensor) for run in runs]
         except np.linalg.LinAlgError:
             continue
         shortest = min(len(squares) for squares, _ in parts)
@@ -188,20 +175,17 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
     return min(found)[1] if found else None
 
 
-def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, absolute: bool,
+def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, dimensions: int,
                         in_sensor: bool) -> tuple[Reals, float]:
     """Return e^T P^-1 e of the errors e (n,), and the mean log-determinant of P."""
-    est, true = Rotation.from_quat(estimates), Rotation.from_quat(truth)
+    est = Rotation.from_quat(estimates)
     if in_sensor:
         turn = est.as_matrix()
         covariances = turn @ covariances @ turn.transpose(0, 2, 1)
-    if absolute:
-        vector = (true * est.inv()).as_rotvec()
-    else:
-        # The true vertical in the estimated world frame, and the small turn that takes z there.
-        vertical = est.apply(true.inv().apply((0.0, 0.0, 1.0)))
-        vector = np.stack((-vertical[:, 1], vertical[:, 0]), axis=1)
-        covariances = covariances[:, :2, :2]
+    # The true vertical in the estimated world frame, and the small turn that takes z there.
+    x, y, _ = (est * Rotation.from_quat(truth).inv()).apply((0.0, 0.0, 1.0)).T
+    vector = np.stack((-y, x, -errors_of(estimates, truth).heading), axis=1)[:, :dimensions]
+    covariances = covariances[:, :dimensions, :dimensions]
     eigenvalues = np.linalg.eigvalsh(covariances)
     if np.any(eigenvalues[:, 0] <= 1e-12 * eigenvalues[:, -1]):
         raise np.linalg.LinAlgError('no inverse')
@@ -221,9 +205,8 @@ def autocorrelation_time(values: Reals) -> float:
         return 1.0
     n = values.shape[1]
     # Zero padding makes the circular correlation of the transform a linear one.
-    size = next_fast_len(2 * n - 1, real=True)
-    power = np.mean(np.abs(rfft(centred / largest, size)) ** 2, axis=0)     # no overflow
-    correlations = irfft(power, size)[:n] / np.arange(n, 0, -1)
+    power = np.mean(np.abs(np.fft.rfft(centred / largest, 2 * n)) ** 2, axis=0)     # no overflow
+    correlations = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
     times = 2.0 * np.cumsum(correlations / correlations[0]) - 1.0
     ends = np.flatnonzero(np.arange(n) >= 5.0 * times)
     return max(float(times[ends[0] if len(ends) else -1]), 1.0)

@@ -5,19 +5,18 @@ The motions of the exam, and what an IMU on them reads.
 Each motion shows a fault that the others hide.  A seed decides the noise, and varies the start.
 """
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.simulation import Simulation
 
@@ -42,7 +41,7 @@ class Scenario:
 
     values : parameters of the simulation that differ from their defaults
     duration, rate : of the run [s], [Hz]
-    reversals : times at which the momenta change their sign, by an impulsive torque [s]
+    reversals : times at which an impulsive torque changes the sign of the momenta [s]
     noisy : whether the IMU has its errors
     """
 
@@ -67,15 +66,20 @@ PIVOT = replace(LEVER_ARM, name='pivot', values={
 FAST = Scenario('fast', {'spin.l3': 1.6, 'spin.lz': 1.7816, 'initial.theta': 0.5236},
                 duration=8.0, reversals=(2.0, 4.0, 6.0), noisy=False)
 
+
 @dataclass(frozen=True)
-class Truth:
+class Run:
     """
-    The true motion of a sensor at n times.
+    What an IMU reads along a motion, at n times.
+
+    The gyroscope's reading is the mean over the step that ends, as of an integrating sensor; the
+    other readings are of its end.
 
     name : of the motion
     t, dt : time and length of the step that ends there, by the stamps [s], (n,)
     truth : q(world <- sensor) as x, y, z, w (n, 4)
     rates : true angular velocity in the frame of the sensor (n, 3) [rad/s]
+    gyroscope, accelerometer, magnetometer : in the frame of the IMU, (n, 3) [rad/s], [m/s^2], [T]
     """
 
     name: str
@@ -83,27 +87,13 @@ class Truth:
     dt: Reals
     truth: Reals
     rates: Reals
-
-    def part(self, rows: slice | NDArray[np.int64]) -> Self:
-        """Return the motion at these times only."""
-        return replace(self, **{one.name: getattr(self, one.name)[rows] for one in fields(self)
-                                if one.name != 'name'})
-
-
-@dataclass(frozen=True)
-class Run(Truth):
-    """
-    What an IMU reads along a motion.
-
-    The gyroscope's reading is the mean over the step that ends, as of an integrating sensor; the
-    other readings are of its end.
-
-    gyroscope, accelerometer, magnetometer : in the frame of the IMU, (n, 3) [rad/s], [m/s^2], [T]
-    """
-
     gyroscope: Reals
     accelerometer: Reals
     magnetometer: Reals
+
+    def part(self, rows: slice | NDArray[np.int64]) -> 'Run':
+        """Return the run at these times only."""
+        return Run(self.name, *(getattr(self, one.name)[rows] for one in fields(self)[1:]))
 
     @property
     def start(self) -> Rotation:
@@ -120,45 +110,40 @@ class Run(Truth):
 def turning(imu: Mapping[str, Any], first: Rotation, last: Rotation, seconds: float,
             declination: float | Reals = 0.0) -> Run:
     """
-    Return a slow tumbling from one attitude to another, without noise and acceleration; t <= 0.
+    Return a slow tumbling from one attitude to another as `along`.
 
     After each third of it, the sensor has gone a third of the way.
-
-    first, last : attitudes world <- sensor
-    declination : by which the field is turned to the west [rad], one or for each sample
     """
     n = round(seconds * SLOW.rate)
     part = np.arange(n + 1) / n
     turns = (Slerp((0.0, 1.0), Rotation.concatenate((first, last)))(part)
              * Rotation.from_euler('zx', np.stack((
                  12.0 * np.pi * part, 0.7 * np.sin(6.0 * np.pi * part)), axis=1)))
-    return along('', turns, imu, SLOW.rate, declination)
+    return along('', turns, imu, declination)
 
 
-def along(name: str, turns: Rotation, imu: Mapping[str, Any], rate: float,
+def along(name: str, turns: Rotation, imu: Mapping[str, Any],
           declination: float | Reals = 0.0) -> Run:
     """
     Return the readings along attitudes q(world <- sensor), without noise and acceleration; t <= 0.
 
+    They have the rate of the slow motion.
+
     turns : n + 1 attitudes, between which the rate is constant
     declination : by which the field is turned to the west [rad], one or for each of n samples
     """
-    n = len(turns) - 1
+    n, rate = len(turns) - 1, SLOW.rate
     t: Reals = np.arange(1 - n, 1) / rate
     rates = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate
     to_sensor = turns[1:].inv()
     field = Rotation.from_euler('z', np.broadcast_to(declination, n)[:, np.newaxis]).apply(
-        without_declination(imu.get('mag.field', FIELD)))
+        magnetic(imu.get('mag.field', FIELD)))
     return Run(name, t, np.full(n, 1.0 / rate), turns[1:].as_quat(), rates, rates.copy(),
                to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(field))
 
 
-def without_declination(field: tuple[float, float, float]) -> tuple[float, float, float]:
-    """
-    Return a field (east, north, up) in a world whose north is magnetic north.
-
-    There the heading of a filter needs no declination.
-    """
+def magnetic(field: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return a field (east, north, up) in a world whose north is magnetic north."""
     east, north, up = field
     return 0.0, math.hypot(east, north), up
 
@@ -174,42 +159,30 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
     given = imu if scenario.noisy else {name: imu[name] for name in OF_PLACE if name in imu}
     values = parameters.checked({
         'initial.phi': phi, 'initial.psi': psi, 'seed': seed, 'solver.method': 'exact',
-        'mag.field': FIELD, **given, **scenario.values})
-    values['mag.field'] = without_declination(values['mag.field'])
-    simulation, device = Simulation(values), Imu(values)
-    period_ns = 2 * round(0.5 * NANOSECONDS / scenario.rate)
+        'mag.field': FIELD, **given, **scenario.values, 'imu.rate': scenario.rate})
+    values['mag.field'] = magnetic(values['mag.field'])
+    simulation = Simulation(values)
+    device, period_ns = simulation.imu, simulation.imu.length_ns
     magnetometer = Magnetometer(values, period_ns)
-    end_ns = round(scenario.duration * scenario.rate) * period_ns
     parts, begin_ns = [], 0
-    for stop_ns in (*(round(t * scenario.rate) * period_ns for t in scenario.reversals), end_ns):
-        steps = range(begin_ns + period_ns, stop_ns + 1, period_ns)
-        halves = simulation.segment.states(range(begin_ns, stop_ns + 1, period_ns // 2))
-        parts.append(_readings(device, magnetometer, halves, steps))
-        if stop_ns < end_ns:
-            simulation.now_ns = stop_ns
+    for end in (*scenario.reversals, scenario.duration):
+        end_ns = round(end * scenario.rate) * period_ns
+        steps = range(begin_ns + period_ns, end_ns + 1, period_ns)
+        halves = simulation.segment.states(range(begin_ns, end_ns + 1, period_ns // 2))
+        signals: Any = np.stack(np.broadcast_arrays(
+            *itertools.chain(*device.true(halves)), *device.orientation(halves)))
+        ends = signals[:, 2::2]
+        # Simpson's rule.
+        mean = (signals[:3, :-2:2] + 4.0 * signals[:3, 1::2] + ends[:3]) / 6.0
+        parts.append(np.stack([
+            *itertools.chain(*device.sensor(period_ns).read((mean, ends[3:6]), steps)),
+            *magnetometer.read(magnetometer.true(ends[6:]), steps), *ends[6:], *ends[:3]]))
+        simulation.now_ns = begin_ns = end_ns
+        if end < scenario.duration:
             simulation.command(-simulation.l3, -simulation.lz)
-        begin_ns = stop_ns
     gyroscope, accelerometer, field, truth, rates = np.split(
         np.concatenate(parts, axis=1).T, (3, 6, 9, 13), axis=1)
     period = period_ns / NANOSECONDS
     t = period * np.arange(1.0, len(truth) + 1.0)
     return Run(f'{scenario.name} at {scenario.rate:g} Hz, seed {seed}', t,
                np.full(len(t), period), truth, rates, gyroscope, accelerometer, field)
-
-
-def _readings(device: Imu, magnetometer: Magnetometer, halves: States, steps: range) -> Reals:
-    """
-    Return what an IMU reads, attitude and rates at the ends of steps, (16, n).
-
-    halves : states at the begin, the middle and the end of each step
-    steps : their ends [ns]
-    """
-    rates, force = (np.stack(np.broadcast_arrays(*vector, np.empty(len(halves)))[:3])
-                    for vector in device.true(halves))
-    # Simpson's rule.
-    mean = (rates[:, :-2:2] + 4.0 * rates[:, 1::2] + rates[:, 2::2]) / 6.0
-    gyroscope, accelerometer = device.sensor(steps.step).read(
-        ((mean[0], mean[1], mean[2]), (force[0, 2::2], force[1, 2::2], force[2, 2::2])), steps)
-    x, y, z, w = (column[2::2] for column in device.orientation(halves))
-    field = magnetometer.read(magnetometer.true((x, y, z, w)), steps)
-    return np.stack([*gyroscope, *accelerometer, *field, x, y, z, w, *rates[:, 2::2]])

@@ -5,13 +5,13 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.exam.measures import Errors, errors_of
-from spinning_top_sim.exam.scenarios import Reals, Run, Truth
+from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.tools.cli import printable
 
 # Covariance and bias are read after every tenth update.
@@ -34,35 +34,26 @@ class Filter(Protocol):
         """
         Take the readings of a step; return the attitude at its end.
 
-        Parameters
-        ----------
-        gyroscope : (3,) array
-            Mean angular velocity over the step [rad/s].
-        accelerometer : (3,) array
-            Specific force at its end [m/s^2], +g upwards at rest.
-        magnetometer : (3,) array or None
-            Field at its end [T].
-        dt : float
-            Length of the step [s].
+        gyroscope : mean angular velocity over the step (3,) [rad/s]
+        accelerometer : specific force at its end (3,) [m/s^2], +g upwards at rest
+        magnetometer : field at its end (3,) [T], or None
+        dt : length of the step [s]
 
-        Returns
-        -------
-        (4,) array_like
-            q(world <- sensor) as x, y, z, w; x of the world is east, y north and z up.
+        Returns q(world <- sensor) as x, y, z, w (4,); x of the world is east, y north and z up.
         """
 
 
 MakeFilter = Callable[[], Filter]
 # From a run to that whose readings are fed instead.
 ChangeReadings = Callable[[Run], Run]
-ChangeAttitudes = Callable[[Reals], Reals]
+ChangeRows = Callable[[Reals], Reals]
 
 
 class InvalidOutputError(Exception):
     """The filter raised an error or returned something invalid; the text is one line."""
 
 
-class NodeError(Exception):
+class NodeError(RuntimeError):
     """A node cannot be examined; the text says why, and what to check."""
 
 
@@ -81,7 +72,7 @@ class Outcome:
     covariances, biases : (n, 3, 3) [rad^2] and (n, 3) [rad/s], NaN where unknown
     """
 
-    run: Truth
+    run: Run
     estimates: Reals
     covariances: Reals
     biases: Reals
@@ -91,19 +82,14 @@ class Outcome:
         """Tilt and heading errors [rad]."""
         return errors_of(self.estimates, self.run.truth)
 
+    def part(self, rows: slice | NDArray[np.intp]) -> 'Outcome':
+        """Return the outcome at these samples only."""
+        return Outcome(self.run.part(rows), self.estimates[rows], self.covariances[rows],
+                       self.biases[rows])
+
     def last(self, fraction: float = 0.5) -> 'Outcome':
         """Return the last part; by default the second half, in which the filter has settled."""
-        return self.since(round(len(self.estimates) * (1.0 - fraction)))
-
-    def since(self, first: int) -> 'Outcome':
-        """Return the part from a sample on."""
-        return Outcome(self.run.part(slice(first, None)), self.estimates[first:],
-                       self.covariances[first:], self.biases[first:])
-
-
-def same(estimates: Reals) -> Reals:
-    """Return the argument."""
-    return estimates
+        return self.part(slice(round(len(self.estimates) * (1.0 - fraction)), None))
 
 
 class Hypothesis(NamedTuple):
@@ -112,7 +98,18 @@ class Hypothesis(NamedTuple):
     faults: tuple[str, ...]
     text: str
     given: ChangeReadings | None = None
-    read: ChangeAttitudes = same
+    read: ChangeRows = lambda estimates: estimates
+
+
+def changed(names: Sequence[str], change: ChangeRows) -> ChangeReadings:
+    """Return what changes the readings (n, 3) of these sensors."""
+    def changed(run: Run) -> Run:
+        readings: Any = {name: change(getattr(run, name)) for name in names}
+        return replace(run, **readings)
+    return changed
+
+
+WITHOUT_FIELD = changed(('magnetometer',), lambda rows: np.full_like(rows, np.nan))
 
 
 def feed(make_filter: MakeFilter, run: Run) -> Output:
@@ -139,12 +136,11 @@ def feed(make_filter: MakeFilter, run: Run) -> Output:
         where = f'update {k} of {n}' if k else 'making the filter'
         raise InvalidOutputError(
             f'{where} raises {type(error).__name__}: {one_line(error)}') from error
-    return _quaternions(attitudes), covariances, biases
-
-
-def without_field(run: Run) -> Run:
-    """Return a run for which the filter gets None as the field."""
-    return replace(run, magnetometer=np.full_like(run.magnetometer, np.nan))
+    if len(bad := no_attitudes(attitudes)):
+        raise InvalidOutputError(f'update {bad[0] + 1} returns {attitudes[bad[0]].tolist()}: its '
+                                 'norm must be 1')
+    attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
+    return attitudes, covariances, biases
 
 
 def follow(make_filter: MakeFilter, run: Run, undone: Sequence[Hypothesis] = (),
@@ -156,7 +152,7 @@ def follow(make_filter: MakeFilter, run: Run, undone: Sequence[Hypothesis] = (),
     """
     fed = run
     for one in undone:
-        fed = fed if one.given is None else one.given(fed)
+        fed = one.given(fed) if one.given else fed
     try:
         estimates, covariances, biases = feed(make_filter, fed)
     except InvalidOutputError as error:
@@ -164,15 +160,6 @@ def follow(make_filter: MakeFilter, run: Run, undone: Sequence[Hypothesis] = (),
     for one in reversed(undone):
         estimates = one.read(estimates)
     return Outcome(run, estimates, covariances, biases)
-
-
-def _quaternions(rows: Reals) -> Reals:
-    """Return the output of a filter (n, 4) as unit quaternions.  Raises InvalidOutputError."""
-    if len(bad := no_attitudes(rows)):
-        raise InvalidOutputError(f'update {bad[0] + 1} returns {rows[bad[0]].tolist()}: its norm '
-                                 'must be 1')
-    unit: Reals = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    return unit
 
 
 def no_attitudes(quaternions: Reals) -> NDArray[np.intp]:
@@ -185,9 +172,7 @@ def no_attitudes(quaternions: Reals) -> NDArray[np.intp]:
 def _covariance_of(filter_: Filter) -> Reals | float:
     """Return the covariance of a filter, NaN if unknown.  Raises InvalidOutputError."""
     value = getattr(filter_, 'covariance', None)
-    if value is None:
-        return math.nan
-    covariance = _numbers('covariance is', value, (3, 3))
+    covariance = _numbers('covariance is', value, (3, 3)) if value is not None else np.zeros(1)
     if not np.any(covariance):      # ROS messages mark an unknown covariance by zeros
         return math.nan
     if is_indefinite(covariance):
@@ -209,7 +194,7 @@ def _numbers(what: str, value: object, shape: tuple[int, ...]) -> Reals:
         numbers = np.array(value, dtype=float)
     except (TypeError, ValueError):
         numbers = np.empty(0)
-    if numbers.shape != shape or not np.all(np.isfinite(numbers)):
+    if numbers.shape != shape or not math.isfinite(np.vdot(numbers, numbers)):
         raise InvalidOutputError(f'{what} {one_line(value)[:80]}: must be '
                                  f'{" x ".join(map(str, shape))} finite numbers')
     return numbers

@@ -31,7 +31,6 @@ from spinning_top_sim.grade.grader import grade_trajectory
 from spinning_top_sim.grade.motion import Trajectory
 from spinning_top_sim.grade.scenes import Body, Reals
 from spinning_top_sim.physics.top import State
-from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, motion_files, scene_file
@@ -46,7 +45,7 @@ COARSE = 0.5                # turned from one sample to the next [rad]: splines 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('grade', __doc__, argv, add_arguments, _run, (LogError,))
+    return cli.run('grade', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
 from spinning_top_sim.installation import remedy
-from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.errors import text_of
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -135,11 +135,9 @@ def _cannot_start(name: str, error: Exception) -> int:
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
                              f'{remedy("ros")}' + name.endswith('view') * (
                                  '; `view LOG` works without'))
-    elif isinstance(error, OSError) and error.filename is not None:
-        error = OSError(f'{error.filename}: {error.strerror}')
-    expected = (isinstance(error, ValueError | RuntimeError | OSError | LogError | ImportError)
+    expected = (isinstance(error, ValueError | RuntimeError | OSError | ImportError)
                 or kind.startswith('Invalid'))
-    print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(error)}',
+    print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(text_of(error))}',
           file=sys.stderr)
     return 2
 

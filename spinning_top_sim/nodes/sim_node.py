@@ -62,11 +62,12 @@ def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
     words = without_ros_arguments(argv)
     if words:
         from spinning_top_sim.tools import cli  # noqa: PLC0415
-        from spinning_top_sim.tools.scene_file import files_for_node  # noqa: PLC0415
+        from spinning_top_sim.tools.scene_file import chosen_files  # noqa: PLC0415
         parser = cli.Parser('node', DESCRIPTION, '\n'.join(_interface()))
         add_arguments(parser)
         arguments = parser.parse_args(words)
-        given = [word for path in files_for_node(arguments)
+        # They are read, because rcl accepts a file that has no parameters of the node.
+        given = [word for path in chosen_files(arguments)
                  for word in ('--params-file', str(path))]
         given += [word for parameter in arguments.param for word in ('-p', parameter)]
         argv[:] = ['--ros-args', *given, '--', *argv[len(words):]]

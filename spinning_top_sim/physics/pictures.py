@@ -16,7 +16,6 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import swing
 
 Reals = NDArray[np.float64]
-
 # From the world to the viewer: towards, right, up.  60 deg about z, then 45 deg about y.
 _TURN, _TILT = np.radians(60.0), np.radians(45.0)
 VIEW = np.array([[np.cos(_TILT), 0.0, np.sin(_TILT)], [0.0, 1.0, 0.0],
@@ -71,20 +70,20 @@ def draw_tip(axes: Axes, path: Reals) -> None:
     axes.plot(across, up, 'o', color=INK, markersize=5)
 
 
-def _check(motion: Any) -> None:
+def _outline(motion: Any) -> tuple[Reals, list[float]]:
+    """Return the path of the axis (n, 3) and the bounds of theta.  Raises ValueError."""
     if len(motion.t) < 2:
         raise ValueError(f't has {len(motion.t)} times: a picture must have 2 at least')
     for k in np.flatnonzero(~(np.diff(motion.t) > 0.0)).tolist():
         raise ValueError(f't[{k + 1}] = {float(motion.t[k + 1])!r} s: must be later than t[{k}] = '
                          f'{float(motion.t[k])!r} s')
+    return np.stack(motion.rows_axis, axis=1), sorted(
+        float(np.arccos(u)) for u in swing(motion.top, motion.start))
 
 
 def plot(motion: Any) -> Figure:
     """Return a figure of `States`; see `States.plot`."""
-    _check(motion)
-    path = np.stack(motion.rows_axis, axis=1)
-    bounds = sorted(float(np.arccos(u)) for u in swing(motion.top, motion.start))
-    energy = motion.energy
+    (path, bounds), energy = _outline(motion), motion.energy
     with rc_context(STYLE):
         figure = Figure(figsize=(10.0, 7.0), layout='constrained')
         panels = figure.subplot_mosaic(
@@ -115,7 +114,7 @@ def plot(motion: Any) -> Figure:
 
 def animate(motion: Any, fps: float, speed: float) -> FuncAnimation:
     """Return an animation of `States`; see `States.animate`."""
-    _check(motion)
+    path, bounds = _outline(motion)
     for name, value in (('fps', fps), ('speed', speed)):
         if not 0.0 < value < np.inf:
             raise ValueError(f'{name} = {value!r}: must be a number > 0')
@@ -123,8 +122,6 @@ def animate(motion: Any, fps: float, speed: float) -> FuncAnimation:
     # Each frame shows a sample: the newest one, but for rounding.
     count = int((times[-1] - times[0]) * fps / speed + 1e-6) + 1
     shown = np.searchsorted(times, times[0] + (np.arange(count) + 1e-6) * speed / fps, 'right') - 1
-    path = np.stack(motion.rows_axis, axis=1)
-    bounds = tuple(float(np.arccos(u)) for u in swing(motion.top, motion.start))
     rim = arc(0.0, FULL_TURN, DISC, DISC_HEIGHT)
     mark = np.vstack(((0.0, 0.0, DISC_HEIGHT), arc(-0.25, 0.25, DISC, DISC_HEIGHT)))
     figure = Figure(figsize=(4.0, 4.0), dpi=80)

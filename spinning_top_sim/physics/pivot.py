@@ -52,9 +52,19 @@ class Piece(NamedTuple):
 
     def at(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at times (n,) [ns]."""
-        t, a = (times_ns - self.start_ns) * 1e-9, _doubles([self.acceleration]).T
-        return Kinematics(self.position + t * (self.velocity + 0.5 * t * a),
-                          self.velocity + t * a, np.broadcast_to(a, (3, len(t))))
+        return kinematics([self], [1], times_ns)
+
+
+def kinematics(pieces: Sequence[Piece], counts: Sequence[int],
+               times_ns: NDArray[np.int64]) -> Kinematics:
+    """Return what the pivot does at times (n,) [ns], in each piece at so many of them."""
+    starts_ns = np.repeat([piece.start_ns for piece in pieces], counts)
+    position, velocity, a = (np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(*(
+        (piece.position, piece.velocity, _doubles([piece.acceleration]).T)
+        for piece in pieces), strict=True))
+    t = (times_ns - starts_ns) * 1e-9
+    return Kinematics(position + t * (velocity + 0.5 * t * a), velocity + t * a,
+                      np.broadcast_to(a, (3, len(t))))
 
 
 class PivotPath:
@@ -183,6 +193,14 @@ class PivotPath:
         return Piece(offset + self._starts[k], offset + end, self._accelerations[k],
                      (self._places[k] + cycle * self._per_cycle)[:, np.newaxis],
                      self._velocities[k][:, np.newaxis])
+
+    def lasting(self, t_ns: int) -> Piece:
+        """Return the piece from a time [ns] on with those that have the same acceleration."""
+        piece = self.piece(t_ns)
+        while piece.end_ns < NEVER_NS and (
+                after := self.piece(piece.end_ns)).acceleration == piece.acceleration:
+            piece = piece._replace(end_ns=after.end_ns)
+        return piece
 
 
 def _ramp(begin: Exact, end: Exact, most_acceleration: float) -> Iterator[tuple[int, Exact]]:

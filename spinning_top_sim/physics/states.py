@@ -24,7 +24,7 @@ Point = tuple[float, float, float]
 _LARGEST = np.finfo(float).max
 
 
-def relative_drift(values: NDArray[np.float64], start: float) -> Column:
+def relative_drift(values: NDArray[np.float64], start: Column | float) -> Column:
     """
     Return how far a constant of the motion has drifted from its value at the start.
 
@@ -32,7 +32,7 @@ def relative_drift(values: NDArray[np.float64], start: float) -> Column:
     of doubles becomes the largest double, with its sign.
     """
     with np.errstate(over='ignore'):
-        return np.clip((values - start) / (abs(start) or 1.0), -_LARGEST, _LARGEST)
+        return np.clip((values - start) / np.where(start, np.abs(start), 1.0), -_LARGEST, _LARGEST)
 
 
 class States:
@@ -74,7 +74,11 @@ class States:
 
     def __init__(self, top: Top, start: State, n: int) -> None:
         self.top, self.start, self._n = top, start, n
-        self._l3, self._lz = start.l3, start.lz
+        self._l3 = start.l3
+        # Columns where the effective gravity of a moving pivot changes.
+        self._lz: Column | float = start.lz
+        self._gravity: Column | float = top.gravity
+        self._torque: Column | float = top.gravity_torque
 
     def __len__(self) -> int:
         return self._n
@@ -132,7 +136,8 @@ class States:
     @cached_property
     def phi_dot(self) -> Column:
         """Eq. (31) of "Analysis of Symmetric Spinning Top"."""
-        return attitude.precession_rate(self.top, self._l3, self._lz, *self.half_angle_squares)
+        lz = self.start.lz
+        return attitude.precession_rate(self.top, self._l3, lz, *self.half_angle_squares)
 
     @cached_property
     def psi_dot(self) -> Column:
@@ -177,8 +182,8 @@ class States:
         """By Euler's equations."""
         top, (w1, w2, w3), (z1, z2, _) = self.top, self.rows_angular_velocity, self.rows_vertical
         gyroscopic = (top.lambda1 - top.lambda3) * w3
-        return ((gyroscopic * w2 + top.gravity_torque * z2) / top.lambda1,
-                -(gyroscopic * w1 + top.gravity_torque * z1) / top.lambda1, 0.0)
+        return ((gyroscopic * w2 + self._torque * z2) / top.lambda1,
+                -(gyroscopic * w1 + self._torque * z1) / top.lambda1, 0.0)
 
     @cached_property
     def angular_acceleration(self) -> NDArray[np.float64]:
@@ -218,7 +223,7 @@ class States:
         tuple of three (n,) array
             Components in the body frame [m/s^2].
         """
-        gravity, (z1, z2, z3) = self.top.gravity, self.rows_vertical
+        gravity, (z1, z2, z3) = self._gravity, self.rows_vertical
         if not any(point):          # the pivot is at rest: no rate is needed
             return gravity * z1, gravity * z2, gravity * z3
         r1, r2, r3 = point
@@ -235,7 +240,7 @@ class States:
         omega1, omega2, _ = self.rows_angular_velocity
         return (0.5 * self.top.lambda1 * (omega1 * omega1 + omega2 * omega2)
                 + 0.5 * self._l3 * self._l3 / self.top.lambda3
-                + self.top.gravity_torque * self.rows_vertical[2])
+                + self._torque * self.rows_vertical[2])
 
     def plot(self) -> Figure:
         """

@@ -27,7 +27,7 @@ class WorldStates(States):
         In the gravity of the world.
     moved : States
         In the frame of the vertical.
-    rotation : (4, 1)
+    rotation : (4, 1) or (4, n)
         q(world <- frame) as x, y, z, w.
     """
 
@@ -41,9 +41,12 @@ class WorldStates(States):
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
-        moved = self._moved.rows_quaternion
-        is_identity = self._rotation[3][0] == 1.0
-        return moved if is_identity else attitude.product(self._rotation, moved)
+        moved, (*_, w) = self._moved.rows_quaternion, self._rotation
+        is_identity = len(w) == 1 and w[0] == 1.0
+        # Without -0.0, which a product with the identity may leave or not.
+        x, y, z, w = (part + 0.0 for part in (
+            moved if is_identity else attitude.product(self._rotation, moved)))
+        return x, y, z, w
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:

@@ -4,12 +4,19 @@
 from pathlib import Path
 
 
-class RecordingError(Exception):
+class RecordingError(RuntimeError):
     """A recording cannot start; the text names the path or type and the reason."""
 
 
-class LogError(Exception):
+class LogError(RuntimeError):
     """A log cannot be read or recovered; the text names the path and the reason."""
+
+
+def text_of(error: BaseException) -> str:
+    """Return the text of an error; that of an OSError as FILE: REASON."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f'{error.filename}: {error.strerror}'
+    return str(error)
 
 
 def why_not_written(path: Path, error: Exception) -> str:

@@ -15,10 +15,12 @@ import itertools
 import os
 import queue
 import zlib
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -119,6 +121,29 @@ class McapWriter:
         sequence = self._next_sequence[channel_id]
         self._next_sequence[channel_id] += 1
         self.add_message(channel_id, sequence, log_time_ns, log_time_ns, data)
+
+    def append_all(self, messages: Iterable[tuple[int, int, bytes]], size: int) -> None:
+        """
+        Add messages as `append` does, one topic after the other, which takes less time.
+
+        size : what they take in a chunk, at most [bytes]
+        """
+        if self._chunk.size + size > chunks.CHUNK_BYTES:
+            self.write_chunk()
+        by_topic: defaultdict[int, list[tuple[int, int, bytes]]] = defaultdict(list)
+        for message in messages:
+            by_topic[message[0]].append(message)
+        for topic_index, group in by_topic.items():
+            _, times_ns, data = zip(*group, strict=True)
+            if len(set(map(len, data))) > 1:
+                for message in group:
+                    self.append(*message)
+                continue
+            channel_id = topic_index + 1
+            self._chunk.add_rows(
+                channel_id, self._next_sequence[channel_id], np.array(times_ns, np.uint64),
+                np.frombuffer(b''.join(data), np.uint8).reshape(len(data), len(data[0])))
+            self._next_sequence[channel_id] += len(data)
 
     def add_message(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
                     data: bytes | bytearray | memoryview) -> None:

@@ -23,12 +23,11 @@ from mcap.records import Channel, Chunk, ChunkIndex, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import records
-from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, known_topics, read_summary
 from spinning_top_sim.recording.records import HEAD, DamagedError, LogMessage, Messages
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
-from spinning_top_sim.recording.scan import Part, Scan
+from spinning_top_sim.recording.scan import Damage, Part, Scan
 from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 BLOCK = 16384               # messages that are read together
@@ -252,11 +251,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         if not (summary.is_complete and all(map(self._leads_to_chunk, summary.chunks.values()))):
             return self.scan()
         metadata = {}
-        size = 0
         for index in summary.metadata:
-            size += index.length
             with contextlib.suppress(DamagedError):
-                records.check_size(size, records.MAX_DECLARED)
                 record = self.file.record(index.offset, summary.data_limit)
                 if isinstance(record, Metadata):
                     metadata[record.name] = record.metadata

@@ -29,33 +29,29 @@ def recover(reader: LogReader, output: str | os.PathLike[str],
     """
     output = Path(output)
     try:
-        return _recover(reader, output, progress)
+        writer = McapWriter(output, header=Header(reader.profile, reader.library),
+                            compression='zstd')
+        with writer.discarded_on_failure():
+            scan = reader.scan(lambda offset: progress(offset / 2))
+            declared = False
+            for part in scan.parts:
+                progress((reader.size + part.offset) / 2)
+                if part.channel_ids:
+                    if not declared:    # channels stand before the messages, metadata as it stood
+                        _declare(scan, writer)
+                    declared = True
+                    _copy_messages(reader, part, writer)
+                else:
+                    _copy_record(reader, part, writer)
+            writer.write_chunk()
+            if not declared:
+                _declare(scan, writer)
+            if not writer.messages and not reader.whole:
+                raise LogError(f'nothing to save in {reader.path}: there is no whole message in '
+                               'it')
+            writer.finish(bag=reader.profile == 'ros2' or BAG_METADATA in scan.metadata)
     except OSError as error:
         raise LogError(f'cannot write {output}: {why_not_written(output, error)}') from error
-
-
-def _recover(reader: LogReader, output: Path,
-             progress: Callable[[float], object]) -> McapWriter:
-    writer = McapWriter(output, header=Header(reader.profile, reader.library),
-                        compression='zstd')
-    with writer.discarded_on_failure():
-        scan = reader.scan(lambda offset: progress(offset / 2))
-        declared = False
-        for part in scan.parts:
-            progress((reader.size + part.offset) / 2)
-            if part.channel_ids:
-                if not declared:        # channels stand before the messages, metadata as it stood
-                    _declare(scan, writer)
-                declared = True
-                _copy_messages(reader, part, writer)
-            else:
-                _copy_record(reader, part, writer)
-        writer.write_chunk()
-        if not declared:
-            _declare(scan, writer)
-        if not writer.messages and not reader.whole:
-            raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
-        writer.finish(bag=reader.profile == 'ros2' or BAG_METADATA in scan.metadata)
     progress(reader.size)
     return writer
 

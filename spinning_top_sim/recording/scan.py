@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
@@ -18,7 +19,6 @@ from mcap.records import Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import time_span
-from spinning_top_sim.recording.damage import Damage, Loss, count
 from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, Summary, known_topics
 from spinning_top_sim.recording.records import (
     HEAD,
@@ -29,6 +29,7 @@ from spinning_top_sim.recording.records import (
     find_messages,
     index_entries,
     open_chunk,
+    parse,
     size_of,
 )
 
@@ -46,6 +47,69 @@ _CANDIDATE = re.compile(
 _CANDIDATE_BYTES = HEAD.size + 28 + 4 + 8       # that the expression looks at
 _SEARCHED = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.CHUNK)
 _MAX_EFFORT = 4         # bytes of candidates read, as a multiple of the file's size
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A range of a file that cannot be decoded, or messages in it that cannot be understood."""
+
+    offset: int
+    bytes: int
+    what: str                       # the kind of the record at the offset
+    reason: str
+
+    def __str__(self) -> str:
+        return (f'lost: {self.what} at byte {self.offset} ({count(self.bytes, "byte")}): '
+                f'{self.reason}')
+
+
+@dataclass(frozen=True)
+class Damage:
+    """What a scan of a whole file found."""
+
+    truncated: bool                 # the file does not end as an MCAP file ends
+    losses: tuple[Loss, ...]        # in the order of the file
+    defects: tuple[str, ...]        # what is wrong but costs nothing
+    # Exact if `missing_exactly`, by the statistics of the file; else a lower bound, by the message
+    # indexes of lost chunks.
+    missing_messages: int
+    missing_exactly: bool
+    # The earliest and the latest log time of the messages that are there; 0 without any.
+    start_ns: int
+    end_ns: int
+
+    @property
+    def lossless(self) -> bool:
+        """Whether everything that the log is known to have held is there."""
+        return not self.losses and not self.missing_messages
+
+    @property
+    def lost_bytes(self) -> int:
+        return sum(loss.bytes for loss in self.losses)
+
+    @property
+    def lost_chunks(self) -> int:
+        return sum(loss.what == 'chunk' for loss in self.losses)
+
+    def lines(self) -> list[str]:
+        """Return a human-readable report: the sums if something is lost, then each loss."""
+        lines = []
+        if not self.lossless:
+            number = count(self.missing_messages, 'message')
+            lines.append(f'lost: {count(self.lost_bytes, "byte")}, ' + (
+                number if self.missing_exactly else f'at least {number}' if self.missing_messages
+                else 'an unknown number of messages'))
+        return [*lines, *map(str, self.losses), *(f'found: {defect}' for defect in self.defects)]
+
+
+def count(number: int, noun: str) -> str:
+    """Return a number with its noun."""
+    return f'{number} {noun}{"" if number == 1 else "s"}'
+
+
+def seconds(time_ns: int) -> str:
+    """Return a stamp in seconds to the nanosecond, exactly."""
+    return f'{time_ns // 10 ** 9}.{time_ns % 10 ** 9:09d} s'
 
 
 class Part(NamedTuple):
@@ -107,18 +171,19 @@ class Scan:
                 if opcode == Opcode.DATA_END and (
                         end == self._limit if end_is_known else end - offset == _DATA_END_SIZE):
                     break
-                self._take(opcode, offset, end)
+                end = self._take(opcode, offset, end)
             except DamagedError as damage:
                 end = self._skip(offset, damage)
             offset = end
         self._check_end(offset)
 
-    def _take(self, opcode: int, offset: int, end: int) -> None:
+    def _take(self, opcode: int, offset: int, end: int) -> int:
+        """Note what is in a record, and return where the next one begins."""
         record, messages = self._decode(opcode, offset, end)
-        self._check_length(record, offset, end)
+        end = self._true_end(record, offset, end)
         if isinstance(record, int):
             self._lost += 0 if self._behind_chunk else record
-            return
+            return end
         self._behind_chunk = opcode == Opcode.CHUNK
         if isinstance(record, Schema | Channel | Metadata):
             self._small_bytes += end - offset
@@ -135,15 +200,16 @@ class Scan:
             self._add(opcode, offset, end, messages)
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             self.parts.append(Part(opcode, offset, end))
+        return end
 
     def _decode(self, opcode: int, offset: int, end: int,
                 ) -> tuple[McapRecord | int | None, Messages]:
         """Return a record, of a message index the number of entries, and the messages in it."""
         nothing = Messages(b'')
-        check_size(end - offset - HEAD.size, self._file.max_bytes)
         if opcode > Opcode.DATA_END:    # of an application, or of a later version of the format
             if self._ours:
                 raise DamagedError('there is no such kind of record')
+            check_size(end - offset - HEAD.size, self._file.max_bytes)
             return None, nothing
         raw = self._file.raw(offset, end)
         if opcode == Opcode.MESSAGE_INDEX:
@@ -152,20 +218,27 @@ class Scan:
             if self._all_in_chunks:
                 raise DamagedError('all messages of the file are in chunks')
             return None, find_messages(raw)
-        record = self._file.record(offset, end)
+        record = parse(raw)
         if isinstance(record, Chunk):
             return record, open_chunk(record, self._file.max_bytes)
         return record, nothing
 
-    def _check_length(self, record: McapRecord | int | None, offset: int, end: int) -> None:
-        """Raise DamagedError for a length that neither its fields nor the next record prove."""
+    def _true_end(self, record: McapRecord | int | None, offset: int, end: int) -> int:
+        """Return the end that its fields or the next record prove; else raise DamagedError."""
         if isinstance(record, McapRecord):
-            is_right = end - offset == size_of(record) or self._is_record(end) or (
+            own = offset + size_of(record)
+            # Such a length would take in the records that follow.
+            if own < end and isinstance(record, Schema | Channel) and self._is_record(own):
+                self._defects.append(f'{type(record).__name__.lower()} at byte {offset}: its '
+                                     'length is wrong')
+                return own
+            is_right = own == end or self._is_record(end) or (
                 end == self._limit and not self._summary.problem)
         else:
             is_right = end == self._limit or self._is_head(end)
         if not is_right:
             raise DamagedError('its length is not that of its content')
+        return end
 
     def _is_head(self, offset: int) -> bool:
         """Return whether a record seems to begin there, which may be truncated."""

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from spinning_top_sim.installation import version
+from spinning_top_sim.recording.chunks import CHUNK_BYTES
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError, why_not_written
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
@@ -236,11 +237,17 @@ class McapRecorder:
             self._on_disk = written
 
     def _write_queued(self) -> None:
+        batch: list[Entry] = []
+        batch_bytes = 0
         for _ in range(len(self._queue)):
             entries, size = self._queue.popleft()
-            for topic_index, log_time_ns, data in entries:
-                self._file.append(topic_index, log_time_ns, data)
+            if batch_bytes + size > CHUNK_BYTES:
+                self._file.append_all(batch, batch_bytes)
+                batch, batch_bytes = [], 0
+            batch += entries
+            batch_bytes += size
             self._bytes_out += size
+        self._file.append_all(batch, batch_bytes)
         if self.room:
             self._taken.set()
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The roots of the nutation's cubic and their distances, in long decimals without cancellation."""
 
+import math
 from decimal import Decimal, getcontext
 from typing import NamedTuple
 
@@ -62,12 +63,14 @@ def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]
     """
     Return the root of y^3 + a2 y^2 + a1 y + a0 that lies alone on its side of -a2/3, and the side.
 
-    It is between sqrt(3) and 2 times `radius` from there (Viete): Newton's method from the far end
-    converges quadratically.
+    It is 2 cos(arccos(|p|/(2 radius^3))/3) times `radius` from there, where p is the value of the
+    cubic (Viete).  Newton's method from the nearest double converges quadratically.
     """
     centre, radius = -a2 / 3, (a2 * a2 - 3 * a1).sqrt() / 3
-    side = -1 if ((centre + a2) * centre + a1) * centre + a0 > 0 else 1
-    y = centre + 2 * side * radius
+    value = ((centre + a2) * centre + a1) * centre + a0
+    side = -1 if value > 0 else 1
+    ratio = min(1.0, float(abs(value / (2 * radius ** 3))))
+    y = centre + side * radius * Decimal(2.0 * math.cos(math.acos(ratio) / 3.0))
     resolution = Decimal(10) ** (3 - getcontext().prec)
     for _ in range(MOST_NEWTON_STEPS):
         step = (((y + a2) * y + a1) * y + a0) / ((3 * y + 2 * a2) * y + a1)

@@ -20,7 +20,12 @@ PARTS = 64
 
 def precision(digits: int) -> AbstractContextManager[Context]:
     """Return a context manager that sets the digits, and room for any exponent."""
-    return localcontext(Context(prec=digits, Emin=-10 ** 12, Emax=10 ** 12))
+    return localcontext(_context(digits))
+
+
+@lru_cache
+def _context(digits: int) -> Context:
+    return Context(prec=digits, Emin=-10 ** 12, Emax=10 ** 12)
 
 
 def pi() -> Decimal:
@@ -39,30 +44,36 @@ def _pi(digits: int) -> Decimal:
 
 
 @lru_cache
-def _tables(digits: int) -> tuple[Decimal, list[tuple[Decimal, Decimal]], list[Decimal]]:
+def _tables(digits: int) -> tuple[Decimal, list[tuple[Decimal, Decimal]], list[Decimal],
+                                  list[Decimal]]:
     """
-    Return what `sin_cos` adds angles from.
+    Return what `sin_cos` and `atan2` add angles from.
 
     The angle of a part, sine and cosine of the multiples below a quarter turn, and the series of
-    sin(x)/x in x^2, which is short up to the angle, the last term first.
+    sin(x)/x and of arctan(x)/x in x^2, which are short up to half of it, the last term first.
     """
     with precision(digits + 10):
-        angle, series, term, size = pi() / (2 * PARTS), [ONE], ONE, ONE
-        while size.adjusted() > -digits - 5:
-            n = 2 * len(series)
-            term, size = -term / (n * (n + 1)), size * angle * angle / (n * (n + 1))
-            series.insert(0, term)
-        s = angle * reduce(lambda total, one: total * angle * angle + one, series)
-        c, values = (1 - s * s).sqrt(), [(ZERO, ONE)]
+        angle = pi() / (2 * PARTS)
+        square = angle * angle / 4
+        sine, arctan, size = [ONE], [ONE], ONE
+        while (size * sine[0]).adjusted() > -digits - 5:
+            n, size = 2 * len(sine), size * square
+            sine.insert(0, -sine[0] / (n * (n + 1)))
+        s = angle / 2 * reduce(lambda total, one: total * square + one, sine)
+        s, c = 2 * s * (1 - s * s).sqrt(), 1 - 2 * s * s
+        while (square ** len(arctan)).adjusted() > -digits - 5:
+            arctan.insert(0, (-1) ** len(arctan) / Decimal(2 * len(arctan) + 1))
+        values = [(ZERO, ONE)]
         while len(values) < PARTS:
             a, b = values[-1]
             values.append((a * c + b * s, b * c - a * s))
-    return angle, values, series
+    with precision(digits):
+        return angle, [(+s, +c) for s, c in values], [+x for x in sine], [+x for x in arctan]
 
 
 def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
     """Return sin x and cos x."""
-    angle, values, series = _tables(getcontext().prec)
+    angle, values, series, _ = _tables(getcontext().prec)
     count = int((x / angle).to_integral_value())
     rest = x - count * angle
     square, total = rest * rest, ZERO
@@ -78,15 +89,22 @@ def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def atan2(y: Decimal, x: Decimal) -> Decimal:
-    """Return the argument of x + iy, to 80 digits at most; 0 at the origin."""
+    """Return the argument of x + iy; 0 at the origin."""
     size = max(abs(x), abs(y))
     if not size:
         return ZERO
-    y, x = y / size, x / size
-    guess = Decimal(math.atan2(y, x))
-    s, c = sin_cos(guess)
-    rest = (y * c - x * s) / (x * c + y * s)    # tangent of the angle that is left, about 1e-16
-    return guess + rest - rest ** 3 / 3 + rest ** 5 / 5
+    angle, values, _, series = _tables(getcontext().prec)
+    count = round(math.atan2(y / size, x / size) / float(angle))
+    quarters, part = divmod(count, PARTS)
+    y, x = [(y, x), (-x, y), (-y, -x), (x, -y)][quarters % 4]
+    if part:
+        s, c = values[part]
+        y, x = y * c - x * s, x * c + y * s
+    tangent = y / x             # of the angle that is left
+    square, total = tangent * tangent, ZERO
+    for coefficient in series:
+        total = total * square + coefficient
+    return count * angle + tangent * total
 
 
 def asinh(x: Decimal) -> Decimal:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Adaptive Dormand-Prince 5(4) steps in plain Python numbers: the method of MATLAB's ODE45.
+Motions by adaptive Dormand-Prince 5(4) steps: the method of MATLAB's ODE45.
 
 Tableau: Dormand & Prince, "A family of embedded Runge-Kutta formulae", J. Comp. Appl. Math. 6
 (1980) 19-26, table 2 (RK5(4)7M).  Step control: Hairer, Norsett & Wanner, *Solving Ordinary
@@ -12,12 +12,19 @@ that of a step, where the usual 4th-order continuous extension would spoil the s
 import functools
 import math
 from abc import ABC, abstractmethod
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.times import NANOSECONDS, Times
 
 # The unknowns of one state: complex numbers, of which floats are some.
 Vector = tuple[complex, ...]
@@ -46,38 +53,16 @@ SHRINK, GROW = 0.2, 5.0
 FASTEST_RATE, LONGEST_STEP = 1e100, 1e100       # [rad/s], [s]
 # A step of fewer units in the last place of t is a collapse, not progress.
 SMALLEST_STEP_ULPS = 16
+# A time that so many steps of the present size do not reach is refused: minutes of work.
+MOST_STEPS = 1e7
+# Steps that `states_at_seconds` takes and reads together; more would only take memory.
+STEPS_TOGETHER = 256
+# Steps that `release` leaves whatever it is asked: some 50 MB.
+MOST_KEPT = 50_000
 
 
 class IntegrationError(RuntimeError):
     """The integration cannot go on; the message says where, why and what to do instead."""
-
-
-class Equations(ABC):
-    """
-    Equations of motion y' = f(y), with what the step control needs.
-
-    start : the unknowns at t = 0, all complex or all real
-    tolerance, fastest_rate : relative error of a step, and a bound on |y'|/|y| [1/s]: the first
-        step's length comes from these two
-    derivative : f; takes the unknowns one by one
-    """
-
-    start: Vector
-    tolerance: float
-    fastest_rate: float
-    derivative: Callable[..., Vector]
-
-    @abstractmethod
-    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
-        """Return y'' from y and y': rows of components (k, n), real and imaginary parts apart."""
-
-    @abstractmethod
-    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
-        """Return each error estimate over what is tolerated: a step passes if all are <= 1."""
-
-    @abstractmethod
-    def accepted(self, y: Vector, y_new: Vector) -> Vector:
-        """Return the end of a step, perhaps moved; IntegrationError if it cannot be trusted."""
 
 
 StepFunction = Callable[..., tuple[Vector, Vector, Vector]]
@@ -125,42 +110,72 @@ class Step(NamedTuple):
     derivative1: Vector
 
 
-class Integrator:
-    """
-    Takes steps forward from t = 0.
+def components(vectors: Sequence[float] | Sequence[Vector]) -> Rows:
+    """Return rows (k, n) of n vectors, or (n,) of floats; a complex component makes two rows."""
+    columns: NDArray[np.generic] = np.array(vectors)
+    return np.ascontiguousarray(columns.view(np.float64).T)
 
-    newest : the latest step, one of no length before the first
+
+class SteppedMotion(ABC):
+    """
+    A motion by steps of equations y' = f(y), from t = 0; every time counts from there.
+
+    A subclass has the equations: f, its derivative, the error that is tolerated, and the states.
+
+    top, start : what moves, and from where
+    ns_limit : the last time that it can give at all [ns]
     steps, evaluations : counts
+
+    y : the unknowns at t = 0, all complex or all real
+    tolerance, fastest_rate : relative error of a step, and a bound on |y'|/|y| [1/s]: the first
+        step's length comes from these two
     """
 
-    def __init__(self, equations: Equations) -> None:
-        self.equations = equations
-        start = equations.start
-        self._step = unrolled_step(len(start), isinstance(start[0], complex))
-        derivative = equations.derivative(*start)
-        self.newest = Step(0.0, start, derivative, 0.0, start, derivative)
-        if not equations.fastest_rate <= FASTEST_RATE:
-            raise OverflowError(f'{equations.fastest_rate:.3g} rad/s')
-        # A careful first step: the control finds the right one within a few.
-        self._next_step = 0.1 * math.pow(equations.tolerance, 0.2) / (
-            equations.fastest_rate or 1.0)
-        self.steps = 0
-        self.evaluations = 1
+    derivative: Callable[..., Vector]   # f of the unknowns, which it takes one by one
+    ns_limit = 2 ** 63 - 1              # steps go on for ever
 
-    def step(self) -> Step:
+    def __init__(self, top: Top, start: State, y: Vector, tolerance: float,
+                 fastest_rate: float) -> None:
+        self.top, self.start = top, start
+        derivative = self.derivative(*y)
+        # The steps that can still be read, in order; the first one has no length.
+        self._kept = [Step(0.0, y, derivative, 0.0, y, derivative)]
+        if not fastest_rate <= FASTEST_RATE:
+            raise OverflowError(f'{fastest_rate:.3g} rad/s')
+        # A careful first step: the control finds the right one within a few.
+        self._next_step = 0.1 * math.pow(tolerance, 0.2) / (fastest_rate or 1.0)
+        self.steps, self.evaluations = 0, 1
+
+    @abstractmethod
+    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        """Return y'' from y and y': rows of components (k, n), real and imaginary parts apart."""
+
+    @abstractmethod
+    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
+        """Return each error estimate over what is tolerated: a step passes if all are <= 1."""
+
+    @abstractmethod
+    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+        """Return the end of a step, perhaps moved; IntegrationError if it cannot be trusted."""
+
+    @abstractmethod
+    def _states_of(self, t: Column, unknowns: Rows) -> States:
+        """Return the states at times [s] from what `_unknowns` returns."""
+
+    def _take_step(self) -> None:
         """Take one accepted step.  Raises IntegrationError where none can be taken."""
-        equations, newest = self.equations, self.newest
+        newest = self._kept[-1]
         t, y, derivative = newest.t1, newest.y1, newest.derivative1
-        grow = GROW
+        grow, step = GROW, unrolled_step(len(y), isinstance(y[0], complex))
         while True:
             end = t + min(self._next_step, LONGEST_STEP)
             h = end - t                         # what the sum really made of it
             if not h > SMALLEST_STEP_ULPS * math.ulp(t):
                 raise IntegrationError(
                     f'the step size collapsed to {self._next_step:.3g} s at t = {t:.9g} s')
-            y_new, derivative_new, difference = self._step(equations.derivative, h, y, derivative)
+            y_new, derivative_new, difference = step(self.derivative, h, y, derivative)
             self.evaluations += 6
-            errors = equations.errors(y, y_new, difference)
+            errors = self.errors(y, y_new, difference)
             # `max` may pass over a NaN.  An infinite error shrinks the step until that collapses.
             error = max(errors) if sum(errors) < math.inf else math.inf
             factor = max(SHRINK, SAFETY * error ** -0.2) if error else GROW
@@ -168,41 +183,98 @@ class Integrator:
                 break
             grow = 1.0
             self._next_step = h * factor
-        y_new = equations.accepted(y, y_new)
+        y_new = self.accepted(y, y_new)
         self._next_step = h * min(grow, factor)
         self.steps += 1
         # First same as last: the projection moves y by less than the step's own error, so the
         # derivative at the unprojected end serves the next step too.
-        self.newest = Step(t, y, derivative, end, y_new, derivative_new)
-        return self.newest
+        self._kept.append(Step(t, y, derivative, end, y_new, derivative_new))
 
+    @property
+    def reached_ns(self) -> int:
+        """The last time that `states` can give without further steps [ns]."""
+        end = self._kept[-1].t1
+        ns = math.floor(end * NANOSECONDS)
+        return ns if ns / NANOSECONDS <= end else ns - 1
 
-class Interpolants:
-    """The quintic Hermite polynomials of n steps of some equations."""
+    def reach(self, ns: int, max_steps: int | None = None) -> bool:
+        """
+        Take steps up to a time [ns]; return False if `max_steps` were too few.
 
-    def __init__(self, steps: Sequence[Step], equations: Equations) -> None:
-        self._begin, y0, first0, end, y1, first1 = map(_components, zip(*steps, strict=True))
-        h = end - self._begin
-        self._length = np.where(h > 0.0, h, 1.0)
+        Raises IntegrationError if the equations cannot go on.
+        """
+        taken = 0
+        while self.reached_ns < ns:
+            if taken == max_steps:
+                return False
+            self._take_step()
+            taken += 1
+        return True
+
+    def release(self, before_ns: int) -> None:
+        """Forget the steps that only states before this time [ns] need, or more to save memory."""
+        count = bisect_left(self._kept, before_ns / NANOSECONDS, hi=len(self._kept) - 1,
+                            key=attrgetter('t1'))
+        self._forget(max(count, len(self._kept) - MOST_KEPT))
+
+    def _forget(self, count: int) -> None:
+        del self._kept[:count]
+
+    def states(self, times_ns: NDArray[np.int64] | range) -> States:
+        """Return the states at ascending times (n,) [ns]; see `states_at_seconds`."""
+        return self.states_at_seconds(Times.from_ns(times_ns).seconds)
+
+    def states_at_seconds(self, t: Column) -> States:
+        """
+        Return the states at ascending times t (n,) [s].
+
+        Missing steps are taken here, STEPS_TOGETHER at a time, and forgotten once the times in
+        them are computed: `solve` reads a motion of any length in bounded memory.
+        Raises IntegrationError if a time lies before the steps that are kept, if the steps cannot
+        go on to the last time, or if it is too many of them away.
+        """
+        if len(t) and t[0] < self._kept[0].t0:
+            raise IntegrationError(f't = {float(t[0])!r} s: steps go forward, and the oldest one '
+                                   f'that is kept begins at {self._kept[0].t0!r} s')
+        parts, begin = [], 0
+        while begin < len(t):
+            while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_TOGETHER:
+                self._take_step()
+            oldest, newest = self._kept[0], self._kept[-1]
+            length = (newest.t1 - oldest.t0) / len(self._kept)
+            if t[-1] - newest.t1 > MOST_STEPS * length:
+                raise IntegrationError(f't = {t[-1]:.9g} s is more than {MOST_STEPS:.0e} steps of '
+                                       f"{length:.3g} s away: use method = 'exact'")
+            end = int(np.searchsorted(t, newest.t1, 'right'))
+            if end > begin:
+                parts.append(self._unknowns(t[begin:end]))
+                begin = end
+            if begin < len(t):
+                self._forget(len(self._kept) - 1)
+        unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
+        return self._states_of(t.copy(), unknowns)
+
+    def _unknowns(self, t: Column) -> Rows:
+        """Return the unknowns (k, n) at times [s] within the steps that are kept."""
+        return self._interpolated(t)[1]
+
+    def _interpolated(self, t: Column) -> tuple[NDArray[np.int64], Rows]:
+        """Return in which of the steps that are kept times [s] lie, and the unknowns there."""
+        steps = np.array([step.t1 for step in self._kept]).searchsorted(t)
+        first, last = (int(steps[0]), int(steps[-1])) if len(t) else (0, 0)
+        begin, y0, first0, end, y1, first1 = map(
+            components, zip(*self._kept[first:last + 1], strict=True))
+        h = end - begin
         rise, p, q = y1 - y0, h * first0, h * first1
-        u = 0.5 * h * h * equations.second_derivative(y0, first0)
-        v = 0.5 * h * h * equations.second_derivative(y1, first1)
-        # (6, k, n), by powers of (t - begin)/length.
-        self._coefficients = np.array((
+        u = 0.5 * h * h * self.second_derivative(y0, first0)
+        v = 0.5 * h * h * self.second_derivative(y1, first1)
+        # (6, k, steps), by powers of (t - begin)/length.
+        coefficients = np.array((
             y0, p, u,
             10.0 * rise - 6.0 * p - 4.0 * q - 3.0 * u + v,
             -15.0 * rise + 8.0 * p + 7.0 * q + 3.0 * u - 2.0 * v,
             6.0 * rise - 3.0 * p - 3.0 * q - u + v))
-
-    def at(self, numbers: NDArray[np.int64], t: Rows) -> Rows:
-        """Return the unknowns (k, m) at m times [s] in the steps of these numbers."""
-        s = (t - self._begin[numbers]) / self._length[numbers]
-        c0, c1, c2, c3, c4, c5 = self._coefficients.take(numbers, axis=2)
-        unknowns: Rows = ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
-        return unknowns
-
-
-def _components(vectors: Sequence[float] | Sequence[Vector]) -> Rows:
-    """Return rows (k, n) of n vectors, or (n,) of floats; a complex component makes two rows."""
-    columns: NDArray[np.generic] = np.array(vectors)
-    return np.ascontiguousarray(columns.view(np.float64).T)
+        numbers = steps - first
+        s = (t - begin[numbers]) / np.where(h > 0.0, h, 1.0)[numbers]
+        c0, c1, c2, c3, c4, c5 = coefficients.take(numbers, axis=2)
+        return steps, ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0

@@ -34,8 +34,9 @@ class GaussMean:
         self._means, self._c = [(a, g)], [c]
         tolerance = _tolerance()
         while len(self._c) < 2 or c > a * tolerance:
-            a, g = (a + g) / 2, (a * g).sqrt()
+            product, a = a * g, (a + g) / 2
             c = c * c / (4 * a)                     # [DLMF 19.8.3]
+            g = product.sqrt() if c > a * tolerance else a
             self._means.append((a, g))
             self._c.append(c)
         self.mean = a
@@ -89,11 +90,11 @@ class GaussMean:
             return ZERO
         a, _ = self._means[0]
         h = a / square.sqrt()
-        tolerance = _tolerance()
+        small = Decimal(10) ** (-(getcontext().prec // 4) - 1)
         for c in self._c:
-            h = (h + (h * h + sense * c * c).sqrt()) / 2
-            if c < h * tolerance:
-                break
+            square = sense * c * c
+            # Two terms of the root are enough where c is small.
+            h = h + square / (4 * h) if c < h * small else (h + (h * h + square).sqrt()) / 2
         amplitude = self.mean / h
         # The square may be 1 but for rounding: the sine is then 1.
         return min(amplitude, Decimal(1)) if sense < 0 else amplitude

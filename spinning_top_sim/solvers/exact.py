@@ -79,32 +79,35 @@ class ExactSolution:
         motion = set_up(top, Decimal(top.gravity), self.start)
         with precision(DIGITS):
             self._take_constants(motion, Decimal(start.l3), Decimal(start.lz))
+            self._take_means(motion)
         self._check_start()
 
     def _take_constants(self, motion: ThetaMotion, l3: Decimal, lz: Decimal) -> None:
-        top, start = self.top, self.start
-        self.m, self.m1 = float(motion.m), float(motion.m1)
-        # 2 K/w, two quarter periods
-        self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
-        alpha, beta = motion.alpha, motion.beta
-        two_lambda1 = 2 * Decimal(top.lambda1)
+        alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * Decimal(self.top.lambda1)
         bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
         in_range('the fastest rate', max(map(abs, (
             motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
-            l3 / Decimal(top.lambda3)))))
-        self.mean_precession_rate = float(alpha.rate + beta.rate)
-        self.mean_spin_rate = float(alpha.rate - beta.rate)
+            l3 / Decimal(self.top.lambda3)))))
         self._bottom_rate, self._top_rate = float(bottom_rate), float(top_rate)
         self._theta = ThetaFunctions(motion)
+        fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
+                      abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
+        limit = min(Decimal(MOST_TURNS) / fastest, MOST)
+        self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
+
+    def _take_means(self, motion: ThetaMotion) -> None:
+        """Take what the motion about a vertical that changes has no use for."""
+        start, alpha, beta = self.start, motion.alpha, motion.beta
+        self.m, self.m1 = float(motion.m), float(motion.m1)
+        # 2 K/w, two quarter periods
+        self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
+        self.mean_precession_rate = float(alpha.rate + beta.rate)
+        self.mean_spin_rate = float(alpha.rate - beta.rate)
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
         self._phi_phase = float(
             Decimal(start.phi) - alpha.start_argument - beta.start_argument) - self._half_turn
         self._psi_phase = float(
             Decimal(start.psi) - alpha.start_argument + beta.start_argument) + self._half_turn
-        fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
-                      abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
-        limit = min(Decimal(MOST_TURNS) / fastest, MOST)
-        self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""

@@ -11,9 +11,11 @@ from numpy.typing import ArrayLike
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
+from spinning_top_sim.solvers.dormand_prince import SteppedMotion
+from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.rk45 import EulerMotion, SteppedMotion, TransportMotion
 from spinning_top_sim.solvers.theta_values import MOST
+from spinning_top_sim.solvers.transport import TransportMotion
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')

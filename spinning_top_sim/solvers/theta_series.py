@@ -9,9 +9,12 @@ four terms reach 1e-19 and six 1e-39.  Positive constants that all series of a f
 out.
 """
 
+import math
 from collections.abc import Sequence
 from decimal import Decimal
+from functools import cached_property
 from itertools import count, zip_longest
+from operator import mul
 from typing import NamedTuple
 
 from spinning_top_sim.solvers.decimal_math import ONE, ZERO
@@ -37,7 +40,11 @@ def _polynomials(first: Sequence[int], second: Sequence[int]) -> list[Sequence[i
     return rows
 
 
-MULTIPLE_ANGLES = [_polynomials(*pair) for pair in FIRST_POLYNOMIALS]
+# By prefactor and power of xi, the coefficients of the multiples that have such a power.
+MULTIPLE_ANGLES = [
+    [[Decimal(row[power]) if power < len(row) else ZERO for row in rows[power:]]
+     for power in range(MOST_TERMS)]
+    for rows in (_polynomials(*pair) for pair in FIRST_POLYNOMIALS)]
 
 
 class Series(NamedTuple):
@@ -53,14 +60,12 @@ class Series(NamedTuple):
     @classmethod
     def of(cls, prefactor: int, weights: Sequence[Decimal]) -> 'Series':
         """Return the sum of weights[k] times cos(n y) or sin(n y)."""
-        polynomial = [ZERO] * len(weights)
-        for weight, shape in zip(weights, MULTIPLE_ANGLES[prefactor], strict=False):
-            for power, coefficient in enumerate(shape):
-                polynomial[power] += weight * coefficient
-        return cls(prefactor, tuple(polynomial))
+        shapes = MULTIPLE_ANGLES[prefactor]
+        return cls(prefactor, tuple([
+            sum(map(mul, weights[power:], shapes[power]), ZERO) for power in range(len(weights))]))
 
     def scaled(self, scale: Decimal) -> 'Series':
-        return Series(self.prefactor, tuple(scale * x for x in self.polynomial))
+        return Series(self.prefactor, tuple([scale * x for x in self.polynomial]))
 
     def at(self, sin: Decimal, cos: Decimal, xi: Decimal) -> Decimal:
         value = ZERO
@@ -95,19 +100,24 @@ class ThetaForm:
     def __init__(self, mean: GaussMean, imaginary: bool, digits: int) -> None:
         self.mean, self.imaginary = mean, imaginary
         q = mean.nome()
+        exponent = q.adjusted()
+        depth = -exponent - math.log10(q.scaleb(-exponent))
         # Terms k are of size q^(k^2 - k/2) or less beside the first one.
         self.size, terms = (
-            next(k for k in count(2) if q ** (2 * k * k - k) < Decimal(10) ** (-2 * wanted))
+            next(k for k in count(2) if (2 * k * k - k) * depth > 2 * wanted)
             for wanted in (DIGITS_OF_DOUBLES, digits))
         self._even = [ONE, *(2 * q ** (k * k) for k in range(1, terms))]
         self._odd = [q ** (k * (k + 1)) for k in range(terms)]
         self.theta1 = Series.of(SIN_ODD, _alternating(self._odd))
-        self.theta2 = Series.of(COS_ODD, self._odd)
         self.theta3 = Series.of(COS_EVEN, self._even)
-        self.theta4 = Series.of(COS_EVEN, _alternating(self._even))
-        if imaginary:
-            self.theta2, self.theta4 = self.theta4, self.theta2
+        pair = (COS_ODD, self._odd), (COS_EVEN, _alternating(self._even))
+        self._weights2, weights4 = pair[::-1] if imaginary else pair
+        self.theta4 = Series.of(*weights4)
         self.odd_over_even = 4 * q.sqrt() if imaginary else ONE
+
+    @cached_property
+    def theta2(self) -> Series:
+        return Series.of(*self._weights2)
 
     def slopes_of_sn2(self) -> tuple[Decimal, Decimal]:
         """Return c with d(sn^2 chi)/dchi = c theta1(2y)/D(y)^4, for theta4 and theta3 as D."""
@@ -123,31 +133,33 @@ class ThetaForm:
         amplitude : sinh A, or, in the imaginary form, sin of its transform pi a/(2K')
         sense : s
         """
-        sines, cosines = self._multiples(amplitude)
-        theta1 = (Series.of(COS_ODD, _alternating(_products(self._odd, sines[1::2]))),
-                  Series.of(SIN_ODD, _alternating(_products(self._odd, cosines[1::2], sense))))
+        square = -amplitude * amplitude if self.imaginary else amplitude * amplitude
+        other, twice = (1 + square).sqrt(), 2 + 4 * square      # twice: 2 cosh 2A, or 2 cos 2A
+        sines = _weighted(self._odd, -amplitude, amplitude, twice)
+        cosines = _weighted(self._odd, other, other, twice)
+        theta1 = (Series.of(COS_ODD, _alternating(sines)),
+                  Series.of(SIN_ODD, _alternating(_signed(sense, cosines))))
         if self.imaginary:
-            return theta1, (
-                Series.of(COS_EVEN, _alternating(_products(self._even, cosines[::2]))),
-                Series.of(SIN_EVEN, _alternating(_products(self._even, sines[::2], -sense))))
-        return theta1, (Series.of(COS_ODD, _products(self._odd, cosines[1::2])),
-                        Series.of(SIN_ODD, _products(self._odd, sines[1::2], sense)))
-
-    def _multiples(self, sin: Decimal) -> tuple[list[Decimal], list[Decimal]]:
-        """Return the sines and cosines, or sinh and cosh, of 0, 1, 2... times A."""
-        square = -sin * sin if self.imaginary else sin * sin
-        cos, sines, cosines = (1 + square).sqrt(), [ZERO], [ONE]
-        sign = -1 if self.imaginary else 1
-        for _ in range(2 * len(self._odd) - 1):
-            s, c = sines[-1], cosines[-1]
-            sines.append(s * cos + c * sin)
-            cosines.append(c * cos + sign * s * sin)
-        return sines, cosines
+            sines = _weighted(self._even, -2 * amplitude * other, ZERO, twice)
+            cosines = _weighted(self._even, twice / 2, ONE, twice)
+            return theta1, (Series.of(COS_EVEN, _alternating(cosines)),
+                            Series.of(SIN_EVEN, _alternating(_signed(-sense, sines))))
+        return theta1, (Series.of(COS_ODD, cosines), Series.of(SIN_ODD, _signed(sense, sines)))
 
 
 def _alternating(weights: Sequence[Decimal]) -> list[Decimal]:
     return [-x if k % 2 else x for k, x in enumerate(weights)]
 
 
-def _products(one: Sequence[Decimal], other: Sequence[Decimal], sign: int = 1) -> list[Decimal]:
-    return [sign * x * y for x, y in zip(one, other, strict=True)]
+def _signed(sign: int, weights: Sequence[Decimal]) -> Sequence[Decimal]:
+    return weights if sign > 0 else [-x for x in weights]
+
+
+def _weighted(weights: Sequence[Decimal], before: Decimal, value: Decimal,
+              twice: Decimal) -> list[Decimal]:
+    """Return weights times sines or cosines of A, 3A ..., or of 0, 2A ..., from two of them."""
+    products = []
+    for weight in weights:
+        products.append(weight * value)
+        before, value = value, twice * value - before
+    return products

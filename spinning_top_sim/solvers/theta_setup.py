@@ -36,7 +36,7 @@ docs/theta_functions.md derives the first two steps.
    theta3 for X.
 
 Everything that cancels, cancels here: next to a pole, to the separatrix, to steady precession.  So
-there are 60 digits, and more if two roots are close.  Then 40 are enough.
+there are 57 digits, and more if two roots are close.  Then 40 are enough.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ from spinning_top_sim.solvers.theta_series import (
     ThetaForm,
 )
 
-DIGITS_TO_TRY = 60, 120, 240, 480
+DIGITS_TO_TRY = 57, 114, 228, 456
 NO_GRAVITY = Decimal('1e-1000')     # so small that u3 is infinite to all digits
 
 

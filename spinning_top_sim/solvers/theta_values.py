@@ -10,8 +10,11 @@ and keeps its relative precision: a top races past a pole that it misses by litt
 All arithmetic is elementwise, so that a value does not depend on the other values in its block.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable, Sequence
+from copy import copy
 from decimal import Decimal
 from functools import cached_property
 from operator import sub
@@ -52,7 +55,10 @@ class ThetaFunctions:
     zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
     u_dot, u_dot_coefficients : of u'
     momentum, swing : of (Lz - L3 u)/lambda1
+    first : of a chain, the place of each time's constants at even N in the last axis, (n,)
     """
+
+    first: NDArray[np.int64] | None = None
 
     def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
@@ -63,19 +69,52 @@ class ThetaFunctions:
         self.start_whole = _column(whole)
         self.offset, self.offset_rest = map(_column, zip(*map(double_double, rest), strict=True))
         self.drifts = _column(0.5 * float(factor.drift) for factor in factors)
-        self.stretch = QUARTER * float(motion.stretch) if motion.stretch else None
+        self.stretch: Column | float | None = (
+            QUARTER * float(motion.stretch) if motion.stretch else None)
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
         self.coefficients = _coefficients(rows, motion.size)
         self.real = [k for k, factor in enumerate(factors) if not factor.sense]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
                       if SIN_ODD in pair}
-        _check_amplitudes(motion)
+        for name, factor in zip(('alpha', 'beta'), factors, strict=True):
+            for real, _ in factor.parts:
+                size = max(map(abs, real.polynomial))
+                if 0 < size < LEAST_AMPLITUDE:
+                    raise ValueError(
+                        f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
+                        f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
         self.u_dot = np.array([in_range("cos(theta)'", x) for x in motion.u_dot])
         self.u_dot_coefficients = _coefficients([[motion.u_dot_series]], motion.size)[:, 0]
         self.momentum, self.swing = (
             np.array([*map(float, pair)]) for pair in (motion.momentum, motion.swing))
         self._quarter0 = motion.quarter0
+
+    @cached_property
+    def kind(self) -> tuple[object, ...] | None:
+        """What motions of one chain have in common; None of one that cannot be part of any."""
+        if self.real or not self.u_dot.any():
+            return None
+        return self.stretch is None, *self.prefactors
+
+    @classmethod
+    def chained(cls, parts: Sequence[ThetaFunctions], counts: Sequence[int]) -> ThetaFunctions:
+        """Return the constants of motions of one kind, of each for so many times."""
+        chain = copy(parts[0])
+        chain.rates = Rates.chained([part.rates for part in parts], counts)
+        chain.offset, chain.offset_rest, chain.start_whole, chain.drifts = (
+            np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(*(
+                (part.offset, part.offset_rest, part.start_whole, part.drifts)
+                for part in parts), strict=True))
+        if chain.stretch is not None:
+            chain.stretch = np.repeat([part.stretch for part in parts], counts)
+        chain.coefficients = _side_by_side([part.coefficients for part in parts])
+        chain.u_dot_coefficients = np.repeat(_side_by_side([
+            part.u_dot_coefficients for part in parts]), counts, axis=1)
+        chain.u_dot, chain.momentum, chain.swing = map(np.concatenate, zip(*(
+            (part.u_dot, part.momentum, part.swing) for part in parts), strict=True))
+        chain.first = np.repeat(np.arange(0, 2 * len(parts), 2), counts)
+        return chain
 
     @property
     def _middles(self) -> Matrix:
@@ -149,7 +188,8 @@ class ThetaValues:
         cos = np.sqrt(1.0 - xi)
         self._parity, self._xi = quarters & 1, xi
         odd = self._parity.astype(bool)
-        rows = _horner(constants.coefficients.take(self._parity, axis=2), xi)
+        self._place = self._parity if constants.first is None else self._parity + constants.first
+        rows = _horner(constants.coefficients.take(self._place, axis=2), xi)
         for k in constants.zeros:           # the sign is (-1)^floor(N/2)
             rows[k] *= 1 - (quarters & 2)
         self._without_zero = {k: rows[k].copy() for k in constants.zeros}
@@ -234,7 +274,7 @@ class ThetaValues:
             without[k] = np.where(here, self._without_zero[k], without[k])
         series = prefactor * _horner(constants.u_dot_coefficients, 4.0 * xi * (1.0 - xi))
         # In this order nothing overflows on the separatrix, where all grow like cosh x.
-        theta_dot: Column = -constants.u_dot.take(self._parity) * (series / size) / (
+        theta_dot: Column = -constants.u_dot.take(self._place) * (series / size) / (
             without[0] * without[1])
         return theta_dot
 
@@ -245,8 +285,8 @@ class ThetaValues:
         series = self._sin_y * _horner(constants.u_dot_coefficients, self._xi)
         half: Column = 0.5 / (alpha * beta)
         return np.stack((
-            constants.momentum.take(self._parity) * ((alpha * alpha + beta * beta) * half),
-            constants.swing.take(self._parity) * (series * series * half)))
+            constants.momentum.take(self._place) * ((alpha * alpha + beta * beta) * half),
+            constants.swing.take(self._place) * (series * series * half)))
 
     @cached_property
     def rates(self) -> Matrix:
@@ -270,22 +310,21 @@ def in_range(name: str, value: Decimal) -> float:
     return float(value)
 
 
-def _check_amplitudes(motion: ThetaMotion) -> None:
-    for name, factor in (('alpha', motion.alpha), ('beta', motion.beta)):
-        for real, _ in factor.parts:
-            size = max(map(abs, real.polynomial))
-            if 0 < size < LEAST_AMPLITUDE:
-                raise ValueError(
-                    f'the amplitude of {name} is {size:.3e}: the start is too close to a pole or '
-                    f'to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
-
-
 def _coefficients(rows: Sequence[Sequence[Series]], most: int) -> NDArray[np.float64]:
     """Return the polynomials' coefficients in doubles, highest of at least 2 powers first."""
-    size = max(2, *(len(x.polynomial[:most]) for row in rows for x in row))
-    doubles = [[[*map(float, x.polynomial[:most])] for x in row] for row in rows]
-    return np.array([[(size - len(x)) * [0.0] + x[::-1] for x in row] for row in doubles]
-                    ).transpose(2, 0, 1)
+    doubles = [[*map(float, x.polynomial[:most])] for row in rows for x in row]
+    size = max(2, *map(len, doubles))
+    return np.array([(size - len(x)) * [0.0] + x[::-1] for x in doubles]
+                    ).T.reshape(size, len(rows), -1)
+
+
+def _side_by_side(parts: Sequence[Matrix]) -> Matrix:
+    """Join coefficients at their last axis, with zeros for the highest powers of the shorter."""
+    size, ends = max(map(len, parts)), np.cumsum([part.shape[-1] for part in parts])
+    joined = np.zeros((size, *parts[0].shape[1:-1], ends[-1]))
+    for part, end in zip(parts, ends, strict=True):
+        joined[size - len(part):, ..., end - part.shape[-1]:end] = part
+    return joined
 
 
 def _column(values: Iterable[float]) -> Matrix:

@@ -89,18 +89,26 @@ class Rates:
         # (k, 1) by unit: nearest doubles, their halves, and what they leave out
         self._constants: dict[str, tuple[NDArray[np.float64], ...]] = {}
 
-    def _add(self, unit: str) -> None:
-        with precision(DIGITS):
-            high, low = np.array([
-                double_double(rate * UNITS[unit]) for rate in self._per_second]).T
-        rates = high[:, np.newaxis]
-        self._constants[unit] = rates, *halves(rates), low[:, np.newaxis]
+    @classmethod
+    def chained(cls, parts: Sequence[Rates], counts: Sequence[int]) -> Rates:
+        """Return rates for integer nanoseconds, those of each part for so many times."""
+        chain = cls(())
+        chain._constants['ns'] = tuple(np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(
+            *(part._of('ns') for part in parts), strict=True))
+        return chain
+
+    def _of(self, unit: str) -> tuple[NDArray[np.float64], ...]:
+        if unit not in self._constants:
+            with precision(DIGITS):
+                high, low = np.array([
+                    double_double(rate * UNITS[unit]) for rate in self._per_second]).T
+            rates = high[:, np.newaxis]
+            self._constants[unit] = rates, *halves(rates), low[:, np.newaxis]
+        return self._constants[unit]
 
     def products(self, times: Times) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return rate * t, (k, n), as nearest doubles and what they leave out."""
-        if times.unit not in self._constants:
-            self._add(times.unit)
-        rate, r1, r2, rate_low = self._constants[times.unit]
+        rate, r1, r2, rate_low = self._of(times.unit)
         t1, t2 = halves(times.high)
         high = rate * times.high
         # Exact up to the last product of halves (Dekker).

@@ -15,9 +15,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.pivot import Exact
@@ -41,6 +42,8 @@ from spinning_top_sim.solvers.theta_setup import (
     ThetaMotion,
     set_up,
 )
+from spinning_top_sim.solvers.theta_values import ThetaFunctions
+from spinning_top_sim.solvers.times import Times
 
 MOST_DIGITS = DIGITS_TO_TRY[0]
 # An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
@@ -50,7 +53,6 @@ POLE = Decimal('1e-30')
 # the share, and has 40 digits.
 THROUGH = Decimal('1e-19')
 Complex = tuple[Decimal, Decimal]
-LongQuaternion = tuple[Decimal, Decimal, Decimal, Decimal]
 
 
 class Posture(NamedTuple):
@@ -68,7 +70,7 @@ class Posture(NamedTuple):
     l3: float
 
 
-class Vertical:
+class Vertical(NamedTuple):
     """
     The line of effective gravity, and a frame with its z axis along it.
 
@@ -79,32 +81,12 @@ class Vertical:
     gravity : downwards along z positive [m/s^2]
     alpha, beta : Cayley-Klein parameters of the least rotation from the world to the frame
     rows : the same rotation, q(world <- frame), in doubles
-
-    Parameters
-    ----------
-    gravity : float
-        Of the world, downwards positive [m/s^2].
-    acceleration : (3,)
-        Of the pivot in the world [m/s^2].
-    posture : Posture
     """
 
-    def __init__(self, gravity: float, acceleration: Exact, posture: Posture) -> None:
-        x, y, z = (Decimal(a.numerator) / Decimal(a.denominator) for a in acceleration)
-        z += Decimal(gravity)
-        (w0, z0), (y0, minus_x0) = posture.alpha, posture.beta
-        n = (2 * (w0 * y0 - z0 * minus_x0), 2 * (y0 * z0 + w0 * minus_x0),
-             _square(posture.alpha) - _square(posture.beta))
-        size = (x * x + y * y + z * z).sqrt()
-        if not size:
-            z = ONE
-        side = ONE if n[0] * x + n[1] * y + n[2] * z >= 0 else -ONE
-        scale = side / (size or ONE)
-        self.gravity = side * size
-        self.alpha, self.beta = _least_rotation(scale * x, scale * y, scale * z)
-        parts = -self.beta[1], self.beta[0], self.alpha[1], self.alpha[0]
-        qx, qy, qz, qw = (np.array([float(part)]) for part in parts)
-        self.rows: Quaternion = qx, qy, qz, qw
+    gravity: Decimal
+    alpha: Complex
+    beta: Complex
+    rows: Quaternion
 
     def start(self, top: Top, posture: Posture) -> HalfAngles:
         """Return a posture as a state in this frame."""
@@ -177,6 +159,18 @@ class AcceleratedMotion(ExactSolution):
         across: Column = np.where(cancels, one + two, bottom + top)
         return across
 
+    @property
+    def kind(self) -> tuple[object, ...] | None:
+        """What motions have in common that can be `chained`; None of one that cannot."""
+        return self._theta.kind
+
+    @property
+    def energy(self) -> float:
+        o1, o2 = map(float, self._posture.across)
+        top, start = self.top, self.start
+        return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
+                + top.gravity_torque * math.cos(start.theta))
+
     def posture(self, ns: int) -> Posture:
         """
         Return the posture in the world at a time [ns] since the start.
@@ -193,6 +187,43 @@ class AcceleratedMotion(ExactSolution):
             return Posture(alpha, beta, across, self.start.l3)
 
 
+class _Chain(AcceleratedMotion):
+    """Motions of one kind as one, each at `counts` of the times."""
+
+    def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int]) -> None:
+        self.top, self.start, self._turns = motions[0].top, motions[0].start, 0
+        self._theta = ThetaFunctions.chained([motion._theta for motion in motions], counts)
+        rates: Any = np.array([(motion._bottom_rate, motion._top_rate) for motion in motions])
+        self._bottom_rate, self._top_rate = np.repeat(rates.T, counts, axis=1)
+
+
+def chained(motions: Sequence[AcceleratedMotion], counts: Sequence[int],
+            times_ns: NDArray[np.int64]) -> States:
+    """Return the states of motions of one kind, of each at so many of the times [ns]."""
+    states = _ExactStates(_Chain(motions, counts), Times.from_ns(times_ns))
+    states._lz, states._gravity, states._torque = np.repeat(np.array([
+        (motion.start.lz, motion.top.gravity, motion.top.gravity_torque)
+        for motion in motions]).T, counts, axis=1)
+    return states
+
+
+@lru_cache(64)
+def _verticals(gravity: float, acceleration: Exact,
+               ) -> tuple[tuple[Decimal, Decimal, Decimal], Vertical, Vertical]:
+    """Return the upward line of effective gravity, and the verticals along and against it."""
+    x, y, z = (Decimal(a.numerator) / Decimal(a.denominator) for a in acceleration)
+    z += Decimal(gravity)
+    size = (x * x + y * y + z * z).sqrt()
+    x, y, z = line = (x / size, y / size, z / size) if size else (ZERO, ZERO, ONE)
+    return line, _upright(size, x, y, z), _upright(-size, -x, -y, -z)
+
+
+def _upright(gravity: Decimal, x: Decimal, y: Decimal, z: Decimal) -> Vertical:
+    alpha, beta = _least_rotation(x, y, z)
+    qx, qy, qz, qw = (np.array([float(part)]) for part in (-beta[1], beta[0], alpha[1], alpha[0]))
+    return Vertical(gravity, alpha, beta, (qx, qy, qz, qw))
+
+
 @lru_cache(16)
 def _in_gravity(top: Top, gravity: float) -> Top:
     return replace(top, gravity=gravity)
@@ -202,7 +233,11 @@ def about_vertical(top: Top, posture: Posture, acceleration: Exact,
                    ) -> tuple[Vertical, HalfAngles]:
     """Return the vertical while the pivot accelerates so, and the state there."""
     with precision(MOST_DIGITS):
-        vertical = Vertical(top.gravity, acceleration, posture)
+        (x, y, z), up, down = _verticals(top.gravity, acceleration)
+        (w0, z0), (y0, minus_x0) = alpha, beta = posture[:2]
+        side = (2 * (x * (w0 * y0 - z0 * minus_x0) + y * (y0 * z0 + w0 * minus_x0))
+                + z * (_square(alpha) - _square(beta)))
+        vertical = up if side >= 0 else down
         return vertical, vertical.start(top, posture)
 
 

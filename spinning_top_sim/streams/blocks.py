@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.solvers.exact import BLOCK
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.path import Path
+from spinning_top_sim.streams.path import Path, Segment
 from spinning_top_sim.streams.stream import Rows, Samples, Stream
 
 STEPS_IN_A_PIECE = 4
@@ -53,11 +54,10 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
             path, after_ns, min(end_ns, after_ns + span_ns), most_steps)
         if edges[-1] > after_ns:
             # Once for all streams of one rate.
-            samples = cache(partial(Samples, path, epoch_ns=epoch_ns))
+            samples = cache(partial(_samples, path, epoch_ns))
             parts = []
             for stream in streams:
-                found = [samples(times) for begin_ns, end in pairwise(edges)
-                         if (times := stream.times(begin_ns, end))]
+                found = samples(*(stream.times(*ends) for ends in pairwise(edges)))
                 if found:
                     times_ns, rows = stream.encode(*found)
                     if len(times_ns):       # a sensor may lose all samples of a block
@@ -70,6 +70,21 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
     if end_ns < until_ns:
         raise IntegrationError(f'the stamp {(epoch_ns + until_ns) / NANOSECONDS:.12g} s: must be '
                                f'< {2 ** 31} s, in January 2038')
+
+
+def _samples(path: Path, epoch_ns: int, *ranges: range) -> list[Samples]:
+    """Return the samples at times [ns] in consecutive segments, short ones of a kind together."""
+    groups: list[list[tuple[Segment, range]]] = []
+    kind, count = None, 0
+    for times in filter(len, ranges):
+        segment = path.after(times.start - 1)
+        count += len(times)
+        if kind and kind == segment.kind and count <= BLOCK:
+            groups[-1].append((segment, times))
+        else:
+            groups.append([(segment, times)])
+            kind, count = segment.kind, len(times)
+    return [Samples(path, group, epoch_ns) for group in groups]
 
 
 def _reach(path: Path, after_ns: int, until_ns: int, most_steps: int,

@@ -7,7 +7,6 @@ delay and outages.
 """
 
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Vector
 from spinning_top_sim.streams import messages, noise
-from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.path import Path
+from spinning_top_sim.streams.cdr import NANOSECONDS, Template
 from spinning_top_sim.streams.stream import Encoded, Samples, Stream
 
 NAN = 3 * (np.nan,)
@@ -36,40 +34,35 @@ class Gnss(Stream):
     _noise: str             # parameter of the standard deviations
     _purpose: noise.Purpose
 
-    def __init__(self, values: Mapping[str, Any], topic: str, template: Any, *,
-                 is_exact: bool) -> None:
-        super().__init__(values, 'gnss', topic, self.type_name, template)
-        self._seed, self._is_exact = values['seed'], is_exact
-        level, vertical = values[self._noise]
-        self._deviation = np.array([[level], [level], [vertical]]) * (not is_exact)
+    def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
+        level, vertical = (0.0, 0.0) if is_exact else values[self._noise]
+        super().__init__(values, 'gnss', topic, self.type_name, self._template(
+            values, (level ** 2, level ** 2, vertical ** 2)))
+        self._seed = values['seed']
+        self._deviation = np.array([[level], [level], [vertical]])
         self.late_ns = 0 if is_exact else round(values['gnss.latency'] * NANOSECONDS)
         # Begin and end of each outage, in turn; an odd number of them is past within an outage.
         self._edges_ns = np.rint(np.array(() if is_exact else values['gnss.outages'])
                                  * NANOSECONDS).astype(np.int64)
 
+    def _template(self, values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
+        raise NotImplementedError
+
     def times(self, after_ns: int, until_ns: int) -> range:
-        """Return the times after `after_ns` and up to `until_ns` at which messages are sent."""
         valid = super().times(max(after_ns - self.late_ns, -1), until_ns - self.late_ns)
         return range(valid.start + self.late_ns, valid.stop + self.late_ns, valid.step)
 
-    def encode(self, *parts: Samples) -> Encoded:
+    def _measured(self, *parts: Samples) -> tuple[
+            NDArray[np.int64], NDArray[np.int64], Vector, NDArray[np.bool_]]:
+        """Return times and stamps of messages [ns], measurements, and which are in an outage."""
         t_ns = np.concatenate([one.t_ns for one in parts])
         valid_ns = t_ns - self.late_ns
-        return self._sent(t_ns, parts[0].epoch_ns + valid_ns, self._measured(
-            parts[0].path, valid_ns), np.searchsorted(self._edges_ns, valid_ns, 'right') % 2 == 1)
-
-    def _measured(self, path: Path, valid_ns: NDArray[np.int64]) -> Vector:
-        value = path.pivot(valid_ns)[self._index]
+        x, y, z = value = parts[0].path.pivot(valid_ns)[self._index]
         if self._deviation.any():
-            value = value + self._deviation * noise.white(
+            x, y, z = value + self._deviation * noise.white(
                 self._seed, self._purpose, valid_ns // self.period_ns, 3)
-        x, y, z = value
-        return x, y, z
-
-    def _sent(self, t_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64], measured: Vector,
-              is_out: NDArray[np.bool_]) -> Encoded:
-        """Return the messages of these measurements; `is_out`: they fall into an outage."""
-        raise NotImplementedError
+        return (t_ns, parts[0].epoch_ns + valid_ns, (x, y, z),
+                np.searchsorted(self._edges_ns, valid_ns, 'right') % 2 == 1)
 
 
 class Fix(Gnss):
@@ -78,31 +71,19 @@ class Fix(Gnss):
     type_name = 'sensor_msgs/msg/NavSatFix'
     _index, _noise, _purpose = 0, 'gnss.position_noise', noise.Purpose.GNSS_POSITION
 
-    def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
-        level, vertical = (0.0, 0.0) if is_exact else values[self._noise]
-        super().__init__(values, topic, messages.nav_sat_fix(
-            values['body_frame'], messages.diagonal(level ** 2, level ** 2, vertical ** 2)),
-            is_exact=is_exact)
-        self._no_fix = messages.nav_sat_fix(values['body_frame'], None)
+    def _template(self, values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
         self._origin = values['gnss.origin']
+        self._no_fix = messages.nav_sat_fix(values['body_frame'], None)
+        return messages.nav_sat_fix(values['body_frame'], messages.diagonal(*variances))
 
-    def _sent(self, t_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64], measured: Vector,
-              is_out: NDArray[np.bool_]) -> Encoded:
-        rows = self.template.encode(stamps_ns, self._geodetic(measured))
+    def encode(self, *parts: Samples) -> Encoded:
+        from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
+        t_ns, stamps_ns, position, is_out = self._measured(*parts)
+        rows = self.template.encode(stamps_ns, enu2geodetic(*position, *self._origin))
         if is_out.any():
             rows = rows.copy()      # the template's own rows keep what is the same in all
             rows[is_out] = self._no_fix.encode(stamps_ns[is_out], NAN)
         return t_ns, rows
-
-    @cached_property
-    def _enu2geodetic(self) -> Any:
-        from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
-        return enu2geodetic
-
-    def _geodetic(self, position: Vector) -> Vector:
-        """Return latitude and longitude [deg] and height above the ellipsoid of WGS-84 [m]."""
-        latitude, longitude, altitude = self._enu2geodetic(*position, *self._origin)
-        return latitude, longitude, altitude
 
 
 class Velocity(Gnss):
@@ -111,14 +92,15 @@ class Velocity(Gnss):
     type_name = 'geometry_msgs/msg/TwistWithCovarianceStamped'
     _index, _noise, _purpose = 1, 'gnss.velocity_noise', noise.Purpose.GNSS_VELOCITY
 
+    def _template(self, values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
+        return messages.twist_with_covariance(values['world_frame'], variances)
+
     def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
-        level, vertical = (0.0, 0.0) if is_exact else values[self._noise]
-        super().__init__(values, topic, messages.twist_with_covariance(
-            values['world_frame'], (level ** 2, level ** 2, vertical ** 2)), is_exact=is_exact)
+        super().__init__(values, topic, is_exact=is_exact)
         edges_ns = self._edges_ns.tolist()
         self.silences_ns = list(zip(edges_ns[::2], edges_ns[1::2], strict=True))
 
-    def _sent(self, t_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64], measured: Vector,
-              is_out: NDArray[np.bool_]) -> Encoded:
-        rows = self.template.encode(stamps_ns, measured)
+    def encode(self, *parts: Samples) -> Encoded:
+        t_ns, stamps_ns, velocity, is_out = self._measured(*parts)
+        rows = self.template.encode(stamps_ns, velocity)
         return t_ns[~is_out], rows[~is_out]

@@ -22,12 +22,14 @@ from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.bandwidth import LowPass
-from spinning_top_sim.streams.intervals import Intervals
-from spinning_top_sim.streams.parameters import BY_NAME, IDENTITY
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.parameters import BY_NAME, IDENTITY, LOWEST_RATE_OF_INTERVALS
 from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Samples, period_ns
 from spinning_top_sim.streams.vibration import Vibration
 
+# Of an interval between two samples.
+LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
 KINDS = ('gyroscope', 'accelerometer')
 # Parameters of the errors that both kinds of axes have.
 ERRORS = ('M', 'noise_density', 'turn_on_bias', 'random_walk', 'bias_stddev', 'bias_instability',
@@ -40,7 +42,11 @@ class Imu:
 
     sensor : returns the `Sensor` for a sample period [ns], which adds the errors
     takes_means : whether a sample is the mean over the interval before it (`imu.sampling`)
-    intervals : the intervals between its samples
+    length_ns : period of its samples [ns]
+
+    Intervals [t - length, t) end with the samples.  The first one is empty, as the motion begins
+    with the first sample.  After a change of the rate the first one begins with the last sample of
+    the old rate, so that no motion is left out.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -49,30 +55,45 @@ class Imu:
         self._mounting = _quaternion(*values['imu.rpy'])
         self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
         self.takes_means = values['imu.sampling'] == 'mean'
-        self.intervals = Intervals(period_ns(values['imu.rate']))
+        self.length_ns = period_ns(values['imu.rate'])
+        # When this rate began, and where the first interval after that begins [ns].
+        self._since_ns = self._first_begin_ns = 0
         bandwidth = values['imu.bandwidth']
         self._low_pass = (LowPass(bandwidth, values['imu.bandwidth_order']) if bandwidth
                           else None)
-        vibration = Vibration(values, self._low_pass.response if self._low_pass else np.ones_like)
-        self._vibration = None if vibration.is_off else vibration
+        self._vibration = Vibration(
+            values, self._low_pass.response if self._low_pass else np.ones_like)
 
     @property
     def keep_ns(self) -> int:
         """The time before a sample that its reading may need [ns]."""
-        memory_ns = self._low_pass.memory_ns if self._low_pass else 0
-        return max(self.intervals.keep_ns, memory_ns)
+        interval_ns = min(self.length_ns, LONGEST_NS) + self._since_ns - self._first_begin_ns
+        return max(interval_ns, self._low_pass.memory_ns if self._low_pass else 0)
 
     @property
     def present_sensor(self) -> 'Sensor':
-        return self.sensor(self.intervals.length_ns)
+        return self.sensor(self.length_ns)
 
     def set_rate(self, rate: float, now_ns: int) -> bool:
         """Take samples at this rate [Hz] after `now_ns`; return whether the period changes."""
         length_ns = period_ns(rate)
-        if length_ns == self.intervals.length_ns:
+        if length_ns == self.length_ns:
             return False
-        self.intervals = self.intervals.changed(length_ns, now_ns)
+        last_ns = now_ns // self.length_ns * self.length_ns
+        if last_ns <= self._since_ns:       # no sample since the change before this one
+            last_ns = self._first_begin_ns
+        self.length_ns, self._since_ns = length_ns, now_ns
+        self._first_begin_ns = max(last_ns, now_ns - LONGEST_NS)
         return True
+
+    def _begin_ns(self, end_ns: int) -> int:
+        """Return where the interval that ends with a sample begins [ns]."""
+        begin_ns = end_ns - self.length_ns
+        return begin_ns if begin_ns > self._since_ns else self._first_begin_ns
+
+    def _lengths(self, times: range) -> Column:
+        """Return the lengths (n,) [s] of the intervals that end at these times [ns]."""
+        return np.array([time - self._begin_ns(time) for time in times]) * 1e-9
 
     def orientation(self, states: States) -> Quaternion:
         """Return q(world <- IMU) as columns x, y, z, w."""
@@ -94,7 +115,7 @@ class Imu:
     def means(self, samples: Samples) -> tuple[Vector, Vector]:
         """Return the means of `true` over the intervals that end at these samples."""
         increments = samples.once(self._body_increments)
-        seconds = self.intervals.lengths(samples.times)
+        seconds = self._lengths(samples.times)
         # The mean over an empty interval is the value itself.
         divisor = np.where(seconds > 0.0, seconds, 1.0)
         states = samples.states
@@ -111,17 +132,17 @@ class Imu:
 
     def felt(self, samples: Samples) -> tuple[Vector, Vector]:
         """Return `sampled` with bandwidth and vibration of the sensor, before its errors."""
-        exact = self.sampled(samples) if self._low_pass is None else self._filtered(samples)
-        if self._vibration is None:
+        if self._low_pass is None:
+            exact = self.sampled(samples)
+        else:
+            w1, w2, w3, f1, f2, f3 = np.concatenate([
+                self._low_pass.filtered(segment, times, self._signal)
+                for segment, times in samples.parts], axis=1)
+            exact = (w1, w2, w3), (f1, f2, f3)
+        if self._vibration.is_off:
             return exact
-        return self._vibration.add(exact, samples.t_ns, self.intervals.lengths(samples.times)
+        return self._vibration.add(exact, samples.t_ns, self._lengths(samples.times)
                                    if self.takes_means else 0.0)
-
-    def _filtered(self, samples: Samples) -> tuple[Vector, Vector]:
-        assert self._low_pass is not None
-        w1, w2, w3, f1, f2, f3 = self._low_pass.filtered(
-            samples.segment, samples.times, self._signal)
-        return (w1, w2, w3), (f1, f2, f3)
 
     def _signal(self, states: States) -> NDArray[np.float64]:
         return np.stack(np.broadcast_arrays(*itertools.chain(*self.true(states))))
@@ -134,11 +155,10 @@ class Imu:
     def measured_increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
         """Return `increments` with the errors of the sensor and its vibration."""
         exact, sensor = self.increments(samples), self.present_sensor
-        if sensor.is_perfect and self._vibration is None:
+        if sensor.is_perfect and self._vibration.is_off:
             return exact
-        means, seconds = samples.once(self.means), self.intervals.lengths(samples.times)
-        felt = means if self._vibration is None else self._vibration.add(
-            means, samples.t_ns, seconds)
+        means, seconds = samples.once(self.means), self._lengths(samples.times)
+        felt = self._vibration.add(means, samples.t_ns, seconds)
         return sensor.disturb(exact, means, sensor.read(felt, samples.times), seconds)
 
     def increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
@@ -151,14 +171,28 @@ class Imu:
         return (x, y, z, w), self.from_body((v1, v2, v3))
 
     def _body_increments(self, samples: Samples) -> Increments:
-        return self.intervals.increments(samples.path, samples.times, self._lever_arm)
+        """Return the increments over the intervals that end at these samples, n of each."""
+        path, point = samples.path, self._lever_arm
+        found: list[Increments] = []
+        for segment, times in samples.parts:
+            # Those that may be shorter, or contain a command, are computed one by one.
+            since_ns = max(self._since_ns, segment.start_ns)
+            single = len(range(times.start, since_ns + self.length_ns + 1, times.step))
+            found += [path.increments(self._begin_ns(end_ns), end_ns, point)
+                      for end_ns in times[:single]]
+            if single < len(times):
+                first_ns = times[single]
+                found.append(path.increments(self._begin_ns(first_ns), first_ns, point,
+                                             len(times) - single, times.step))
+        return found[0] if len(found) == 1 else Increments(*(
+            np.concatenate(rows, axis=1) for rows in zip(*found, strict=True)))
 
     def motion(self, samples: Samples) -> tuple[Vector, Quaternion, Vector]:
         """Return position [m] and orientation in the world, velocity in the IMU's frame [m/s]."""
         states = samples.states
         x, y, z = attitude.in_world(states.rows_quaternion, self._lever_arm)
         v1, v2, v3 = states.velocity(self._lever_arm)
-        if samples.segment.ride:
+        if samples.pivot_moves:
             (a, b, c), (u, v, w), _ = samples.pivot
             x, y, z = x + a, y + b, z + c
             u, v, w = attitude.in_body(states.rows_quaternion, (u, v, w))
@@ -217,10 +251,15 @@ class Sensor:
             return exact
         white, bias = self._noise.at(times)
         # The chain of docs/sensor.md: matrices, g-sensitivity, bias, noise, rounding, range.
+        rates, force = exact
+        rates = transformed(self._rate_matrix, rates)
+        if any(self._g_sensitivity):
+            x, y, z = transformed(self._g_sensitivity, force)
+            rates = rates[0] + x, rates[1] + y, rates[2] + z
         w1, w2, w3, f1, f2, f3 = (
             converted(value + one_bias + one_white, resolution, largest)
             for value, one_bias, one_white, resolution, largest in zip(
-                itertools.chain(*self._distorted(*exact)), bias, white, self._resolutions,
+                (*rates, *transformed(self._force_matrix, force)), bias, white, self._resolutions,
                 self._ranges, strict=True))
         return (w1, w2, w3), (f1, f2, f3)
 
@@ -259,14 +298,6 @@ class Sensor:
     def bias(self, times: range) -> tuple[Vector, Vector]:
         _, (w1, w2, w3, f1, f2, f3) = self._noise.at(times)
         return (w1, w2, w3), (f1, f2, f3)
-
-    def _distorted(self, rates: Vector, force: Vector) -> tuple[Vector, Vector]:
-        """Return rates and force after matrices and g-sensitivity (kalibr's M and A)."""
-        read_rates = transformed(self._rate_matrix, rates)
-        if any(self._g_sensitivity):
-            x, y, z = transformed(self._g_sensitivity, force)
-            read_rates = read_rates[0] + x, read_rates[1] + y, read_rates[2] + z
-        return read_rates, transformed(self._force_matrix, force)
 
 
 def _six(values: Mapping[str, Any], error: str) -> tuple[float, ...]:

@@ -9,9 +9,10 @@ after `now_ns` empties the queue.
 
 import contextlib
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 from spinning_top_sim.physics.pivot import NEVER_NS
@@ -55,15 +56,6 @@ class Output:
         return self.publish is not None or self.log_index is not None
 
 
-@dataclass(slots=True)
-class Instant:
-    """The messages of one time: for the log, their size together [bytes], and for subscribers."""
-
-    entries: list[Entry] = field(default_factory=list)
-    size: int = 0
-    published: list[tuple[Output, bytes]] = field(default_factory=list)
-
-
 class LiveSimulation(Simulation):
     """
     A simulation with an output for each stream.
@@ -79,7 +71,7 @@ class LiveSimulation(Simulation):
         self.outputs = [Output(stream) for stream in self.streams]
         self.computed_ns = -1
         self._write: Write = lambda entries, size: None
-        self._queue: deque[tuple[int, Instant]] = deque()       # by time [ns]
+        self._queue: deque[tuple[int, Output, bytes]] = deque()     # messages by time [ns]
         self._used: list[Output] = []               # those whose samples are in the queue
         # `version`, `epoch_ns`, and which outputs had no subscribers, when the queue was computed.
         self._holds_for: tuple[int, int, list[bool]] = -1, 0, []
@@ -104,13 +96,10 @@ class LiveSimulation(Simulation):
             output.log_index = streams.index(output.stream) if output.stream in streams else None
         self.version += 1
 
-    def lowest_imu_rate(self, *, restarted: bool) -> float:
-        """
-        Return the lowest `imu.rate` [Hz] with which means and increments in use can go on.
-
-        restarted : after `restart`, which may end the means
-        """
-        uses = (self.imu.takes_means and not restarted) or any(
+    @property
+    def lowest_imu_rate(self) -> float:
+        """The lowest `imu.rate` [Hz] with which means and increments in use can go on."""
+        uses = self.imu.takes_means or any(
             output.stream.parameter == 'increments' and output.is_used for output in self.outputs)
         return parameters.LOWEST_RATE_OF_INTERVALS if uses else 0.0
 
@@ -131,7 +120,7 @@ class LiveSimulation(Simulation):
         try:
             while True:
                 while queue and queue[0][0] <= target_ns:
-                    self._send(*queue.popleft(), publish_from_ns)
+                    self._send(queue[0][0], publish_from_ns)
                 if self.computed_ns >= target_ns:
                     self.now_ns = max(self.now_ns, target_ns)
                     return True
@@ -178,13 +167,20 @@ class LiveSimulation(Simulation):
             self._queue.clear()
             self._work, self.computed_ns, self._block = None, self.now_ns, SMALLEST_BLOCK
 
-    def _send(self, t_ns: int, instant: Instant, publish_from_ns: int) -> None:
-        if instant.entries:
-            self._write(instant.entries, instant.size)
+    def _send(self, t_ns: int, publish_from_ns: int) -> None:
+        """Send the first messages in the queue, those of one time, to the log before others."""
+        queue, stamp_ns = self._queue, self.epoch_ns + t_ns
+        instant = []
+        while queue and queue[0][0] == t_ns:
+            instant.append(queue.popleft())
+        entries = [(output.log_index, stamp_ns, message) for _, output, message in instant
+                   if output.log_index is not None]
+        if entries:
+            self._write(entries, sum(len(message) for *_, message in entries))
         self.now_ns = t_ns
         if t_ns >= publish_from_ns:
-            for output, message in instant.published:
-                if output.publish is not None:      # it may be gone since the head of `advance`
+            for _, output, message in instant:
+                if output.publish is not None:
                     output.publish(message)
                     output.sent += 1
 
@@ -228,21 +224,11 @@ class LiveSimulation(Simulation):
         return True
 
     def _append(self, block: Block) -> None:
-        instants: defaultdict[int, Instant] = defaultdict(Instant)
-        epoch_ns = self.epoch_ns
+        messages: list[tuple[int, Output, bytes]] = []
         for stream, times_ns, rows in block.parts:
             output = next(one for one in self.outputs if one.stream is stream)
             data, size = rows.tobytes(), stream.size
-            log_index, is_published = output.log_index, output.publish is not None
-            begin = 0
-            for t_ns in times_ns.tolist():
-                message = data[begin:begin + size]
-                begin += size
-                instant = instants[t_ns]
-                if log_index is not None:
-                    instant.entries.append((log_index, epoch_ns + t_ns, message))
-                    instant.size += size
-                if is_published:
-                    instant.published.append((output, message))
-        self._queue.extend(sorted(instants.items()))
+            messages += [(t_ns, output, data[begin:begin + size]) for t_ns, begin in zip(
+                times_ns.tolist(), range(0, len(data), size), strict=True)]
+        self._queue.extend(sorted(messages, key=itemgetter(0)))
         self.computed_ns = block.until_ns

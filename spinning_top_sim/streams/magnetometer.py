@@ -21,7 +21,6 @@ class Magnetometer:
     A magnetometer that takes a sample every `period_ns`.
 
     variance : of white noise and rounding together [T^2]
-    is_disturbed : whether there are `mag.disturbance` events
 
     (V. Renaudin et al., "Complete triaxis magnetometer calibration in the magnetic domain",
     Journal of Sensors 2010: soft iron, hard iron, noise)
@@ -40,7 +39,7 @@ class Magnetometer:
             if walk else ())
         self._events = [np.reshape(values[f'mag.disturbance.{frame}'], (-1, 5)).tolist()
                         for frame in ('world', 'body')]
-        self.is_disturbed = any(itertools.chain(*itertools.chain(*self._events)))
+        self._is_disturbed = any(itertools.chain(*itertools.chain(*self._events)))
 
     def true(self, orientation: Quaternion) -> Vector:
         """Return the field [T] in frames with these orientations in the world."""
@@ -54,6 +53,8 @@ class Magnetometer:
         orientation : of the IMU in the world
         from_body : returns a vector of the body in the frame of the IMU
         """
+        if not self._is_disturbed:
+            return exact
         world, body = (_at(events, t_ns) for events in self._events)
         x, y, z = (one + outside + magnet for one, outside, magnet in zip(
             exact, attitude.in_body(orientation, world), from_body(body), strict=True))

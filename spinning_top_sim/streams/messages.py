@@ -6,7 +6,7 @@ Their parts are in the order of the .msg definitions (ROS 2 Jazzy, common_interf
 compares every template with the serializer of rclpy.
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
 from spinning_top_sim.streams.cdr import CdrWriter, Template
 
@@ -31,9 +31,17 @@ EXACT = diagonal(0.0, 0.0, 0.0)
 
 
 @lru_cache(64)      # ensembles make it in every run
-def pose_stamped(frame_id: str) -> Template:
-    """geometry_msgs/PoseStamped; fields: position, orientation x, y, z, w."""
-    return Template(CdrWriter().header(frame_id).field(3).field(4))
+def stamped(frame_id: str, *counts: int) -> Template:
+    """
+    A header and fields with so many numbers.
+
+    geometry_msgs/PoseStamped (3, 4), Vector3Stamped (3) and QuaternionStamped (4), and
+    sensor_msgs/MagneticField (3, 9): the field and its covariance; quaternions are x, y, z, w.
+    """
+    writer = CdrWriter().header(frame_id)
+    for count in counts:
+        writer.field(count)
+    return Template(writer)
 
 
 @lru_cache(64)
@@ -56,12 +64,6 @@ def imu(frame_id: str, *covariances: tuple[float, ...]) -> Template:
 
 
 @lru_cache(64)
-def magnetic_field(frame_id: str) -> Template:
-    """sensor_msgs/MagneticField; fields: the magnetic field, its covariance."""
-    return Template(CdrWriter().header(frame_id).field(3).field(9))
-
-
-@lru_cache(64)
 def nav_sat_fix(frame_id: str, covariance: tuple[float, ...] | None) -> Template:
     """
     sensor_msgs/NavSatFix of GPS; fields: latitude and longitude [deg], altitude [m].
@@ -80,9 +82,8 @@ def twist_with_covariance(frame_id: str, variances: tuple[float, ...]) -> Templa
 
     variances : of the linear velocity; those of the angular one are -1, as ublox_gps has it
     """
-    covariance = list(diagonal(*variances, *3 * (-1.0,)))
-    writer = CdrWriter().header(frame_id).field(3).append('d', *ORIGIN, *covariance)
-    return Template(writer)
+    covariance = diagonal(*variances, *3 * (-1.0,))
+    return Template(CdrWriter().header(frame_id).field(3).append('d', *ORIGIN, *covariance))
 
 
 @lru_cache(64)
@@ -103,12 +104,6 @@ def transform(frame_id: str, child_frame_id: str) -> Template:
     """tf2_msgs/TFMessage with one transform; fields: translation, rotation x, y, z, w."""
     return Template(CdrWriter().append('I', 1).header(frame_id).string(child_frame_id)
                     .field(3).field(4))
-
-
-@lru_cache(64)
-def stamped(frame_id: str, count: int) -> Template:
-    """geometry_msgs/Vector3Stamped (count 3) or QuaternionStamped (4); fields: x, y, z(, w)."""
-    return Template(CdrWriter().header(frame_id).field(count))
 
 
 @lru_cache(64)
@@ -139,25 +134,23 @@ def markers(frame_id: str, size: tuple[float, ...], lines: tuple[float, ...], li
     line_width : [m]; the trace is half as wide
     """
     writer = CdrWriter().append('I', 3 if trace_points else 2)
-    _begin(writer, frame_id, 'body', CYLINDER).field(3).field(4)
-    _end(writer, size, BODY_COLOR, 0)
-    _begin(writer, frame_id, 'axis', LINE_LIST).field(3).field(4)
-    _end(writer, (line_width, 0.0, 0.0), AXIS_COLOR, len(lines) // 3, lines)
+    marker = partial(_append_marker, writer, frame_id)
+    marker('body', CYLINDER, size, BODY_COLOR, 0)
+    marker('axis', LINE_LIST, (line_width, 0.0, 0.0), AXIS_COLOR, len(lines) // 3, lines)
     if trace_points:
-        _begin(writer, frame_id, 'trace', LINE_STRIP).append('d', *ORIGIN, *NO_ROTATION)
-        _end(writer, (0.5 * line_width, 0.0, 0.0), TRACE_COLOR, trace_points)
+        marker('trace', LINE_STRIP, (0.5 * line_width, 0.0, 0.0), TRACE_COLOR, trace_points)
     return Template(writer)
 
 
-def _begin(writer: CdrWriter, frame_id: str, namespace: str, kind: int) -> CdrWriter:
-    """Append the parts of a visualization_msgs/Marker before its pose."""
-    # id, type, action: add or modify
-    return writer.header(frame_id).string(namespace).append('i', 0, kind, 0)
-
-
-def _end(writer: CdrWriter, scale: tuple[float, ...], color: tuple[float, ...], count: int,
-         points: tuple[float, ...] = ()) -> None:
-    """Append the parts of a Marker behind its pose; `count` points that are not given: a field."""
+def _append_marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int,
+                   scale: tuple[float, ...], color: tuple[float, ...], count: int,
+                   points: tuple[float, ...] = ()) -> None:
+    """Append a visualization_msgs/Marker; `count` points that are not given: a field."""
+    writer.header(frame_id).string(namespace).append('i', 0, kind, 0)   # id, type, action: add
+    if kind == LINE_STRIP:
+        writer.append('d', *ORIGIN, *NO_ROTATION)
+    else:
+        writer.field(3).field(4)
     writer.append('d', *scale).append('f', *color)
     writer.append('I', 0, 0)                                # lifetime: for ever
     writer.append('?', False)                               # frame_locked

@@ -3,7 +3,7 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cached_property, reduce
 from itertools import pairwise
@@ -26,6 +26,7 @@ from spinning_top_sim.solvers.vertical import (
     AcceleratedMotion,
     Posture,
     Vertical,
+    chained,
     posture_at,
 )
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS
@@ -68,7 +69,14 @@ class Segment:
 
     @cached_property
     def energy(self) -> float:
+        if isinstance(self.solver, AcceleratedMotion):
+            return self.solver.energy
         return float(self._first.energy[0])
+
+    @property
+    def kind(self) -> tuple[object, ...] | None:
+        """What segments have in common that are evaluated together; None of one that is not."""
+        return self.solver.kind if isinstance(self.solver, AcceleratedMotion) else None
 
     @cached_property
     def exact(self) -> ExactSolution | None:
@@ -146,6 +154,19 @@ class Segment:
             a, b, c = self.pivot(times_ns).position
             x, y, z = x + a, y + b, z + c
         return x, y, z
+
+
+def states_of(segments: Sequence[Segment], counts: Sequence[int],
+              times_ns: NDArray[np.int64]) -> States:
+    """Return the states in the world in segments of one kind, in each at so many times [ns]."""
+    motions, rides = [], []
+    for segment in segments:
+        assert isinstance(segment.solver, AcceleratedMotion) and segment.ride
+        motions.append(segment.solver)
+        rides.append(segment.ride)
+    since_ns = times_ns - np.repeat([segment.start_ns for segment in segments], counts)
+    x, y, z, w = np.repeat(np.hstack([ride.vertical.rows for ride in rides]), counts, axis=1)
+    return WorldStates(rides[0].top, chained(motions, counts, since_ns), (x, y, z, w))
 
 
 class Path:

@@ -4,53 +4,79 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import cached_property
+from statistics import NormalDist
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.pivot import Kinematics
+from spinning_top_sim.physics.pivot import Kinematics, kinematics
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
-from spinning_top_sim.streams.path import Path, Segment
-from spinning_top_sim.streams.timing import Timing
+from spinning_top_sim.streams import noise
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, Field, Template
+from spinning_top_sim.streams.path import Path, Segment, states_of
 
+# Jitter is cut at this share of the period, so that no stamp is before that of an earlier sample.
+MOST_JITTER = 0.45
+FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_rate',
+          'imu.duplicate_rate')
 Result = TypeVar('Result')
 # Messages as rows (n, size): bytes or, of a table, numbers.
 Rows = NDArray[Any]
+# A segment and times in it [ns].
+Part = tuple[Segment, range]
 # Times (n,) [ns] of messages, and the messages.
 Encoded = tuple[NDArray[np.int64], Rows]
 
 
 class Samples:
     """
-    The motion at the times of a block in one segment; the streams of one rate share it.
+    The motion at times of a block; the streams of one rate share it.
 
     path : the motion
+    parts : a segment and its times [ns], or several segments of one kind
     times : of the samples [ns]
     epoch_ns : stamp of t = 0 [ns]
     """
 
-    def __init__(self, path: Path, times: range, epoch_ns: int) -> None:
-        self.path, self.times, self.epoch_ns = path, times, epoch_ns
+    def __init__(self, path: Path, parts: Sequence[Part], epoch_ns: int) -> None:
+        self.path, self.parts, self.epoch_ns = path, parts, epoch_ns
+        self._segments = [segment for segment, _ in parts]
+        (_, first), (_, last) = parts[0], parts[-1]
+        self.times = range(first.start, last.stop, first.step)
+        self._counts = [len(times) for _, times in parts]
         self._results: dict[Callable[..., Any], Any] = {}
 
     @cached_property
     def t_ns(self) -> NDArray[np.int64]:
         return np.arange(self.times.start, self.times.stop, self.times.step)
 
-    @cached_property
-    def segment(self) -> Segment:
-        return self.path.after(self.times.start - 1)
+    @property
+    def pivot_moves(self) -> bool:
+        return self._segments[0].ride is not None
 
     @cached_property
     def states(self) -> States:
-        return self.segment.states(self.times)
+        if len(self.parts) == 1:
+            return self._segments[0].states(self.times)
+        return states_of(self._segments, self._counts, self.t_ns)
 
     @cached_property
     def pivot(self) -> Kinematics:
         """Position, velocity and acceleration of the pivot in the world, (3, n) each."""
-        return self.segment.pivot(self.t_ns)
+        if len(self.parts) == 1:
+            return self._segments[0].pivot(self.t_ns)
+        return kinematics([segment.ride.piece for segment in self._segments if segment.ride],
+                          self._counts, self.t_ns)
+
+    def at_start(self, name: str) -> NDArray[np.float64]:
+        """Return a constant of the motion, (n,), as it is at the start of each segment."""
+        return np.repeat([getattr(segment, name) for segment in self._segments], self._counts)
+
+    @property
+    def orientation_error(self) -> NDArray[np.float64]:
+        """The angles (n,) [rad] to the exact attitudes; NaN where these are not known."""
+        return self._segments[0].orientation_error(self.states, self.times)
 
     def once(self, compute: Callable[['Samples'], Result]) -> Result:
         """Return `compute(self)`, which is called for the first of the streams that ask for it."""
@@ -58,6 +84,49 @@ class Samples:
             self._results[compute] = compute(self)
         result: Result = self._results[compute]
         return result
+
+
+class Timing:
+    """
+    The stamps of an IMU, and the number of messages that are sent for each of its samples.
+
+    Offset, drift and jitter of its clock depend on the seed, the number of the sample and its
+    time alone.
+    """
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._seed = values['seed']
+        self._offset_ns = round(values['imu.stamp_offset'] * NANOSECONDS)
+        self._jitter_ns = values['imu.stamp_jitter'] * NANOSECONDS
+        self._drift = values['imu.clock_drift'] * 1e-6
+        # A standard normal number is below these with the probability of the fault.
+        self._dropped_below, self._repeated_below = (
+            NormalDist().inv_cdf(rate) if rate else -np.inf
+            for rate in (values['imu.drop_rate'], values['imu.duplicate_rate']))
+
+    def stamps_ns(self, epoch_ns: int, t_ns: NDArray[np.int64], period_ns: int,
+                  ) -> NDArray[np.int64]:
+        """Return the stamps (n,) [ns] of samples at times (n,) [ns]; epoch_ns is that of t = 0."""
+        jitter, _, _ = self._draw(t_ns, period_ns)
+        most = MOST_JITTER * period_ns
+        errors = self._drift * t_ns + np.clip(self._jitter_ns * jitter, -most, most)
+        stamps: NDArray[np.int64] = (
+            epoch_ns + self._offset_ns + t_ns + np.rint(errors).astype(np.int64))
+        return np.clip(stamps, 0, LAST_STAMP_NS)
+
+    def copies(self, t_ns: NDArray[np.int64], period_ns: int) -> NDArray[np.int64]:
+        """Return how many messages are sent for each of the samples: 0, 1 or 2."""
+        _, drop, repeat = self._draw(t_ns, period_ns)
+        return np.where(drop < self._dropped_below, 0,
+                        np.where(repeat < self._repeated_below, 2, 1))
+
+    def _draw(self, t_ns: NDArray[np.int64], period_ns: int) -> NDArray[np.float64]:
+        return noise.white(self._seed, noise.Purpose.TIMING, t_ns // period_ns, 3)
+
+
+def faults_of(values: Mapping[str, Any]) -> Timing | None:
+    """Return the timing of an IMU with faults, None if it has none."""
+    return Timing(values) if any(map(values.get, FAULTS)) else None
 
 
 class Stream:

@@ -19,19 +19,17 @@ from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.gnss import Fix, Velocity
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
-from spinning_top_sim.streams.stream import Samples, Stream
-from spinning_top_sim.streams.timing import Timing, faults_of
+from spinning_top_sim.streams.stream import Samples, Stream, Timing, faults_of
 
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
               'quaternion_norm_error', 'orientation_error')
 TIMING = ('stamp_sec', 'stamp_nanosec', 'true_sec', 'true_nanosec', 'copies')
 ARRAY, ODOMETRY = 'std_msgs/msg/Float64MultiArray', 'nav_msgs/msg/Odometry'
-NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
 def _place(samples: Samples) -> Sequence[Any]:
-    return tuple(samples.pivot.position) if samples.segment.ride else messages.ORIGIN
+    return tuple(samples.pivot.position) if samples.pivot_moves else messages.ORIGIN
 
 
 def _pose(samples: Samples) -> Sequence[Field]:
@@ -44,7 +42,7 @@ def _odometry(samples: Samples) -> Sequence[Field]:
 
 
 def _velocity(samples: Samples) -> Vector:
-    if not samples.segment.ride:
+    if not samples.pivot_moves:
         return messages.ORIGIN
     x, y, z = samples.pivot.velocity
     return attitude.in_body(samples.states.rows_quaternion, (x, y, z))
@@ -57,7 +55,7 @@ def _joints(samples: Samples) -> Sequence[Field]:
 
 
 def _readings(imu: Imu, samples: Samples) -> Sequence[Field]:
-    return (NO_ROTATION, *imu.present_sensor.read(samples.once(imu.felt), samples.times))
+    return (messages.NO_ROTATION, *imu.present_sensor.read(samples.once(imu.felt), samples.times))
 
 
 def _estimates(imu: Imu, samples: Samples) -> Sequence[Field]:
@@ -66,13 +64,9 @@ def _estimates(imu: Imu, samples: Samples) -> Sequence[Field]:
     return (imu.present_sensor.orientation(exact, samples.times), *readings)
 
 
-def _increment(imu: Imu, place: int, samples: Samples) -> Sequence[Field]:
-    return (samples.once(imu.measured_increments)[place],)
-
-
 def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
     """Return stamp and true time of each sample of the IMU, and how often it was sent."""
-    t_ns, period_ns = samples.t_ns, imu.intervals.length_ns
+    t_ns, period_ns = samples.t_ns, imu.length_ns
     stamps_ns = timing.stamps_ns(samples.epoch_ns, t_ns, period_ns)
     true_ns = samples.epoch_ns + t_ns
     columns = (*np.divmod(stamps_ns, NANOSECONDS), *np.divmod(true_ns, NANOSECONDS),
@@ -80,18 +74,19 @@ def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
     return ([column.astype(np.float64) for column in columns],)
 
 
-def _imu_odometry(imu: Imu, samples: Samples) -> Sequence[Field]:
-    states = samples.states
-    return (*imu.motion(samples), imu.true(states)[0])
-
-
 def _invariants(samples: Samples) -> Sequence[Field]:
     """Return the constants of the motion, drifts, and errors of norm and orientation."""
-    segment, states = samples.segment, samples.states
+    states = samples.states
     now = (states.energy, states.l3, states.lz)
-    drifts = map(relative_drift, now, (segment.energy, segment.l3, segment.lz))
-    error = segment.orientation_error(states, samples.times)
-    return ((*now, *drifts, states.norm_error, error),)
+    drifts = map(relative_drift, now, map(samples.at_start, ('energy', 'l3', 'lz')))
+    return ((*now, *drifts, states.norm_error, samples.orientation_error),)
+
+
+def _magnetic_field(imu: Imu, magnetometer: Callable[[int], Magnetometer], stream: Stream,
+                    samples: Samples) -> Sequence[Field]:
+    sensor, orientation = magnetometer(stream.period_ns), imu.orientation(samples.states)
+    field = sensor.disturbed(sensor.true(orientation), orientation, imu.from_body, samples.t_ns)
+    return sensor.read(field, samples.times), messages.diagonal(*3 * (sensor.variance,))
 
 
 class ImuStream(Stream):
@@ -119,35 +114,6 @@ class ImuStream(Stream):
         if not self.has_orientation:
             covariances[0] = messages.UNKNOWN_ORIENTATION
         return messages.imu(self._frame_id, *covariances)
-
-
-class Mag(Stream):
-    """The magnetic field: as a magnetometer reads it (REP-145), or exact."""
-
-    def __init__(self, values: Mapping[str, Any], imu: Imu, topic: str, *,
-                 is_exact: bool = False) -> None:
-        super().__init__(values, 'mag', topic, 'sensor_msgs/msg/MagneticField',
-                         messages.magnetic_field(values['imu.frame_id']),
-                         self._truth if is_exact else self._readings)
-        self._imu, self._sensor_of = imu, lru_cache(4)(partial(Magnetometer, values))
-
-    @property
-    def _sensor(self) -> Magnetometer:
-        return self._sensor_of(self.period_ns)
-
-    def _exact(self, samples: Samples) -> Vector:
-        return self._sensor.true(self._imu.orientation(samples.states))
-
-    def _readings(self, samples: Samples) -> Sequence[Field]:
-        exact = self._exact(samples)
-        if self._sensor.is_disturbed:
-            exact = self._sensor.disturbed(exact, self._imu.orientation(samples.states),
-                                           self._imu.from_body, samples.t_ns)
-        return (self._sensor.read(exact, samples.times),
-                messages.diagonal(*3 * (self._sensor.variance,)))
-
-    def _truth(self, samples: Samples) -> Sequence[Field]:
-        return self._exact(samples), messages.EXACT
 
 
 class Markers(Stream):
@@ -197,7 +163,7 @@ class Markers(Stream):
     @staticmethod
     def _point(samples: Samples, along: float) -> Vector:
         x, y, z = (along * part for part in samples.states.rows_axis)
-        if samples.segment.ride:
+        if samples.pivot_moves:
             a, b, c = samples.pivot.position
             x, y, z = x + a, y + b, z + c
         return x, y, z
@@ -209,9 +175,13 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
     frame, faults = values['imu.frame_id'], faults_of(values)
     stream, of_imu = partial(Stream, values), partial(ImuStream, values, imu)
     increment = partial(stream, 'increments', timing=faults, rate_parameter='imu.rate')
+    magnetic = partial(stream, 'mag', type_name='sensor_msgs/msg/MagneticField',
+                       template=messages.stamped(frame, 3, 9))
+    mag = magnetic('imu/mag')
+    mag.fields = partial(_magnetic_field, imu, lru_cache(4)(partial(Magnetometer, values)), mag)
     return [
         stream('clock', '/clock', 'rosgraph_msgs/msg/Clock', messages.clock()),
-        stream('pose', 'pose', 'geometry_msgs/msg/PoseStamped', messages.pose_stamped(world),
+        stream('pose', 'pose', 'geometry_msgs/msg/PoseStamped', messages.stamped(world, 3, 4),
                _pose),
         stream('tf', '/tf', 'tf2_msgs/msg/TFMessage', messages.transform(world, body), _pose),
         stream('joint_states', 'joint_states', 'sensor_msgs/msg/JointState',
@@ -219,27 +189,30 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
         of_imu('imu', 'imu/data_raw', partial(_readings, imu), has_orientation=False,
                is_noisy=True),
         of_imu('imu_data', 'imu/data', partial(_estimates, imu), is_noisy=True),
-        of_imu('imu', 'ground_truth/imu_bias', has_orientation=False,
-               fields=lambda samples: (NO_ROTATION, *imu.present_sensor.bias(samples.times))),
+        of_imu('imu', 'ground_truth/imu_bias', has_orientation=False, fields=lambda samples: (
+            messages.NO_ROTATION, *imu.present_sensor.bias(samples.times))),
         of_imu('ground_truth_imu', 'ground_truth/imu',
                lambda samples: (imu.orientation(samples.states), *imu.sampled(samples))),
         stream('imu_timing', 'ground_truth/imu_timing', ARRAY,
                messages.float64_multi_array(TIMING), partial(_timing, Timing(values), imu),
                rate_parameter='imu.rate'),
-        Mag(values, imu, 'imu/mag'),
-        Mag(values, imu, 'ground_truth/mag', is_exact=True),
+        mag,
+        magnetic('ground_truth/mag', fields=lambda samples: (
+            attitude.in_body(imu.orientation(samples.states), values['mag.field']),
+            messages.EXACT)),
         Fix(values, 'gnss/fix'),
         Fix(values, 'ground_truth/gnss/fix', is_exact=True),
         Velocity(values, 'gnss/velocity'),
         Velocity(values, 'ground_truth/gnss/velocity', is_exact=True),
         increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped', messages.stamped(frame, 4),
-                  partial(_increment, imu, 0)),
+                  lambda samples: samples.once(imu.measured_increments)[:1]),
         increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', messages.stamped(frame, 3),
-                  partial(_increment, imu, 1)),
+                  lambda samples: samples.once(imu.measured_increments)[1:]),
         stream('ground_truth_odom', 'ground_truth/odom', ODOMETRY, messages.odometry(world, body),
                _odometry),
         stream('ground_truth_imu_odom', 'ground_truth/imu_odom', ODOMETRY,
-               messages.odometry(world, frame), partial(_imu_odometry, imu)),
+               messages.odometry(world, frame),
+               lambda samples: (*imu.motion(samples), imu.true(samples.states)[0])),
         stream('invariants', '~/invariants', ARRAY, messages.float64_multi_array(INVARIANTS),
                _invariants),
         Markers(values)]

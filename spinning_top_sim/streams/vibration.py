@@ -27,6 +27,8 @@ class Vibration:
     of the band.  Its place in the middle half of the band and its phase follow from the seed.  So
     no beat is longer than two over the width of a band, and short records have the power.
 
+    is_off : whether nothing vibrates
+
     response : the complex gain of the sensor at frequencies [Hz]
 
     (S. Rice, "Mathematical analysis of random noise", Bell System Technical Journal 23 (1944) 282;
@@ -36,11 +38,7 @@ class Vibration:
     def __init__(self, values: Mapping[str, Any], response: Response) -> None:
         self._kinds = [_lines(values, kind, purpose, response) for kind, purpose in (
             ('rate', noise.Purpose.VIBRATION_RATE), ('force', noise.Purpose.VIBRATION_FORCE))]
-
-    @property
-    def is_off(self) -> bool:
-        """Whether nothing vibrates."""
-        return all(len(lines) == 0 for lines in self._kinds)
+        self.is_off = not any(map(len, self._kinds))
 
     def add(self, exact: tuple[Vector, Vector], t_ns: NDArray[np.int64],
             seconds: Column | float = 0.0) -> tuple[Vector, Vector]:

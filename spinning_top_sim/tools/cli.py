@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import NoReturn, TextIO
 
 from spinning_top_sim.installation import version
-from spinning_top_sim.recording.errors import why_not_written
+from spinning_top_sim.recording.errors import text_of, why_not_written
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # argparse uses 2, too
-ERRORS: tuple[type[Exception], ...] = (ValueError, ArithmeticError, OSError, ImportError)
 
 
 class Parser(argparse.ArgumentParser):
@@ -30,13 +29,12 @@ class Parser(argparse.ArgumentParser):
 
 def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         add_arguments: Callable[[argparse.ArgumentParser], object],
-        command: Callable[[argparse.Namespace], int],
-        errors: tuple[type[Exception], ...] = ()) -> int:
+        command: Callable[[argparse.Namespace], int]) -> int:
     """
     Run the command `spinning-top NAME`; return its exit code.
 
-    errors : exceptions that are printed as one line, besides ValueError, ArithmeticError, OSError
-        and ImportError; the exit code is then FAILED, or WRONG_USAGE for a ValueError
+    A ValueError is printed as one line, and the code is WRONG_USAGE; a RuntimeError,
+    ArithmeticError, OSError or ImportError likewise, with FAILED.
     """
     parser = Parser(name, help_text)
     add_arguments(parser)
@@ -49,11 +47,8 @@ def run(name: str, help_text: str | None, argv: Sequence[str] | None,
         # The reader of the output, such as a pager, has ended.  Python flushes the output again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (*ERRORS, *errors) as error:
-        what = str(error)
-        if isinstance(error, OSError) and error.filename is not None:
-            what = f'{error.filename}: {error.strerror}'
-        print_line(f'{parser.prog}: {what}', sys.stderr)
+    except (ValueError, RuntimeError, ArithmeticError, OSError, ImportError) as error:
+        print_line(f'{parser.prog}: {text_of(error)}', sys.stderr)
         return WRONG_USAGE if isinstance(error, ValueError) else FAILED
     except KeyboardInterrupt as interrupt:
         what = f'; {interrupt}' if interrupt.args else ''

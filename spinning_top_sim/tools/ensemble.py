@@ -29,16 +29,8 @@ from pathlib import Path
 from typing import Any
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.tools import cli, ensemble_spec
-from spinning_top_sim.tools.ensemble_part import (
-    DATA,
-    EnsembleError,
-    compute_part,
-    versions,
-    write_row,
-)
+from spinning_top_sim.tools.ensemble_part import DATA, compute_part, versions, write_row
 from spinning_top_sim.tools.recorded_run import MALFORMED, reason_of
 
 MANIFEST = 'manifest.json'
@@ -46,8 +38,7 @@ MANIFEST = 'manifest.json'
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('ensemble', __doc__, argv, add_arguments, _run,
-                   (RecordingError, IntegrationError, EnsembleError))
+    return cli.run('ensemble', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -154,7 +145,3 @@ def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     written = folder / f'{MANIFEST}.new'
     written.write_text(json.dumps(manifest, indent=1), encoding='utf-8')
     written.replace(folder / MANIFEST)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

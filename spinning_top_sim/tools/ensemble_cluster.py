@@ -14,8 +14,6 @@ from typing import TypeVar
 import dask
 import distributed
 
-from spinning_top_sim.tools.ensemble_part import EnsembleError
-
 Result = TypeVar('Result')
 
 LOOPBACK = '127.0.0.1'
@@ -29,7 +27,7 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.
 
     workers : number of processes on this machine, None for one a core
 
-    Raises EnsembleError if the cluster cannot be reached, or has no workers.
+    Raises RuntimeError if the cluster cannot be reached, or has no workers.
     """
     for handler in logging.getLogger('distributed').handlers:
         handler.setLevel(logging.CRITICAL)          # errors are raised by the client
@@ -54,8 +52,8 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.
             client = stack.enter_context(distributed.Client(
                 address, timeout=CONNECT_S, set_as_default=False))
             client.wait_for_workers(1, FIRST_WORKER_S)
-        except (OSError, TimeoutError) as error:
-            raise EnsembleError(f'no workers at {scheduler or "this machine"}: {error}') from error
+        except OSError as error:
+            raise RuntimeError(f'no workers at {scheduler or "this machine"}: {error}') from error
         yield client
 
 
@@ -65,7 +63,7 @@ def compute(client: distributed.Client, task: Callable[[int], Result],
     Yield the results of task(number) in the order of completion.
 
     If a worker is killed, another one computes its task again.  Raises what a task raises, and
-    EnsembleError if the scheduler is lost, or if a task kills several workers.
+    RuntimeError if the scheduler is lost, or if a task kills several workers.
     """
     results = distributed.as_completed(client.map(task, list(numbers), pure=False),
                                        loop=client.loop)
@@ -73,8 +71,8 @@ def compute(client: distributed.Client, task: Callable[[int], Result],
         for future in results:
             yield future.result()
     except distributed.KilledWorker as error:
-        raise EnsembleError(f'several workers died, all of them with the same task: {error}'
-                            ) from error
+        raise RuntimeError(f'several workers died, all of them with the same task: {error}'
+                           ) from error
     except (concurrent.futures.CancelledError, asyncio.CancelledError,
             distributed.comm.CommClosedError) as error:
-        raise EnsembleError('the scheduler is lost') from error
+        raise RuntimeError('the scheduler is lost') from error

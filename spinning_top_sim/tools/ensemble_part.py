@@ -8,14 +8,13 @@ A file gets its name when it is whole.  One that is there already is not compute
 import contextlib
 import json
 import platform
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from uuid import uuid4
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.streams import journal
@@ -40,49 +39,12 @@ PLACE = ('latitude', 'longitude', 'altitude')
 LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING,
           'gnss/fix': PLACE, 'ground_truth/gnss/fix': PLACE}
 
-# Times of samples (n,) [ns], and the numbers in their messages as columns (n,) by name.
-TimedColumns = tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]
-
-
-class EnsembleError(Exception):
-    """An ensemble cannot go on; the text says why, and what to do."""
-
 
 @cache
 def versions() -> dict[str, str]:
     """Return the versions on which the bytes of a dataset depend."""
     return {'python': platform.python_version(), 'machine': platform.machine(),
             **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}
-
-
-def samples(values: Mapping[str, Any], names: Collection[str]) -> dict[str, TimedColumns]:
-    """
-    Return the samples of a run by topic, for the streams with these names.
-
-    values : checked parameters; a stream that they do not enable, or that `record.streams` does
-        not choose, has no samples
-
-    Raises ValueError if no motion begins, IntegrationError if it ends early.
-    """
-    simulation = Simulation(values, EPOCH_NS)
-    columns = {stream: _column_names(stream) for stream in simulation.streams
-               if stream.parameter in names}
-    # Empty arrays first, for a stream without samples.
-    parts = {stream: [(np.empty(0, np.int64), np.empty((len(labels), 0)))]
-             for stream, labels in columns.items()}
-    recorded = journal.recorded_streams(list(columns), values)
-    for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
-        for stream, times_ns, rows in block.parts:
-            once = np.diff(times_ns, prepend=-1) > 0        # a faulty sensor sends some twice
-            numbers = np.vstack([field.T for field in stream.template.decode(rows)])
-            parts[stream].append((times_ns[once], numbers[:, once]))
-    found = {}
-    for stream, labels in columns.items():
-        times_ns = np.concatenate([times_ns for times_ns, _ in parts[stream]])
-        numbers = np.concatenate([numbers for _, numbers in parts[stream]], axis=1)
-        found[stream.topic] = times_ns, {
-            label: column for label, column in zip(labels, numbers, strict=True) if label}
-    return found
 
 
 def _column_names(stream: Stream) -> Sequence[str]:
@@ -102,24 +64,37 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
 
     A row has the samples of one time; where a stream has none, its columns are null.  All runs
     have the same columns.
-    Raises ValueError or IntegrationError as `samples` does.
+    Raises ValueError if no motion begins, IntegrationError if it ends early.
     """
     import pyarrow as pa  # noqa: PLC0415
 
-    found = samples(specification.values(run), specification.kept)
-    rows_ns = np.unique(np.concatenate([times_ns for times_ns, _ in found.values()]))
+    values = specification.values(run)
+    simulation = Simulation(values, EPOCH_NS)
+    names = {stream: _column_names(stream) for stream in simulation.streams
+             if stream.parameter in specification.kept}
+    # Times and numbers of the samples; empty arrays first, for a stream without any.
+    parts = {stream: [(np.empty(0, np.int64), np.empty((len(labels), 0)))]
+             for stream, labels in names.items()}
+    recorded = journal.recorded_streams(list(names), values)
+    for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
+        for stream, times_ns, encoded in block.parts:
+            once = np.diff(times_ns, prepend=-1) > 0        # a faulty sensor sends some twice
+            numbers = np.vstack([field.T for field in stream.template.decode(encoded)])
+            parts[stream].append((times_ns[once], numbers[:, once]))
+    rows_ns = np.unique(np.concatenate([
+        times_ns for blocks in parts.values() for times_ns, _ in blocks]))
     columns = {'run': pa.repeat(pa.scalar(run), len(rows_ns)),
                't': pa.array(rows_ns / NANOSECONDS)}
     for name, value in specification.drawn(run).items():
         # An unset value (spin.lz) is a null of the type that the other runs have.
         one = pa.scalar(value, pa.float64() if value is None else None)
         columns[name] = pa.repeat(one, len(rows_ns))
-    for topic, (times_ns, named) in found.items():
-        present = np.isin(rows_ns, times_ns)
-        for name, numbers in named.items():
-            column = np.zeros(len(rows_ns))
-            column[present] = numbers
-            columns[f'{topic}.{name}'] = pa.array(column, mask=~present)
+    for stream, blocks in parts.items():
+        present = np.isin(rows_ns, np.concatenate([times_ns for times_ns, _ in blocks]))
+        numbers = np.zeros((len(names[stream]), len(rows_ns)))
+        numbers[:, present] = np.hstack([numbers for _, numbers in blocks])
+        columns.update((f'{stream.topic}.{name}', pa.array(column, mask=~present))
+                       for name, column in zip(names[stream], numbers, strict=True) if name)
     return pa.table(columns)
 
 

@@ -80,8 +80,7 @@ class Specification:
         return -(-self.runs // self.runs_per_part)
 
     def part(self, number: int) -> range:
-        first = number * self.runs_per_part
-        return range(first, min(first + self.runs_per_part, self.runs))
+        return range(self.runs)[number * self.runs_per_part:][:self.runs_per_part]
 
     def drawn(self, run: int) -> dict[str, Any]:
         """
@@ -196,26 +195,21 @@ def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
     if not isinstance(rule, Mapping) or len(rule) != 1 or not set(rule) <= set(kinds):
         raise ValueError(f'{what} = {shown(rule)}: must be one of {", ".join(kinds)} with a list')
     (kind, given), = rule.items()
-    items = _list(given, f'{what}: {kind}')
-    if kind != VALUES:
-        return {kind: _bounds(str(name), kind, items)}
-    if not items:
-        raise ValueError(f'{what}: values = []: must have one value at least')
-    return {kind: [_parameter_set(item, what, folder) if name == PARAMS else
-                   parameters.BY_NAME[str(name)].check(item) for item in items]}
-
-
-def _bounds(name: str, kind: str, items: Sequence[Any]) -> list[float]:
-    if name == PARAMS or not parameters.BY_NAME[name].is_double:
-        raise ValueError(f'sample: {name}: {kind}: must be values, because the parameter is no '
-                         'double')
-    what, (_, allowed, is_allowed) = f'sample: {name}: {kind}', DISTRIBUTIONS[kind]
-    bounds = list(_entry(what, (0.0, 0.0)).check(items))
+    items, parameter = _list(given, f'{what}: {kind}'), parameters.BY_NAME.get(str(name))
+    if kind == VALUES:
+        if not items:
+            raise ValueError(f'{what}: values = []: must have one value at least')
+        return {kind: [_parameter_set(item, what, folder) if parameter is None
+                       else parameter.check(item) for item in items]}
+    if parameter is None or not parameter.is_double:
+        raise ValueError(f'{what}: {kind}: must be values, because the parameter is no double')
+    _, allowed, is_allowed = DISTRIBUTIONS[kind]
+    bounds = list(_entry(f'{what}: {kind}', (0.0, 0.0)).check(items))
     if not is_allowed(*bounds):
-        raise ValueError(f'{what} = {shown(items)}: must be {allowed}')
+        raise ValueError(f'{what}: {kind} = {shown(items)}: must be {allowed}')
     for bound in bounds[:1] if kind == 'normal' else bounds:
-        parameters.BY_NAME[name].check(bound)
-    return bounds
+        parameter.check(bound)
+    return {kind: bounds}
 
 
 def _runs_per_part(specification: Specification) -> int:

@@ -22,14 +22,14 @@ from dataclasses import asdict
 from pathlib import Path
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.recording.damage import count, seconds
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.scan import count, seconds
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import cli, export
 from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import MotionReport, Survey, survey
-from spinning_top_sim.tools.verify import Comparison, Verdict
+from spinning_top_sim.tools.verify import Verdict, compare
 
 DEGREES = math.degrees(1.0)
 # Rows of the table of a motion: text, field of Description and Measured, factor.
@@ -46,7 +46,7 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('inspect', __doc__, argv, add_arguments, _run, (LogError,))
+    return cli.run('inspect', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,7 +71,11 @@ def _run(arguments: argparse.Namespace) -> int:
         exported: list[str] = []
         if found.run is not None:
             if arguments.verify:
-                verdict = _verified(arguments, reader, found, found.run)
+                begin_ns, end_ns = found.damage.start_ns, found.end_ns
+                with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
+                                  quiet=arguments.json) as show:
+                    verdict = compare(found.run, reader, end_ns, lambda stamp_ns: show(
+                        (stamp_ns - begin_ns) / NANOSECONDS))
             exported += export.write(reader, found.run, arguments.export)
     if arguments.json:
         print(json.dumps(_as_json(found, verdict), indent=2, allow_nan=False))
@@ -86,15 +90,6 @@ def _run(arguments: argparse.Namespace) -> int:
     _draw(arguments, found)
     passed = found.whole and not found.damage.defects and (verdict is None or verdict.identical)
     return cli.OK if passed else cli.FAILED
-
-
-def _verified(arguments: argparse.Namespace, reader: LogReader, found: Survey,
-              run: RunDescription) -> Verdict:
-    begin_ns, end_ns = found.damage.start_ns, found.end_ns
-    with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
-                      quiet=arguments.json) as show:
-        return Comparison(run).compare(
-            reader, end_ns, lambda stamp_ns: show((stamp_ns - begin_ns) / NANOSECONDS))
 
 
 def _draw(arguments: argparse.Namespace, found: Survey) -> None:
@@ -257,7 +252,3 @@ def _difference(expected: float | None, seen: float | None) -> str:
     if abs(difference) > abs(expected):         # also where that is 0
         return f'{difference:.1e} absolute'
     return f'{difference / abs(expected):.1e}' if difference else '0'
-
-
-if __name__ == '__main__':
-    sys.exit(main())

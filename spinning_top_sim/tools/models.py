@@ -17,6 +17,7 @@ import numpy as np
 from spinning_top_sim.installation import needed, share
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.pivot import NANOSECONDS, NEVER_NS
+from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.solvers.propagator import solve
 from spinning_top_sim.streams import parameters
@@ -41,17 +42,15 @@ def model(values: Mapping[str, Any], file_format: str, name: str) -> str:
     return FORMATS[file_format](values, re.sub(r'[^\w.]+', '_', name))
 
 
-def start_of(values: Mapping[str, Any]) -> tuple[list[float], list[float], list[float]]:
-    """Return q(world <- body) x, y, z, w at the start, and the rates in body and world [rad/s]."""
-    start = solve(parameters.top_of(values), parameters.start_state(values), [0.0], method='rk45')
-    rates = start.angular_velocity[0].tolist()
-    world = attitude.in_world(start.rows_quaternion, tuple(rates))
-    return start.quaternion[0].tolist(), rates, np.concatenate(world).tolist()
+def start_of(values: Mapping[str, Any]) -> States:
+    """Return the state at the start, as columns of one."""
+    return solve(parameters.top_of(values), parameters.start_state(values), [0.0], method='rk45')
 
 
 def _mjcf(values: Mapping[str, Any], name: str) -> str:
     top = parameters.top_of(values)
-    (x, y, z, w), rates, _ = start_of(values)
+    start = start_of(values)
+    x, y, z, w = start.quaternion[0]
     shape, imu = Shape(top), values['imu.frame_id']
     root = ElementTree.Element('mujoco', model=name)
     _add(root, 'compiler', angle='radian', eulerseq='XYZ', balanceinertia='false')
@@ -72,7 +71,8 @@ def _mjcf(values: Mapping[str, Any], name: str) -> str:
     sensors = _add(root, 'sensor')
     _add(sensors, 'gyro', name='gyroscope', site=imu)
     _add(sensors, 'accelerometer', name='accelerometer', site=imu)
-    _add(_add(root, 'keyframe'), 'key', name='start', qpos=_text(w, x, y, z), qvel=_text(*rates))
+    _add(_add(root, 'keyframe'), 'key', name='start', qpos=_text(w, x, y, z),
+         qvel=_text(*start.angular_velocity[0]))
     return _document(root, [
         'Reset to the keyframe start: mj_resetDataKeyframe(model, data, 0).', *_facts(values)])
 
@@ -82,10 +82,7 @@ def _urdf(values: Mapping[str, Any], name: str) -> str:
         text = robot.robot_description(values, share() / 'urdf')
     root = ElementTree.fromstring(text)
     root.set('name', name)
-    start = parameters.start_state(values)
-    states = solve(parameters.top_of(values), start, [0.0], method='rk45')
-    rates = _text(*(float(rate[0]) for rate in (
-        states.phi_dot, states.theta_dot, states.psi_dot)))
+    start, states = parameters.start_state(values), start_of(values)
     return _document(root, [
         'URDF has no ball joint: the three joints are the ZYZ Euler angles.',
         'They are singular where the axis is vertical, and two of their links have no inertia.',
@@ -93,7 +90,8 @@ def _urdf(values: Mapping[str, Any], name: str) -> str:
         'and what is below it on a ball joint at its origin, the pivot.',
         f'Gravity: {_text(0.0, 0.0, -values["top.gravity"])} m/s^2 in the world, z up.',
         f'Start: joint positions {_text(start.phi, start.theta, start.psi)} rad,',
-        f'joint velocities {rates} rad/s.', *_facts(values)])
+        f'joint velocities {_text(*states.phi_dot, *states.theta_dot, *states.psi_dot)} rad/s.',
+        *_facts(values)])
 
 
 def _sdf(values: Mapping[str, Any], name: str) -> str:
@@ -102,7 +100,7 @@ def _sdf(values: Mapping[str, Any], name: str) -> str:
     world = _add(root, 'world', name=f'{name}_world')
     _add(world, 'gravity', _text(0.0, 0.0, -top.gravity))
     body_model = _add(world, 'model', name=name)
-    _add(body_model, 'pose', _text(0.0, 0.0, 0.0, *start_of(values)[0]),
+    _add(body_model, 'pose', _text(0.0, 0.0, 0.0, *start_of(values).quaternion[0]),
          rotation_format='quat_xyzw')
     link = _add(body_model, 'link', name=values['body_frame'])
     inertial = _add(link, 'inertial')
@@ -136,10 +134,11 @@ FORMATS: dict[str, Callable[[Mapping[str, Any], str], str]] = {
 
 def _facts(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield what each file says about its start and its pivot."""
-    quaternion, rates, world = start_of(values)
-    yield f'Attitude at the start, q(world <- body) as x y z w: {_text(*quaternion)}'
-    yield f'Angular velocity at the start in the body: {_text(*rates)} rad/s,'
-    yield f'in the world: {_text(*world)} rad/s'
+    start = start_of(values)
+    world = attitude.in_world(start.rows_quaternion, tuple(start.angular_velocity[0]))
+    yield f'Attitude at the start, q(world <- body) as x y z w: {_text(*start.quaternion[0])}'
+    yield f'Angular velocity at the start in the body: {_text(*start.angular_velocity[0])} rad/s,'
+    yield f'in the world: {_text(*np.concatenate(world))} rad/s'
     path = parameters.pivot_path(values)
     if path is None:
         return

@@ -194,66 +194,60 @@ def _event(stamp_ns: int, data: bytes) -> Event:
     return Event(name, stamp_ns, t_ns, sent_ns, details)
 
 
-class Rerun:
+def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
+          ) -> Iterator[tuple[Simulation, Event | Block]]:
     """
-    The computation of the run of a log, within limits that the size of the log sets.
+    Compute the run of a log up to a log time, within limits that the size of the log sets.
 
     samples : yield the messages of the log's streams in blocks; else only motions are computed
+
+    Yields the simulation at the start, after each event and after each block.
+    Raises one of MALFORMED where there is no motion with these parameters and commands, or where
+    it takes far more work than a run that fits into the log.
     """
+    simulation = Simulation(run.values_at_start, run.epoch_ns)
+    most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
+    samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
 
-    def __init__(self, run: RunDescription, *, samples: bool = False) -> None:
-        self._run, self._samples = run, samples
-        self._most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
-        self._samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
-        self._simulation = Simulation(run.values_at_start, run.epoch_ns)
-
-    def events(self, end_ns: int) -> Iterator[tuple[Simulation, Event | Block]]:
-        """
-        Yield the simulation at the start, after each event and after each block, up to a log time.
-
-        Raises one of MALFORMED where there is no motion with these parameters and commands, or
-        where it takes far more work than a run that fits into the log.
-        """
-        simulation, run = self._simulation, self._run
-        # Before the recording: the motion and its commands, no samples.
-        for event in run.history:
-            yield from self._play(event.t_ns, ())
-            _apply(simulation, event)
-        if self._samples:
-            yield from self._play(run.begun_ns, ())
-        simulation.now_ns = run.begun_ns
-        at_once = {stream.rate_parameter for stream in simulation.streams}
-        simulation.apply({name: run.values_at_recording[name] for name in at_once})
-        yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
-
-        # The journal: samples up to each event that acts on them, and up to the end.
-        for event in run.events:
-            if event.name in ('reset', *FIELDS_OF) or not at_once.isdisjoint(event.details):
-                yield from self._up_to(event.sent_ns, event.name in FIELDS_OF)
-                _apply(simulation, event)
-                yield simulation, event
-        yield from self._up_to(end_ns - simulation.epoch_ns, False)
-
-    def _up_to(self, t_ns: int, moves: bool) -> Iterator[tuple[Simulation, Block]]:
-        """Compute the samples up to a time; `moves`: let the motion reach it in any case."""
-        streams = [stream for stream in self._simulation.streams
-                   if self._samples and stream.topic in self._run.topics]
-        if streams or moves:
-            yield from self._play(t_ns, streams)
-        self._simulation.now_ns = t_ns
-
-    def _play(self, t_ns: int, streams: Sequence[Stream]) -> Iterator[tuple[Simulation, Block]]:
+    def play(t_ns: int, streams: Sequence[Stream]) -> Iterator[tuple[Simulation, Block]]:
         """Yield the blocks up to a time, as far as the equations and the limits go."""
-        simulation, log_bytes = self._simulation, self._run.log_bytes
-        self._samples_left -= sum(len(one.times(simulation.now_ns, t_ns)) for one in streams)
-        if self._samples_left < 0:
-            raise ValueError(f'a log of {log_bytes} bytes lacks most samples of this run')
+        nonlocal samples_left
+        samples_left -= sum(len(one.times(simulation.now_ns, t_ns)) for one in streams)
+        if samples_left < 0:
+            raise ValueError(f'a log of {run.log_bytes} bytes lacks most samples of this run')
         with contextlib.suppress(IntegrationError):
             for block in simulation.play(streams, t_ns):
                 yield simulation, block
-                if simulation.steps > self._most_steps:
-                    raise ValueError(f'over {self._most_steps} integration steps are too many for '
-                                     f'a log of {log_bytes} bytes')
+                if simulation.steps > most_steps:
+                    raise ValueError(f'over {most_steps} integration steps are too many for a log '
+                                     f'of {run.log_bytes} bytes')
+
+    def up_to(t_ns: int, *, moves: bool = False) -> Iterator[tuple[Simulation, Block]]:
+        """Yield the samples up to a time; `moves`: let the motion reach it in any case."""
+        streams = [stream for stream in simulation.streams
+                   if samples and stream.topic in run.topics]
+        if streams or moves:
+            yield from play(t_ns, streams)
+        simulation.now_ns = t_ns
+
+    # Before the recording: the motion and its commands, no samples.
+    for event in run.history:
+        yield from play(event.t_ns, ())
+        _apply(simulation, event)
+    if samples:
+        yield from play(run.begun_ns, ())
+    simulation.now_ns = run.begun_ns
+    at_once = {stream.rate_parameter for stream in simulation.streams}
+    simulation.apply({name: run.values_at_recording[name] for name in at_once})
+    yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
+
+    # The journal: samples up to each event that acts on them, and up to the end.
+    for event in run.events:
+        if event.name in ('reset', *FIELDS_OF) or not at_once.isdisjoint(event.details):
+            yield from up_to(event.sent_ns, moves=event.name in FIELDS_OF)
+            _apply(simulation, event)
+            yield simulation, event
+    yield from up_to(end_ns - simulation.epoch_ns)
 
 
 def _apply(simulation: Simulation, event: Event) -> None:

@@ -14,14 +14,12 @@ exit codes:
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from spinning_top_sim.recording.damage import count
-from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recovery import recover
+from spinning_top_sim.recording.scan import count
 from spinning_top_sim.tools import cli
 
 SOME_LOST = 3
@@ -29,7 +27,7 @@ SOME_LOST = 3
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('recover', __doc__, argv, add_arguments, _run, (LogError,))
+    return cli.run('recover', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +52,3 @@ def _run(arguments: argparse.Namespace) -> int:
                    f'{count(recovered.chunk_count, "chunk")}, {count(recovered.size, "byte")} in '
                    f'{output}')
     return cli.OK if damage.lossless else SOME_LOST
-
-
-if __name__ == '__main__':
-    sys.exit(main())

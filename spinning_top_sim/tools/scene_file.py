@@ -77,20 +77,20 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
 def given(arguments: argparse.Namespace) -> dict[str, object]:
     """Return the parameters that these options give, not checked.  Raises as `read_scene`."""
     values: dict[str, object] = {}
-    for path in (*chosen_files(arguments), *arguments.params):
-        values.update(read_scene(path))
+    for content in (*chosen_files(arguments).values(), *map(read_scene, arguments.params)):
+        values.update(content)
     values.update((name, value) for name, value in map(parse_assignment, arguments.param)
                   if not is_of_ros(name))
     return values
 
 
-def chosen_files(arguments: argparse.Namespace) -> list[Path]:
+def chosen_files(arguments: argparse.Namespace) -> dict[Path, dict[str, object]]:
     """
-    Return the parameter files of --scene and --imu.
+    Return the parameter files of --scene and --imu, and what is in them.
 
-    Raises ValueError for a name that is not there.
+    Raises ValueError for a name that is not there, or as `read_scene`.
     """
-    paths = []
+    found = {}
     for kind in ('scene', 'imu'):
         name = getattr(arguments, kind, None)
         if name is None:
@@ -99,21 +99,9 @@ def chosen_files(arguments: argparse.Namespace) -> list[Path]:
         if name not in files and '/' not in name and not name.endswith('.yaml'):
             raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
                              f'{", ".join(files)}')
-        paths.append(files.get(name, Path(name)))
-    return paths
-
-
-def files_for_node(arguments: argparse.Namespace) -> list[Path]:
-    """
-    Return the parameter files of --scene and --imu for a node.
-
-    They are read here because rcl accepts a file that has no parameters of the node.  Raises as
-    `read_scene`.
-    """
-    paths = chosen_files(arguments)
-    for path in paths:
-        read_scene(path)
-    return paths
+        path = files.get(name, Path(name))
+        found[path] = read_scene(path)
+    return found
 
 
 def read_scene(path: str | Path) -> dict[str, object]:
@@ -122,28 +110,21 @@ def read_scene(path: str | Path) -> dict[str, object]:
 
     Raises OSError, or ValueError, which names the file.
     """
-    return known(parse_scene(Path(path).read_bytes(), str(path)), str(path))
-
-
-def parse_scene(text: str | bytes, source: str) -> dict[str, object]:
-    """
-    Return the parameters of the node spinning_top in the text of a file, whatever their names.
-
-    Raises ValueError, which names the source.
-    """
-    content = parse_yaml(text, source)
+    source = str(path)
+    content = parse_yaml(Path(path).read_bytes(), source)
     sections = [node['ros__parameters'] for name, node in content.items()
                 if name in NODES and isinstance(node, Mapping) and isinstance(
                     node.get('ros__parameters'), Mapping)] if isinstance(content, Mapping) else []
     if not sections:
         raise ValueError(f'{source} has no parameters for the node spinning_top: it must have '
                          "'/**:' or 'spinning_top:', and 'ros__parameters:' in it")
-    return {name: value for section in sections for name, value in _flatten(section)}
+    return {name: value for section in sections
+            for name, value in parse_section(section, source).items()}
 
 
 def parse_section(section: Mapping[object, object], source: str) -> dict[str, object]:
-    """Return the parameters in a mapping, not checked.  Raises ValueError, as `parse_scene`."""
-    return known(dict(_flatten(section)), source)
+    """Return the parameters in a mapping, not checked.  Raises ValueError, as `read_scene`."""
+    return _known(dict(_flatten(section)), source)
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
@@ -152,12 +133,12 @@ def parse_assignment(text: str) -> tuple[str, object]:
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
     value = parse_yaml(yaml_text, text)
-    known({name: value}, text)
+    _known({name: value}, text)
     return name, value
 
 
 def parse_yaml(text: str | bytes, source: str) -> object:
-    """Return the content of YAML with the types of rcl.  Raises ValueError, as `parse_scene`."""
+    """Return the content of YAML with the types of rcl.  Raises ValueError, as `read_scene`."""
     try:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -177,7 +158,7 @@ def is_of_ros(name: str) -> bool:
     return name.partition('.')[0] in ROS_PARAMETERS
 
 
-def known(values: Mapping[str, object], source: str) -> dict[str, object]:
+def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
     """Return the values without those of ROS.  Raises ValueError for unknown parameters."""
     ours = {name: value for name, value in values.items() if not is_of_ros(name)}
     for name, value in ours.items():

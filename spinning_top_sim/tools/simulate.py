@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
@@ -29,7 +28,7 @@ from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream, period_ns
 from spinning_top_sim.tools import cli, export, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
-from spinning_top_sim.tools.table import RideTable, Table, write_csv, write_parquet
+from spinning_top_sim.tools.table import RIDE_UNITS, Table, write_csv, write_parquet
 
 FORMATS = ('mcap', 'csv', 'parquet')
 
@@ -39,8 +38,7 @@ Stop = tuple[int, tuple[float, float] | None]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('simulate', __doc__, argv, add_arguments, _run,
-                   (RecordingError, IntegrationError))
+    return cli.run('simulate', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -102,7 +100,10 @@ def _run(arguments: argparse.Namespace) -> int:
 def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
                  show: Callable[[float], object]) -> Mapping[str, str]:
     """Write a table; return the units of its columns."""
-    table = (RideTable if simulation.pivot else Table)(period_ns(simulation.values['pose.rate']))
+    table = Table(period_ns(simulation.values['pose.rate']))
+    if simulation.pivot:
+        table = Table(table.period_ns, RIDE_UNITS, lambda samples: (
+            *samples.pivot.position, *samples.pivot.velocity))
     write = write_csv if file_format == 'csv' else write_parquet
     # A command changes the rows after its time.
     write(path, (rows for done in _play(simulation, [table], stops, show)
@@ -194,7 +195,3 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
         finally:
             file.finish()
     return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -10,6 +10,7 @@ import itertools
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,8 +20,8 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.recording.damage import Damage, seconds
 from spinning_top_sim.recording.reader import LogMessage, LogReader
+from spinning_top_sim.recording.scan import Damage, seconds
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Imu
@@ -65,8 +66,7 @@ class Section:
     begin_ns: int                         # log times [ns]
     end_ns: int
     epoch_ns: int                         # stamp of t = 0 [ns]
-    periods_ns: dict[str, int]            # of the streams, by topic of the log
-    streams: dict[str, Stream]            # with their delays and silences
+    streams: dict[str, Stream]            # with their rates, by topic of the log
 
 
 @dataclass
@@ -78,7 +78,6 @@ class MotionReport:
     segment: Segment                      # its constants and its exact solution
     exact: Description | None             # None if the closed form cannot represent it
     source: str | None                    # topic that it is measured from
-    streams: dict[str, Stream]            # by topic of the log
     imu: Imu
     # Log times (n,) [ns] and `Attitudes.rows` of the source
     samples: list[tuple[Stamps, Rows]] = field(default_factory=list)
@@ -137,7 +136,7 @@ def survey(reader: LogReader) -> Survey:
     if sections:        # the last entry of the journal may be later than the last sample
         last = sections[-1]
         found.end_ns = last.end_ns = max(last.begin_ns, 0, *(
-            int(stamps_ns[topic].max(initial=0)) for topic in last.periods_ns))
+            int(stamps_ns[topic].max(initial=0)) for topic in last.streams))
     for topic, report in found.topics.items():
         _count(report, stamps_ns[topic], sections if report.stream is not None else [], topic)
     for motion in found.motions:
@@ -149,14 +148,14 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
     """Compute the motions of a run; add notes about what cannot be followed."""
     motions = found.motions
     try:
-        for simulation, event in recorded_run.Rerun(run).events(found.damage.end_ns):
+        for simulation, event in recorded_run.rerun(run, found.damage.end_ns):
             if isinstance(event, Block):
                 continue
             if motions:
                 last = motions[-1].sections[-1]
                 last.end_ns = last.epoch_ns + event.sent_ns
             begin_ns = simulation.epoch_ns + simulation.now_ns
-            streams = {run.topics[stream.topic]: stream for stream in simulation.streams
+            streams = {run.topics[stream.topic]: copy(stream) for stream in simulation.streams
                        if stream.topic in run.topics}
             # The velocities of the pivot belong to one motion.
             if event.name != 'parameters' and not (
@@ -164,10 +163,10 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
                 exact = simulation.describe() if len(motions) < MOST_EXACT else None
                 motions.append(MotionReport(
                     event.name, simulation.epoch_ns + simulation.segment.start_ns,
-                    simulation.segment, exact, _source(run, streams, exact), streams,
+                    simulation.segment, exact, _source(run, streams, exact),
                     Imu(simulation.values)))
-            motions[-1].sections.append(Section(begin_ns, begin_ns, simulation.epoch_ns, {
-                topic: stream.period_ns for topic, stream in streams.items()}, streams))
+            motions[-1].sections.append(
+                Section(begin_ns, begin_ns, simulation.epoch_ns, streams))
     except MALFORMED as error:
         found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
     if len(motions) > MOST_EXACT:
@@ -200,7 +199,7 @@ def _stamps(samples: Sequence[LogMessage]) -> Stamps:
 
 
 def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogMessage]) -> None:
-    stream, segment = motion.streams[topic], motion.segment
+    stream, segment = motion.sections[0].streams[topic], motion.segment
     fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
     stamps_ns = _stamps(fitting)
     fields = stream.template.decode(b''.join(sample.data for sample in fitting))
@@ -235,31 +234,26 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
         duration_ns = int(stamps_ns[-1] - stamps_ns[0])
         report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
     for section in sections:
-        stream, period_ns = section.streams[topic], section.periods_ns[topic]
-        zero_ns = section.epoch_ns + stream.late_ns         # log time of the sample at t = 0
+        stream, epoch_ns = section.streams[topic], section.epoch_ns
+        period_ns, late_ns = stream.period_ns, stream.late_ns
         end = int(np.searchsorted(stamps_ns, section.end_ns, 'right'))
-        here, stamps_ns = stamps_ns[:end], stamps_ns[end:]
-        first, last = (max(-1, (at_ns - zero_ns) // period_ns)
-                       for at_ns in (section.begin_ns, section.end_ns))
-        is_on_grid = (here - zero_ns) % period_ns == 0
-        # First sample of each silence, and the first one after it
-        silences = [(-(-begin // period_ns), -(-end // period_ns))
-                    for begin, end in stream.silences_ns]
-        expected = last - first - sum(max(0, min(end - 1, last) - max(begin, first + 1) + 1)
-                                      for begin, end in silences)
+        here, stamps_ns = stamps_ns[:end] - epoch_ns, stamps_ns[end:]
+        bounds_ns = max(section.begin_ns - epoch_ns, -1), section.end_ns - epoch_ns
+        due = stream.times(*bounds_ns)
+        silences = [(begin + late_ns, end + late_ns) for begin, end in stream.silences_ns]
+        silent = sum(len(stream.times(max(bounds_ns[0], begin - 1), min(bounds_ns[1], end - 1)))
+                     for begin, end in silences)
         report.grid_rate = NANOSECONDS / period_ns
         # A sample that is there twice does not replace a missing one.
-        report.missing = (report.missing or 0) + expected - len(np.unique(here[is_on_grid]))
-        edges_ns = np.array([first * period_ns + zero_ns, *here,
-                             (last + 1) * period_ns + zero_ns])
+        present = np.unique(here[(here - late_ns) % period_ns == 0])
+        report.missing = (report.missing or 0) + len(due) - silent - len(present)
+        edges_ns = np.array([due.start - period_ns, *here, due.start + len(due) * period_ns])
         for place in np.flatnonzero(np.diff(edges_ns) > period_ns):
-            if len(report.gaps_ns) == MOST_GAPS:
-                break
-            from_ns, to_ns = (int(edges_ns[place]) + period_ns,
-                              int(edges_ns[place + 1]) - period_ns)
-            if not any(begin * period_ns <= from_ns - zero_ns and to_ns - zero_ns < end * period_ns
-                       for begin, end in silences):
-                report.gaps_ns.append((from_ns, to_ns))
+            begin_ns, end_ns = int(edges_ns[place]) + period_ns, int(edges_ns[place + 1])
+            if len(report.gaps_ns) < MOST_GAPS and not any(
+                    begin <= begin_ns and end_ns - period_ns < end
+                    for begin, end in silences):
+                report.gaps_ns.append((epoch_ns + begin_ns, epoch_ns + end_ns - period_ns))
 
 
 def _measure(found: Survey, motion: MotionReport) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of true states, as CSV and Parquet; their numbers are read back to the last bit."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +21,20 @@ RIDE_UNITS = {**UNITS, 'x': 'm', 'y': 'm', 'z': 'm', 'vx': 'm/s', 'vy': 'm/s', '
 
 
 class Table(Stream):
-    """The true states as rows of numbers: a stream whose messages are the rows of a table."""
+    """
+    The true states as rows of numbers: a stream whose messages are the rows of a table.
 
-    units = UNITS
-    size = 8 * len(UNITS)
+    units : names and units of its columns: UNITS, and those that `added` returns for samples
+    """
 
-    def __init__(self, period_ns: int) -> None:
-        self.period_ns = period_ns
+    def __init__(self, period_ns: int, units: Mapping[str, str] = UNITS,
+                 added: Callable[[Samples], Sequence[NDArray[np.float64]]] = lambda _: (),
+                 ) -> None:
+        self.period_ns, self.units, self._added = period_ns, units, added
+
+    @property
+    def size(self) -> int:
+        return 8 * len(self.units)
 
     def encode(self, *parts: Samples) -> Encoded:
         return (np.concatenate([one.t_ns for one in parts]),
@@ -38,18 +45,7 @@ class Table(Stream):
         return np.stack(np.broadcast_arrays(
             samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
             states.psi, states.psi_dot, *states.quaternion.T, *states.angular_velocity.T,
-            states.energy, states.l3, states.lz), axis=-1)
-
-
-class RideTable(Table):
-    """The columns of `Table`, and place and velocity of the pivot in the world."""
-
-    units = RIDE_UNITS
-    size = 8 * len(RIDE_UNITS)
-
-    def _rows(self, samples: Samples) -> NDArray[np.float64]:
-        position, velocity, _ = samples.pivot
-        return np.column_stack((super()._rows(samples), *position, *velocity))
+            states.energy, states.l3, states.lz, *self._added(samples)), axis=-1)
 
 
 def write_csv(path: Path, blocks: Iterable[NDArray[np.float64]],

@@ -16,11 +16,14 @@ from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools.recorded_run import (
     MALFORMED,
-    Rerun,
     RunDescription,
     field_names,
     reason_of,
+    rerun,
 )
+
+# Streams and messages by stamp and topic: several commands may have the same.
+_Computed = defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]]
 
 
 class Difference(NamedTuple):
@@ -55,75 +58,71 @@ class Verdict:
         self.first = min(self.first or this, this, key=operator.attrgetter('stamp_ns'))
 
 
-class Comparison:
-    """Computes the run of a log while the log is read in the order of time."""
+def compare(run: RunDescription, reader: LogReader, end_ns: int,
+            show: Callable[[int], None]) -> Verdict:
+    """
+    Compute the run of a log while the log is read in the order of time; return the result.
 
-    def __init__(self, run: RunDescription) -> None:
-        self._run = run
-        topics = (*run.topics.values(), run.commands_topic)
-        self._verdict = Verdict(dict.fromkeys(filter(None, topics), 0), warnings=_warnings(run))
-        # What has not been met in the log, by stamp and topic: several commands may have the same.
-        self._computed: defaultdict[
-            tuple[int, str], deque[tuple[Stream | None, bytes]]] = defaultdict(deque)
-
-    def compare(self, reader: LogReader, end_ns: int, show: Callable[[int], None]) -> Verdict:
-        """Return the result up to a log time; `show` takes the one reached [ns]."""
-        run, verdict = self._run, self._verdict
-        for stamp_ns, reason in run.broken:
-            verdict.different += 1
-            verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
-        progress, before_ns = self._compute(end_ns, show), -math.inf
-        for message in reader.messages(topics=verdict.compared):
-            while message.log_time >= before_ns:
-                before_ns = next(progress)
-                self._miss(message.log_time)
-            self._meet((message.log_time, message.topic), message.data)
-        for _ in progress:
-            self._miss(math.inf)
-        self._miss(math.inf)
-        return verdict
-
-    def _compute(self, end_ns: int, show: Callable[[int], None]) -> Iterator[float]:
-        """Compute the run; yield the log times before which all is computed, at last infinity."""
-        topics, commands, computed = self._run.topics, self._run.commands_topic, self._computed
-        try:
-            for simulation, event in Rerun(self._run, samples=True).events(end_ns):
-                if isinstance(event, Block):
-                    for stream, times_ns, rows in event.parts:
-                        for t_ns, row in zip(times_ns.tolist(), rows, strict=True):
-                            computed[simulation.epoch_ns + t_ns, topics[stream.topic]].append(
-                                (stream, row.tobytes()))
-                elif commands is not None and event.name == 'command':
-                    computed[event.stamp_ns, commands].append(
-                        (None, journal.command(event.details['l3'], event.details['lz'])))
-                reached_ns = simulation.epoch_ns + simulation.now_ns
-                show(reached_ns)
-                # Not up to it: another command at this very time may follow.
-                yield reached_ns
-        except MALFORMED as error:
-            self._verdict.stopped = reason_of(error)
-        yield math.inf
-
-    def _meet(self, key: tuple[int, str], data: bytes) -> None:
-        """Compare a message of the log with the computed one of its stamp and topic."""
-        verdict = self._verdict
-        if key not in self._computed:
+    end_ns : log time up to which they are compared [ns]
+    show : takes the log time that is reached [ns]
+    """
+    topics = (*run.topics.values(), run.commands_topic)
+    verdict = Verdict(dict.fromkeys(filter(None, topics), 0), warnings=_warnings(run))
+    for stamp_ns, reason in run.broken:
+        verdict.different += 1
+        verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
+    # What has not been met in the log.
+    computed: _Computed = defaultdict(deque)
+    progress, before_ns = _compute(run, end_ns, computed, verdict, show), -math.inf
+    for message in reader.messages(topics=verdict.compared):
+        while message.log_time >= before_ns:
+            before_ns = next(progress)
+            _miss(computed, verdict, message.log_time)
+        key = message.log_time, message.topic
+        if key not in computed:
             verdict.unexpected += 1
             verdict.note(Difference(*key, 'message', 'there', 'no such message'))
-            return
-        stream, expected = self._computed[key].popleft()
-        if not self._computed[key]:
-            del self._computed[key]
-        verdict.compared[key[1]] += 1
-        if data != expected:
+            continue
+        stream, expected = computed[key].popleft()
+        if not computed[key]:
+            del computed[key]
+        verdict.compared[message.topic] += 1
+        if message.data != expected:
             verdict.different += 1
-            verdict.note(_difference(key, stream, data, expected))
+            verdict.note(_difference(key, stream, message.data, expected))
+    for _ in progress:
+        _miss(computed, verdict, math.inf)
+    _miss(computed, verdict, math.inf)
+    return verdict
 
-    def _miss(self, before_ns: float) -> None:
-        """Count the computed messages before a time that the log does not have."""
-        for key in [key for key in self._computed if key[0] < before_ns]:
-            self._verdict.missing += len(self._computed.pop(key))
-            self._verdict.note(Difference(*key, 'message', 'no such message', 'there'))
+
+def _compute(run: RunDescription, end_ns: int, computed: _Computed, verdict: Verdict,
+             show: Callable[[int], None]) -> Iterator[float]:
+    """Compute the run; yield the log times before which all is computed, at last infinity."""
+    try:
+        for simulation, event in rerun(run, end_ns, samples=True):
+            if isinstance(event, Block):
+                for stream, times_ns, rows in event.parts:
+                    topic = run.topics[stream.topic]
+                    for t_ns, row in zip(times_ns.tolist(), rows, strict=True):
+                        computed[simulation.epoch_ns + t_ns, topic].append((stream, row.tobytes()))
+            elif run.commands_topic is not None and event.name == 'command':
+                computed[event.stamp_ns, run.commands_topic].append(
+                    (None, journal.command(event.details['l3'], event.details['lz'])))
+            reached_ns = simulation.epoch_ns + simulation.now_ns
+            show(reached_ns)
+            # Not up to it: another command at this very time may follow.
+            yield reached_ns
+    except MALFORMED as error:
+        verdict.stopped = reason_of(error)
+    yield math.inf
+
+
+def _miss(computed: _Computed, verdict: Verdict, before_ns: float) -> None:
+    """Count the computed messages before a time that the log does not have."""
+    for key in [key for key in computed if key[0] < before_ns]:
+        verdict.missing += len(computed.pop(key))
+        verdict.note(Difference(*key, 'message', 'no such message', 'there'))
 
 
 def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 from spinning_top_sim.installation import needed
 from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
-from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.tools import cli, scene_file
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     arguments = parser.parse_args(words)
     if arguments.log:
-        return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs, (LogError,))
+        return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs)
     with contextlib.ExitStack() as stack:
         return run('view', argv, partial(_prepare, stack, arguments))
 
@@ -132,7 +131,7 @@ def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, argv: l
     """Return what opens the page; a node of a scene or IMU runs until `stack` is closed."""
     if arguments.html is not None:
         raise ValueError(f'--html {arguments.html}: must have a log')
-    files = scene_file.files_for_node(arguments)
+    files = list(scene_file.chosen_files(arguments))
     from spinning_top_sim.view.live import LiveView  # noqa: PLC0415
 
     def make_node() -> RunnableNode:

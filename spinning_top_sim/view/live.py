@@ -221,14 +221,10 @@ class LiveView(Node):
         client: Client = self._services_of_sim[name]
         if not client.service_is_ready():
             raise RequestError(f'there is no {self._sim}')
-        future = client.call_async(request)
-        end = time.monotonic() + ANSWER_S
-        while not future.done():
-            time.sleep(0.01)
-            if time.monotonic() > end or self._stopped:
-                client.remove_pending_request(future)
-                raise RequestError(f'{self._sim}/{name} has not answered')
-        return future.result()
+        answer = client.call(request, ANSWER_S)
+        if answer is None:
+            raise RequestError(f'{self._sim}/{name} has not answered')
+        return answer
 
     def call(self, name: str, *on: bool) -> str:
         """Call a service of the sim_node; return its message.  Raises RequestError."""

@@ -86,7 +86,7 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
 
 
 def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> None:
-    for simulation, event in recorded_run.Rerun(run).events(end_ns):
+    for simulation, event in recorded_run.rerun(run, end_ns):
         if isinstance(event, Block) or event.name == 'parameters':
             continue
         begin_ns = simulation.epoch_ns + max(simulation.now_ns, 0)

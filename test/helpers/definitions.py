@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rosbags.typesys import Stores, get_typestore
 
+from spinning_top_sim.recording import definitions
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.topics import all_streams
 
@@ -17,6 +18,11 @@ JAZZY = get_typestore(Stores.ROS2_JAZZY)
 
 def definition(type_name):
     return [JAZZY.generate_msgdef(type_name, ros_version=2)[0], JAZZY.hash_rihs01(type_name)]
+
+
+def add_definitions(*type_names):
+    """Let logs have these types for the rest of the tests."""
+    definitions.definitions().update({name: definition(name) for name in type_names})
 
 
 if __name__ == '__main__':

@@ -57,10 +57,12 @@ class LateRates(Misreading):
 
 
 class Drifting(Misreading):
-    """Its heading drifts."""
+    """Its heading drifts by the noise of the accelerometer."""
+
+    _angle = 0.0
 
     def update(self, gyroscope, accelerometer, magnetometer, dt):
-        self._angle = getattr(self, '_angle', 0.0) + 0.005 * dt
+        self._angle += 0.6 * abs(np.linalg.norm(accelerometer) - 9.80665) * dt
         return product(np.array((0.0, 0.0, np.sin(self._angle), np.cos(self._angle))),
                        super().update(gyroscope, accelerometer, magnetometer, dt))
 

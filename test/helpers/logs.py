@@ -18,6 +18,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from helpers.definitions import add_definitions
 from helpers.recordings import METADATA
 from spinning_top_sim.recording import chunks
 from spinning_top_sim.recording.reader import LogReader
@@ -28,6 +29,7 @@ from spinning_top_sim.tools.recover import main
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 POINT = 'geometry_msgs/msg/Point'
 NUMBER = 'std_msgs/msg/Float64'
+add_definitions(POINT, NUMBER)
 TOPICS = (
     RecordedTopic('/top/point', POINT),
     RecordedTopic('/top/number', NUMBER, {'depth': 3, 'reliability': 2}),

@@ -20,9 +20,9 @@ from helpers.random_tops import random_case
 from helpers.taylor import LONG
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.solvers.equations import NUTATION_SHARE
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.solvers.transport import NUTATION_SHARE
 
 EPS = 2.0 ** -53
 # Of |q|: the scale 1/sqrt(sum of squares) is off by 4 roundings at most, and each part by 3 more:

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The equations of motion of the Euler angles, stepped by rk45."""
+
+import math
+from functools import cached_property
+
+import numpy as np
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.dormand_prince import IntegrationError, Rows, SteppedMotion, Vector
+
+# |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
+SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
+ADVICE = "use the regular equations (equations = 'transport') or method = 'exact'"
+
+
+class EulerMotion(SteppedMotion):
+    """
+    Equations (29)-(32) of "Analysis of Symmetric Spinning Top" (2023), to the letter, for study.
+
+    They are singular where the axis is vertical, and near there wrong without a sign of it:
+    cos(theta) rounds towards 1, Lz - L3 cos(theta) loses its digits, or a step leaps over the
+    pole, and phi and psi drift off while every error estimate is small.  So these equations stop
+    with an error there.
+    """
+
+    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+        self.top, self._l3, self._lz = top, start.l3, start.lz
+        self._rtol, self._atol = rtol, atol
+        super().__init__(
+            top, start, (start.theta, start.theta_dot, start.phi, start.psi), rtol + atol,
+            abs(start.theta_dot) + (abs(start.l3) + abs(start.lz)) / top.lambda1
+            + abs(start.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
+
+    def derivative(self, theta: float, theta_dot: float, phi: float, psi: float) -> Vector:
+        """Return (theta', theta'', phi', psi'), eqs. (29)-(32); IntegrationError near a pole."""
+        sine, cosine = math.sin(theta), math.cos(theta)
+        if not abs(sine) > SMALLEST_SINE:
+            raise IntegrationError(
+                f'euler equations: the axis is at a pole (theta = {theta!r} rad): cos(theta) '
+                f"rounds to {cosine!r} and eq. (31) loses phi'; {ADVICE}")
+        top = self.top
+        phi_dot = (self._lz - self._l3 * cosine) / (top.lambda1 * sine * sine)
+        psi_dot = self._l3 / top.lambda3 - phi_dot * cosine
+        return (theta_dot,
+                phi_dot * phi_dot * sine * cosine
+                - top.lambda3 / top.lambda1 * (psi_dot + phi_dot * cosine) * phi_dot * sine
+                + top.gravity_torque / top.lambda1 * sine,
+                phi_dot, psi_dot)
+
+    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        theta = y[0]
+        theta_dot, theta_ddot, phi_dot, _ = derivative
+        sine, cosine = np.sin(theta), np.cos(theta)
+        lambda1 = self.top.lambda1
+        phi_ddot = theta_dot * (self._l3 / lambda1 - 2.0 * phi_dot * cosine) / sine
+        theta_dddot = (
+            2.0 * phi_dot * phi_ddot * sine * cosine
+            + theta_dot * phi_dot * phi_dot * (cosine * cosine - sine * sine)
+            - self._l3 / lambda1 * (phi_ddot * sine + phi_dot * cosine * theta_dot)
+            + self.top.gravity_torque / lambda1 * cosine * theta_dot)
+        return np.array((theta_ddot, theta_dddot, phi_ddot,
+                         phi_dot * sine * theta_dot - phi_ddot * cosine))
+
+    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
+        return tuple(
+            abs(e) / (self._atol + self._rtol * max(abs(a), abs(b)) or math.ulp(0.0))
+            for e, a, b in zip(difference, y, y_new, strict=True))
+
+    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+        """Raise IntegrationError if the step leapt over a pole: phi and psi would be lost."""
+        before, after = y[0].real, y_new[0].real
+        if math.floor(before / math.pi) != math.floor(after / math.pi):
+            raise IntegrationError(
+                f'euler equations: a step leapt over a pole, from theta = {before!r} to '
+                f'{after!r} rad, and lost phi and psi; {ADVICE}')
+        return y_new
+
+    def _states_of(self, t: Column, unknowns: Rows) -> States:
+        return _EulerStates(self.top, self.start, t, unknowns)
+
+
+class _EulerStates(States):
+    def __init__(self, top: Top, start: State, t: Column, unknowns: Rows) -> None:
+        super().__init__(top, start, len(t))
+        theta, theta_dot, phi, psi = unknowns
+        self.t, self.theta_dot, self.angles = t, theta_dot, (phi, theta, psi)
+
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        return attitude.quaternion_of_angles(*self.angles)
+
+    @cached_property
+    def transverse_velocity(self) -> tuple[Column, Column]:
+        """omega_1 + i omega_2 = (-phi' sin(theta) + i theta') exp(-i psi), eq. (4)."""
+        across = self.phi_dot * np.sin(self.theta)
+        cosine, sine = np.cos(self.psi), np.sin(self.psi)
+        return self.theta_dot * sine - across * cosine, self.theta_dot * cosine + across * sine

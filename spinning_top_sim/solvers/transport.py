@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The regular equations of motion, stepped by rk45, and their states."""
+
+import cmath
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.dormand_prince import Rows, SteppedMotion, Vector, components
+
+# The energy corrects the nutation rate only where its square is at least this share of the
+# largest |m|^2: at a turning point the energy does not tell the rate.
+NUTATION_SHARE = 1e-6
+# (sin(theta)/2)^2 below which rounding in L.e3 would spoil the momentum more than it mends it.
+POLE_SHARE = 1e-4
+
+
+# Real and imaginary parts of alpha, beta and m.
+Parts = Sequence[Column]
+
+# The functions sqrt, copysign and where of the projection, for columns and for one state, where
+# numpy would take ten times as long.
+COLUMNS = np.sqrt, np.copysign, np.where
+ONE_STATE = math.sqrt, math.copysign, lambda condition, x, y: x if condition else y
+
+
+class TransportMotion(SteppedMotion):
+    """
+    The default: regular at every attitude.
+
+    Unknowns are the Cayley-Klein parameters and the horizontal angular momentum in the world,
+    m = i (L_x + i L_y)/(2 lambda1).  From q' = (1/2) omega q and L' = torque,
+
+        alpha' =  i (Lz - c)/(2 lambda1) alpha + m conj(beta)
+        beta'  =  i (Lz + c)/(2 lambda1) beta  - m conj(alpha)
+        m'     = -(P/lambda1) alpha beta
+
+    with c the part of L3 that these equations carry.  They are those of a frame that turns about
+    e3 with the body, less a known uniform rate chi = L3/lambda3 - (L3 - c)/lambda1.  The factor
+    exp(+-i chi t/2) is put on when a state is read, so the step size follows the nutation and not
+    the spin.  With c = L3/2 the spectrum of alpha and beta is centred about zero;
+    docs/accuracy.md has the reasons for this choice.
+
+    The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each
+    sample (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
+
+    phi + psi and phi - psi are twice the phases of alpha and beta, with the rates
+
+        alpha:   Omega/2 + (Lz + L3)/(4 lambda1 cos^2(theta/2)),   Omega = L3/lambda3 - L3/lambda1,
+        beta:   -Omega/2 + (Lz - L3)/(4 lambda1 sin^2(theta/2)).
+
+    The first term is the uniform part.  The second never changes its sign, and turns the phase by
+    little more than half a turn in a step, however near a pole the step passes.  So the phase of
+    a sample is, of all arctan2(..) + 2 pi k, the first one ahead of the phase at the begin of its
+    step.  If Lz + L3 or Lz - L3 is 0, alpha or beta has the uniform part alone.  It then moves on
+    a line through zero, and its modulus changes sign where the axis passes that pole.
+
+    rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
+    spin_rate : chi [rad/s]
+    uniform_rates : rate of the uniform part of alpha's phase, in the frame that is stepped and in
+        the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
+    momenta : Lz + L3, Lz - L3 and 0: their signs are the senses in which the phases turn
+    """
+
+    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+        lambda1, l3, lz, torque = top.lambda1, start.l3, start.lz, top.gravity_torque
+        self.top, self._l3, self._lz = top, l3, lz
+        carried = 0.5 * l3                                              # c
+        self.spin_rate = l3 / top.lambda3 - (l3 - carried) / lambda1
+        self.uniform_rates = -0.5 * carried / lambda1, 0.5 * (l3 / top.lambda3 - l3 / lambda1)
+        self._turn_alpha = 0.5j * (lz - carried) / lambda1
+        self._turn_beta = 0.5j * (lz + carried) / lambda1
+        self._fall = complex(-torque / lambda1)
+        # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
+        alpha, beta, m = self._vector(start)
+        self._energy = 2.0 * lambda1 * abs(m) ** 2 + torque * (abs(alpha) ** 2 - abs(beta) ** 2)
+        # |m| never exceeds this: the scale of its error, as 1 is that of alpha and beta.  Close to
+        # hanging the sum is what its rounding leaves.
+        above_lowest = max(self._energy + abs(torque), 4.0 * math.ulp(1.0) * abs(torque))
+        self._scale = math.sqrt(0.5 * above_lowest / lambda1) or 1.0
+        self._tolerance = rtol + atol
+        self._large_enough = NUTATION_SHARE * self._scale ** 2
+        self.momenta = lz + l3, lz - l3, 0.0
+        half = 0.5 * start.theta
+        # Of the moduli, where theta is continued out of [0, pi].
+        self._signs = math.copysign(1.0, math.cos(half)), math.copysign(1.0, math.sin(half))
+        self._starts = 0.5 * start.phi + 0.5 * start.psi, 0.5 * start.phi - 0.5 * start.psi
+        # Phases of alpha and beta, less their uniform parts, and theta/2 at the begins of the
+        # steps that are kept [rad].
+        self._begins = np.array([*self._starts, half])[:, np.newaxis]
+        super().__init__(
+            top, start, self.accepted((), (alpha, beta, m)), self._tolerance,
+            self._scale + (abs(l3) + abs(lz)) / lambda1 + math.sqrt(abs(torque) / lambda1))
+
+    def _vector(self, start: State) -> Vector:
+        """Return alpha, beta and m of a state; L_x + i L_y by eq. (6), turned by exp(i phi)."""
+        lambda1 = self.top.lambda1
+        cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
+        phi_dot = attitude.precession_rate(self.top, self._l3, self._lz, cosine * cosine,
+                                           sine * sine)
+        momentum = cmath.rect(1.0, start.phi) * complex(
+            2.0 * sine * cosine * (self._l3 - lambda1 * phi_dot
+                                   * (cosine * cosine - sine * sine)),
+            lambda1 * start.theta_dot)
+        return (cosine * cmath.rect(1.0, 0.5 * start.phi + 0.5 * start.psi),
+                sine * cmath.rect(1.0, 0.5 * start.phi - 0.5 * start.psi),
+                0.5j * momentum / lambda1)
+
+    def derivative(self, alpha: complex, beta: complex, m: complex) -> Vector:
+        return (self._turn_alpha * alpha + m * beta.conjugate(),
+                self._turn_beta * beta - m * alpha.conjugate(),
+                self._fall * (alpha * beta))
+
+    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+        # The product rule in real parts: of complex columns the last bits depend on the block.
+        a, a_imag, b, b_imag, m, m_imag = y
+        da, da_imag, db, db_imag, dm, dm_imag = derivative
+        turn_a, turn_b, fall = self._turn_alpha.imag, self._turn_beta.imag, self._fall.real
+        return np.array((
+            dm * b + dm_imag * b_imag + m * db + m_imag * db_imag - turn_a * da_imag,
+            dm_imag * b - dm * b_imag + m_imag * db - m * db_imag + turn_a * da,
+            -(dm * a + dm_imag * a_imag + m * da + m_imag * da_imag) - turn_b * db_imag,
+            -(dm_imag * a - dm * a_imag + m_imag * da - m * da_imag) + turn_b * db,
+            fall * (da * b - da_imag * b_imag + a * db - a_imag * db_imag),
+            fall * (da * b_imag + da_imag * b + a * db_imag + a_imag * db)))
+
+    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
+        da, db, dm = difference
+        tolerance = self._tolerance
+        return abs(da) / tolerance, abs(db) / tolerance, abs(dm) / self._scale / tolerance
+
+    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+        """Return y_new moved back onto the invariants; see `project`."""
+        alpha, beta, m = y_new
+        projected = self.project((alpha.real, alpha.imag, beta.real, beta.imag, m.real, m.imag),
+                                 POLE_SHARE, ONE_STATE)
+        return complex(*projected[:2]), complex(*projected[2:4]), complex(*projected[4:])
+
+    def project(self, y: Sequence[Any], pole_share: float,
+                functions: tuple[Callable[..., Any], ...] = COLUMNS) -> tuple[Any, ...]:
+        """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
+        # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows
+        # from L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.
+        sqrt, copysign, where = functions
+        alpha_real, alpha_imag, beta_real, beta_imag, m_real, m_imag = y
+        cos2 = alpha_real * alpha_real + alpha_imag * alpha_imag
+        sin2 = beta_real * beta_real + beta_imag * beta_imag
+        inverse_norm = 1.0 / sqrt(cos2 + sin2)
+        alpha_real, alpha_imag = alpha_real * inverse_norm, alpha_imag * inverse_norm
+        beta_real, beta_imag = beta_real * inverse_norm, beta_imag * inverse_norm
+        inverse_square = inverse_norm * inverse_norm
+        cos2, sin2 = cos2 * inverse_square, sin2 * inverse_square
+        size = cos2 * sin2
+        axis_real, axis_imag = half_axis(alpha_real, alpha_imag, beta_real, beta_imag)
+        lambda1, l3, lz = self.top.lambda1, self._l3, self._lz
+        # L3 - Lz cos(theta), without cancellation at the poles
+        v = 0.25 / lambda1 * where(sin2 < cos2, (l3 - lz) + 2.0 * lz * sin2,
+                                   (l3 + lz) - 2.0 * lz * cos2)
+        u = m_real * axis_real + m_imag * axis_imag
+        u_squared = size * (self._energy - self.top.gravity_torque * (cos2 - sin2)) / (
+            2.0 * lambda1) - v * v
+        # What rounding leaves of the energy does not tell u.
+        is_known = (u * u > self._large_enough * size) & (u_squared > 0.0)
+        u = where(is_known, copysign(sqrt(where(is_known, u_squared, 0.0)), u), u)
+        at_pole = size <= pole_share
+        divisor = where(at_pole, 1.0, size)
+        return (
+            alpha_real, alpha_imag, beta_real, beta_imag,
+            where(at_pole, m_real, (u * axis_real - v * axis_imag) / divisor),
+            where(at_pole, m_imag, (u * axis_imag + v * axis_real) / divisor))
+
+    def polar(self, y: Sequence[Column], uniform: Column) -> tuple[list[Column], list[Column]]:
+        """
+        Return the signed moduli of alpha and beta, and their phases less the uniform parts.
+
+        The phases are known but for whole turns; theta/2 follows them.
+
+        y : real and imaginary parts of alpha and beta, and more
+        uniform : the uniform part of alpha's phase in the same frame [rad]
+        """
+        moduli, phases = [], []
+        for k, part in enumerate((uniform, -uniform)):
+            real, imag, sign, start = y[2 * k], y[2 * k + 1], self._signs[k], self._starts[k]
+            if self.momenta[k]:
+                moduli.append(sign * np.hypot(real, imag))
+                phases.append(np.arctan2(sign * imag, sign * real) - part)
+            else:       # it moves on a line through zero
+                moduli.append(real * np.cos(start + part) + imag * np.sin(start + part))
+                phases.append(np.full(len(part), start))
+        return moduli, [*phases, np.arctan2(moduli[1], moduli[0])]
+
+    def _unwrap(self) -> None:
+        """Follow the phases to the begins of all steps that are kept."""
+        new = self._kept[self._begins.shape[1]:]
+        if new:
+            t = np.array([step.t0 for step in new])
+            y = tuple(components([step.y0 for step in new]))
+            _, phases = self.polar(y, self.uniform_rates[0] * t)
+            self._begins = np.concatenate((self._begins, [
+                phase + math.tau * np.cumsum(turns_to_follow(
+                    phase, np.concatenate(([before], phase[:-1])), momentum))
+                for phase, before, momentum in zip(
+                    phases, self._begins[:, -1], self.momenta, strict=True)]), axis=1)
+
+    def _forget(self, count: int) -> None:
+        self._unwrap()
+        super()._forget(count)
+        self._begins = self._begins[:, count:].copy()
+
+    def _unknowns(self, t: Column) -> Rows:
+        """Return the unknowns, and `_begins` of the step that each time [s] lies in."""
+        self._unwrap()
+        steps, unknowns = self._interpolated(t)
+        return np.concatenate((unknowns, self._begins.take(steps, axis=1)))
+
+    def _states_of(self, t: Column, unknowns: Rows) -> States:
+        return _TransportStates(self, t, unknowns)
+
+
+def half_axis(a: Any, a_imag: Any, b: Any, b_imag: Any) -> tuple[Any, Any]:
+    """Return alpha beta = (e3_x + i e3_y)/2, of length sin(theta)/2."""
+    return a * b - a_imag * b_imag, a * b_imag + a_imag * b
+
+
+def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
+    """
+    Return the whole turns to add to `phase` so that it follows `before` [rad].
+
+    In the sense of `momentum` it then lies within (-pi/2, 3 pi/2) from there: backwards by
+    rounding at most.  Without a sense (momentum 0) it is the nearest.
+    """
+    ahead = 0.5 * math.pi * ((momentum > 0.0) - (momentum < 0.0))
+    return 0.0 - np.rint((phase - before - ahead) / math.tau)
+
+
+class _TransportStates(States):
+    """
+    States known by alpha, beta and the momentum.
+
+    rows : what `TransportMotion._unknowns` returns
+    """
+
+    def __init__(self, motion: TransportMotion, t: Column, rows: Rows) -> None:
+        super().__init__(motion.top, motion.start, len(t))
+        self.t, self._motion = t, motion
+        self._stepped: Parts = tuple(rows[:6])
+        self._begins = rows[6:]
+
+    @cached_property
+    def _projected(self) -> Parts:
+        """The unknowns on the invariants, in the body's own frame."""
+        motion, y, pole_share = self._motion, self._stepped, POLE_SHARE
+        if not all(motion.momenta[:2]):     # the meridian of the axis is known
+            y, pole_share = self._on_lines(y, motion.uniform_rates[0] * self.t), 0.0
+        a, b, c, d, m_real, m_imag = motion.project(y, pole_share)
+        spin = 0.5 * motion.spin_rate * self.t
+        cosine, sine = np.cos(spin), np.sin(spin)
+        return (a * cosine - b * sine, b * cosine + a * sine,
+                c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
+
+    def _on_lines(self, y: Parts, uniform: Column) -> Parts:
+        """Return y with alpha or beta moved onto the line through zero, and m turned with them."""
+        moved = list(y[:4])
+        moduli, phases = self._motion.polar(y, uniform)
+        for k, part in enumerate((uniform, -uniform)):
+            if not self._motion.momenta[k]:
+                moved[2 * k] = moduli[k] * np.cos(phases[k] + part)
+                moved[2 * k + 1] = moduli[k] * np.sin(phases[k] + part)
+        x, z = half_axis(*y[:4])
+        u, v = half_axis(*moved)
+        # Next to the pole m is known better than the axis.
+        away = x * x + z * z > POLE_SHARE
+        scale = np.where(away, np.hypot(x, z) * np.hypot(u, v), 1.0)
+        cosine = np.where(away, (x * u + z * v) / scale, 1.0)
+        sine = np.where(away, (x * v - z * u) / scale, 0.0)
+        return *moved, y[4] * cosine - y[5] * sine, y[4] * sine + y[5] * cosine
+
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        alpha_real, alpha_imag, beta_real, beta_imag, *_ = self._projected
+        return -beta_imag, beta_real, alpha_imag, alpha_real
+
+    @cached_property
+    def angles(self) -> tuple[Column, Column, Column]:
+        uniform = self._motion.uniform_rates[1] * self.t
+        _, phases = self._motion.polar(self._projected, uniform)
+        # theta/2 turns by less than half a turn within a step.
+        half_sum, half_difference, half = (
+            phase + math.tau * turns_to_follow(phase, begin, momentum)
+            for phase, begin, momentum in zip(
+                phases, self._begins, self._motion.momenta, strict=True))
+        half_sum, half_difference = half_sum + uniform, half_difference - uniform
+        return half_sum + half_difference, 2.0 * half, half_sum - half_difference
+
+    @cached_property
+    def _momentum(self) -> tuple[Column, Column]:
+        """L_x and L_y in the world frame [kg m^2/s]."""
+        unit, (*_, m_real, m_imag) = 2.0 * self.top.lambda1, self._projected
+        return unit * m_imag, -unit * m_real
+
+    @cached_property
+    def theta_dot(self) -> Column:
+        """The momentum across the meridian plane, over lambda1."""
+        lx, ly = self._momentum
+        return (ly * np.cos(self.phi) - lx * np.sin(self.phi)) / self.top.lambda1
+
+    @cached_property
+    def transverse_velocity(self) -> tuple[Column, Column]:
+        first, second, _ = attitude.in_body(self.rows_quaternion, (*self._momentum, self._lz))
+        return first / self.top.lambda1, second / self.top.lambda1
+
+    @cached_property
+    def l3(self) -> Column:
+        x, y, z = self.rows_axis
+        lx, ly = self._momentum
+        return lx * x + ly * y + self._lz * z
