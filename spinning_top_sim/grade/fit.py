@@ -87,8 +87,7 @@ class Fit:
         yield (f'fit: residual {self.residual:.3g} rad, noise {self.noise:.3g} rad' + (
             '' if self.reached else ': no motion of a top comes near the attitudes' if
             self.residual > LARGEST else ': the residual is not noise, or the fit has not '
-            'converged. No motion that was found explains the attitudes; what follows is of the '
-            'nearest one'))
+            'converged; what follows is of the nearest motion, and the intervals mean nothing'))
         for name, value in self.values.items():
             spread = INTERVAL * self.deviations[name]
             yield f'  {name:<16}{value:>16.9g} ' + (
