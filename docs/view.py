@@ -10,7 +10,7 @@ from pathlib import Path
 from playwright.sync_api import sync_playwright
 
 from spinning_top_sim.tools import simulate
-from spinning_top_sim.view.log import Player, read_log
+from spinning_top_sim.view.log import Player, read_logs
 from spinning_top_sim.view.model import ARROWS
 from spinning_top_sim.view.page import Page
 
@@ -26,7 +26,7 @@ def take(address, path):
             '--enable-unsafe-swiftshader'])
         page = browser.new_page(viewport={'width': 1280, 'height': 800})
         page.goto(address)
-        page.wait_for_function("window.__viserMutable?.nodePoseData['/top/body']")
+        page.wait_for_function("window.__viserMutable?.nodePoseData['/top0/body']")
         page.wait_for_timeout(12_000)          # the scene fades in
         # What the browser says about a machine without graphics.
         page.evaluate("document.querySelectorAll('.mantine-Notifications-root')"
@@ -42,7 +42,7 @@ def main():
         simulate.main(['-o', str(log), '--duration', '30', '--quiet'])
         page = Page('cusp.mcap', '127.0.0.1', 0)
         page.arrows[ARROWS.index('angular momentum')].value = True
-        player = Player(page, read_log(log))
+        player = Player(page, read_logs([log]))
         stopped = threading.Event()
 
         def show():

@@ -16,6 +16,13 @@ def pytest_xdist_make_scheduler(config, log):
     return BySharedFixture(config, log)
 
 
+def pytest_collection_modifyitems(items):
+    """Begin with the files of the longest tests, so that at the end no worker waits for one."""
+    long = {f'test_{name}.py' for name in (
+        'attitude_filter', 'docs', 'tour', 'view_node', 'sim_node_life', 'grade_files', 'recover')}
+    items.sort(key=lambda item: item.path.name not in long)
+
+
 @pytest.fixture(autouse=True)
 def _signals():
     """Restore what a command that is called in this process leaves ignored."""

@@ -39,11 +39,3 @@ def test_an_integrator_with_a_fine_tolerance_passes_and_with_its_default_does_no
 
     assert grade(lambda *given: run(*given, rtol=1e-10, atol=1e-12), scenes=SHORT).passed
     assert not grade(run, scenes=SHORT).passed
-
-
-def test_steps_and_readings_of_mujoco_are_named(adapter):
-    pytest.importorskip('mujoco')
-    run = adapter('mujoco_engine').run
-    euler = grade(lambda *given: run(*given, 'Euler'), scenes=SHORT)
-    assert {'first_order', 'imu_one_step_late'} <= set(euler.names)
-    assert grade(lambda *given: run(*given, 'RK4'), scenes=SHORT).names == ['imu_one_step_late']

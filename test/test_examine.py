@@ -127,9 +127,9 @@ def test_a_misreading_is_named_with_its_evidence(report, name):
 @pytest.mark.parametrize('name', ['first_order_integration', 'lever_arm', 'no_bias_estimate'])
 def test_a_fault_of_the_method_is_named(report, name):
     assert report(name).faults == [name]
-    found = report(name, 'component_order')
-    assert found.faults == ['component_order', name]        # which hides the other comes first
     assert set(FAULTY) == set(FAULTS)
+    if name == 'lever_arm':             # which hides the other comes first
+        assert report(name, 'component_order').faults == ['component_order', name]
 
 
 @pytest.mark.parametrize('name', ['mahony, right', 'mahony, no gravity', 'mahony, bias clamped'])
@@ -145,6 +145,9 @@ def test_a_filter_without_faults_passes(report):
     marks = found.measures
     assert marks['tilt_rms_deg'] < 0.03 and marks['convergence_s'] < 1.0
     assert marks['bias_found'] == pytest.approx(1.0, abs=0.01)
+    # The bound is that of white noise alone, in the settled half.
+    assert 0.7 < marks['tilt_to_bound'] < 1.3 and 0.7 < marks['heading_to_bound'] < 2.0
+    assert marks['tilt_to_gyroscope'] < 0.6
     assert marks['nees_low'] < marks['nees'] < marks['nees_high']
     explained = {name for name in MEANINGS if not name.startswith(('data_', 'field_'))}
     assert {*explained, 'nees_low', 'nees_high', 'nees_attitude_low', 'nees_attitude_high'} == {

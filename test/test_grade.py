@@ -286,25 +286,3 @@ def test_attitudes_keep_their_sign_from_sample_to_sample():
     right['attitudes'][100:] *= -1.0
     said = Trajectory.of(right, right['t'])
     assert np.min(np.sum(said.attitudes[1:] * said.attitudes[:-1], axis=1)) > 0.99
-
-
-@pytest.fixture(scope='module')
-def mujoco_top():
-    pytest.importorskip('mujoco')
-    from helpers.mujoco_top import MujocoTop
-    return MujocoTop
-
-
-def test_mujoco_by_default_is_of_first_order_and_its_readings_are_one_step_late(mujoco_top):
-    report = grade(mujoco_top(), scenes=SCENES[:1])
-    assert report.names == ['first_order', 'explicit_gyroscopic_term', 'imu_one_step_late'], report
-    assert 10.0 < report.marks['total_error_deg: cusps'] < 11.0
-    assert report.marks['order: cusps'] == pytest.approx(1.0, abs=0.05)
-    late = [fault.number for fault in report.faults if fault.name == 'imu_one_step_late']
-    assert late == pytest.approx([1.0] * 3, abs=0.05)
-
-
-def test_mujoco_with_runge_kutta_passes_when_its_sensors_are_evaluated(mujoco_top):
-    report = grade(mujoco_top('RK4', forward=True))
-    assert report.passed, report
-    assert grade(mujoco_top('RK4'), scenes=SCENES[1:2]).names == ['imu_one_step_late']

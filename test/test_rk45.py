@@ -79,7 +79,7 @@ def test_dense_output_is_as_good_as_the_steps(motion_type):
         motion._next_step = h
         truth = np.array(fixed_steps(motion, 64, 0.37 * h)).view(float)
         motion._take_step()
-        middle = motion._interpolated(np.array([1]), np.array([0.37 * h]))[:, 0]
+        middle = motion._interpolated(np.array([0.37 * h]))[1][:, 0]
         errors.append(np.abs(middle - truth).max())
     ratios = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert np.all(ratios > 5.5)
@@ -346,13 +346,14 @@ def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
 
 
 @both_equations
-def test_an_error_that_is_no_number_is_no_small_error(motion_type):
+def test_an_error_that_is_no_number_is_no_small_error(motion_type, monkeypatch):
     motion = motion_type(top_of(LOOPING), start_of(LOOPING), 1e-9, 1e-10)
     y = motion._kept[0].y0
     for place in range(len(y)):
         difference = [0.0 * unknown for unknown in y]
         difference[place] = math.nan + 0.0 * y[place]
-        motion._step = lambda f, h, y, k1, rest=tuple(difference): (y, k1, rest)
+        monkeypatch.setattr(dormand_prince, 'unrolled_step', lambda size, is_complex, rest=tuple(
+            difference): lambda f, h, y, k1: (y, k1, rest))
         with pytest.raises(IntegrationError, match='collapsed'):
             motion._take_step()
 

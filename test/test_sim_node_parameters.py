@@ -26,9 +26,7 @@ def shared(tmp_path_factory):
 @pytest.fixture
 def node(shared, tmp_path):
     """A paused node at its start."""
-    shared.node._session.stop()
-    shared.node.start_again({**shared.first_values, 'record.uri': str(tmp_path / 'run.mcap')},
-                            paused=True)
+    shared.begin_again({**shared.first_values, 'record.uri': str(tmp_path / 'run.mcap')})
     return shared
 
 

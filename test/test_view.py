@@ -60,7 +60,7 @@ def log(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def shown(log):
-    return logs.read_log(log)
+    return logs.read_logs([log])[0]
 
 
 def truth(shown, stamp_ns):
@@ -122,7 +122,7 @@ def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     assert lines[-1, 1] == pytest.approx(
         model.reach(shown) * np.ravel(exact.rows_axis), abs=1e-6)
     assert len(lines) == 200            # 2 s at 100 Hz
-    track = Track(parameters.checked({}))
+    track = Track('', parameters.checked({}))
     half = math.sqrt(0.5)
     track.add('pose', Samples(np.arange(4), np.array(
         [(0, 0, 0, 1, 0, 0, 0), (0, 0.01, 0, 1, 0, 0, 0), (0, half, 0, half, 0, 0, 0),
@@ -132,7 +132,7 @@ def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
 
 def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
     moved = solve(shown.top, parameters.start_state(shown.values), np.arange(20) * 0.04)
-    track = Track(shown.values)
+    track = Track('', shown.values)
     track.add('joint_states', Samples(np.arange(20) * 40_000_000, np.column_stack(
         (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
     stamps_ns, axis, joined = model.path(track, 0, NANOSECONDS)
@@ -147,7 +147,7 @@ def plotted(shown, stamp_ns):
     """Return the lines of the plots of 2.5 s, by plot and name."""
     top = plots.Shown(shown, stamp_ns, shown.origin_ns, stamp_ns, shown.origin_ns)
     return {(plot.title, line.name): (plot, line) for plot in (
-        *plots.motion_plots(top), *plots.accuracy_plots(top)) for line in plot.lines}
+        *plots.motion_plots([top]), *plots.accuracy_plots([top])) for line in plot.lines}
 
 
 def test_plots_are_the_published_numbers(shown):
@@ -208,7 +208,7 @@ def test_a_plot_is_svg_with_title_units_and_its_points():
 @pytest.mark.parametrize('scene', parameter_files('scene'))
 def test_every_scene_has_words_and_plots(scene):
     values = parameters.checked(read_scene(parameter_files('scene')[scene]))
-    track, start = Track(values), parameters.start_state(values)
+    track, start = Track('', values), parameters.start_state(values)
     moved = solve(track.top, start, np.arange(300) * 0.01)
     track.add('joint_states', Samples(np.arange(300) * 10_000_000, np.column_stack(
         (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
@@ -216,7 +216,7 @@ def test_every_scene_has_words_and_plots(scene):
     (motion,) = track.motions
     words = text.words(track, motion, 0, 0)
     assert SENTENCES[motion.description.name] in words and 'nan' not in words
-    for plot in plots.motion_plots(plots.Shown(track, 0, 0, NANOSECONDS, 0)):
+    for plot in plots.motion_plots([plots.Shown(track, 0, 0, NANOSECONDS, 0)]):
         ElementTree.fromstring(svg.draw(plot))
         assert 'nan' not in svg.draw(plot)
 
@@ -228,7 +228,7 @@ def test_every_scene_has_words_and_plots(scene):
     (State(theta=1.0, theta_dot=0.5, l3=0.0, lz=0.0), 'planar pendulum, swinging')])
 def test_a_live_track_names_the_motion_from_its_samples(start, words):
     values = parameters.checked({})
-    track = Track(values)
+    track = Track('', values)
     moved = solve(track.top, start, np.arange(200) * 0.01)
     rows = np.column_stack((moved.quaternion, moved.angular_velocity, moved.phi_dot))
     for k, row in enumerate(rows):
@@ -240,11 +240,24 @@ def test_a_live_track_names_the_motion_from_its_samples(start, words):
     assert (energy, l3, lz) == pytest.approx((moved.energy[50], start.l3, start.lz), abs=1e-9)
 
 
+def test_each_of_two_logs_has_its_own_time(page, tmp_path):
+    paths = [tmp_path / f'{epoch}.mcap' for epoch in (1, 1000)]
+    for path in paths:
+        assert simulate.main(['--quiet', '--duration', '2', '-o', str(path), '--epoch',
+                              path.stem]) == 0
+    player = logs.Player(page, logs.read_logs(paths))
+    player.draw_next(0.5)
+    assert player.length == 2.0
+    assert page._words.content.count('t = 0.500 s, stamp ') == 2
+    assert page._plots.content.count('aria-label="Tilt"') == 1
+    assert page._plots.content.count('stroke-dasharray="5 3"') >= 4       # of the second log
+
+
 def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
     path = tmp_path / 'shuttle.mcap'
     assert simulate.main(['--scene', 'shuttle', '--duration', '3', '-o', str(path)]) == 0
-    track = logs.read_log(path)
-    player = logs.Player(page, track)
+    track, = logs.read_logs([path])
+    player = logs.Player(page, [track])
     for t, x in ((1.0, 1.0), (2.2, 4.0 + 0.2 * 4.0)):       # 2 m/s^2, then 4 m/s
         player.draw(t)
         reach = abs(model.reach(track))
@@ -263,7 +276,7 @@ def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
 def test_a_truncated_log_is_shown_as_far_as_it_goes(log, shown, tmp_path):
     path = tmp_path / 'torn.mcap'
     path.write_bytes(log.read_bytes()[:-60_000])
-    part = logs.read_log(path)
+    part, = logs.read_logs([path])
     assert part.note.startswith('torn.mcap: it is truncated') and not shown.note
     assert shown.span[0] == part.span[0] < part.span[1] <= shown.span[1]
 
@@ -285,22 +298,22 @@ def foreign(log, path, topics):
 def test_the_log_of_another_program_shows_its_attitudes(log, shown, page, tmp_path, topic):
     # The first topic has no orientation.
     path = foreign(log, tmp_path / 'run.mcap', {'/imu/data_raw': '/raw', topic: '/robot/state'})
-    track = logs.read_log(path)
+    track, = logs.read_logs([path])
     assert not track.has_body and track.origin_ns == track.span[0]
     if topic == '/pose':
         assert track.attitudes.rows == pytest.approx(shown.samples['pose'].rows, abs=1e-15)
-    player = logs.Player(page, track)
+    player = logs.Player(page, [track])
     player.draw_next(0.5)
     assert 'The body is not in this log' in page._words.content
     assert page._plots.content.count('<svg') == 1       # the tilt
     names = set(page.server.scene._handle_from_node_name)
-    assert '/top/body/disc' in names and '/top/body/rim' not in names
+    assert '/top0/body/disc' in names and '/top0/body/rim' not in names
 
 
 def test_a_log_without_attitudes_is_refused(log, tmp_path):
     path = foreign(log, tmp_path / 'raw.mcap', {'/imu/data_raw': '/raw'})
     with pytest.raises(LogError, match=r'raw.mcap: no attitude in it \(sensor_msgs/msg/Imu, '):
-        logs.read_log(path)
+        logs.read_logs([path])
 
 
 def test_a_page_as_a_file_is_never_overwritten(log, tmp_path, capsys):
@@ -313,7 +326,7 @@ def test_a_page_as_a_file_is_never_overwritten(log, tmp_path, capsys):
 
 
 def test_a_player_follows_its_buttons_and_the_slider(shown, page):
-    player = logs.Player(page, shown)
+    player = logs.Player(page, [shown])
     assert player.length == pytest.approx(6.0)
     player.draw_next(1.0)
     assert player._slider.value == pytest.approx(1.0)
@@ -345,6 +358,7 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port(page):
 
 
 @pytest.mark.parametrize(('arguments', 'told'), [
+    (['LOG', 'LOG', 'LOG'], '3 logs: must be one or two'),
     (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535')])
 def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
     assert command.main([*(str(log) if word == 'LOG' else word
@@ -361,10 +375,10 @@ def page():
 
 def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
     stamp_ns = shown.origin_ns + NANOSECONDS
-    page.set_track(shown)
+    page.set_tracks([shown])
     page._trace.value = page._bounds.value = False
     page.draw(stamp_ns, shown.origin_ns)
-    top = page.top
+    (top,) = page._tops
     page.arrows[0].value = True
     page.draw(stamp_ns, shown.origin_ns)
     assert top._arrows[0].points[0, 1] == pytest.approx(

@@ -101,7 +101,7 @@ def test_live(browser, peer, tmp_path):
             visit.read('The pivot moves')
             visit.read(r'Pivot\s+0\.\d+, 0, 0')
             assert visit.place('/ground')[0] < 0.0 == visit.place('/ground')[1]
-            assert visit.place('/top') == [0, 0, 0]
+            assert visit.place('/top0') == [0, 0, 0]
 
             # A chosen scene is another top, from its start.
             visit.choose('scene', 'wavy')
@@ -154,22 +154,28 @@ def test_log(browser, tmp_path):
 
 
 def test_file_without_a_network(browser, tmp_path):
-    page, log = tmp_path / 'page.html', write_log(tmp_path / 'cusp.mcap', '6')
-    assert command.main([str(log), '--html', str(page)]) == 0
-    assert page.stat().st_size < 3e6        # for 6 s
-    poses = poses_of(log)
+    page, ride = tmp_path / 'page.html', tmp_path / 'ride.mcap'
+    assert simulate.main(['--scene', 'shuttle', '--duration', '6', '-o', str(ride)]) == 0
+    log = write_log(tmp_path / 'cusp.mcap', '6')
+    assert command.main([str(ride), str(log), '--html', str(page)]) == 0
+    assert page.stat().st_size < 3e6        # for 6 s of two tops
+    poses = poses_of(ride)
     with Visit(browser, str(page), offline=True, framed=True) as visit:
         # Before the first picture, and where it begins again, viser turns nothing.
         shown = wait_for('a picture', lambda: turned(visit.attitude()))
         assert min(apart(shown, pose) for pose in poses.values()) < 1e-6
-        visit.wait("String(window.__viserMutable.nodePoseData['/top/body'].wxyz) != "
+        visit.wait("String(window.__viserMutable.nodePoseData['/top0/body'].wxyz) != "
                    f"'{','.join(map(str, [shown[3], *shown[:3]]))}'")
 
-        # Beside it: what one sees before and after the command, legend and plots.
-        for words in ('cusp.mcap', '[Cc]usps', 'Released without a push', '[Ll]oops',
+        # Beside it: the logs, what one sees before and after the command, legend and plots.
+        for words in ('ride.mcap', 'cusp.mcap', '[Cc]usps', 'Released without a push', '[Ll]oops',
                       'trace of the axis', 'Effective potential', 'Energy', 'Tilt',
-                      'Precession rate'):
+                      'Precession rate', 'The pivot moves'):
             visit.read(words)
+        # The ground moves under the first top.
+        place = visit.place('/top0')
+        visit.wait("window.__viserMutable.nodePoseData['/ground'].position[0] < -0.1")
+        assert visit.place('/top0') == place
         ends = visit.page.evaluate("[...document.querySelectorAll('.plot')].slice(1).map("
                                    "plot => plot.dataset.x)")
         assert ends == ['0 6'] * 5

@@ -20,7 +20,7 @@ from spinning_top_sim.__main__ import COMMANDS, main
 
 ROOT = Path(__file__).parents[1]
 NAME = 'spinning_top_sim'
-SDIST = 'import sys, setuptools.build_meta; setuptools.build_meta.build_sdist(sys.argv[1])'
+BUILD = 'import sys, setuptools.build_meta as m; getattr(m, sys.argv[1])(sys.argv[2])'
 
 
 def run(*command, cwd=ROOT, **variables):
@@ -31,26 +31,23 @@ def run(*command, cwd=ROOT, **variables):
     return done.returncode, done.stdout, done.stderr
 
 
-def pip(*arguments, **variables):
-    code, _, err = run(sys.executable, '-m', 'pip', '--disable-pip-version-check', *arguments,
-                       **variables)
-    assert code == 0, err
-
-
 @pytest.fixture(scope='module')
 def wheel(tmp_path_factory):
     """Return the wheel that is made of the source distribution."""
     folder = tmp_path_factory.mktemp('build')
     settings = folder / 'setup.cfg'
     settings.write_text(f'[build]\nbuild_base={folder}/build\n[egg_info]\negg_base={folder}\n')
-    code, _, err = run(sys.executable, '-c', SDIST, folder, DIST_EXTRA_CONFIG=str(settings))
-    assert code == 0, err
+
+    def build(what, place):
+        code, _, err = run(sys.executable, '-c', BUILD, what, folder, cwd=place,
+                           DIST_EXTRA_CONFIG=str(settings))
+        assert code == 0, err
+
+    build('build_sdist', ROOT)
     (archive,) = folder.glob('*.tar.gz')
     with tarfile.open(archive) as sdist:
         sdist.extractall(folder, filter='data')
-    (unpacked,) = folder.glob('spinning_top_sim-*/')
-    pip('wheel', '--no-deps', '--no-build-isolation', '--no-index', '-w', folder, unpacked,
-        DIST_EXTRA_CONFIG=str(settings))
+    build('build_wheel', *folder.glob('spinning_top_sim-*/'))
     (made,) = folder.glob('*.whl')
     return made
 
@@ -69,7 +66,10 @@ def empty(tmp_path_factory, wheel):
     folder = tmp_path_factory.mktemp('empty')
     code, _, err = run(sys.executable, '-m', 'venv', '--without-pip', folder)
     assert code == 0, err
-    pip('--python', folder / 'bin/python', 'install', '--no-deps', '--no-index', wheel)
+    code, _, err = run(sys.executable, '-m', 'pip', '--disable-pip-version-check', '--python',
+                       folder / 'bin/python', 'install', '--no-deps', '--no-index',
+                       '--no-compile', wheel)
+    assert code == 0, err
     (packages,) = folder.glob('lib/python*/site-packages')
     for distribution in dependencies('spinning_top_sim'):
         tops = {file.parts[0] for file in distribution.files if file.parts[0] != '..'}
@@ -139,14 +139,6 @@ def run_all(empty, folder, lines):
     return json.loads(out)
 
 
-def test_help_needs_nothing(empty, tmp_path):
-    names = ['', *COMMANDS]
-    for name, (code, out, err) in zip(names, run_all(
-            empty, tmp_path, [[*name.split(), '--help'] for name in names]), strict=True):
-        assert (code, err) == (0, '')
-        assert out.startswith(f'usage: spinning-top {name}')
-
-
 REMEDIES = [
     (['node'], "pip install 'ros-jazzy-rclpy"),
     (['replay', 'a.mcap'], "pip install 'ros-jazzy-rclpy"),
@@ -160,12 +152,24 @@ REMEDIES = [
 ]
 
 
-def test_what_is_missing_is_told_with_its_remedy(empty, tmp_path):
-    assert main(['simulate', '--duration', '0.1', '--quiet', '-o', str(tmp_path / 'a.mcap')]) == 0
-    shutil.copy(ROOT / 'examples/ensemble.yaml', tmp_path / 'e.yaml')
-    lines = [arguments for arguments, _ in REMEDIES]
-    for (arguments, remedy), (code, _, err) in zip(
-            REMEDIES, run_all(empty, tmp_path, lines), strict=True):
+@pytest.fixture(scope='module')
+def answers(empty, tmp_path_factory):
+    """Return what the commands of REMEDIES say, and all --help after it."""
+    folder = tmp_path_factory.mktemp('answers')
+    assert main(['simulate', '--duration', '0.1', '--quiet', '-o', str(folder / 'a.mcap')]) == 0
+    shutil.copy(ROOT / 'examples/ensemble.yaml', folder / 'e.yaml')
+    return run_all(empty, folder, [*(arguments for arguments, _ in REMEDIES), ['--help'],
+                                   *([name, '--help'] for name in COMMANDS)])
+
+
+def test_help_needs_nothing(answers):
+    for name, (code, out, err) in zip(['', *COMMANDS], answers[len(REMEDIES):], strict=True):
+        assert (code, err) == (0, '')
+        assert out.startswith(f'usage: spinning-top {name}')
+
+
+def test_what_is_missing_is_told_with_its_remedy(empty, answers):
+    for (arguments, remedy), (code, _, err) in zip(REMEDIES, answers, strict=False):
         assert code in (1, 2)
         assert err.startswith(f'spinning-top {arguments[0]}: ') and err.count('\n') == 1
         assert f'{empty}/bin/python -m {remedy}' in err

@@ -77,14 +77,12 @@ class Ahrs:
         if self._attitude is None:
             start = from_two_vectors(accelerometer, magnetometer if uses_field else None)
             self._attitude = (self._turn.inv() * Rotation.from_quat(start)).as_quat()[W_FIRST]
-        elif self._name == 'EKF':
-            # This attribute, not the argument, tells it whether there is a magnetometer.
-            self._filter.mag = np.empty(0) if uses_field else None
-            self._attitude = self._filter.update(self._attitude, *readings, dt=dt)
-        elif uses_field:
-            self._attitude = self._filter.updateMARG(self._attitude, *readings, dt=dt)
         else:
-            self._attitude = self._filter.updateIMU(self._attitude, *readings, dt=dt)
+            # This attribute, not the argument, tells the EKF whether there is a magnetometer.
+            self._filter.mag = np.empty(0) if uses_field else None
+            update = ('update' if self._name == 'EKF' else
+                      'updateMARG' if uses_field else 'updateIMU')
+            self._attitude = getattr(self._filter, update)(self._attitude, *readings, dt=dt)
         attitude = Rotation.from_quat(np.asarray(self._attitude)[W_LAST])
         turned: Reals = (self._turn * attitude).as_quat()
         return turned

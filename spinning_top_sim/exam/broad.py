@@ -6,6 +6,7 @@ Examines filters with trials of BROAD: readings of a real IMU beside an optical 
 Estimation", Data 2021, 6, 72)
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,18 +55,11 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     of the errors in motion, of each trial and their means.  `invalid_output` is the only fault
     that can be found.
 
-    Parameters
-    ----------
     make_filter, subject : as for `examine`
-    folder : path
-        With files of BROAD: .mat, or .hdf5, which need h5py.
-    show : callable, optional
-        Is called with the number of trials that are done.
+    folder : with files of BROAD: .mat, or .hdf5, which need h5py
+    show : is called with the number of trials that are done
 
-    Raises
-    ------
-    ValueError
-        If there is no folder, no trial in it, or a file is none.
+    Raises ValueError if there is no folder, no trial in it, or a file is none.
     """
     return judge(make_filter, map(read_trial, trials_in(folder)), 'data', subject, show=show)
 
@@ -73,7 +67,7 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
 def judge(make_filter: MakeFilter, trials: Iterable[Trial], kind: str, subject: str | None,
           feed: Feed = feed_apart, show: Callable[[float], object] = lambda done: None) -> Report:
     """Return the report on a filter in trials; the names of its measures begin with `kind`."""
-    found: dict[str, list[measures.Rmse]] = {}
+    found: dict[str, list[tuple[float, ...]]] = {}
     outcomes, failed, means = [], [], {}
     for number, trial in enumerate(trials, start=1):
         try:
@@ -81,15 +75,23 @@ def judge(make_filter: MakeFilter, trials: Iterable[Trial], kind: str, subject: 
         except InvalidOutputError as error:
             failed.append(str(error))
         else:
-            found.setdefault(f'{kind}_rms_{trial.run.name}_deg', []).append(
-                measures.rmse(outcome.estimates, outcome.run.truth))
+            one = measures.rmse(outcome.estimates, outcome.run.truth)
+            # The truth of real data has gaps.
+            alone = (measures.unaided(trial.run, trial.counts).total if kind == 'field'
+                     else math.nan)
+            found.setdefault(trial.run.name, []).append((*one, one.total / alone))
         show(number)
     if found:
-        names = (f'{kind}_rms_deg', f'{kind}_heading_rms_deg', f'{kind}_tilt_rms_deg')
-        means = dict(zip(names, np.mean([one for trials in found.values() for one in trials],
-                                        axis=0).tolist(), strict=True))
-        means |= {name: float(np.mean([one.total for one in same]))
-                  for name, same in found.items()}
+        names = f'{kind}_rms_deg', f'{kind}_heading_rms_deg', f'{kind}_tilt_rms_deg'
+        means = dict(zip(names, np.mean([one for same in found.values() for one in same],
+                                        axis=0).tolist(), strict=False))
+    for name, same in found.items():
+        total, ratio = np.array(same)[:, [0, 3]].T
+        means |= {f'{kind}_rms_{name}_deg': float(np.mean(total)),
+                  f'{kind}_rms_{name}_spread_deg': float(np.std(total, ddof=1))
+                  if len(same) > 1 else math.nan,
+                  f'{kind}_{name}_to_gyroscope': float(np.mean(ratio))}
+    means = {name: value for name, value in means.items() if not math.isnan(value)}
     return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
                   [Fault('invalid_output', '; '.join(failed))] if failed else [], means, outcomes)
 

@@ -9,13 +9,12 @@ disappears, it was the cause.
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import measures
+from spinning_top_sim.exam import measures, scenarios
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.trial import ChangeRows, Hypothesis, Outcome, changed
 
@@ -27,7 +26,6 @@ FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component
 
 # Thresholds; docs/exam.md compares them with the values of filters.  Errors are in rad.
 TILT, HEADING = np.radians((0.3, 0.8)).tolist()         # rms of a right filter, no noise
-GROSS = np.radians(3.0)         # a smaller error is no misreading
 DIVERGED, GROWS = np.radians(10.0), 1.2     # from one quarter to the next
 EXPLAINED = 0.25                # of the error is left at most when its cause is undone
 FIRST_ORDER = np.radians(0.2)   # on the fast motion
@@ -87,22 +85,34 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
             for outcome, one in zip(settled, errors, strict=True)])))}
 
 
+def quality(outcomes: Sequence[Outcome], unaided: Sequence[measures.Rmse],
+            imu: Mapping[str, Any], absolute: bool) -> dict[str, float]:
+    """
+    Return ratios of errors to the least that white noise allows, and to those without a filter.
+
+    A Kalman filter of a random walk of density q, read with noise of density r, has the variance
+    sqrt(q r) (Bar-Shalom et al. 2001, 4.5).
+    """
+    rate, force, field = (imu.get(f'{name}noise_density', 0.0)
+                          for name in ('imu.gyroscope_', 'imu.accelerometer_', 'mag.'))
+    horizontal = math.hypot(*imu.get('mag.field', scenarios.FIELD)[:2])
+    found: dict[str, float] = {}
+    for what, variance in (('tilt', 2.0 * rate * force / scenarios.GRAVITY), (
+            'heading', rate * field / max(horizontal, 1e-12)))[:1 + absolute]:
+        errors = np.array([getattr(measures.rmse(one.estimates, one.run.truth), what)
+                           for one in (outcome.last() for outcome in outcomes)])
+        least = math.degrees(math.sqrt(variance)) or math.nan
+        found |= {f'{what}_to_bound': float(np.mean(errors)) / least,
+                  f'{what}_to_bound_spread': float(np.std(errors, ddof=1)) / least
+                  if len(errors) > 1 else math.nan,
+                  f'{what}_to_gyroscope': float(np.mean(errors / [
+                      max(getattr(one, what), 1e-9) for one in unaided]))}
+    return found
+
+
 def error_of(outcome: Outcome, absolute: bool) -> float:
     """Return the rms attitude error [rad]."""
     return rms(outcome.errors.attitude(absolute))
-
-
-def explain(outcome: Outcome, absolute: bool) -> Hypothesis | None:
-    """Return the misreading of attitudes that explains the error of a settled filter, or None."""
-    before = error_of(outcome, absolute)
-    after, best = min((
-        (error_of(replace(outcome, estimates=one.read(outcome.estimates)), absolute), one)
-        for one in READINGS), key=lambda pair: pair[0])
-    if before < GROSS or after > EXPLAINED * before:
-        return None
-    text = (f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
-            'measures are those after this correction')
-    return ambiguous(best._replace(text=text), absolute)
 
 
 def ambiguous(one: Hypothesis, absolute: bool) -> Hypothesis:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import scenarios
-from spinning_top_sim.exam.measures import rms
+from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.exam.trial import Outcome
 
@@ -80,44 +80,29 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
                       slice(end - len(motion.t) // 2, end), kicks)
 
 
-class Gyroscope(NamedTuple):
+def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Reals, int]:
     """
-    The response to the gyroscope: increments of the attitude over those of the sensor.
+    Fit the response to the gyroscope: increments of the attitude over those of the sensor.
 
-    matrix : (3, 3), the identity for a right filter
-    late : delay in samples
-    scatter : share of the squared increments that the matrix leaves
+    Returns two matrices (3, 3) from whole turns and from their begins, the identity for a right
+    filter, and the delay in samples that leaves least of whole turns.
     """
-
-    matrix: Reals
-    late: int
-    scatter: float
-
-    @property
-    def off(self) -> float:
-        """The largest deviation of the matrix from the identity."""
-        return float(np.max(np.abs(self.matrix - np.eye(3))))
-
-
-def increments(quaternions: Reals) -> Reals:
-    """Return the rotation vectors of the steps (n, 3) about axes of the sensor."""
-    turns = Rotation.from_quat(quaternions)
-    return np.concatenate((np.zeros((1, 3)), (turns[:-1].inv() * turns[1:]).as_rotvec()))
-
-
-def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Gyroscope, Gyroscope]:
-    """Fit the response to whole turns, at the delay that leaves least, and to their begins."""
     estimated, true = increments(outcome.estimates), increments(outcome.run.truth)
 
-    def fit(length: int, late: int) -> Gyroscope:
+    def fit(length: int, late: int) -> tuple[Reals, float]:
         rows = (turns[:, np.newaxis] + np.arange(length)).ravel()
         given, response = true[rows - late], estimated[rows]
         matrix = np.linalg.lstsq(given, response, rcond=None)[0]
-        return Gyroscope(matrix.T, late, float(
-            np.sum((response - given @ matrix) ** 2) / max(np.sum(response ** 2), 1e-12)))
+        return matrix.T, rms(response - given @ matrix)
 
-    return (min((fit(WHOLE, late) for late in range(LATEST + 1)), key=lambda one: one.scatter),
-            fit(EARLY, 0))
+    fits = [fit(WHOLE, late) for late in range(LATEST + 1)]
+    late = int(np.argmin([left for _, left in fits]))
+    return fits[late][0], fit(EARLY, 0)[0], late
+
+
+def off(*matrices: Reals) -> float:
+    """Return how far the nearest of some matrices is from the identity."""
+    return float(min(np.max(np.abs(matrix - np.eye(3))) for matrix in matrices))
 
 
 def affine_of(readings: Reals, estimated: Rotation, level: Sequence[int],
@@ -141,6 +126,7 @@ def affine_of(readings: Reals, estimated: Rotation, level: Sequence[int],
     entries = np.append(np.zeros(first), found)
     change = np.eye(4)
     change[:3] += np.hstack((entries[:9].reshape(3, 3), entries[9:, np.newaxis]))
+    change[:3] /= np.median(np.diag(change)[:3])    # most axes are right
     return change, rms(matrix @ entries - wanted) / max(rms(wanted), 1e-6)
 
 

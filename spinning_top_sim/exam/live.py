@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
@@ -24,6 +23,7 @@ from sensor_msgs.msg import Imu, MagneticField
 
 from spinning_top_sim.exam.examiner import examine
 from spinning_top_sim.exam.report import Report
+from spinning_top_sim.exam.scenarios import Reals
 from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.attitudes import NO_ORIENTATION
@@ -50,24 +50,12 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
     """
     Examine a ROS node.
 
-    Parameters
-    ----------
-    topic : str
-        Topic of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
-    command : str, optional
-        Command that starts the node for each run, without a shell; default: the node runs.
-    level, imu, seeds : optional
-        As for `examine`.
+    topic : of its attitudes, sensor_msgs/Imu, each with the stamp of its sample
+    command : starts the node for each run, without a shell; by default the node runs
+    level, imu, seeds : as for `examine`
 
-    Returns
-    -------
-    Report
-        Faults with their evidence, and measures.
-
-    Raises
-    ------
-    NodeError
-        If the node is not found, or other nodes publish on its topics.
+    Returns faults with their evidence, and measures.  Raises NodeError if the node is not found,
+    or other nodes publish on its topics.
     """
     with NodeExam(topic, command) as node:
         return examine(node.start, level, imu, seeds, subject=command or topic,
@@ -94,7 +82,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._subscription = self._node.create_subscription(Imu, topic, self._take, profile)
         self._process: subprocess.Popen[bytes] | None = None
         self._answers: dict[int, Any] = {}          # by stamp [ns]
-        self.covariance: NDArray[np.float64] | None = None
+        self.covariance: Reals | None = None
 
     def __exit__(self, *exception: object) -> None:
         self._end_process()
@@ -113,7 +101,10 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         there = self._wait(self.is_there, PATIENCE_S)
         if there and self._process is None:
             self._wait(lambda: False, DISCOVERY_S)
-        self._find_others()
+        for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
+            if (count := self._node.count_publishers(name)) > 1:
+                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
+                                'needs the topic alone')
         if not there:
             text = (f'no node reads {IMU_TOPIC} and publishes {self._topic} within '
                     f'{PATIENCE_S:g} s: check that it runs, its ROS_DOMAIN_ID '
@@ -126,12 +117,25 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self.covariance = None
         return self
 
-    def update(self, gyroscope: NDArray[np.float64], accelerometer: NDArray[np.float64],
-               magnetometer: NDArray[np.float64] | None, dt: float) -> NDArray[np.float64]:
+    def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
+               dt: float) -> Reals:
         """Publish the readings, and wait for the attitude with their stamp."""
         self._now_ns += round(dt * NANOSECONDS)
         self._sent += 1
-        self._publish(gyroscope, accelerometer, magnetometer)
+        clock, imu = Clock(), Imu()
+        clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
+        imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
+        imu.orientation_covariance[0] = NO_ORIENTATION
+        field = MagneticField(header=imu.header)
+        for vector, values in ((imu.angular_velocity, gyroscope),
+                               (imu.linear_acceleration, accelerometer),
+                               (field.magnetic_field, magnetometer)):
+            if values is not None:
+                vector.x, vector.y, vector.z = values.tolist()
+        self._clock.publish(clock)
+        if magnetometer is not None:
+            self._field.publish(field)
+        self._imu.publish(imu)
         patience = PATIENCE_S if self._answered else FIRST_PATIENCE_S
         if not self._wait(lambda: self._now_ns in self._answers, patience):
             if self._command is None and not self.is_there():
@@ -149,34 +153,10 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         q = message.orientation
         return np.array((q.x, q.y, q.z, q.w))
 
-    def _publish(self, gyroscope: NDArray[np.float64], accelerometer: NDArray[np.float64],
-                 magnetometer: NDArray[np.float64] | None) -> None:
-        clock, imu = Clock(), Imu()
-        clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
-        imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
-        imu.orientation_covariance[0] = NO_ORIENTATION
-        for vector, values in ((imu.angular_velocity, gyroscope),
-                               (imu.linear_acceleration, accelerometer)):
-            vector.x, vector.y, vector.z = values.tolist()
-        self._clock.publish(clock)
-        if magnetometer is not None:
-            field = MagneticField(header=imu.header)
-            (field.magnetic_field.x, field.magnetic_field.y,
-             field.magnetic_field.z) = magnetometer.tolist()
-            self._field.publish(field)
-        self._imu.publish(imu)
-
     def is_there(self) -> bool:
         """Return whether a node reads the samples, and one publishes the attitudes."""
         return bool(self._imu.get_subscription_count()
                     and self._node.count_publishers(self._topic))
-
-    def _find_others(self) -> None:
-        """Raise NodeError if a topic of the exam has several publishers."""
-        for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
-            if (count := self._node.count_publishers(name)) > 1:
-                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
-                                'needs the topic alone')
 
     def _wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Spin until a condition holds; return False on timeout.  Raise if the node has ended."""

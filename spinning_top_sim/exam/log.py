@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from spinning_top_sim.exam import diagnosis
-from spinning_top_sim.exam.diagnosis import Fault
+from spinning_top_sim.exam.diagnosis import Fault, degrees
 from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.scenarios import OF_PLACE, Reals, Truth
+from spinning_top_sim.exam.scenarios import OF_PLACE, Reals, Run
 from spinning_top_sim.exam.trial import Outcome, is_indefinite, no_attitudes, one_line
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.writer import METADATA_NAME
@@ -31,8 +31,8 @@ from spinning_top_sim.tools.attitudes import LAYOUTS, decode
 # about the body.
 TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
 ODOMETRY_OF_SENSOR = 'ground_truth/imu_odom'
-NORTHS = TRUE, MAGNETIC = 'true', 'magnetic'
 LONGEST_GAP_S = 0.1             # of the truth, across which it is interpolated
+GROSS = np.radians(3.0)         # a smaller error is no misreading
 FEWEST = 100                    # attitudes in a log that can be judged
 
 
@@ -49,26 +49,13 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     """
     Examine the attitudes of a topic.
 
-    Parameters
-    ----------
-    path : Path
-        An MCAP file.
-    topic : str
-        Topic of the attitudes q(world <- sensor); its type must be one of LAYOUTS.
-    truth : str, optional
-        Topic of the truth; default: the first of TRUTHS.
-    north : {'true', 'magnetic'}, optional
-        From which the heading counts; by default it needs only be steady.
+    path : of an MCAP file
+    topic : of the attitudes q(world <- sensor); its type must be one of LAYOUTS
+    truth : topic of the truth; by default the first of TRUTHS
+    north : 'true' or 'magnetic', from which the heading counts; by default it need only be steady
 
-    Returns
-    -------
-    Report
-        Faults that show in a log, and measures.
-
-    Raises
-    ------
-    LogError, ValueError
-        If the file is no log, or lacks what the exam needs.
+    Returns the faults that show in a log, and measures.  Raises LogError or ValueError if the file
+    is no log, or lacks what the exam needs.
     """
     with LogReader(path) as reader:
         examined = _topic(reader, topic)
@@ -77,11 +64,10 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
         true = _read(reader, true_topic)
         turns = _of_sensor(true_topic, true, _parameters(reader), north)
     subject = one_line(f'{topic} of {path.name}')
-    invalid = _invalid_output(estimates)
-    if invalid is not None:
-        return Report(subject, [invalid], {})
-    return _judge(subject, _beside(one_line(topic), estimates, true.stamps_ns, turns),
-                  north is not None)
+    if invalid := _invalid_output(estimates):
+        return Report(subject, invalid, {})
+    outcome = _beside(one_line(topic), estimates, true.stamps_ns, turns)
+    return _judge(subject, outcome, north is not None)
 
 
 def _topic(reader: LogReader, name: str) -> LogTopic:
@@ -138,7 +124,7 @@ def _of_sensor(topic: LogTopic, true: Attitudes, values: dict[str, Any],
     turns = Rotation.from_quat(true.quaternions)
     if not (topic.type_name == 'sensor_msgs/msg/Imu' or topic.name.endswith(ODOMETRY_OF_SENSOR)):
         turns = turns * Rotation.from_euler('xyz', values.get('imu.rpy', (0.0, 0.0, 0.0)))
-    if north == MAGNETIC:
+    if north == 'magnetic':
         if 'mag.field' not in values:
             raise ValueError('the log does not say where magnetic north is')
         east_part, north_part, _ = values['mag.field']
@@ -146,19 +132,17 @@ def _of_sensor(topic: LogTopic, true: Attitudes, values: dict[str, Any],
     return turns
 
 
-def _invalid_output(estimates: Attitudes) -> Fault | None:
+def _invalid_output(estimates: Attitudes) -> list[Fault]:
     covariances = estimates.covariances
     finite = np.all(np.isfinite(covariances), axis=(1, 2))
     impossible = ~finite & ~np.any(np.isnan(covariances), axis=(1, 2))      # NaN: unknown
     impossible[finite] = is_indefinite(covariances[finite])
-    for what, rows, wrong in (
-            ('quaternion', estimates.quaternions, no_attitudes(estimates.quaternions)),
-            ('covariance', covariances, np.flatnonzero(impossible))):
-        for k in wrong[:1]:
-            return Fault('invalid_output', f'{len(wrong)} of {len(rows)} messages have an invalid '
-                         f'{what}; the first, at {estimates.stamps_ns[k] * 1e-9:.9f} s, has '
-                         f'{rows[k].tolist()}')
-    return None
+    return [Fault('invalid_output', f'{len(wrong)} of {len(rows)} messages have an invalid '
+                  f'{what}; the first, at {estimates.stamps_ns[wrong[0]] * 1e-9:.9f} s, has '
+                  f'{rows[wrong[0]].tolist()}')
+            for what, rows, wrong in (
+                ('quaternion', estimates.quaternions, no_attitudes(estimates.quaternions)),
+                ('covariance', covariances, np.flatnonzero(impossible))) if len(wrong)][:1]
 
 
 def _beside(name: str, said: Attitudes, true_ns: NDArray[np.int64], turns: Rotation) -> Outcome:
@@ -179,23 +163,31 @@ def _beside(name: str, said: Attitudes, true_ns: NDArray[np.int64], turns: Rotat
     rates = np.stack([np.interp(t, middle, column) for column in step.T], axis=1)
     # The period of the filter, which may be shorter than that of the truth.
     dt = np.full(len(t), float(np.median(np.diff(said.stamps_ns))) * 1e-9)
-    return Outcome(Truth(name, t - t[0], dt, Slerp(times, turns)(t).as_quat(), rates),
+    readings = np.full((3, len(t), 3), np.nan)          # nothing asks for them
+    return Outcome(Run(name, t - t[0], dt, Slerp(times, turns)(t).as_quat(), rates, *readings),
                    said.quaternions[chosen], said.covariances[chosen],
                    np.full((len(t), 3), np.nan))
 
 
 def _judge(subject: str, outcome: Outcome, heading: bool) -> Report:
-    faults, corrected = [], outcome
-    found = diagnosis.explain(outcome.last(), heading)
-    if found is not None:
-        faults = [Fault(name, found.text) for name in found.faults]
-        corrected = replace(outcome, estimates=found.read(outcome.estimates))
+    settled, found = outcome.last(), None
+    before = diagnosis.error_of(settled, heading)
+    after, best = min(((diagnosis.error_of(replace(
+        settled, estimates=one.read(settled.estimates)), heading), one)
+        for one in diagnosis.READINGS), key=lambda pair: pair[0])
+    if before > GROSS and after < diagnosis.EXPLAINED * before:
+        found = diagnosis.ambiguous(best._replace(
+            text=f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
+            'measures are those after this correction'), heading)
+    corrected = outcome if found is None else replace(
+        outcome, estimates=found.read(outcome.estimates))
     offset, late = diagnosis.stamp_fault(corrected.last(), heading)
     consistency = diagnosis.consistency([corrected], heading)
+    # The first of these that applies, besides a misreading and a wrong stamp.
+    faults = [*([Fault(name, found.text) for name in found.faults] if found else ()),
+              *([late] if late else ())] or [fault for fault in (
+                  diagnosis.inaccuracy(outcome, heading),
+                  diagnosis.covariance_fault(consistency)) if fault][:1]
     measured = {**diagnosis.marks([corrected], heading), 'stamp_offset_s': offset.seconds,
                 **diagnosis.nees_marks(consistency)}
-    faults += [late] if late is not None else []
-    if not faults:      # the first of these that applies
-        faults += filter(None, [diagnosis.inaccuracy(outcome, heading)
-                                or diagnosis.covariance_fault(consistency)])
     return Report(subject, list(diagnosis.one_of_each(faults)), measured, [corrected])

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
-from spinning_top_sim.exam.scenarios import Reals
+from spinning_top_sim.exam.scenarios import Reals, Run
 
 CONVERGED_DEG = 1.0
 # Runs from which their spread is known, and how much of it has another reason than chance.
@@ -61,6 +62,21 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
     return Rmse(*(math.degrees(rms(one)) for one in (total, errors.turned(True), errors.tilt)))
 
 
+def unaided(run: Run, rows: slice | NDArray[np.intp]) -> Rmse:
+    """Return the errors, if small, of the gyroscope integrated from the truth without a filter."""
+    apart = run.dt[:, np.newaxis] * run.gyroscope - increments(run.truth)
+    error = np.cumsum(Rotation.from_quat(run.truth[1:]).apply(apart[1:]), axis=0)
+    error = np.concatenate((np.zeros((1, 3)), error))[rows]
+    return Rmse(*(math.degrees(rms(np.linalg.norm(part, axis=1)))
+                  for part in (error, error[:, 2:], error[:, :2])))
+
+
+def increments(quaternions: Reals) -> Reals:
+    """Return the rotation vectors of the steps (n, 3) about axes of the sensor."""
+    turns = Rotation.from_quat(quaternions)
+    return np.concatenate((np.zeros((1, 3)), (turns[:-1].inv() * turns[1:]).as_rotvec()))
+
+
 def rms(values: Reals) -> float:
     """Return the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
@@ -99,14 +115,11 @@ def time_offset(estimates: Reals, truth: Reals, rates: Reals, absolute: bool) ->
     absolute : True fixes h to 0; False is for a filter without a heading reference
     """
     true, est = Rotation.from_quat(truth), Rotation.from_quat(estimates)
-    columns = [-rates.ravel()]
-    if not absolute:
-        heading = errors_of(estimates, truth).heading
-        mean = math.atan2(np.mean(np.sin(heading)), np.mean(np.cos(heading)))
-        est = Rotation.from_rotvec((0.0, 0.0, -mean)) * est
-        columns.append(true.inv().apply((0.0, 0.0, 1.0)).ravel())
-    vector = (true.inv() * est).as_rotvec().ravel()
-    matrix = np.stack(columns, axis=1)
+    heading = errors_of(estimates, truth).heading
+    mean = 0.0 if absolute else math.atan2(np.mean(np.sin(heading)), np.mean(np.cos(heading)))
+    vector = (true.inv() * Rotation.from_rotvec((0.0, 0.0, -mean)) * est).as_rotvec().ravel()
+    vertical = true.inv().apply((0.0, 0.0, 1.0)).ravel()
+    matrix = np.stack((-rates.ravel(), vertical)[:2 - absolute], axis=1)
     found = np.linalg.lstsq(matrix, vector, rcond=None)[0]
     before, after = vector - matrix[:, 1:] @ found[1:], vector - matrix @ found
     return Offset(float(found[0]), math.sqrt(3.0) * rms(before), math.sqrt(3.0) * rms(after))

@@ -5,7 +5,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from xml.etree import ElementTree
 
 from spinning_top_sim.exam import diagnosis
 from spinning_top_sim.exam.diagnosis import FAULTS, Fault
@@ -19,6 +18,11 @@ MEANINGS = {
     'convergence_s': f'until the tilt error stays below {CONVERGED_DEG:g} deg',
     'heading_drift_deg_per_s': 'slope of the heading error',
     'stamp_offset_s': f'> 0: late; right from {diagnosis.AHEAD:g} to {diagnosis.DELAYED:g} steps',
+    'tilt_to_bound': 'of the least that white noise allows; mean over seeds',
+    'tilt_to_bound_spread': 'standard deviation over seeds',
+    'tilt_to_gyroscope': 'of the error of the gyroscope alone',
+    'heading_to_bound': 'the same of the heading', 'heading_to_bound_spread': '',
+    'heading_to_gyroscope': '',
     'order': 'p of error ~ rate^-p on the fast motion',
     'integration_error_deg': 'on the fast motion, without noise',
     'lever_arm_deg': f'tilt by motion 10 cm off the axis; fault from '
@@ -38,16 +42,10 @@ class Report:
     """
     The result of an exam; `str(report)` is readable.
 
-    Parameters
-    ----------
-    subject : str
-        Name of the filter.
-    found : sequence of Fault
-        The faults with their evidence.
-    measures : mapping
-        Measures by name, as docs/exam.md defines them; NaN: could not be measured.
-    outcomes : sequence of Outcome
-        Output of the filter in the runs, for pictures.
+    subject : name of the filter
+    found : the faults with their evidence
+    measures : by name, as docs/exam.md defines them; NaN: could not be measured
+    outcomes : output of the filter in the runs, for pictures
     """
 
     subject: str
@@ -87,6 +85,8 @@ class Report:
 
     def as_junit(self) -> str:
         """Return a test suite in JUnit XML with a test case for each fault of FAULTS."""
+        from xml.etree import ElementTree  # noqa: PLC0415 - slow
+
         suite = ElementTree.Element('testsuite', name=f'examine {self.subject}',
                                     tests=str(len(FAULTS)), failures=str(len(self.found)),
                                     errors='0', skipped='0')

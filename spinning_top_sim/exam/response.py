@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import diagnosis, excitation, measures, scenarios
 from spinning_top_sim.exam.diagnosis import HEADING, TILT, Fault, degrees
-from spinning_top_sim.exam.excitation import Gyroscope, axes, gyroscope_of, moved, words
+from spinning_top_sim.exam.excitation import axes, gyroscope_of, moved, off, words
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.exam.trial import (
@@ -43,6 +43,7 @@ LIKELY = 4                      # signed permutations of a sensor that are tried
 START = 50                      # samples after which a filter that starts has an attitude
 SURE = 0.2                      # of the largest error that explains: nothing else is tried
 WORST = 30.0                    # condition of a matrix that can be inverted
+EARLY_RESTS = slice(2, 5)       # when the error of the start is over
 STAYS = 0.98                    # of a kick
 # Of the search for an affine change: what a fit leaves of the error at rest; steps, and by what
 # the whole error falls in one.
@@ -56,13 +57,24 @@ STUCK = np.radians(1.0)         # by which attitudes differ at least
 Tried = tuple[Hypothesis, Outcome]
 
 
+def wired(name: str, text: str, matrix: Any, offset: Any = 0.0,
+          fault: str = '') -> Hypothesis:
+    """Return the hypothesis that the readings of a sensor need this matrix and offset."""
+    return Hypothesis((fault or f'{name}_wiring',), text, given=changed(
+        (name,), lambda rows: rows @ matrix.T + offset))
+
+
+UNITS = [wired('accelerometer', f'with the accelerometer multiplied by {by:.4g}', by * np.eye(3))
+         for by in (scenarios.GRAVITY, 1.0 / scenarios.GRAVITY)]
+LEVEL = Hypothesis(('magnetometer_wiring',), 'with the field of a level sensor',
+                   given=excitation.untilted)
+
+
 class Responses:
     """
-    The responses of one filter, and what they show.
+    The responses of one filter: faults, measures, and the inverses of causes that are undone.
 
     restarts : whether each run has a new filter
-    faults, measures : what is found
-    undone : inverses of the causes that are found, the last one first
     unclear : whether an error is left that would be taken for that by a lever arm or a bias
     """
 
@@ -75,6 +87,7 @@ class Responses:
         self.measures: dict[str, float] = {}
         self.undone: list[Hypothesis] = []
         self._harmless: list[Hypothesis] = []
+        self._early = np.eye(3)         # the response to the begin of turns
 
     def _follow(self, run: Run, undone: Sequence[Hypothesis] = ()) -> Outcome:
         """Return the outcome of a run, fed to a new filter."""
@@ -100,33 +113,45 @@ class Responses:
         self.measures |= {'tilt_clean_deg': float(max(clean[::2])),
                           'heading_clean_deg': float(max(clean[1::2]))}
         rest = self._rest()
+        if 'magnetometer_wiring' in dict(rest):     # a heading that nothing corrects is any
+            self.faults = [fault for fault in self.faults if fault.name != 'heading_offset']
         self.faults += rest
         self.unclear |= bool(rest)
         if self.unclear:
             self.faults[-1] = self.faults[-1]._replace(evidence=f'{self.faults[-1].evidence}; '
                                                        'no lever arm and no bias is judged')
 
-    def _clean(self, outcome: Outcome) -> Reals:
-        """Return errors of tilt and heading at rest, then in motion, rms [rad]."""
+    def _clean(self, outcome: Outcome, *places: Any) -> Reals:
+        """Return errors of tilt and heading, by default at rest, then in motion, rms [rad]."""
         errors = outcome.errors
         heading = self._absolute * errors.turned(True)
-        return np.array([rms(error[rows]) for rows in (self._rests, self._given.motion)
+        return np.array([rms(error[rows]) for rows in places or (self._rests, self._given.motion)
                          for error in (errors.tilt, heading)])
 
-    def _whole(self, outcome: Outcome) -> float:
-        return float(np.linalg.norm(self._clean(outcome)))
+    def _whole(self, outcome: Outcome, *places: Any) -> float:
+        return float(np.linalg.norm(self._clean(outcome, *places)))
 
     def _respond(self, more: Sequence[Hypothesis] = (), run: Run | None = None) -> Outcome:
         return self._follow(run or self._excited, [*more, *self._harmless, *self.undone])
 
-    def _tried(self, *hypotheses: Hypothesis) -> Iterator[Tried]:
+    def _tried(self, *hypotheses: Hypothesis, screened: bool = True) -> Iterator[Tried]:
+        """Yield the hypotheses with their outcomes; `screened` leaves out what is in vain."""
         for one in hypotheses:
             with contextlib.suppress(InvalidOutputError):       # the filter rejects the readings
-                yield one, (self._respond((one,)) if one.given else replace(
-                    self._outcome, estimates=one.read(self._outcome.estimates)))
+                if one.given is None:
+                    yield one, replace(self._outcome, estimates=one.read(self._outcome.estimates))
+                elif not (screened and self.restarts and self._in_vain(one)):
+                    yield one, self._respond((one,))
+
+    def _in_vain(self, one: Hypothesis) -> bool:
+        """Return whether a short run has the error of early rests still: a long one would, too."""
+        rests = self._rests[EARLY_RESTS]
+        short = self._respond((one,), self._excited.part(slice(rests[-1] + 1)))
+        before, after = (self._whole(outcome, rests) for outcome in (self._outcome, short))
+        return before > HEADING and after > LESS * before
 
     def _turns_wrong(self, outcome: Outcome) -> bool:
-        return min(one.off for one in gyroscope_of(outcome, self._given.turns)) > GROSS_GAIN
+        return off(*gyroscope_of(outcome, self._given.turns)[:2]) > GROSS_GAIN
 
     def _cause(self) -> Tried | None:
         """Return a hypothesis that explains the error, and the outcome when it is undone."""
@@ -134,10 +159,12 @@ class Responses:
         if not (gross or np.any(self._clean(self._outcome) > CLEAN)):
             return None
         limit = diagnosis.EXPLAINED * self._whole(self._outcome)
-        whole, early = gyroscope_of(self._outcome, self._given.turns)
-        for stage in (self._of_attitudes(), self._of_delays(whole.late),
-                      gyroscope := self._of_gyroscope(whole, early), self._of_accelerometer(),
-                      self._of_magnetometer(), self._of_smoothing()):
+        whole, early, late = gyroscope_of(self._outcome, self._given.turns)
+        for stage in (self._of_attitudes(), self._of_delays(late),
+                      gyroscope := self._of_gyroscope(whole, early),
+                      self._of_sensor('accelerometer', 2, (0, 1), diagnosis.GRAVITY_SIGN, *UNITS),
+                      self._of_sensor('magnetometer', 1, (0,), LEVEL) if self._absolute else (),
+                      self._of_smoothing()):
             tried = []
             for one, outcome in stage:
                 error = self._whole(outcome)
@@ -146,10 +173,9 @@ class Responses:
                     tried.append((error, one, outcome))
                 if error <= SURE * limit:
                     break
-            least = min((error for error, *_ in tried), default=0.0)
-            for error, one, outcome in tried:
-                if error <= 1.1 * least:
-                    return diagnosis.ambiguous(one, self._absolute), outcome
+            if tried:
+                _, one, outcome = min(tried, key=lambda found: found[0])
+                return diagnosis.ambiguous(one, self._absolute), outcome
         return None
 
     def _of_attitudes(self) -> Iterator[Tried]:
@@ -190,45 +216,30 @@ class Responses:
         if late > 0:
             yield from self._tried(delayed(('gyroscope',), late))
 
-    def _of_gyroscope(self, whole: Gyroscope, early: Gyroscope) -> Iterator[Tried]:
+    def _of_gyroscope(self, whole: Reals, early: Reals) -> Iterator[Tried]:
         """Try the inverse of the matrix that the gyroscope has."""
-        if min(whole.off, early.off) < GAIN:
+        if off(whole, early) < GAIN:
             return
-        if min(whole.off, early.off) > GROSS_GAIN:
-            yield from self._tried(
-                *permuted('gyroscope', lambda one: -np.sum((one - early.matrix) ** 2)),
+        if off(whole, early) > GROSS_GAIN:
+            yield from self._tried(         # judged by the turns
+                *permuted('gyroscope', lambda one: -np.sum((one - early) ** 2)),
                 *(wired('gyroscope', f'with the gyroscope multiplied by {text}', by * np.eye(3),
                         fault='gyroscope_units') for text, by in (
                             ('pi/180', math.radians(1.0)), ('180/pi', math.degrees(1.0)))),
                 Hypothesis(('gyroscope_wiring',), 'with rates about axes of the world (a product '
-                           'on the wrong side)', given=excitation.of_world))
-        for matrix in (early.matrix, whole.matrix):
+                           'on the wrong side)', given=excitation.of_world), screened=False)
+        for matrix in (early, whole):
             scale = float(np.trace(matrix)) / 3.0
             uniform = np.max(np.abs(matrix - scale * np.eye(3))) < 0.3 * abs(scale - 1.0)
             if uniform and scale > 1.0 / WORST:
                 yield from self._tried(Hypothesis(
                     ('gyroscope_wiring', 'time_step'), f'with steps {1.0 / scale:.4g} times as '
                     'long (scales of rates and steps cannot be told apart)',
-                    given=partial(with_steps, scale)))
+                    given=changed(('dt',), partial(np.multiply, 1.0 / scale))), screened=False)
             if np.linalg.cond(matrix) < WORST:
                 yield from self._tried(wired(
                     'gyroscope', f'{words(matrix)}: with the inverse of that',
-                    np.linalg.inv(matrix)))
-
-    def _of_accelerometer(self) -> Iterator[Tried]:
-        """Try signs, axes and scales of the accelerometer that fit the verticals at rest."""
-        name = 'accelerometer'
-        if self._clean(self._outcome)[0] > TILT:
-            yield from self._of_sensor(name, 2, (0, 1), diagnosis.GRAVITY_SIGN, *(
-                wired(name, f'with the {name} multiplied by {by:.4g}', by * np.eye(3))
-                for by in (scenarios.GRAVITY, 1.0 / scenarios.GRAVITY)))
-
-    def _of_magnetometer(self) -> Iterator[Tried]:
-        """Try signs and axes of the magnetometer that fit the headings at rest, and irons."""
-        if self._absolute and max(self._clean(self._outcome)[:2]) > HEADING:
-            yield from self._of_sensor('magnetometer', 1, (0,), Hypothesis(
-                ('magnetometer_wiring',), 'with the field of a level sensor',
-                given=excitation.untilted))
+                    np.linalg.inv(matrix)), screened=False)
 
     def _of_sensor(self, name: str, axis: int, level: Sequence[int],
                    *more: Hypothesis) -> Iterator[Tried]:
@@ -238,6 +249,9 @@ class Responses:
         axis, level : axes of the world along which the readings of a right filter are positive,
             and zero
         """
+        tilt, heading, *_ = self._clean(self._outcome)
+        if max(tilt, heading) < HEADING if name == 'magnetometer' else tilt < TILT:
+            return
         readings = getattr(self._excited, name)
         found = self._at_rest(self._outcome)
 
@@ -256,7 +270,7 @@ class Responses:
         error = self._apart(self._excited.truth)
         for names in (('gyroscope',), ('accelerometer',), ('magnetometer',),
                       ('accelerometer', 'magnetometer')):
-            for _, outcome in self._tried(sharpened(names, 1.0)):
+            for _, outcome in self._tried(sharpened(names, 1.0), screened=False):
                 change = self._apart(outcome.estimates)
                 by = float(change @ error) / max(float(change @ change), 1e-12)
                 if by > 0.5:
@@ -295,8 +309,7 @@ class Responses:
                 return
             before = self._whole(outcome)
             for turns, rows in self._at_rest(outcome, tried):
-                change, left = excitation.affine_of(
-                    readings[rows] / size, turns, level, first)
+                change, left = excitation.affine_of(readings[rows] / size, turns, level, first)
                 if left < FITS:
                     break
             if np.linalg.cond(change) > WORST:
@@ -314,14 +327,15 @@ class Responses:
         left = (f'without noise the error at rest is {tilt} of tilt and {heading} of heading, in '
                 f'motion {tilt_moving} and {heading_moving}')
         wrong = bool(np.any(self._clean(self._outcome) > CLEAN))
-        whole, early = gyroscope_of(self._outcome, self._given.turns)
+        whole, early, late = gyroscope_of(self._outcome, self._given.turns)
+        self._early = early
         turns = Rotation.from_quat(self._outcome.estimates)
         if np.max((turns * turns[0].inv()).magnitude()) < STUCK:
             return [Fault('inaccurate', 'the attitude hardly changes')]
-        if min(whole.off, early.off) > GROSS_GAIN:
-            return [Fault('gyroscope_wiring', words(early.matrix))]
-        if wrong and whole.late > 1:
-            return [Fault('lag', f'turns are followed {whole.late} samples late; {left}')]
+        if off(whole, early) > GROSS_GAIN:
+            return [Fault('gyroscope_wiring', words(early))]
+        if wrong and late > 1:
+            return [Fault('lag', f'turns are followed {late} samples late; {left}')]
         found = self._not_corrected(self._excited.truth)
         if found:       # compared with a run without kicks, as there may be another error
             without = self._respond((), self._given.still).estimates
@@ -383,18 +397,6 @@ class Responses:
             self.faults.append(Fault(
                 'bias_report', f'a gyroscope bias of {np.degrees(BIAS).round(2).tolist()} deg/s '
                 f'is learned, but the estimate is {np.degrees(found).round(2).tolist()} deg/s'))
-
-
-def wired(name: str, text: str, matrix: Any, offset: Any = 0.0,
-          fault: str = '') -> Hypothesis:
-    """Return the hypothesis that the readings of a sensor need this matrix and offset."""
-    return Hypothesis((fault or f'{name}_wiring',), text, given=changed(
-        (name,), lambda rows: rows @ matrix.T + offset))
-
-
-def with_steps(scale: float, run: Run) -> Run:
-    """Return steps that are so many times shorter, by their stamps."""
-    return replace(run, dt=run.dt / scale)
 
 
 def permuted(name: str, fit: Callable[[Reals], Any]) -> list[Hypothesis]:

@@ -9,7 +9,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ class Scenario:
 
     values : parameters of the simulation that differ from their defaults
     duration, rate : of the run [s], [Hz]
-    reversals : times at which the momenta change their sign, by an impulsive torque [s]
+    reversals : times at which an impulsive torque changes the sign of the momenta [s]
     noisy : whether the IMU has its errors
     """
 
@@ -66,15 +66,20 @@ PIVOT = replace(LEVER_ARM, name='pivot', values={
 FAST = Scenario('fast', {'spin.l3': 1.6, 'spin.lz': 1.7816, 'initial.theta': 0.5236},
                 duration=8.0, reversals=(2.0, 4.0, 6.0), noisy=False)
 
+
 @dataclass(frozen=True)
-class Truth:
+class Run:
     """
-    The true motion of a sensor at n times.
+    What an IMU reads along a motion, at n times.
+
+    The gyroscope's reading is the mean over the step that ends, as of an integrating sensor; the
+    other readings are of its end.
 
     name : of the motion
     t, dt : time and length of the step that ends there, by the stamps [s], (n,)
     truth : q(world <- sensor) as x, y, z, w (n, 4)
     rates : true angular velocity in the frame of the sensor (n, 3) [rad/s]
+    gyroscope, accelerometer, magnetometer : in the frame of the IMU, (n, 3) [rad/s], [m/s^2], [T]
     """
 
     name: str
@@ -82,27 +87,13 @@ class Truth:
     dt: Reals
     truth: Reals
     rates: Reals
-
-    def part(self, rows: slice | NDArray[np.int64]) -> Self:
-        """Return the motion at these times only."""
-        return replace(self, **{one.name: getattr(self, one.name)[rows] for one in fields(self)
-                                if one.name != 'name'})
-
-
-@dataclass(frozen=True)
-class Run(Truth):
-    """
-    What an IMU reads along a motion.
-
-    The gyroscope's reading is the mean over the step that ends, as of an integrating sensor; the
-    other readings are of its end.
-
-    gyroscope, accelerometer, magnetometer : in the frame of the IMU, (n, 3) [rad/s], [m/s^2], [T]
-    """
-
     gyroscope: Reals
     accelerometer: Reals
     magnetometer: Reals
+
+    def part(self, rows: slice | NDArray[np.int64]) -> 'Run':
+        """Return the run at these times only."""
+        return Run(self.name, *(getattr(self, one.name)[rows] for one in fields(self)[1:]))
 
     @property
     def start(self) -> Rotation:
@@ -119,12 +110,9 @@ class Run(Truth):
 def turning(imu: Mapping[str, Any], first: Rotation, last: Rotation, seconds: float,
             declination: float | Reals = 0.0) -> Run:
     """
-    Return a slow tumbling from one attitude to another, without noise and acceleration; t <= 0.
+    Return a slow tumbling from one attitude to another as `along`.
 
     After each third of it, the sensor has gone a third of the way.
-
-    first, last : attitudes world <- sensor
-    declination : by which the field is turned to the west [rad], one or for each sample
     """
     n = round(seconds * SLOW.rate)
     part = np.arange(n + 1) / n
@@ -149,17 +137,13 @@ def along(name: str, turns: Rotation, imu: Mapping[str, Any],
     rates = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate
     to_sensor = turns[1:].inv()
     field = Rotation.from_euler('z', np.broadcast_to(declination, n)[:, np.newaxis]).apply(
-        without_declination(imu.get('mag.field', FIELD)))
+        magnetic(imu.get('mag.field', FIELD)))
     return Run(name, t, np.full(n, 1.0 / rate), turns[1:].as_quat(), rates, rates.copy(),
                to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(field))
 
 
-def without_declination(field: tuple[float, float, float]) -> tuple[float, float, float]:
-    """
-    Return a field (east, north, up) in a world whose north is magnetic north.
-
-    There the heading of a filter needs no declination.
-    """
+def magnetic(field: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return a field (east, north, up) in a world whose north is magnetic north."""
     east, north, up = field
     return 0.0, math.hypot(east, north), up
 
@@ -176,7 +160,7 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
     values = parameters.checked({
         'initial.phi': phi, 'initial.psi': psi, 'seed': seed, 'solver.method': 'exact',
         'mag.field': FIELD, **given, **scenario.values, 'imu.rate': scenario.rate})
-    values['mag.field'] = without_declination(values['mag.field'])
+    values['mag.field'] = magnetic(values['mag.field'])
     simulation = Simulation(values)
     device, period_ns = simulation.imu, simulation.imu.length_ns
     magnetometer = Magnetometer(values, period_ns)

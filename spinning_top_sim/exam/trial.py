@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.exam.measures import Errors, errors_of
-from spinning_top_sim.exam.scenarios import Reals, Run, Truth
+from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.tools.cli import printable
 
 # Covariance and bias are read after every tenth update.
@@ -34,21 +34,12 @@ class Filter(Protocol):
         """
         Take the readings of a step; return the attitude at its end.
 
-        Parameters
-        ----------
-        gyroscope : (3,) array
-            Mean angular velocity over the step [rad/s].
-        accelerometer : (3,) array
-            Specific force at its end [m/s^2], +g upwards at rest.
-        magnetometer : (3,) array or None
-            Field at its end [T].
-        dt : float
-            Length of the step [s].
+        gyroscope : mean angular velocity over the step (3,) [rad/s]
+        accelerometer : specific force at its end (3,) [m/s^2], +g upwards at rest
+        magnetometer : field at its end (3,) [T], or None
+        dt : length of the step [s]
 
-        Returns
-        -------
-        (4,) array_like
-            q(world <- sensor) as x, y, z, w; x of the world is east, y north and z up.
+        Returns q(world <- sensor) as x, y, z, w (4,); x of the world is east, y north and z up.
         """
 
 
@@ -81,7 +72,7 @@ class Outcome:
     covariances, biases : (n, 3, 3) [rad^2] and (n, 3) [rad/s], NaN where unknown
     """
 
-    run: Truth
+    run: Run
     estimates: Reals
     covariances: Reals
     biases: Reals
@@ -181,9 +172,7 @@ def no_attitudes(quaternions: Reals) -> NDArray[np.intp]:
 def _covariance_of(filter_: Filter) -> Reals | float:
     """Return the covariance of a filter, NaN if unknown.  Raises InvalidOutputError."""
     value = getattr(filter_, 'covariance', None)
-    if value is None:
-        return math.nan
-    covariance = _numbers('covariance is', value, (3, 3))
+    covariance = _numbers('covariance is', value, (3, 3)) if value is not None else np.zeros(1)
     if not np.any(covariance):      # ROS messages mark an unknown covariance by zeros
         return math.nan
     if is_indefinite(covariance):

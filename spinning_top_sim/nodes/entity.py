@@ -66,7 +66,15 @@ def requested_state(request: Message, top: Top, frame: str, now: States,
     rates = np.concatenate(attitude.in_world(now.rows_quaternion, now.rows_angular_velocity))
     if sets_pose:
         rotation = _numbers(wanted.pose.orientation, 'xyzw')
-        _check_pose(_numbers(wanted.pose.position, 'xyz'), rotation, pivot.position[:, 0])
+        position = _numbers(wanted.pose.position, 'xyz')
+        if not np.all(np.abs(position - pivot.position[:, 0]) <= SMALLEST_LENGTH):
+            raise RefusedError(INVALID_POSE, f'pose.position = {position.tolist()} m: must be the '
+                               f'pivot, {pivot.position[:, 0].tolist()} (within '
+                               f'{SMALLEST_LENGTH:g})')
+        length = float(np.linalg.norm(rotation))
+        if not abs(length - 1.0) <= LENGTH_ERROR:
+            raise RefusedError(INVALID_POSE, f'pose.orientation = {rotation.tolist()} has length '
+                               f'{length!r}: must be 1 (within {LENGTH_ERROR:g})')
     if sets_twist:
         rates = _numbers(wanted.twist.angular, 'xyz')
         velocity = _numbers(wanted.twist.linear, 'xyz')
@@ -77,17 +85,6 @@ def requested_state(request: Message, top: Top, frame: str, now: States,
         if not np.all(np.isfinite(rates)):
             raise ValueError(f'twist.angular = {rates.tolist()} rad/s: must be finite')
     return state_of(top, rotation, rates)
-
-
-def _check_pose(position: NDArray[np.float64], rotation: NDArray[np.float64],
-                pivot: NDArray[np.float64]) -> None:
-    if not np.all(np.abs(position - pivot) <= SMALLEST_LENGTH):
-        raise RefusedError(INVALID_POSE, f'pose.position = {position.tolist()} m: must be the '
-                           f'pivot, {pivot.tolist()} (within {SMALLEST_LENGTH:g})')
-    length = float(np.linalg.norm(rotation))
-    if not abs(length - 1.0) <= LENGTH_ERROR:
-        raise RefusedError(INVALID_POSE, f'pose.orientation = {rotation.tolist()} has length '
-                           f'{length!r}: must be 1 (within {LENGTH_ERROR:g})')
 
 
 def _numbers(message: Message, names: Sequence[str]) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 
 Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], its publish function, CDR
 
@@ -65,15 +65,15 @@ class DeadlineThread(threading.Thread):
 
     A late tick comes at once, and deadlines that have passed are skipped.
 
-    grid : returns a deadline on the monotonic clock and the time between two deadlines [s]
+    grid : returns a deadline on the monotonic clock and the time between two, under a second [s]
     failed : takes an error that a call raises; the thread goes on
     """
 
-    LONGEST_SLEEP = 0.05    # [s], so that `stop` is quick
     # Share of the period to sleep between `tick` and `idle`.  A tick wakes threads that send; they
     # often run on the same core and would wait for `idle`.
     NAP = 0.15
     SHORTEST_NAP = 1e-4     # [s]
+    AFTER_FAILURE_S = 0.05
 
     def __init__(self, tick: Callable[[], object], idle: Callable[[], object],
                  grid: Callable[[], tuple[float, float]],
@@ -90,22 +90,16 @@ class DeadlineThread(threading.Thread):
                 origin, period = grid
                 passed = int((time.monotonic() - origin) // period)
                 newest = max(passed, newest + 1) if grid == before else passed + 1
-                if self._sleep_until(origin + newest * period, grid) and self._tick():
-                    nap = min(self.NAP * period, self.LONGEST_SLEEP)
-                    if nap >= self.SHORTEST_NAP:
-                        time.sleep(nap)
+                left = origin + newest * period - time.monotonic()
+                if left > 0.0:
+                    time.sleep(left)
+                if not self._stopped and self._tick():
+                    if self.NAP * period >= self.SHORTEST_NAP:
+                        time.sleep(self.NAP * period)
                     self._idle()
             except Exception as error:
                 self._failed(error)
-                time.sleep(self.LONGEST_SLEEP)
-
-    def _sleep_until(self, deadline: float, grid: tuple[float, float]) -> bool:
-        """Return True at the deadline, or False when stopped or when the grid changes before."""
-        while (left := deadline - time.monotonic()) > 0.0:
-            if self._stopped or (left > self.LONGEST_SLEEP and self._grid() != grid):
-                return False
-            time.sleep(min(left, self.LONGEST_SLEEP))
-        return not self._stopped
+                time.sleep(self.AFTER_FAILURE_S)
 
     def stop(self) -> None:
         self._stopped = True
@@ -113,35 +107,26 @@ class DeadlineThread(threading.Thread):
             self.join(5.0)
 
 
-def read_ahead(messages: Iterable[Message]) -> Generator[Message]:
-    """Yield messages that a thread reads ahead; raise its error after the last one."""
-    batches = _batches(messages)
+def read_ahead(messages: Iterator[Message]) -> Generator[Message]:
+    """Yield messages that a thread reads ahead; raise its error in their place."""
+    def batch() -> list[Message]:
+        found: list[Message] = []
+        size = 0
+        while size < BATCH_BYTES and len(found) < BATCH_MESSAGES:
+            if (message := next(messages, None)) is None:
+                break
+            found.append(message)
+            size += len(message[2])
+        return found
+
     with ThreadPoolExecutor(1) as reader:
-        ahead: deque[Future[list[Message]]] = deque(
-            reader.submit(next, batches, []) for _ in range(BATCHES))
+        ahead = deque(reader.submit(batch) for _ in range(BATCHES))
         try:
-            while batch := ahead.popleft().result():
-                ahead.append(reader.submit(next, batches, []))
-                yield from batch
+            while found := ahead.popleft().result():
+                ahead.append(reader.submit(batch))
+                yield from found
         finally:
             reader.shutdown(wait=False, cancel_futures=True)
-
-
-def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    batch: list[Message] = []
-    size = 0
-    try:
-        for message in messages:
-            batch.append(message)
-            size += len(message[2])
-            if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
-                yield batch
-                batch, size = [], 0
-    except Exception:
-        if batch:
-            yield batch
-        raise
-    yield batch
 
 
 class Playback:

@@ -21,6 +21,8 @@ from spinning_top_sim.nodes.simulation_standard import FEATURES, RefusedError, s
 from spinning_top_sim.nodes.simulator import Simulator
 from spinning_top_sim.nodes.tick_loop import LoopState
 from spinning_top_sim.physics.pivot import Kinematics
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
@@ -101,10 +103,11 @@ class SimulationHandlers:
 
     def _set_simulation_state(self, request: Any, response: Any) -> None:
         states, target = self._states, request.state.state
-        changes = {states.STATE_STOPPED: ('STOPPED', self._stop),
-                   states.STATE_PLAYING: ('PLAYING', self._play),
-                   states.STATE_PAUSED: ('PAUSED', self._pause),
-                   states.STATE_QUITTING: ('QUITTING', self._quit)}
+        changes: dict[int, tuple[str, Callable[[], None]]] = {
+            states.STATE_STOPPED: ('STOPPED', partial(self._node.start_again, paused=True)),
+            states.STATE_PLAYING: ('PLAYING', self._play),
+            states.STATE_PAUSED: ('PAUSED', self._pause),
+            states.STATE_QUITTING: ('QUITTING', self._quit)}
         if target not in changes:
             raise RefusedError(response.INCORRECT_TRANSITION, f'state = {target}: must be ' + (
                 ', '.join(f'{number} ({name})' for number, (name, _) in changes.items())))
@@ -120,9 +123,6 @@ class SimulationHandlers:
             change()
         except (ValueError, RuntimeError) as error:
             raise RefusedError(response.STATE_TRANSITION_ERROR, error) from error
-
-    def _stop(self) -> None:
-        self._node.start_again(paused=True)
 
     def _play(self) -> None:
         self._node.check_started()
@@ -232,17 +232,18 @@ class SimulationHandlers:
             self._node.start_again()
         elif request.scope == request.SCOPE_STATE:
             values = self._node.start_values
-            with self._lock:
-                self._loop.set_state(lambda _: parameters.start_state(values))
-            self._node.show_spin()
+            self._set_state(lambda _: parameters.start_state(values))
         else:
-            raise self._unsupported(
+            raise RefusedError(
+                self._results.RESULT_FEATURE_UNSUPPORTED,
                 f'scope = {request.scope}: must be {request.SCOPE_DEFAULT} or '
                 f'{request.SCOPE_ALL} (all), {request.SCOPE_STATE} (state) or {time_and_state} '
                 '(time and state): time goes back with the state only, and nothing is spawned')
 
-    def _unsupported(self, reason: str) -> RefusedError:
-        return RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED, reason)
+    def _set_state(self, change: Callable[[States], State]) -> None:
+        with self._lock:
+            self._loop.set_state(change)
+        self._node.show_spin()
 
     def _check_entity(self, name: str) -> None:
         if name != self._name:
@@ -263,7 +264,8 @@ class SimulationHandlers:
         filters = request.filters
         if (filters.filter or filters.categories or filters.tags.tags
                 or filters.bounds.type != filters.bounds.TYPE_EMPTY):
-            raise self._unsupported('filters must be empty: there is one entity')
+            raise RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED,
+                               'filters must be empty: there is one entity')
         response.entities = [self._name]
 
     def _get_entities_states(self, request: Any, response: Any) -> None:
@@ -279,10 +281,8 @@ class SimulationHandlers:
         self._check_entity(request.entity)
         self._check_runs()
         top, frame = self._simulation.top, self._node.values['world_frame']
-        with self._lock:
-            self._loop.set_state(
-                lambda now: entity.requested_state(request, top, frame, now, self._pivot()))
-        self._node.show_spin()
+        self._set_state(lambda now: entity.requested_state(
+            request, top, frame, now, self._pivot()))
 
     def _get_entity_info(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)

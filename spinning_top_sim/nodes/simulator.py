@@ -5,7 +5,7 @@ import functools
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -90,6 +90,7 @@ class Simulator(Node):
 
     def _begin(self) -> None:
         if self._date.now_ns() == 0:
+            self._log.warning('waiting for /clock (use_sim_time is set)', once=True)
             return
         if self.values['max_error'] > 0.0:
             _ = self.simulation.segment.exact    # its modules take a while to import
@@ -199,7 +200,7 @@ class Simulator(Node):
 
     def _change(self, changes: dict[str, Any]) -> None:
         values, start_spin = ros_parameters.changed(self.values, changes, self._start_spin)
-        self._check_context(values, restarted=False)
+        self._check_context(values)
         rest = sorted(changes.keys() - SPIN)
         with self.lock:
             if ros_parameters.is_command(changes):
@@ -218,12 +219,12 @@ class Simulator(Node):
                 self._log.info(f'{", ".join(names)}: {effect.value}')
         self.values, self._start_spin = values, start_spin
 
-    def _check_context(self, values: Mapping[str, Any], *, restarted: bool) -> None:
+    def _check_context(self, values: Mapping[str, Any]) -> None:
         if self._date.follows and journal.is_enabled('clock', values):
             raise ValueError('clock.enabled, publish_clock: must be false while this node follows '
                              'another /clock (use_sim_time)')
         self._outputs.check(self.simulation.outputs, values)
-        lowest = self.simulation.lowest_imu_rate(restarted=restarted)
+        lowest = self.simulation.lowest_imu_rate
         if values['imu.rate'] < lowest:
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
                              'means or increments are taken, published or recorded')
@@ -277,39 +278,26 @@ class Simulator(Node):
         self.start_again()
         return f'at t = 0, stamps go on from {self.simulation.epoch_ns} ns'
 
-    def start_again(self, values: Mapping[str, Any] | None = None,
-                    paused: bool | None = None) -> None:
+    def start_again(self, paused: bool | None = None) -> None:
         """
         Reset the motion.
 
-        values : all parameters of the new motion; None keeps the present ones
         paused : whether the motion is paused after the reset; None keeps the present state
 
-        Raises RuntimeError before the motion begins, and ValueError if no motion begins with these
-        values; nothing changes then.
+        Raises RuntimeError before the motion begins, and ValueError if no motion begins with the
+        present parameters; nothing changes then.
         """
-        start = self.start_values if values is None else dict(values)
         with self.lock:
             self.check_started()
-            self._check_context(start, restarted=True)
-            self.loop.reset(start, self._date.first_ns(), paused)
-            self._open_outputs(start)
-        changed = [name for name in start if start[name] != self.values[name] and name not in SPIN]
-        self.values, self._start_spin = start, {name: start[name] for name in SPIN}
-        self._show(changed)
+            self.loop.reset(self.start_values, self._date.first_ns(), paused)
         self.show_spin()
 
     def show_spin(self) -> None:
+        """Let the parameters show the present spin."""
         self.values |= {'spin.l3': self.simulation.l3, 'spin.lz': self.simulation.lz}
-        self._show(SPIN)
-
-    def _show(self, names: Iterable[str]) -> None:
-        """Set parameters whose values are in effect already."""
         self.remove_on_set_parameters_callback(self._on_set_parameters)
         try:
-            self.set_parameters([
-                Parameter(name, value=list(value) if isinstance(value, tuple) else value)
-                for name, value in ((name, self.values[name]) for name in names)])
+            self.set_parameters([Parameter(name, value=self.values[name]) for name in SPIN])
         finally:
             self.add_on_set_parameters_callback(self._on_set_parameters)
 
@@ -339,7 +327,6 @@ class Simulator(Node):
         return self.create_timer(period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish_diagnostics(self) -> None:
-        self._check_clock()
         self._check_recording()
         if self._session.warning:
             self._log.warning(f'recording: {self._session.warning}', throttle_duration_sec=10.0)
@@ -355,14 +342,6 @@ class Simulator(Node):
                 self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),
                 self.values['max_error'])
         self._diagnostics.publish(message)
-
-    def _check_clock(self) -> None:
-        """Warn when the /clock that is followed stops; say when it goes on."""
-        waits = self._date.is_missing()
-        if waits != self._report.waits_for_clock:
-            self._report.waits_for_clock = waits
-            self._log.warning('waiting for /clock (use_sim_time is set)' if waits else
-                              '/clock goes on')
 
     def _check_recording(self) -> None:
         reason = self._session.check()

@@ -14,13 +14,12 @@ from decimal import Decimal
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.top import State, Top
 
 Real = TypeVar('Real', float, Decimal)
-Reals = NDArray[np.float64]
 # Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
 COINCIDE = 1e-12
 # What one sees of each motion, by its name.
@@ -170,18 +169,16 @@ def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
     low, high = swing(top, state)
     rests = high - low <= coincide
     if rests and 1.0 - abs(low) <= coincide:
-        return _vertical_regime(top, state.l3, upright=low > 0.0) if moves else 'at rest'
+        if not moves:
+            return 'at rest'
+        if (low > 0.0) != (top.gravity_torque > 0.0):       # the centre of mass is below
+            return 'hanging'
+        stable = state.l3 * state.l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)
+        return 'sleeping' if stable else 'sleeping, unstable'
     if not moves:
         rotating = high >= 1.0 - coincide and low <= -1.0 + coincide
         return f'planar pendulum, {"rotating" if rotating else "swinging"}'
     return 'steady precession' if rests else _precessing_regime(state, low, high, coincide)
-
-
-def _vertical_regime(top: Top, l3: float, upright: bool) -> str:
-    if upright != (top.gravity_torque > 0.0):       # the centre of mass is below
-        return 'hanging'
-    stable = l3 * l3 > 4.0 * top.lambda1 * abs(top.gravity_torque)
-    return 'sleeping' if stable else 'sleeping, unstable'
 
 
 def _precessing_regime(state: State, low: float, high: float, coincide: float) -> str:
@@ -198,7 +195,7 @@ def _precessing_regime(state: State, low: float, high: float, coincide: float) -
     return 'loops' if low < reversal < high else 'waves'
 
 
-def effective_potential(top: Top, l3: float, lz: float, theta: Reals) -> Reals:
+def effective_potential(top: Top, l3: float, lz: float, theta: Column) -> Column:
     """
     Return V(theta) [J] of lambda1 theta'^2/2 + V(theta) = E - L3^2/(2 lambda3).
 

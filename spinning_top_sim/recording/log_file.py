@@ -118,6 +118,7 @@ class Summary:
         return (
             self.statistics is not None and self.indexes_all_messages
             and len(self.metadata) == self.statistics.metadata_count
+            and sum(index.length for index in self.metadata) <= MAX_DECLARED
             and set(self.channels).union(
                 *(index.message_index_offsets for index in self.chunks.values()))
             <= known_topics(self.schemas, self.channels).keys())

@@ -251,11 +251,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         if not (summary.is_complete and all(map(self._leads_to_chunk, summary.chunks.values()))):
             return self.scan()
         metadata = {}
-        size = 0
         for index in summary.metadata:
-            size += index.length
             with contextlib.suppress(DamagedError):
-                records.check_size(size, records.MAX_DECLARED)
                 record = self.file.record(index.offset, summary.data_limit)
                 if isinstance(record, Metadata):
                     metadata[record.name] = record.metadata

@@ -137,7 +137,6 @@ class SteppedMotion(ABC):
     def __init__(self, top: Top, start: State, y: Vector, tolerance: float,
                  fastest_rate: float) -> None:
         self.top, self.start = top, start
-        self._step = unrolled_step(len(y), isinstance(y[0], complex))
         derivative = self.derivative(*y)
         # The steps that can still be read, in order; the first one has no length.
         self._kept = [Step(0.0, y, derivative, 0.0, y, derivative)]
@@ -167,14 +166,14 @@ class SteppedMotion(ABC):
         """Take one accepted step.  Raises IntegrationError where none can be taken."""
         newest = self._kept[-1]
         t, y, derivative = newest.t1, newest.y1, newest.derivative1
-        grow = GROW
+        grow, step = GROW, unrolled_step(len(y), isinstance(y[0], complex))
         while True:
             end = t + min(self._next_step, LONGEST_STEP)
             h = end - t                         # what the sum really made of it
             if not h > SMALLEST_STEP_ULPS * math.ulp(t):
                 raise IntegrationError(
                     f'the step size collapsed to {self._next_step:.3g} s at t = {t:.9g} s')
-            y_new, derivative_new, difference = self._step(self.derivative, h, y, derivative)
+            y_new, derivative_new, difference = step(self.derivative, h, y, derivative)
             self.evaluations += 6
             errors = self.errors(y, y_new, difference)
             # `max` may pass over a NaN.  An infinite error shrinks the step until that collapses.
@@ -257,14 +256,11 @@ class SteppedMotion(ABC):
 
     def _unknowns(self, t: Column) -> Rows:
         """Return the unknowns (k, n) at times [s] within the steps that are kept."""
-        return self._interpolated(self._steps_at(t), t)
+        return self._interpolated(t)[1]
 
-    def _steps_at(self, t: Column) -> NDArray[np.int64]:
-        """Return the numbers of the steps that are kept in which times [s] lie."""
-        return np.array([step.t1 for step in self._kept]).searchsorted(t)
-
-    def _interpolated(self, steps: NDArray[np.int64], t: Column) -> Rows:
-        """Return the unknowns (k, n) at times [s] in the steps of these numbers."""
+    def _interpolated(self, t: Column) -> tuple[NDArray[np.int64], Rows]:
+        """Return in which of the steps that are kept times [s] lie, and the unknowns there."""
+        steps = np.array([step.t1 for step in self._kept]).searchsorted(t)
         first, last = (int(steps[0]), int(steps[-1])) if len(t) else (0, 0)
         begin, y0, first0, end, y1, first1 = map(
             components, zip(*self._kept[first:last + 1], strict=True))
@@ -281,5 +277,4 @@ class SteppedMotion(ABC):
         numbers = steps - first
         s = (t - begin[numbers]) / np.where(h > 0.0, h, 1.0)[numbers]
         c0, c1, c2, c3, c4, c5 = coefficients.take(numbers, axis=2)
-        unknowns: Rows = ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
-        return unknowns
+        return steps, ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0

@@ -77,7 +77,13 @@ class ThetaFunctions:
         self.real = [k for k, factor in enumerate(factors) if not factor.sense]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
                       if SIN_ODD in pair}
-        _check_amplitudes(motion)
+        for name, factor in zip(('alpha', 'beta'), factors, strict=True):
+            for real, _ in factor.parts:
+                size = max(map(abs, real.polynomial))
+                if 0 < size < LEAST_AMPLITUDE:
+                    raise ValueError(
+                        f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
+                        f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
         self.u_dot = np.array([in_range("cos(theta)'", x) for x in motion.u_dot])
         self.u_dot_coefficients = _coefficients([[motion.u_dot_series]], motion.size)[:, 0]
         self.momentum, self.swing = (
@@ -302,16 +308,6 @@ def in_range(name: str, value: Decimal) -> float:
         raise ValueError(f'{name} is {value:.3e}: must be at most {MOST} for doubles to hold '
                          f'the motion; the constants of the top are too far apart in size')
     return float(value)
-
-
-def _check_amplitudes(motion: ThetaMotion) -> None:
-    for name, factor in (('alpha', motion.alpha), ('beta', motion.beta)):
-        for real, _ in factor.parts:
-            size = max(map(abs, real.polynomial))
-            if 0 < size < LEAST_AMPLITUDE:
-                raise ValueError(
-                    f'the amplitude of {name} is {size:.3e}: the start is too close to a pole or '
-                    f'to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
 
 
 def _coefficients(rows: Sequence[Sequence[Series]], most: int) -> NDArray[np.float64]:

@@ -217,8 +217,8 @@ class TransportMotion(SteppedMotion):
     def _unknowns(self, t: Column) -> Rows:
         """Return the unknowns, and `_begins` of the step that each time [s] lies in."""
         self._unwrap()
-        steps = self._steps_at(t)
-        return np.concatenate((self._interpolated(steps, t), self._begins.take(steps, axis=1)))
+        steps, unknowns = self._interpolated(t)
+        return np.concatenate((unknowns, self._begins.take(steps, axis=1)))
 
     def _states_of(self, t: Column, unknowns: Rows) -> States:
         return _TransportStates(self, t, unknowns)

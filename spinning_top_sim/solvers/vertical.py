@@ -53,7 +53,6 @@ POLE = Decimal('1e-30')
 # the share, and has 40 digits.
 THROUGH = Decimal('1e-19')
 Complex = tuple[Decimal, Decimal]
-LongQuaternion = tuple[Decimal, Decimal, Decimal, Decimal]
 
 
 class Posture(NamedTuple):

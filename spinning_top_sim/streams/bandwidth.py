@@ -103,7 +103,9 @@ class LowPass:
         # Before that the signal has been what it is there, unless its history is known.
         first = (np.stack(self._order * [values[:, -1] / (self._order * self._decay)])
                  if carried is None else carried)
-        totals = self._later(first, 1e-9 * back_ns)[-parts:]
+        real, *imag = self._kernel(1e-9 * back_ns)      # what is left of that state
+        totals = [real * first[0]] if not imag else [
+            real * first[0] - imag[0] * first[1], real * first[1] + imag[0] * first[0]][-parts:]
         for node in range(len(before)):         # in one order, however many samples there are
             totals = [total + kernel[node] * values[:, node]
                       for total, kernel in zip(totals, kernels, strict=True)]
@@ -114,11 +116,3 @@ class LowPass:
         angle = self._decay * seconds
         fade = np.exp(-angle)
         return [fade] if self._order == 1 else [fade * np.cos(angle), fade * np.sin(angle)]
-
-    def _later(self, state: NDArray[np.float64], seconds: NDArray[np.float64],
-               ) -> list[NDArray[np.float64]]:
-        """Return what is left of a state after a time."""
-        real, *imag = self._kernel(seconds)
-        if not imag:
-            return [real * state[0]]
-        return [real * state[0] - imag[0] * state[1], real * state[1] + imag[0] * state[0]]

@@ -49,7 +49,6 @@ class Gnss(Stream):
         raise NotImplementedError
 
     def times(self, after_ns: int, until_ns: int) -> range:
-        """Return the times after `after_ns` and up to `until_ns` at which messages are sent."""
         valid = super().times(max(after_ns - self.late_ns, -1), until_ns - self.late_ns)
         return range(valid.start + self.late_ns, valid.stop + self.late_ns, valid.step)
 

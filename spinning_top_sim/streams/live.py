@@ -96,13 +96,10 @@ class LiveSimulation(Simulation):
             output.log_index = streams.index(output.stream) if output.stream in streams else None
         self.version += 1
 
-    def lowest_imu_rate(self, *, restarted: bool) -> float:
-        """
-        Return the lowest `imu.rate` [Hz] with which means and increments in use can go on.
-
-        restarted : after `restart`, which may end the means
-        """
-        uses = (self.imu.takes_means and not restarted) or any(
+    @property
+    def lowest_imu_rate(self) -> float:
+        """The lowest `imu.rate` [Hz] with which means and increments in use can go on."""
+        uses = self.imu.takes_means or any(
             output.stream.parameter == 'increments' and output.is_used for output in self.outputs)
         return parameters.LOWEST_RATE_OF_INTERVALS if uses else 0.0
 

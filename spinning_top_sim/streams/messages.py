@@ -6,7 +6,7 @@ Their parts are in the order of the .msg definitions (ROS 2 Jazzy, common_interf
 compares every template with the serializer of rclpy.
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
 from spinning_top_sim.streams.cdr import CdrWriter, Template
 
@@ -134,25 +134,23 @@ def markers(frame_id: str, size: tuple[float, ...], lines: tuple[float, ...], li
     line_width : [m]; the trace is half as wide
     """
     writer = CdrWriter().append('I', 3 if trace_points else 2)
-    _begin(writer, frame_id, 'body', CYLINDER).field(3).field(4)
-    _end(writer, size, BODY_COLOR, 0)
-    _begin(writer, frame_id, 'axis', LINE_LIST).field(3).field(4)
-    _end(writer, (line_width, 0.0, 0.0), AXIS_COLOR, len(lines) // 3, lines)
+    marker = partial(_append_marker, writer, frame_id)
+    marker('body', CYLINDER, size, BODY_COLOR, 0)
+    marker('axis', LINE_LIST, (line_width, 0.0, 0.0), AXIS_COLOR, len(lines) // 3, lines)
     if trace_points:
-        _begin(writer, frame_id, 'trace', LINE_STRIP).append('d', *ORIGIN, *NO_ROTATION)
-        _end(writer, (0.5 * line_width, 0.0, 0.0), TRACE_COLOR, trace_points)
+        marker('trace', LINE_STRIP, (0.5 * line_width, 0.0, 0.0), TRACE_COLOR, trace_points)
     return Template(writer)
 
 
-def _begin(writer: CdrWriter, frame_id: str, namespace: str, kind: int) -> CdrWriter:
-    """Append the parts of a visualization_msgs/Marker before its pose."""
-    # id, type, action: add or modify
-    return writer.header(frame_id).string(namespace).append('i', 0, kind, 0)
-
-
-def _end(writer: CdrWriter, scale: tuple[float, ...], color: tuple[float, ...], count: int,
-         points: tuple[float, ...] = ()) -> None:
-    """Append the parts of a Marker behind its pose; `count` points that are not given: a field."""
+def _append_marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int,
+                   scale: tuple[float, ...], color: tuple[float, ...], count: int,
+                   points: tuple[float, ...] = ()) -> None:
+    """Append a visualization_msgs/Marker; `count` points that are not given: a field."""
+    writer.header(frame_id).string(namespace).append('i', 0, kind, 0)   # id, type, action: add
+    if kind == LINE_STRIP:
+        writer.append('d', *ORIGIN, *NO_ROTATION)
+    else:
+        writer.field(3).field(4)
     writer.append('d', *scale).append('f', *color)
     writer.append('I', 0, 0)                                # lifetime: for ever
     writer.append('?', False)                               # frame_locked

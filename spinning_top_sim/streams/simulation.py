@@ -2,7 +2,7 @@
 """A run: the parameters, the motion with its commands, and the samples of its streams."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from spinning_top_sim.solvers.vertical import (
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.imu import LONGEST_NS, Imu
+from spinning_top_sim.streams.imu import LONGEST_NS
 from spinning_top_sim.streams.path import Path, Ride, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import ImuStream, all_streams
@@ -63,11 +63,14 @@ class Simulation:
         t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate), velocities of the
         pivot as `Drive`
     pivot : the path of the pivot; None while it rests at the origin
+    lz : as last commanded, about the vertical of the world [kg m^2/s]
     epoch_ns : stamp of t = 0 [ns]
     version : changes with all but `epoch_ns` that makes samples after `now_ns` other ones
 
     Raises ValueError where there is no motion from the start state.
     """
+
+    _begun: Callable[..., PivotPath]    # the path of the newest `Drive`, from its `stop_ns`
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         self.version = 0
@@ -96,19 +99,16 @@ class Simulation:
         segment = _segment(top, start, 0, values, pivot)
         streams = all_streams(values)
         self.values, self.top, self.streams = dict(values), top, streams
+        self.imu = next(stream.imu for stream in streams if isinstance(stream, ImuStream))
         self.history: list[tuple[Any, ...]] = []
         self.now_ns = -1
         # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
-        self.pivot, self._lz = pivot, start.lz
+        self.pivot, self.lz = pivot, start.lz
         self.path = Path(segment, self._follow, self.imu.carry,
                          keep_ns=max(trace_ns, LONGEST_NS, self.imu.keep_ns),
                          keep_steps_ns=self.imu.keep_ns)
         self.version += 1
-
-    @property
-    def imu(self) -> Imu:
-        return next(stream.imu for stream in self.streams if isinstance(stream, ImuStream))
 
     @property
     def segment(self) -> Segment:
@@ -119,11 +119,6 @@ class Simulation:
     def l3(self) -> float:
         """L3 as last commanded [kg m^2/s]."""
         return self.segment.l3
-
-    @property
-    def lz(self) -> float:
-        """Lz as last commanded, about the vertical of the world [kg m^2/s]."""
-        return self._lz
 
     @property
     def steps(self) -> int:
@@ -243,7 +238,12 @@ class Simulation:
             stop_ns = self.now_ns + timeout_ns if timeout_ns else NEVER_NS
         last = self.history[-1] if self.history else None
         if isinstance(last, Drive) and last[1:4] == target and self.now_ns < last.stop_ns:
-            self._put_off(stop_ns)
+            # The motion up to now is the same.
+            self.pivot, segment = self._begun(stop_ns=stop_ns), self.segment
+            assert segment.ride is not None
+            segment.ride = segment.ride._replace(piece=self.pivot.lasting(segment.start_ns))
+            if self.path.end_after(self.now_ns):
+                self.version += 1
             self.history[-1] = last._replace(stop_ns=stop_ns)
             return stop_ns
         pivot = self.segment.pivot(np.array([self.now_ns]))
@@ -254,14 +254,6 @@ class Simulation:
         self._continue(self.segment.posture(self.now_ns), self._begun(stop_ns=stop_ns))
         self.history.append(Drive(self.now_ns, *target, stop_ns))
         return stop_ns
-
-    def _put_off(self, stop_ns: int) -> None:
-        """Let the velocity last until another time; the motion up to now is the same."""
-        self.pivot, segment = self._begun(stop_ns=stop_ns), self.segment
-        assert segment.ride is not None
-        segment.ride = segment.ride._replace(piece=self.pivot.lasting(segment.start_ns))
-        if self.path.end_after(self.now_ns):
-            self.version += 1
 
     def _settle(self) -> None:
         """Let the solver reach `now_ns`, and be at t = 0 at least."""
@@ -275,7 +267,7 @@ class Simulation:
         segment = _segment(self.top, start, self.now_ns, self.values, pivot)
         self.pivot = pivot
         if isinstance(start, State):
-            self._lz = start.lz
+            self.lz = start.lz
         self.path.go_on_with(segment)
         self.version += 1
 

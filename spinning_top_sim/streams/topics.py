@@ -58,18 +58,10 @@ def _readings(imu: Imu, samples: Samples) -> Sequence[Field]:
     return (messages.NO_ROTATION, *imu.present_sensor.read(samples.once(imu.felt), samples.times))
 
 
-def _bias(imu: Imu, samples: Samples) -> Sequence[Field]:
-    return (messages.NO_ROTATION, *imu.present_sensor.bias(samples.times))
-
-
 def _estimates(imu: Imu, samples: Samples) -> Sequence[Field]:
     _, *readings = _readings(imu, samples)
     exact = imu.orientation(samples.states)
     return (imu.present_sensor.orientation(exact, samples.times), *readings)
-
-
-def _increment(imu: Imu, place: int, samples: Samples) -> Sequence[Field]:
-    return (samples.once(imu.measured_increments)[place],)
 
 
 def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
@@ -82,11 +74,6 @@ def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
     return ([column.astype(np.float64) for column in columns],)
 
 
-def _imu_odometry(imu: Imu, samples: Samples) -> Sequence[Field]:
-    states = samples.states
-    return (*imu.motion(samples), imu.true(states)[0])
-
-
 def _invariants(samples: Samples) -> Sequence[Field]:
     """Return the constants of the motion, drifts, and errors of norm and orientation."""
     states = samples.states
@@ -95,9 +82,9 @@ def _invariants(samples: Samples) -> Sequence[Field]:
     return ((*now, *drifts, states.norm_error, samples.orientation_error),)
 
 
-def _magnetic_field(imu: Imu, magnetometer: Callable[[int], Magnetometer],
+def _magnetic_field(imu: Imu, magnetometer: Callable[[int], Magnetometer], stream: Stream,
                     samples: Samples) -> Sequence[Field]:
-    sensor, orientation = magnetometer(samples.times.step), imu.orientation(samples.states)
+    sensor, orientation = magnetometer(stream.period_ns), imu.orientation(samples.states)
     field = sensor.disturbed(sensor.true(orientation), orientation, imu.from_body, samples.t_ns)
     return sensor.read(field, samples.times), messages.diagonal(*3 * (sensor.variance,))
 
@@ -188,8 +175,10 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
     frame, faults = values['imu.frame_id'], faults_of(values)
     stream, of_imu = partial(Stream, values), partial(ImuStream, values, imu)
     increment = partial(stream, 'increments', timing=faults, rate_parameter='imu.rate')
-    mag = partial(stream, 'mag', type_name='sensor_msgs/msg/MagneticField',
-                  template=messages.stamped(frame, 3, 9))
+    magnetic = partial(stream, 'mag', type_name='sensor_msgs/msg/MagneticField',
+                       template=messages.stamped(frame, 3, 9))
+    mag = magnetic('imu/mag')
+    mag.fields = partial(_magnetic_field, imu, lru_cache(4)(partial(Magnetometer, values)), mag)
     return [
         stream('clock', '/clock', 'rosgraph_msgs/msg/Clock', messages.clock()),
         stream('pose', 'pose', 'geometry_msgs/msg/PoseStamped', messages.stamped(world, 3, 4),
@@ -200,15 +189,15 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
         of_imu('imu', 'imu/data_raw', partial(_readings, imu), has_orientation=False,
                is_noisy=True),
         of_imu('imu_data', 'imu/data', partial(_estimates, imu), is_noisy=True),
-        of_imu('imu', 'ground_truth/imu_bias', partial(_bias, imu), has_orientation=False),
+        of_imu('imu', 'ground_truth/imu_bias', has_orientation=False, fields=lambda samples: (
+            messages.NO_ROTATION, *imu.present_sensor.bias(samples.times))),
         of_imu('ground_truth_imu', 'ground_truth/imu',
                lambda samples: (imu.orientation(samples.states), *imu.sampled(samples))),
         stream('imu_timing', 'ground_truth/imu_timing', ARRAY,
                messages.float64_multi_array(TIMING), partial(_timing, Timing(values), imu),
                rate_parameter='imu.rate'),
-        mag('imu/mag', fields=partial(
-            _magnetic_field, imu, lru_cache(4)(partial(Magnetometer, values)))),
-        mag('ground_truth/mag', fields=lambda samples: (
+        mag,
+        magnetic('ground_truth/mag', fields=lambda samples: (
             attitude.in_body(imu.orientation(samples.states), values['mag.field']),
             messages.EXACT)),
         Fix(values, 'gnss/fix'),
@@ -216,13 +205,14 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
         Velocity(values, 'gnss/velocity'),
         Velocity(values, 'ground_truth/gnss/velocity', is_exact=True),
         increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped', messages.stamped(frame, 4),
-                  partial(_increment, imu, 0)),
+                  lambda samples: samples.once(imu.measured_increments)[:1]),
         increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', messages.stamped(frame, 3),
-                  partial(_increment, imu, 1)),
+                  lambda samples: samples.once(imu.measured_increments)[1:]),
         stream('ground_truth_odom', 'ground_truth/odom', ODOMETRY, messages.odometry(world, body),
                _odometry),
         stream('ground_truth_imu_odom', 'ground_truth/imu_odom', ODOMETRY,
-               messages.odometry(world, frame), partial(_imu_odometry, imu)),
+               messages.odometry(world, frame),
+               lambda samples: (*imu.motion(samples), imu.true(samples.states)[0])),
         stream('invariants', '~/invariants', ARRAY, messages.float64_multi_array(INVARIANTS),
                _invariants),
         Markers(values)]

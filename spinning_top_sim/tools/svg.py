@@ -21,6 +21,7 @@ class Line(NamedTuple):
     colour: str
     x: Reals
     y: Reals
+    dash: str = ''
     dots: bool = False
 
 
@@ -102,7 +103,7 @@ def _curve(frame: _Frame, line: Line) -> str:
         return ''.join(f'<circle cx="{x}" cy="{y}" r="4" fill="{line.colour}"/>'
                        for x, y in places)
     points = ' '.join(f'{x},{y}' for x, y in places)
-    return f'<polyline stroke="{line.colour}" points="{points}"/>'
+    return f'<polyline stroke="{line.colour}" stroke-dasharray="{line.dash}" points="{points}"/>'
 
 
 def _mark(frame: _Frame, plot: Plot) -> str:

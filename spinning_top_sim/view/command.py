@@ -23,14 +23,15 @@ if TYPE_CHECKING:
     from spinning_top_sim.view.page import Page
 
 DESCRIPTION = """\
-Show a top in the browser: the one that a node simulates, or that of a log.
+Show a top in the browser: the one that a node simulates, or those of logs.
 
   spinning-top view --scene wavy             starts a node, and shows it
   spinning-top view                          a running node of this namespace
   spinning-top view run.mcap                 a log; needs no ROS, and may be of another program
+  spinning-top view rk45.mcap exact.mcap     side by side, or one over the other
   spinning-top view run.mcap --html a.html   a file that opens without this program
 
-exit code: 0 ended, also by a signal; 1 the log cannot be read, or a file written;
+exit code: 0 ended, also by a signal; 1 a log cannot be read, or a file written;
 2 cannot be started, or wrong arguments; 130 interrupted before
 """
 LOOPBACK = '127.0.0.1'
@@ -45,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     arguments = parser.parse_args(words)
     if arguments.log:
-        return cli.run('view', DESCRIPTION, words, add_arguments, _show_log)
+        return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs)
     with contextlib.ExitStack() as stack:
         return run('view', argv, partial(_prepare, stack, arguments))
 
@@ -70,25 +71,27 @@ def _node(files: Iterable[Path], ros_arguments: Sequence[str]) -> Iterator[None]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add = parser.add_argument
-    add('log', nargs='?', type=Path, help='an MCAP file; without: a running node')
+    add('log', nargs='*', type=Path, help='one or two MCAP files; without: a running node')
     scene_file.add_arguments(parser)
     add('--port', type=int, help='of the page (default: the first free one from 8080 on)')
     add('--host', default=LOOPBACK,
         help=f'address to serve at (default: {LOOPBACK}, which only this machine reaches)')
     add('--html', type=Path, metavar='FILE',
-        help='write the first minute of the log as a page that needs no server, and end')
+        help='write the first minute of the logs as a page that needs no server, and end')
     add('--no-browser', action='store_true', help='only print the address')
 
 
-def _show_log(arguments: argparse.Namespace) -> int:
+def _show_logs(arguments: argparse.Namespace) -> int:
+    if len(arguments.log) > 2:
+        raise ValueError(f'{len(arguments.log)} logs: must be one or two')
     if arguments.html is not None:
         cli.check_output(arguments.html)
     with needed('the page', 'view'):
-        from spinning_top_sim.view.log import Player, read_log  # noqa: PLC0415
-    track = read_log(arguments.log)
-    page = _open_page(arguments, arguments.log.name)
+        from spinning_top_sim.view.log import Player, read_logs  # noqa: PLC0415
+    logs = read_logs(arguments.log)
+    page = _open_page(arguments, ' and '.join(log.name for log in arguments.log))
     try:
-        player = Player(page, track)
+        player = Player(page, logs)
         if arguments.html is not None:
             cli.print_line(f'{arguments.html}: {player.write_html(arguments.html)}')
         else:

@@ -205,13 +205,13 @@ class LiveView(Node):
         # The present spin is not checked: it need not be possible at the start.
         values = {**parameters.checked(dict(zip(names, shown, strict=False))),
                   **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
-        track = Track(values)
+        track = Track('', values)
         if self._track is not None:
             if all(values[name] == self._track.values[name] for name in names):
                 return
             track.samples = self._track.samples
         self._track = track
-        self._page.set_track(track)
+        self._page.set_tracks([track])
         self._controls.set_range(track.top, *(values[name] for name in SPIN))
 
     # Called by the page's controls, in threads of their own.
@@ -221,14 +221,10 @@ class LiveView(Node):
         client: Client = self._services_of_sim[name]
         if not client.service_is_ready():
             raise RequestError(f'there is no {self._sim}')
-        future = client.call_async(request)
-        end = time.monotonic() + ANSWER_S
-        while not future.done():
-            time.sleep(0.01)
-            if time.monotonic() > end or self._stopped:
-                client.remove_pending_request(future)
-                raise RequestError(f'{self._sim}/{name} has not answered')
-        return future.result()
+        answer = client.call(request, ANSWER_S)
+        if answer is None:
+            raise RequestError(f'{self._sim}/{name} has not answered')
+        return answer
 
     def call(self, name: str, *on: bool) -> str:
         """Call a service of the sim_node; return its message.  Raises RequestError."""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a log: reads its track, and plays it."""
+"""The page of one log or two: reads their tracks, and plays them."""
 
 import contextlib
 import time
 from bisect import bisect_right
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,9 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools import recorded_run
+from spinning_top_sim.tools import recorded_run, svg
 from spinning_top_sim.tools.attitudes import LAYOUTS, decode
-from spinning_top_sim.view import text
+from spinning_top_sim.view import plots, text
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
 from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Samples, Track, joined
 
@@ -26,17 +26,21 @@ SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
 LONGEST_HTML_S = 60.0
 
 
-def read_log(path: Path) -> Track:
-    """Return the track of a log, which may be truncated.  Raises LogError."""
+def read_logs(paths: Sequence[Path]) -> list[Track]:
+    """Return the tracks of one log or two, which may be truncated.  Raises LogError."""
+    return [_read_log(path, path.stem if len(paths) > 1 else '') for path in paths]
+
+
+def _read_log(path: Path, name: str) -> Track:
     with LogReader(path) as reader:
         notes = [] if reader.whole else ['it is truncated: shown as far as it goes']
         try:
             run = recorded_run.read_run_description(reader)
         except recorded_run.ForeignLogError as error:
-            track = _read_foreign(reader)
+            track = _read_foreign(reader, name)
             notes.append(str(error))
         else:
-            track = Track(run.values_in_effect)
+            track = Track(name, run.values_in_effect)
             track.origin_ns = run.epoch_ns
             _read_samples(reader, track, run.topics)
             try:
@@ -61,9 +65,9 @@ def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) ->
         track.samples[name] = joined(samples)
 
 
-def _read_foreign(reader: LogReader) -> Track:
+def _read_foreign(reader: LogReader, name: str) -> Track:
     """Read the attitudes in a log of another program, from its first topic that has some."""
-    track = Track(parameters.checked({}), has_body=False)
+    track = Track(name, parameters.checked({}), has_body=False)
     for topic in reader.topics:
         found: dict[int, NDArray[np.float64]] = {}
         for message in reader.messages([topic.name]) if topic.type_name in LAYOUTS else ():
@@ -95,18 +99,22 @@ def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> 
 
 class Player:
     """
-    Plays a log on a page.
+    Plays logs on a page.
 
-    length : of the log [s]; the time of the player begins with the first sample
+    length : of all logs [s]; the time of the player begins with the first sample
     """
 
-    def __init__(self, page: Page, track: Track) -> None:
-        self._page, self._origin_ns = page, track.origin_ns
-        self._begin_ns, end_ns = track.span
-        self.length = self._seconds(end_ns)
-        self._commands = list(map(self._seconds, track.commands_ns))
-        page.set_track(track)
-        page.message.content = track.note and f'*{track.note}*'
+    def __init__(self, page: Page, tracks: Sequence[Track]) -> None:
+        self._page = page
+        self._origin_ns = tracks[0].origin_ns       # t = 0 of all logs coincides
+        shifts_ns = [track.origin_ns - self._origin_ns for track in tracks]
+        shifted = list(zip(tracks, shifts_ns, strict=True))
+        self._begin_ns = min(track.span[0] - shift_ns for track, shift_ns in shifted)
+        self.length = self._seconds(max(track.span[1] - shift_ns for track, shift_ns in shifted))
+        self._commands = sorted({self._seconds(stamp_ns - shift_ns)
+                                 for track, shift_ns in shifted for stamp_ns in track.commands_ns})
+        page.set_tracks(tracks, shifts_ns)
+        page.message.content = '\n'.join(f'*{track.note}*' for track in tracks if track.note)
         gui = page.gui
         with page.controls:
             self._button = gui.add_button('Pause')
@@ -120,8 +128,8 @@ class Player:
         self._next.on_click(lambda _: self._go_to_next())
         self._drawn_at = self._slider.value
 
-    def _seconds(self, stamp_ns: int) -> float:
-        return (stamp_ns - self._begin_ns) / NANOSECONDS
+    def _seconds(self, page_ns: int) -> float:
+        return (page_ns - self._begin_ns) / NANOSECONDS
 
     def _switch(self) -> None:
         if not self._plays and self._now >= self.length:
@@ -169,15 +177,15 @@ class Player:
         seconds = min(self.length, LONGEST_HTML_S)
         words = ''.join(page.words(begin_ns + round(second * NANOSECONDS), self._origin_ns)
                         for second in [0.0, *self._commands] if second <= seconds)
-        motion_plots, accuracy_plots = page.plots(
-            begin_ns, self._origin_ns, begin_ns, begin_ns + round(seconds * NANOSECONDS))
+        tops = page.shown(begin_ns, self._origin_ns, begin_ns,
+                          begin_ns + round(seconds * NANOSECONDS))
         serializer = page.server.get_scene_serializer()
         for picture in range(1, int(seconds * RATE) + 1):
             serializer.insert_sleep(1.0 / RATE)
             clock.position = (start + picture / RATE, 0.0, 0.0)
             self.draw(picture / RATE)
-        document = text.document(page.title, serializer.as_html(), page.legend(), words,
-                                 motion_plots + accuracy_plots)
+        document = text.document(page.title, serializer.as_html(), page.legend(), words, [
+            svg.draw(plot) for plot in (*plots.motion_plots(tops), *plots.accuracy_plots(tops))])
         with open(path, 'x', encoding='utf-8') as file:
             file.write(document)
         return f'{seconds:g} of {self.length:g} s, {len(document.encode()) / 1e6:.1f} MB'

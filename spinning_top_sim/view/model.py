@@ -44,7 +44,7 @@ def circle(radius: float, theta: float) -> Lines:
 def trace(track: Track, stamp_ns: int) -> Lines:
     """Return the lines along which the tip has moved, up to a stamp, from where the pivot is."""
     stamps_ns, axis, joined = path(track, stamp_ns - TRACE_NS, stamp_ns)
-    moved = track.places(stamps_ns) - track.place(stamp_ns)
+    moved = track.places(stamps_ns) - track.places(np.array([stamp_ns]))
     return segments(reach(track) * axis + moved)[joined]
 
 

@@ -23,8 +23,8 @@ WINDOW_NS = 10 * NANOSECONDS    # of the plots
 PANEL_WIDTH = 330               # [px]
 VIEW_ANGLE = math.radians(35.0)
 STANDS_TO = math.radians(100.0)     # tilt up to which the pivot stands on a peg; else it hangs
-TRACE, BOUNDS = (217, 72, 43), (122, 82, 179)
-SPHERE, STAND, FOOT = (190, 200, 215), (120, 126, 136), 0.8
+TRACES = ((217, 72, 43), (30, 138, 76))
+BOUNDS, SPHERE, STAND, FOOT = (122, 82, 179), (190, 200, 215), (120, 126, 136), 0.8
 ARROW_COLOURS = ((20, 120, 70), (196, 50, 150), (20, 150, 180), (230, 130, 20))
 NO_LINES = np.zeros((1, 2, 3), np.float32)
 NO_SAMPLES = 'no samples yet'
@@ -44,42 +44,51 @@ def set_content(handle: viser.GuiHtmlHandle | viser.GuiMarkdownHandle, content: 
 
 class DrawnTop:
     """
-    The top in the scene.
+    One top in the scene.
 
+    shift_ns : added to the stamp of the page
     drawn : stamp [ns] and row of the attitude that is drawn, None if there is none
     """
 
-    def __init__(self, scene: viser.SceneApi, track: Track) -> None:
-        self.track, far = track, model.reach(track)
+    def __init__(self, scene: viser.SceneApi, number: int, track: Track, shift_ns: int) -> None:
+        self.track, self.shift_ns = track, shift_ns
+        name, far = f'/top{number}', model.reach(track)
         radius = abs(far)
-        self.root = scene.add_frame('/top', show_axes=False)
-        self._sphere = scene.add_icosphere('/top/sphere', radius, SPHERE, subdivisions=5,
+        self.root = scene.add_frame(name, show_axes=False)
+        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
                                            opacity=0.12, side='back', cast_shadow=False,
                                            receive_shadow=False)
-        self._body = scene.add_frame('/top/body', show_axes=not track.has_body,
+        self._body = scene.add_frame(f'{name}/body', show_axes=not track.has_body,
                                      axes_length=0.7 * radius, axes_radius=0.015 * radius)
         for part in (body.wheel if track.has_body else body.disc)(track.shape, far):
             scene.add_mesh_simple(
-                f'/top/body/{part.name}', part.mesh.vertices, part.mesh.faces, color=part.colour,
+                f'{name}/body/{part.name}', part.mesh.vertices, part.mesh.faces,
+                color=part.colour, opacity=0.4 if number else None,
                 flat_shading=part.name != 'axle', side='double')
         peg = body.stand(FOOT * radius)
-        self._stand = scene.add_mesh_simple('/top/stand', peg.vertices, peg.faces, color=STAND,
+        self._stand = scene.add_mesh_simple(f'{name}/stand', peg.vertices, peg.faces, color=STAND,
                                             side='double')
-        self._trace = scene.add_line_segments('/top/trace', NO_LINES, TRACE,
-                                              thickness=0.018 * radius)
+        self._trace = scene.add_line_segments(
+            f'{name}/trace', NO_LINES, TRACES[number], thickness=0.018 * radius)
         self._bounds = [scene.add_line_segments(
-            f'/top/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * radius, visible=False)
+            f'{name}/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * radius, visible=False)
             for k in range(2)]
         self._arrows = [scene.add_arrows(
-            f'/top/{arrow.replace(" ", "_")}', NO_LINES, colour,
+            f'{name}/{arrow.replace(" ", "_")}', NO_LINES, colour,
             shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
             visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
+        self._colour = np.array(TRACES[number])
         self._limits: tuple[float, float] | None = None         # that are drawn [rad]
         self.drawn: tuple[int, model.Vectors] | None = None
         self._shown: object = None                      # stamp and switches of the picture
 
-    def draw(self, stamp_ns: int, *, trace: bool, bounds: bool, arrows: Sequence[bool]) -> None:
-        """Draw the newest samples up to a stamp, with some of the parts."""
+    def motion(self, page_ns: int) -> DescribedMotion | None:
+        """Return the motion at a stamp of the page."""
+        return self.track.motion_at(page_ns + self.shift_ns)
+
+    def draw(self, page_ns: int, *, trace: bool, bounds: bool, arrows: Sequence[bool]) -> None:
+        """Draw the newest samples up to a stamp of the page, with some of the parts."""
+        stamp_ns = page_ns + self.shift_ns
         self.drawn = sample = self.track.attitudes.at(stamp_ns)
         self.root.visible = sample is not None
         shown = sample and (sample[0], trace, bounds, arrows)
@@ -98,7 +107,7 @@ class DrawnTop:
             vector = model.arrow(self.track, name, stamp_ns) if on else None
             arrow.points = NO_LINES if vector is None else model.segments(
                 np.vstack((np.zeros(3), vector)))
-        self._draw_bounds(self.track.motion_at(stamp_ns), bounds)
+        self._draw_bounds(self.motion(page_ns), bounds)
 
     def _draw_trace(self, lines: model.Lines) -> None:
         """Draw a trace that fades with its age; the colours of a line's points are linear."""
@@ -106,7 +115,7 @@ class DrawnTop:
         if len(lines) != len(self._trace.points):
             share = np.linspace(0.35, 1.0, len(lines))[:, np.newaxis, np.newaxis]
             self._trace.colors = np.broadcast_to(255 * (
-                1.0 + share * (np.array(TRACE) / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
+                1.0 + share * (self._colour / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
         self._trace.points = lines
 
     def _draw_bounds(self, motion: DescribedMotion | None, on: bool) -> None:
@@ -124,7 +133,7 @@ class DrawnTop:
 
 class Page:
     """
-    The page, with its own server.  One thread calls `set_track` and `draw`.
+    The page, with its own server.  One thread calls `set_tracks` and `draw`.
 
     title : such as the name of the log
     controls : the folder for the controls of the source of the samples
@@ -150,6 +159,7 @@ class Page:
             self._trace = gui.add_checkbox('trace of the axis', True)
             self._bounds = gui.add_checkbox('bounds of θ', True)
             self.arrows = [gui.add_checkbox(name, False) for name in model.ARROWS]
+            self._over = gui.add_checkbox('one over the other', False, visible=False)
         self._accuracy_folder = gui.add_folder('Accuracy', expand_by_default=False)
         with self._accuracy_folder:
             self._accuracy = gui.add_html('')
@@ -159,7 +169,7 @@ class Page:
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)
         panel.expand()              # also on a phone, where it is below
-        self.top: DrawnTop | None = None
+        self._tops: list[DrawnTop] = []
         self._number = 0            # of the picture
 
     def close(self) -> None:
@@ -168,69 +178,77 @@ class Page:
         time.sleep(LAST_WORDS_S)
         self.server.stop()
 
-    def set_track(self, track: Track) -> None:
-        """Show this top."""
-        if self.top is not None:
-            self.top.root.remove()
+    def set_tracks(self, tracks: Sequence[Track], shifts_ns: Sequence[int] = (0,)) -> None:
+        """Show these tops; a shift is added to a stamp of the page to get the track's."""
+        for top in self._tops:
+            top.root.remove()
         scene = self.server.scene
-        self.top = DrawnTop(scene, track)
-        size = self._reach = abs(model.reach(track))
-        self._accuracy_folder.visible = track.has_body
-        for switch in (self._bounds, *self.arrows):
-            switch.visible = track.has_body
+        self._tops = [DrawnTop(scene, number, track, shift_ns) for number, (track, shift_ns)
+                      in enumerate(zip(tracks, shifts_ns, strict=True))]
+        size = self._reach = max(abs(model.reach(track)) for track in tracks)
+        self._over.visible = len(tracks) > 1
+        self._bounds.visible = self._accuracy_folder.visible = any(
+            track.has_body for track in tracks)
+        for arrow in self.arrows:
+            arrow.visible = self._bounds.visible
         self._ground = scene.add_grid(
             '/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
             cell_color=(238, 240, 244), section_color=(228, 231, 236), fade_distance=9 * size,
             fade_from='origin', shadow_opacity=0.1, position=(0.0, 0.0, -FOOT * size))
         camera = self.server.initial_camera
+        away = size * (5.2 if len(tracks) == 1 else 10.5)
         camera.fov = VIEW_ANGLE
-        camera.position = (0.0, -4.8 * size, 2.0 * size)
+        camera.position = (0.0, -0.92 * away, 0.39 * away)
         camera.look_at = (0.0, 0.0, 0.1 * size)
         camera.near, camera.far = 0.01 * size, 100.0 * size
 
-    def draw(self, stamp_ns: int, origin_ns: int) -> None:
+    def draw(self, page_ns: int, origin_ns: int) -> None:
         """
-        Draw the top at a stamp [ns].
+        Draw all tops at a stamp of the page [ns].
 
         origin_ns : stamp of t = 0
         """
-        assert self.top is not None
+        arrows = [switch.value for switch in self.arrows]
+        side = 0.0 if self._over.value else 1.3 * self._reach
+        places = [top.track.places(np.array([page_ns + top.shift_ns]))[0] for top in self._tops]
         with self.server.atomic():
-            # The top stays in the picture: the ground moves.
-            x, y, z = self.top.track.place(stamp_ns)
-            self._ground.position = (-(x % self._reach), -(y % self._reach),
-                                     -FOOT * self._reach - z)
-            self.top.draw(stamp_ns, trace=self._trace.value, bounds=self._bounds.value,
-                          arrows=[switch.value for switch in self.arrows])
+            if places:          # the picture follows the first top: the ground moves
+                x, y, z = places[0]
+                self._ground.position = (-(x % self._reach), -(y % self._reach),
+                                         -FOOT * self._reach - z)
+            for k, (top, place) in enumerate(zip(self._tops, places, strict=True)):
+                top.root.position = place - places[0] + (
+                    side * (2 * k - len(self._tops) + 1), 0.0, 0.0)
+                top.draw(page_ns, trace=self._trace.value, bounds=self._bounds.value,
+                         arrows=arrows)
         if self._number % PLOT_EVERY == 0:
-            motion, accuracy = self.plots(stamp_ns, origin_ns, stamp_ns - WINDOW_NS, stamp_ns)
-            set_content(self._plots, motion)
-            set_content(self._accuracy, accuracy)
-            set_content(self._words, self.words(stamp_ns, origin_ns))
+            tops = self.shown(page_ns, origin_ns, page_ns - WINDOW_NS, page_ns)
+            set_content(self._plots, ''.join(map(svg.draw, plots.motion_plots(tops))))
+            set_content(self._accuracy, ''.join(map(svg.draw, plots.accuracy_plots(tops))))
+            set_content(self._words, self.words(page_ns, origin_ns))
             set_content(self._legend, self.legend())
         self._number += 1
 
-    def plots(self, stamp_ns: int, origin_ns: int, begin_ns: int, end_ns: int) -> tuple[str, str]:
-        """Return the plots of a span of stamps, with a mark at one, and those of the accuracy."""
-        assert self.top is not None
-        shown = plots.Shown(self.top.track, stamp_ns, begin_ns, end_ns, origin_ns)
-        motion, accuracy = (''.join(map(svg.draw, found)) for found in (
-            plots.motion_plots(shown), plots.accuracy_plots(shown)))
-        return motion, accuracy
+    def shown(self, page_ns: int, origin_ns: int, begin_ns: int,
+              end_ns: int) -> list[plots.Shown]:
+        """Return what is plotted of the tops at a stamp, for a span of stamps of the page."""
+        return [plots.Shown(top.track, *(stamp_ns + top.shift_ns for stamp_ns in (
+            page_ns, begin_ns, end_ns, origin_ns))) for top in self._tops]
 
-    def words(self, stamp_ns: int, origin_ns: int) -> str:
-        """Return HTML about the motion and the sample that is drawn at a stamp."""
-        assert self.top is not None
-        track = self.top.track
-        sample = track.attitudes.at(stamp_ns)
-        return f'<p>{NO_SAMPLES}</p>' if sample is None else text.words(
-            track, track.motion_at(stamp_ns), sample[0], sample[0] - origin_ns)
+    def words(self, page_ns: int, origin_ns: int) -> str:
+        """Return HTML about the motions and the samples that are drawn."""
+        drawn = [(top, top.track.attitudes.at(page_ns + top.shift_ns)) for top in self._tops]
+        return ''.join(text.words(top.track, top.motion(page_ns), sample[0],
+                                  sample[0] - top.shift_ns - origin_ns) if sample else
+                       f'<p>{top.track.name} {NO_SAMPLES}</p>' for top, sample in drawn)
 
     def legend(self) -> str:
         """Return HTML about the colours of what is switched on."""
-        assert self.top is not None
-        entries = [(TRACE, 'trace of the axis')] if self._trace.value else []
-        if self._bounds.value and self.top.track.motions:
+        entries = []
+        if self._trace.value:
+            entries += [(TRACES[k], f'trace of the axis {top.track.name}'.rstrip()
+                         + k * ' (plots: dashed)') for k, top in enumerate(self._tops)]
+        if self._bounds.value and any(top.track.motions for top in self._tops):
             entries.append((BOUNDS, 'bounds of θ'))
         entries += [(colour, name) for name, colour, switch in zip(
             model.ARROWS, ARROW_COLOURS, self.arrows, strict=True) if switch.value]

@@ -2,6 +2,7 @@
 """The plots beside the scene."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,49 +38,50 @@ class Shown(NamedTuple):
     def seconds(self, stamps_ns: NDArray[np.int64]) -> Reals:
         return (stamps_ns - self.origin_ns) / NANOSECONDS
 
-    @property
-    def now(self) -> float:
-        return (self.stamp_ns - self.origin_ns) / NANOSECONDS
-
     def part(self, samples: Samples) -> tuple[Reals, Reals]:
         stamps_ns, rows = samples.part(self.begin_ns, self.end_ns).thinned(POINTS)
         return self.seconds(stamps_ns), rows
 
 
-def motion_plots(top: Shown) -> list[Plot]:
+def motion_plots(tops: Sequence[Shown]) -> list[Plot]:
     """Return the plots of potential, energies, tilt and precession, as far as there are data."""
-    potential = _potential(top)
-    stamps_ns, axis, _ = model.path(top.track, top.begin_ns, top.end_ns)
-    stamps_ns, axis = Samples(stamps_ns, axis).thinned(POINTS)
-    tilt = [Line('θ', RED, top.seconds(stamps_ns), model.tilt(axis))]
-    energy, rate = list[Line](), list[Line]()
-    times, rows = top.part(top.track.rates)
-    if len(rows):
-        rate = [Line('φ′', BLUE, times, rows[:, PRECESSION])]
-        kinetic, height = model.energies(top.track.top, rows)
-        energy = [Line('kinetic', RED, times, kinetic), Line('potential', BLUE, times, height),
-                  Line('sum', GREEN, times, kinetic + height)]
-    present = top.track.attitudes.at(top.stamp_ns)
+    potential, energy, tilt, rate = (list[Line]() for _ in range(4))
+    for top, dash in zip(tops, ('', '5 3'), strict=False):
+        potential += _potential(top, dash)
+        stamps_ns, axis, _ = model.path(top.track, top.begin_ns, top.end_ns)
+        stamps_ns, axis = Samples(stamps_ns, axis).thinned(POINTS)
+        tilt.append(Line('θ', RED, top.seconds(stamps_ns), model.tilt(axis), dash))
+        times, rows = top.part(top.track.rates)
+        if len(rows):
+            rate.append(Line('φ′', BLUE, times, rows[:, PRECESSION], dash))
+            kinetic, height = model.energies(top.track.top, rows)
+            energy += [Line('kinetic', RED, times, kinetic, dash),
+                       Line('potential', BLUE, times, height, dash),
+                       Line('sum', GREEN, times, kinetic + height, dash)]
+    now = float(tops[0].seconds(np.array(tops[0].stamp_ns)))
+    present = tops[0].track.attitudes.at(tops[0].stamp_ns)
     theta = float(model.tilt(model.axis_of(present[1]))[0]) if present else math.nan
     return [plot for plot in (
         Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', potential, theta,
              float(potential[1].y[0]) if potential else None),
-        Plot('Energy', 'time t [s]', 'E [J]', energy, top.now),
-        Plot('Tilt', 'time t [s]', 'θ [deg]', tilt, top.now),
-        Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', rate, top.now)) if plot.lines]
+        Plot('Energy', 'time t [s]', 'E [J]', energy, now),
+        Plot('Tilt', 'time t [s]', 'θ [deg]', tilt, now),
+        Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', rate, now)) if plot.lines]
 
 
-def accuracy_plots(top: Shown) -> list[Plot]:
-    """Return the plots of energy drift and orientation error, of ~/invariants."""
-    times, rows = top.part(top.track.samples['~/invariants'])
+def accuracy_plots(tops: Sequence[Shown]) -> list[Plot]:
+    """Return the plots of the drift of the energy and of the error of the orientation."""
+    now = float(tops[0].seconds(np.array(tops[0].stamp_ns)))
+    parts = [top.part(top.track.samples['~/invariants']) for top in tops]
     return [Plot(title, 'time t [s]', y_label, [
-        Line('', RED, times, np.log10(np.maximum(np.abs(rows[:, column]), LEAST)))], top.now)
+        Line('', RED, times, np.log10(np.maximum(np.abs(rows[:, column]), LEAST)), dash)
+        for (times, rows), dash in zip(parts, ('', '5 3'), strict=False)], now)
         for title, y_label, column in (
             ('Energy drift, relative', 'log₁₀', ENERGY_DRIFT),
             ('Orientation error', 'log₁₀ [rad]', ORIENTATION_ERROR))]
 
 
-def _potential(top: Shown) -> list[Line]:
+def _potential(top: Shown, dash: str) -> list[Line]:
     """Return V around the bounds of theta, the energy of the axis, and the turning points."""
     motion = top.track.motion_at(top.stamp_ns)
     if motion is None or motion.description is None:
@@ -96,7 +98,7 @@ def _potential(top: Shown) -> list[Line]:
         heights = effective_potential(axis, l3, lz, bounds)
     turning = bounds[np.abs(heights - motion.energy) < 1e-3 * depth]
     inside = np.degrees(np.clip(bounds, theta[0], theta[-1]))
-    return [Line('V', BLUE, np.degrees(theta), effective_potential(axis, l3, lz, theta)),
-            Line('E − L₃²/2λ₃', GREEN, inside, np.full(2, motion.energy)),
+    return [Line('V', BLUE, np.degrees(theta), effective_potential(axis, l3, lz, theta), dash),
+            Line('E − L₃²/2λ₃', GREEN, inside, np.full(2, motion.energy), dash),
             Line('turning points', VIOLET, np.degrees(turning),
                  np.full(len(turning), motion.energy), dots=True)]

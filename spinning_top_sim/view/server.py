@@ -67,20 +67,16 @@ def refusal(asked: str | None, origin: str | None, names: set[str]) -> str:
     asked : the header `Host`;  origin : the header `Origin`, None if no browser asks
     names : the names that are allowed; addresses always are
     """
-    if asked and not _is_own(asked, names):
+    host = ''
+    with contextlib.suppress(ValueError):       # malformed, or no address
+        host = urllib.parse.urlsplit(f'//{asked or ""}').hostname or ''
+        ipaddress.ip_address(host)
+        names = {*names, host}
+    if asked and host not in names:
         return f'Host: {asked}: must be an address or one of {", ".join(sorted(names))}'
     if origin is not None and origin.partition('://')[2].lower() != (asked or '').lower():
         return f'Origin: {origin}: must be the address of this page, {asked}'
     return ''
-
-
-def _is_own(asked: str, names: set[str]) -> bool:
-    host = ''
-    with contextlib.suppress(ValueError):       # malformed, or no address
-        host = urllib.parse.urlsplit(f'//{asked}').hostname or ''
-        ipaddress.ip_address(host)
-        return True
-    return host in names
 
 
 @contextlib.contextmanager

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from string import Template
 
+import numpy as np
+
 from spinning_top_sim.physics.regimes import SENTENCES
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -36,12 +38,12 @@ def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns:
                        ('motion', PIVOT_MOVES if motion.pivot_moves else BEYOND) if motion else
                        ('attitude', '' if track.has_body else NEUTRAL))
     rows = [*_rows(track.top, motion)] if motion else []
-    place = track.place(stamp_ns)
+    place = track.places(np.array([stamp_ns]))[0]
     if place.any():
         rows.append(('Pivot', ', '.join(map(number, place)), 'x, y, z [m]'))
     return ''.join((
-        f'<div class="top-words"><h1>{title}</h1>', f'<p>{sentence}</p>' if sentence else '',
-        '<table>',
+        '<div class="top-words">', f'<p>{html.escape(track.name)}</p>' if track.name else '',
+        f'<h1>{title}</h1>', f'<p>{sentence}</p>' if sentence else '', '<table>',
         *(f'<tr><td>{label}</td><td>{value}{f"<small>{note}</small>" if note else ""}</td></tr>'
           for label, value, note in rows),
         f'</table><p class="stamp">t = {since_ns / NANOSECONDS:.3f} s, stamp '
@@ -76,9 +78,9 @@ def legend(entries: Sequence[tuple[tuple[int, int, int], str]]) -> str:
 
 
 def document(title: str, scene: str, legend_html: str, words_html: str,
-             plots_html: str) -> str:
+             plots_html: Sequence[str]) -> str:
     """Return a page that works without a server; `scene` is a page for its own frame."""
     template = Template((HERE / 'file.html').read_text('utf-8'))
     return template.substitute(
         title=html.escape(title), style=STYLE, legend=legend_html, words=words_html,
-        plots=plots_html, scene=scene.replace('&', '&amp;').replace('"', '&quot;'))
+        plots=''.join(plots_html), scene=scene.replace('&', '&amp;').replace('"', '&quot;'))

@@ -99,6 +99,7 @@ class Track:
     """
     The samples of a top.
 
+    name : shown if there are several tracks
     values : checked parameters of the run
     has_body : whether they are those of the body; in the logs of other programs they are not
     samples : by topic
@@ -107,8 +108,8 @@ class Track:
     note : what is missing in a log, '' if nothing is
     """
 
-    def __init__(self, values: Mapping[str, Any], has_body: bool = True) -> None:
-        self.values, self.has_body = values, has_body
+    def __init__(self, name: str, values: Mapping[str, Any], has_body: bool = True) -> None:
+        self.name, self.values, self.has_body = name, values, has_body
         self.top = parameters.top_of(values)
         self.shape = Shape(self.top)
         self.samples = {topic: empty(topic) for topic in WIDTHS}
@@ -169,10 +170,6 @@ class Track:
             return np.zeros((len(stamps_ns), 3))
         return np.stack([np.interp(stamps_ns - known_ns[0], known_ns - known_ns[0], column)
                          for column in rows[:, -3:].T], axis=-1)
-
-    def place(self, stamp_ns: int) -> NDArray[np.float64]:
-        """Return where the pivot is at a stamp, (3,) [m]."""
-        return self.places(np.array([stamp_ns]))[0]
 
     @property
     def moves(self) -> bool:

@@ -15,9 +15,11 @@ PATIENCE_MS = 60_000
 OPTIONS = ('--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader',
            '--enable-unsafe-swiftshader')
 # Shaders are made and the scene is moved, but no pixel is computed: the processor would need ten
-# seconds for the first picture.
+# seconds for the first picture.  Ten pictures a second are enough to be looked at by a program.
 NOT_DRAWN = """for (const name of ['drawArrays', 'drawElements', 'drawElementsInstanced'])
-    WebGL2RenderingContext.prototype[name] = () => {};"""
+    WebGL2RenderingContext.prototype[name] = () => {};
+const draw = window.requestAnimationFrame.bind(window);
+window.requestAnimationFrame = act => setTimeout(() => draw(act), 100);"""
 
 
 def launch():
@@ -49,7 +51,7 @@ class Visit:
                 urllib.parse.urlsplit(asked.url).hostname))
         self.page.goto(address if '://' in address else Path(address).as_uri())
         self.scene = self.page.frames[1] if framed else self.page
-        self.wait("window.__viserMutable?.nodePoseData['/top/body']")
+        self.wait("window.__viserMutable?.nodePoseData['/top0/body']")
 
     def __enter__(self):
         return self
@@ -61,7 +63,7 @@ class Visit:
         """Wait until a JavaScript expression is true; return it."""
         return self.scene.wait_for_function(condition, timeout=PATIENCE_MS).json_value()
 
-    def attitude(self, name='/top/body'):
+    def attitude(self, name='/top0/body'):
         """Return the quaternion x, y, z, w with which a node of the scene is drawn."""
         w, *xyz = self.scene.evaluate(f'window.__viserMutable.nodePoseData[{name!r}].wxyz')
         return [*xyz, w]

@@ -62,25 +62,6 @@ def turned(q, v):
     return product(product(q, pure), conjugate(q))[..., :3]
 
 
-def about_z(angle):
-    zero = np.zeros_like(angle)
-    return np.stack([zero, zero, np.sin(angle / 2), np.cos(angle / 2)], axis=-1)
-
-
-def about_y(angle):
-    zero = np.zeros_like(angle)
-    return np.stack([zero, np.sin(angle / 2), zero, np.cos(angle / 2)], axis=-1)
-
-
-def in_common(*topics):
-    """Return the messages of topics at the stamps that all of them have."""
-    by_stamp = [{stamp_of(data): i for i, data in enumerate(topic.raw)} for topic in topics]
-    common = sorted(set.intersection(*map(set, by_stamp)))
-    return common, [[messages[index[stamp]] for stamp in common]
-                    for messages, index in zip((t.messages() for t in topics), by_stamp,
-                                               strict=True)]
-
-
 def log_of(path):
     """Return {topic: [(log time, bytes)]} and the metadata of a log, by the mcap package."""
     with Path(path).open('rb') as file:

@@ -14,6 +14,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from helpers.node_harness import as_yaml, numbers, wait_for
+from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.simulator import Simulator
 
 
@@ -56,6 +57,20 @@ class OwnNode(InThisProcess):
             setattr(one, 'publish', self.heard[one.stream.topic].append)
             for one in outputs if one.stream.topic in self.heard]
         return self
+
+    def begin_again(self, values):
+        """Let the node be as after a start with these values, and paused."""
+        node = self.node
+        node._session.stop()
+        before, node.values = node.values, dict(values)
+        node._start_spin = {name: values[name] for name in SPIN}
+        node._open_outputs(values)
+        node.remove_on_set_parameters_callback(node._on_set_parameters)
+        node.set_parameters([
+            Parameter(name, value=list(value) if isinstance(value, tuple) else value)
+            for name, value in values.items() if value != before[name] and name not in SPIN])
+        node.add_on_set_parameters_callback(node._on_set_parameters)
+        node.start_again(paused=True)
 
     def set(self, **values):
         """Set parameters all or none; return the result."""

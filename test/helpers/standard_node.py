@@ -38,8 +38,7 @@ class StandardNode(OwnNode):
 
     def renew(self):
         """Go back to the state after the start."""
-        self.node._session.stop()
-        self.node.start_again(self._first_values, paused=True)
+        self.begin_again(self._first_values)
         self._forget()
 
     def call(self, name, **request):

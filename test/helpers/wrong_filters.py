@@ -203,7 +203,10 @@ OWN = {     # and these
         'wrong side': ({'advance': world}, GYROSCOPE),
         'Euler angles': ({'advance': euler}, GYROSCOPE),
         'never corrects': ({'share': 0.0}, f'{GRAVITY} {FIELD}')},
-    'ekf': {'bias negated': ({'report': np.negative}, 'bias_report')}}
+    'ekf': {
+        # It takes the lag for motion of the device, and follows such forces little.
+        'force smoothed': ({'smooth': (0.0, 0.1, 0.0)}, f'{LAG} {OFF}'),
+        'bias negated': ({'report': np.negative}, 'bias_report')}}
 KINDS = {'mahony': Mahony, 'complementary': Complementary, 'ekf': Ekf}
 TABLE = {f'{kind}, {name}': (partial(make, **change), set(causes.split()))
          for kind, make in KINDS.items()
