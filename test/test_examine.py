@@ -163,9 +163,13 @@ def test_vqf_passes_with_and_without_magnetometer(report):
     assert without.passed and without.measures['heading_rms_deg'] < 0.1, without
 
 
-def test_the_fixture_for_pytest_fails_a_test_of_a_filter_with_faults(
-        pass_exam, report, monkeypatch):        # noqa: F811
+@pytest.fixture
+def short_exam(report, monkeypatch):
     monkeypatch.setattr(pytest_plugin, 'examine', report)
+
+
+def test_the_fixture_for_pytest_fails_a_test_of_a_filter_with_faults(
+        short_exam, pass_exam, report):         # noqa: F811
     assert pass_exam('vqf') is report('vqf')
     with pytest.raises(pytest.fail.Exception, match='conjugated, the error falls'):
         pass_exam('vqf', 'conjugated')

@@ -24,11 +24,10 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top
 from spinning_top_sim.grade import Body, Start, grade, grade_trajectory
-from spinning_top_sim.grade.motion import errors_of
+from spinning_top_sim.grade.motion import InvalidTrajectoryError, Trajectory, errors_of
 from spinning_top_sim.grade.pytest_plugin import pass_grade  # noqa: F401, a fixture
 from spinning_top_sim.grade.report import FAULTS
 from spinning_top_sim.grade.scenes import SCENES, WHEEL
-from spinning_top_sim.grade.trajectory import InvalidTrajectoryError, Trajectory
 
 QUIET = WHEEL
 SENSOR = replace(WHEEL, gyroscope_noise_density=1.7e-4, accelerometer_noise_density=1.2e-3)

@@ -10,8 +10,7 @@ from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.grade.command import main
-from spinning_top_sim.grade.files import trajectory_of
+from spinning_top_sim.grade.command import main, trajectory_of
 from spinning_top_sim.grade.scenes import Start
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file

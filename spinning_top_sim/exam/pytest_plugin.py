@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A fixture for pytest: `pytest_plugins = ['spinning_top_sim.exam.pytest_plugin']`."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import pytest
 
 from spinning_top_sim.exam.examiner import examine
 from spinning_top_sim.exam.report import Report
+from spinning_top_sim.tools.verdict import passing
 
 
 @pytest.fixture
@@ -17,10 +18,4 @@ def pass_exam() -> Callable[..., Report]:
     The function takes the arguments of `examine`, and `known`, names of faults that are allowed.
     It returns the report.
     """
-    def pass_exam(*arguments: object, known: Iterable[str] = (), **options: object) -> Report:
-        __tracebackhide__ = True
-        report = examine(*arguments, **options)     # type: ignore[arg-type]
-        if not set(report.faults) <= set(known):
-            pytest.fail(str(report), pytrace=False)
-        return report
-    return pass_exam
+    return passing(examine)

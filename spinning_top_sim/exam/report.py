@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of an exam as text, JSON and JUnit XML."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 from spinning_top_sim.exam import diagnosis
-from spinning_top_sim.exam.diagnosis import FAULTS, Fault
+from spinning_top_sim.exam.diagnosis import FAULTS
 from spinning_top_sim.exam.measures import CONVERGED_DEG
 from spinning_top_sim.exam.trial import Outcome
+from spinning_top_sim.tools.verdict import Verdict, number
 
-# Of each measure that needs a word: what it is, and from where on it is a fault.
 MEANINGS = {
     'tilt_rms_deg': 'settled', 'tilt_max_deg': 'settled', 'heading_rms_deg': 'settled',
     'tilt_clean_deg': 'without noise, at rest and in motion', 'heading_clean_deg': 'the same',
@@ -38,7 +38,7 @@ MEANINGS = {
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Verdict):
     """
     The result of an exam; `str(report)` is readable.
 
@@ -48,40 +48,19 @@ class Report:
     outcomes : output of the filter in the runs, for pictures
     """
 
-    subject: str
-    found: Sequence[Fault]
-    measures: Mapping[str, float]
     outcomes: Sequence[Outcome] = field(default=(), repr=False)
-
-    @property
-    def passed(self) -> bool:
-        """Whether no fault was found."""
-        return not self.found
+    meanings: ClassVar[Mapping[str, str]] = MEANINGS
 
     @property
     def faults(self) -> list[str]:
         """Names of the faults found, from `diagnosis.FAULTS`."""
-        return [fault.name for fault in self.found]
+        return self.names
 
-    def __str__(self) -> str:
-        lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.faults)}']
-        lines += [f'  {fault.name}: {fault.evidence}' for fault in self.found]
-        lines += [f'  {line}' for line in self.measure_lines()]
-        return '\n'.join(lines)
-
-    def measure_lines(self) -> list[str]:
-        """Return the measures, with what they mean, except those that could not be measured."""
-        width = max(map(len, self.measures), default=0)
-        return [f'{name:<{width}}{value:>12.4g}  {MEANINGS.get(name, "")}'.rstrip()
-                for name, value in self.measures.items() if not math.isnan(value)]
-
-    def as_json(self) -> str:
-        """Return JSON with subject, passed, faults, evidence and measures, null for NaN."""
-        return json.dumps({
-            'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
-            'evidence': dict(self.found),
-            'measures': {name: value if math.isfinite(value) else None
-                         for name, value in self.measures.items()}}, indent=2)
+    def as_dict(self) -> dict[str, Any]:
+        """Return subject, passed, faults, evidence and measures; None: NaN."""
+        return {'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
+                'evidence': dict(self.found),
+                'measures': {name: number(value) for name, value in self.measures.items()}}
 
     def as_junit(self) -> str:
         """Return a test suite in JUnit XML with a test case for each fault of FAULTS."""

@@ -22,18 +22,25 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from scipy.spatial.transform import Rotation
+import numpy as np
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation, RotationSpline
 
-from spinning_top_sim.grade.files import trajectory_of
-from spinning_top_sim.grade.fit import Fit, far_start, fit, start_of
+from spinning_top_sim.grade import fit as fitting
 from spinning_top_sim.grade.grader import grade_trajectory
-from spinning_top_sim.grade.scenes import Body
+from spinning_top_sim.grade.motion import Trajectory
+from spinning_top_sim.grade.scenes import Body, Reals
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, motion_files, scene_file
+from spinning_top_sim.tools.motion_files import Recorded
 
-DENSITIES = 'gyroscope_noise_density', 'accelerometer_noise_density'
+SAME_S = 1e-6               # between two stamps of one time
+EVEN = 1e-4                 # share of the interval by which evenly spaced samples may be off
+GAP = 2.5                   # intervals that are a gap
+DEGREE = 5                  # of the splines between samples
+COARSE = 0.5                # turned from one sample to the next [rad]: splines fail
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -65,25 +72,18 @@ def _run(arguments: argparse.Namespace) -> int:
         print(json.dumps({**report.as_dict(), 'notes': recorded.notes,
                           'fit': found and found.as_dict()}, indent=2))
     else:
-        fitted = found.lines() if found else ()
-        for line in (*recorded.notes, *fitted, *str(report).splitlines()):
+        for line in (*recorded.notes, *(found.lines() if found else ()),
+                     *str(report).splitlines()):
             cli.print_line(line)
     return cli.OK if report.passed and (found is None or found.reached) else cli.FAILED
 
 
-def _given(arguments: argparse.Namespace) -> dict[str, object]:
-    """Return the parameters that are given.  Raises ValueError for a start beside --fit."""
-    given = scene_file.given(arguments)
-    starts = [name for name in given if name.startswith(('initial.', 'spin.'))]
-    if starts and (arguments.fit or arguments.fit_imu):
-        raise ValueError(f'--fit finds the start: {", ".join(starts)} must not be given')
-    return given
-
-
 def _motion(arguments: argparse.Namespace,
-            recorded: motion_files.Recorded) -> tuple[Body, State, Fit | None]:
+            recorded: Recorded) -> tuple[Body, State, fitting.Fit | None]:
     """Return top with IMU and start, as given or as fitted, and the fit."""
-    given, fits = _given(arguments), arguments.fit or arguments.fit_imu
+    given, fits = scene_file.given(arguments), arguments.fit or arguments.fit_imu
+    if fits and (starts := [name for name in given if name.startswith(('initial.', 'spin.'))]):
+        raise ValueError(f'--fit finds the start: {", ".join(starts)} must not be given')
     known = None if given else recorded.parameters
     values = known or parameters.checked(given)
     x, y, z, w = Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()
@@ -91,21 +91,83 @@ def _motion(arguments: argparse.Namespace,
     body = Body.of(
         top, lever_arm=tuple(arguments.lever_arm or values['imu.lever_arm']),
         mounting=(w, x, y, z), field=tuple(values['mag.field']),
-        **{name: given.get(f'imu.{name}') for name in DENSITIES})
+        **{name: given.get(f'imu.{name}') for name in (
+            'gyroscope_noise_density', 'accelerometer_noise_density')})
     if fits or not (given or known):
-        found = fit(recorded.parts, lambda1=top.lambda1, gravity=top.gravity,
-                    imu=arguments.fit_imu)
-        fitted, start = found.body(body), found.start
-        if arguments.lever_arm or 'imu.lever_arm' in given:
-            fitted = replace(fitted, lever_arm=body.lever_arm)
+        found = fitting.fit(recorded.parts, lambda1=top.lambda1, gravity=top.gravity,
+                            imu=arguments.fit_imu)
+        if arguments.fit_imu:
+            body = replace(body, mounting=found.mounting, lever_arm=body.lever_arm if (
+                arguments.lever_arm or 'imu.lever_arm' in given) else found.lever_arm)
         if any(name.startswith('top.') for name in given):
-            fitted = replace(fitted, **vars(top))
-            start = start_of(found, recorded.parts, top)
-        return fitted, start, found
-    if off := far_start(recorded.parts, top, start):
+            return body, fitting.start_of(found, recorded.parts, top), found
+        return replace(body, **vars(found.top)), found.start, found
+    if off := fitting.far_start(recorded.parts, top, start):
         raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
                          '--fit finds top and start')
     return body, start, None
+
+
+def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0) -> Trajectory:
+    """
+    Return all parts at the times of the one with most samples, made evenly spaced.
+
+    motion : about which attitudes are interpolated; white noise about it is taken away
+    begin : time of its start; times are counted from there [s]
+    """
+    def turns(times: Reals) -> Rotation:
+        return Rotation.from_quat(motion.states_at_seconds(times).quaternion)
+
+    notes = recorded.notes
+    parts = {name: _longest(name, at - begin, values, notes)
+             for name, (at, values) in recorded.parts.items()}
+    times, attitudes = parts.pop('attitudes')
+    for name, (at, _) in [*parts.items()]:
+        if min(at[-1], times[-1]) - max(at[0], times[0]) < 0.5 * np.ptp(times):
+            notes.append(f'{name}: not at the times of the attitudes, left out')
+            del parts[name]
+    even = _even([times, *(at for at, _ in parts.values())], notes)
+    error = turns(times).inv() * Rotation.from_quat(np.roll(attitudes, -1, axis=1))
+    level, white = fitting.whiteness(error.as_rotvec().T)
+    found = turns(even)
+    if white and fitting.EXACT < level < fitting.LARGEST:
+        notes.append(f'the attitudes are exact but for noise of {level:.3g} rad: graded without '
+                     'it')
+    else:
+        found = found * (error if np.array_equal(even, times) else
+                         RotationSpline(times, error)(even))
+    angle = float(abs(motion.start.l3 / motion.top.lambda3)) * (even[1] - even[0])
+    readings = {'attitudes': np.roll(found.as_quat(), 1, axis=1)}
+    for name, (at, values) in parts.items():
+        if len(at) == len(even) and np.max(np.abs(at - even)) < SAME_S:
+            readings[name] = values
+        elif angle < COARSE:
+            readings[name] = make_interp_spline(at, values, DEGREE)(even)
+        else:
+            notes.append(f'{name}: not at the times of the attitudes, and the spin is '
+                         f'{angle:.2g} rad from one sample to the next: not compared')
+    return Trajectory.of({**readings, 'covariance': recorded.covariance}, even)
+
+
+def _longest(name: str, at: Reals, values: Reals, notes: list[str]) -> tuple[Reals, Reals]:
+    """Return the longest part without a gap."""
+    steps = np.diff(at)
+    ends = np.array([0, *(np.flatnonzero(steps > GAP * np.median(steps)) + 1), len(at)])
+    if len(ends) > 2:
+        notes.append(f'{name}: the longest part without a gap is used')
+    chosen = slice(*ends[np.argmax(np.diff(ends)):][:2].tolist())
+    return at[chosen], values[chosen]
+
+
+def _even(times: Sequence[Reals], notes: list[str]) -> Reals:
+    """Return evenly spaced times within all of these, as many as most of them have."""
+    begin, end = max(at[0] for at in times) - SAME_S, min(at[-1] for at in times) + SAME_S
+    grid = max((at[(at >= begin) & (at <= end)] for at in times), key=len)
+    even: Reals = np.linspace(grid[0], grid[-1], len(grid))
+    if np.max(np.abs(even - grid)) < EVEN * (even[1] - even[0]):
+        return grid
+    notes.append('stamps are not evenly spaced: interpolated')
+    return even
 
 
 if __name__ == '__main__':

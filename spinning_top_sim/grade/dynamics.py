@@ -7,13 +7,14 @@ its own attitudes and rates, would cause.  Errors do not add up there, so that t
 every motion, and for every size of the error.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade.motion import MARGIN, Motion
-from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead
+from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, listed, pooled
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
@@ -21,58 +22,67 @@ from spinning_top_sim.grade.scenes import Body, Reals
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
 UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
 EXPLAINED = 0.25    # of the discrepancy is left at most
+WRONG_ENERGY = 0.1  # of the change of the potential energy
 
 
 def faults_of(motions: Sequence[Motion], dt: float) -> list[Fault]:
     """Return the causes of the error of motions."""
-    blocks = [_terms(motion, dt) for motion in motions]
-    # Motions count the same, unless what is not explained is small there.
-    sizes = [rms(target) for target, _ in blocks]
-    weights = [1.0 / max(size, 0.1 * max(sizes), UNIMPORTANT) for size in sizes]
-    target, columns = (np.concatenate([weight * part for weight, part in zip(
-        weights, parts, strict=True)]) for parts in zip(*blocks, strict=True))
-    # Columns as `_terms` has them.
-    gyroscopic, gyroscopic_step, gravity_step, in_world, damping, axis_damping, *others = (
-        columns.transpose(1, 0, 2))
-    arms, euler = others[:3], others[3:]
-    body = motions[0].body
-    if max(sizes) < UNIMPORTANT:
+    parts, body = [_terms(motion, dt) for motion in motions], motions[0].body
+    largest = max(rms(target) for target, _ in parts)
+    if largest < UNIMPORTANT:
         return []
-    faults, residual = explain(target, [
-        Cause([gyroscopic], _gyroscopic), Cause([gyroscopic_step, gravity_step], _step),
-        Cause([gyroscopic, in_world], instead('inertia_frame', 'the gyroscopic term is that of '
-                                              'moments of inertia about axes of the world')),
-        Cause([damping, axis_damping], _damping), Cause(arms, lambda found: _com(body, found)),
-        Cause(euler, lambda found: _inertia(body, found))])
+    # Motions count the same, unless what is not explained is small there.
+    weights = [1.0 / max(rms(target), 0.1 * largest) for target, _ in parts]
+    target, effects = pooled((weight * target, {
+        name: weight * effect for name, effect in effects.items()})
+        for weight, (target, effects) in zip(weights, parts, strict=True))
+    faults, residual = explain(target, effects, [
+        Cause(['gyroscopic'], _gyroscopic), Cause(['gyroscopic step', 'gravity step'], _step),
+        Cause(['gyroscopic', 'in world'], instead(
+            'inertia_frame', 'the gyroscopic term is that of moments of inertia about axes of the '
+            'world')),
+        Cause(['damping', 'axis damping'], _damping),
+        Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
+        Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
     return faults if rms(residual) < EXPLAINED * rms(target) else []
 
 
-def _terms(motion: Motion, dt: float) -> tuple[Reals, Reals]:
-    """Return the angular acceleration that is not explained (N, 3), and its causes (N, k, 3)."""
+def energy_fault(motion: Motion) -> Iterator[Fault]:
+    """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
+    if motion.trajectory.energy is None:
+        return
+    data, torque = motion.data, motion.body.gravity_torque
+    energy, _, _ = data.constants(motion.body) or (0.0, 0.0, 0.0)
+    share = float(np.ptp(motion.trajectory.energy[MARGIN:-MARGIN] - energy)) / (
+        float(np.ptp(torque * data.height)) or 1.0)
+    if share > WRONG_ENERGY:
+        yield Fault('energy', f'{motion.name}: the energy told differs from that of attitude and '
+                    f'rates by up to {100.0 * share:.3g} % of the change of the potential energy',
+                    share)
+
+
+def _terms(motion: Motion, dt: float) -> tuple[Reals, Mapping[str, Reals]]:
+    """Return the angular acceleration that is not explained (N, 3), and effects of causes."""
     body, step, w = motion.body, motion.trajectory.step, motion.rates
-    rotation = motion.trajectory.rotation[MARGIN:-MARGIN]
-    z = rotation.inv().apply((0.0, 0.0, 1.0))
-    inertia = np.array(body.inertia)
-    zero = np.zeros(len(w))
-    weight = body.mass * body.gravity
-    gyroscopic = -np.cross(w, inertia * w) / inertia
-    arms = [-weight * np.cross(e, z) / inertia for e in np.eye(3)]
-    gravity = body.com_distance * arms[2]
-    world = rotation.apply(w)
-    in_world = rotation.inv().apply(-np.cross(world, inertia * world) / inertia)
-    across = w * (1.0, 1.0, 0.0)
-    euler = [np.stack(rows, axis=1) for rows in (
-        (gravity[:, 0], zero, zero), (zero, gravity[:, 1], zero), (w[:, 1] * w[:, 2], zero, zero),
-        (zero, w[:, 2] * w[:, 0], zero), (zero, zero, w[:, 0] * w[:, 1]))]
-    nodes = np.stack([gyroscopic, in_world, -across, across - w, *arms, *euler], axis=1)
-    means = sum(weight * nodes[at:len(nodes) - 5 + at] for at, weight in enumerate(_MEAN))
-    steps = (dt / step) * np.stack([np.diff(part, axis=0)[2:-2]
-                                    for part in (gyroscopic, gravity)], axis=1)
-    columns = np.concatenate((means[:, :1], steps, means[:, 1:]), axis=1)
+    rotation, inertia, axes = motion.trajectory.rotation[MARGIN:-MARGIN], body.inertia, np.eye(3)
+    z, world = rotation.inv().apply((0.0, 0.0, 1.0)), rotation.apply(w)
+    gyroscopic = -np.cross(w, w * inertia) / inertia
+    arms = [-body.mass * body.gravity * np.cross(axis, z) / inertia for axis in axes]
+    gravity, products = body.com_distance * arms[2], w[:, [1, 2, 0]] * w[:, [2, 0, 1]]
+    euler = [gravity * axes[0], gravity * axes[1], *(products * axis for axis in axes)]
+    nodes = {'gyroscopic': gyroscopic, 'gravity': gravity,
+             'in world': rotation.inv().apply(-np.cross(world, world * inertia) / inertia),
+             'damping': -w * (1.0, 1.0, 0.0), 'axis damping': -w * axes[2],
+             **{f'arm {k}': arm for k, arm in enumerate(arms)},
+             **{f'euler {k}': term for k, term in enumerate(euler)}}
+    effects = {name: sum(weight * node[at:len(node) - 5 + at] for at, weight in enumerate(_MEAN))
+               for name, node in nodes.items()}
+    for name in ('gyroscopic', 'gravity'):
+        effects[f'{name} step'] = dt / step * np.diff(nodes[name], axis=0)[2:-2]
     change = np.diff(w, axis=0)[2:-2] / step
-    target = change - means[:, 0] - body.com_distance * means[:, 6]
     size = 1.0 / (rms(change) or 1.0)
-    return size * target, size * columns
+    return size * (change - effects['gyroscopic'] - effects['gravity']), {
+        name: size * effect for name, effect in effects.items()}
 
 
 def _gyroscopic(found: Reals) -> Fault:
@@ -101,8 +111,8 @@ def _damping(found: Reals) -> Fault:
 
 def _com(body: Body, found: Reals) -> Fault:
     com = found + body.com
-    text = f'the torque of gravity is that of a centre of mass at ({_listed(com)}) m, not at ' \
-        f'({_listed(body.com)}) m'
+    text = f'the torque of gravity is that of a centre of mass at ({listed(com)}) m, not at ' \
+        f'({listed(body.com)}) m'
     if np.linalg.norm(com + body.com) < 0.1 * abs(body.com_distance):
         return Fault('gravity_sign', f'{text}: gravity points upwards', -1.0)
     return Fault('com_offset', text, float(np.linalg.norm(found)))
@@ -117,9 +127,5 @@ def _inertia(body: Body, found: Reals) -> Fault | None:
     right = (body.lambda1 - body.lambda3) / body.lambda1
     third = 0.5 * (second - first * (right + found[2]) + first + second * (found[3] - right))
     return Fault('inertia', 'the motion is that of moments of inertia '
-                 f'{_listed((first, second, third))} kg m^2, not {_listed(body.inertia)}',
+                 f'{listed((first, second, third))} kg m^2, not {listed(body.inertia)}',
                  float(first))
-
-
-def _listed(values: Sequence[float] | Reals) -> str:
-    return ', '.join(f'{float(value):.4g}' for value in values)

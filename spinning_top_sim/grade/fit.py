@@ -8,7 +8,6 @@ long, so that no phase is ever off by half a turn.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,13 +18,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import guess
 from spinning_top_sim.grade import problem as unknowns
 from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Readings, turned
-from spinning_top_sim.grade.scenes import Body, Reals, Start
+from spinning_top_sim.grade.scenes import Reals, Start
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.tools.verdict import number
 
 FEWEST = 32                 # attitudes that can be fitted
 GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
@@ -43,7 +42,7 @@ ONCE_IN = 1000.0            # noise that is called a residue of the motion
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
-BEGIN = 64                  # attitudes that tell the start of a known top, whatever follows
+BEGIN = 16, 32, 64          # attitudes that tell the start of a known top, whatever follows
 OFF = 0.1                   # rad, or share of the rates: another start
 
 
@@ -52,32 +51,22 @@ class Fit:
     """
     A fitted motion; `lines` tells it.
 
-    Attributes
-    ----------
-    top, start : Top, State
-        At the first attitude.  lambda1 is as given: attitudes tell ratios only.
-    mounting, lever_arm : tuple of float
-        Of the IMU, as `Body` has them.
-    begin : float
-        Time of the first attitude [s].
-    values, deviations : dict
-        Estimates and standard deviations by the names of NAMES; inf where the readings do not
-        tell the value.
-    covariance : (k, k) array
-        Of the values.
-    undetermined : tuple of str
-        What the readings cannot tell apart.
-    residual, noise : float
-        Root mean square of a component of the attitude residual, and of its white part [rad].
-    reached : bool
-        Whether the fit has converged and the residuals are noise.  If not, the intervals mean
-        nothing.
+    top, start : at the first attitude; lambda1 is as given: attitudes tell ratios only
+    mounting, lever_arm : of the IMU, as `Body` has them
+    begin : time of the first attitude [s]
+    values, deviations : estimates and standard deviations by the names of NAMES; inf where the
+        readings do not tell the value
+    covariance : (k, k), of the values
+    undetermined : what the readings cannot tell apart
+    residual, noise : rms of a component of the attitude residual, and of its white part [rad]
+    reached : whether the fit has converged and the residuals are noise; if not, the intervals
+        mean nothing
     """
 
     top: Top
     start: State
-    mounting: tuple[float, ...]
-    lever_arm: tuple[float, ...]
+    mounting: tuple[float, float, float, float]
+    lever_arm: tuple[float, float, float]
     begin: float
     values: Mapping[str, float]
     deviations: Mapping[str, float]
@@ -87,25 +76,19 @@ class Fit:
     noise: float
     reached: bool
 
-    def body(self, given: Body) -> Body:
-        """Return the fitted top with the IMU of a body, or the fitted one."""
-        new: dict[str, Any] = dict(vars(self.top))
-        if 'stamp_offset' in self.values:
-            new.update(mounting=self.mounting, lever_arm=self.lever_arm)
-        return replace(given, **new)
-
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; null: not told by the readings."""
         return {'values': dict(self.values), 'undetermined': list(self.undetermined),
-                'deviations': {name: value if math.isfinite(value) else None
-                               for name, value in self.deviations.items()},
+                'deviations': {name: number(one) for name, one in self.deviations.items()},
                 'residual': self.residual, 'noise': self.noise, 'reached': self.reached}
 
     def lines(self) -> Iterator[str]:
         """Yield lines for a reader."""
         yield (f'fit: residual {self.residual:.3g} rad, noise {self.noise:.3g} rad' + (
-            '' if self.reached else ': the residual is not noise, or the fit has not converged. '
-            'No motion that was found explains the attitudes; what follows is of the nearest one'))
+            '' if self.reached else ': no motion of a top comes near the attitudes' if
+            self.residual > LARGEST else ': the residual is not noise, or the fit has not '
+            'converged. No motion that was found explains the attitudes; what follows is of the '
+            'nearest one'))
         for name, value in self.values.items():
             spread = INTERVAL * self.deviations[name]
             yield f'  {name:<16}{value:>16.9g} ' + (
@@ -120,7 +103,7 @@ class _Trial(NamedTuple):
     noise: float
     explained: bool                     # the residual is noise
     reached: bool                       # the same, and the fit has converged
-    frozen: tuple[int, ...] = ()        # unknowns that the attitudes cannot tell
+    frozen: Sequence[int] = ()          # unknowns that the attitudes cannot tell
 
 
 def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
@@ -139,23 +122,15 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     imu : bool
         Whether mounting, lever arm and offset of the stamps of the IMU are fitted.
 
-    Raises
-    ------
-    ValueError
-        If there are too few attitudes, no readings, or no motion of a top comes near.
+    Raises ValueError if there are too few attitudes, or no readings.
     """
-    one, begin = _attitudes_of(parts)
-    (first, sure, _), trials = _first_values(one, _told(parts)), []
-    axis = np.stack(attitude.axis_in_world(tuple(one.values)))
-    small = [(0, *pair) for pair in guess.small_nutation(one.times, axis)]
+    (one, first, sure), trials = _begun(parts), []
+    small = [(0, *pair) for pair in unknowns.small_nutation(one.times, one.values)]
     for size, l3, p in ((FIRST, first[SPIN], 0.0), *small[:4], (4 * FIRST, first[SPIN], 0.0)):
         first[[L3, P]] = l3, p
-        with contextlib.suppress(ValueError):       # no motion begins so
-            trials.append(_fit_from(one, first, size, gravity))
-            if trials[-1].explained:                # another guess finds the same
-                break
-    if not trials:
-        raise ValueError('no motion of a top comes near the attitudes')
+        trials.append(_fit_from(one, first, size, gravity))
+        if trials[-1].explained:                # another guess finds the same
+            break
     best = min(trials, key=lambda trial: trial.residual)
     if not sure:
         _add_turns(best.x, one.times)
@@ -163,8 +138,9 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     if best.reached:
         at, frozen = _without_unseen_nutation(best.problem, best.x, best.residual)
         free = [k for k in MOTION if k not in frozen]
-        best = best._replace(frozen=frozen, x=descend(best.problem, at, free)[0]
+        best = best._replace(frozen=frozen, x=_descend(best.problem, at, free)[0]
                              if frozen else best.x)
+    begin = float(parts['attitudes'][0][0])
     if imu:
         best = _with_imu(best, parts, begin)
     return _conclude(best, begin, lambda1, gravity)
@@ -173,57 +149,50 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
 def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> State:
     """Return the start of a known top: the fitted one, or if none was found that of the begin."""
     if found.reached:
-        start = Start.of(found.top, found.start)
-        return Start(start.attitude, start.rates).state_of(top)
-    one, _ = _attitudes_of(parts)
-    first = replace(one, times=one.times[:BEGIN], values=one.values[:, :BEGIN])
-    problem = Problem([first], one.values[:, 0], top.gravity)
-    x, _, _ = _first_values(one, _told(parts))
-    x[P] = top.gravity_torque / top.lambda1
-    for _ in range(3):
-        x[L3] = top.lambda3 / top.lambda1 * x[SPIN]
-        x, _ = descend(problem, x, MOTION[:6])
-    _, state = problem.start(x)
-    return replace(state, l3=state.l3 * top.lambda1, lz=state.lz * top.lambda1)
+        return replace(Start.of(found.top, found.start), state=None).state_of(top)
+    return _begin_of(parts, top)[0]
 
 
 def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) -> str:
     """Return how far the attitudes are from a start at t = 0, '' if they are near it."""
-    one, begin = _attitudes_of(parts)
-    right = ExactSolution(top, start).states_at_seconds(np.array([begin]))
-    apart = float(attitude.angle_between(right.rows_quaternion, tuple(one.values[:, :1]))[0])
-    x, _, error = _first_values(one, right.angular_velocity)
-    off, noise = float(np.linalg.norm(x[unknowns.RATES] - right.angular_velocity)), 6.0 * error
-    if (apart <= OFF + noise * one.times[1]
-            and off <= OFF * np.linalg.norm(right.angular_velocity) + noise):
+    right = ExactSolution(top, start).states_at_seconds(parts['attitudes'][0][:1])
+    state, noise = _begin_of({**parts, 'rates': (right.t, right.angular_velocity)}, top)
+    found = ExactSolution(top, state).states_at_seconds(np.zeros(1))
+    apart = float(attitude.angle_between(right.rows_quaternion, found.rows_quaternion)[0])
+    off = float(np.linalg.norm(found.angular_velocity - right.angular_velocity))
+    if apart <= OFF and off <= OFF * np.linalg.norm(right.angular_velocity) + noise:
         return ''
     return (f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates '
             f'{off:.3g} rad/s')
 
 
-def _attitudes_of(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, float]:
-    """Return attitudes from t = 0 on, and the time of the first."""
+def _begin_of(parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> tuple[State, float]:
+    """Return the state of a known top that the first attitudes tell, and doubt of its rates."""
+    one, x, _ = _begun(parts)
+    problem = Problem([], one.values[:, 0], top.gravity)
+    x[P] = top.gravity_torque / top.lambda1
+    for count in BEGIN:
+        problem.readings = [replace(one, times=one.times[:count], values=one.values[:, :count])]
+        x[L3] = top.lambda3 / top.lambda1 * x[SPIN]
+        x, _ = _descend(problem, x, MOTION[:6])
+    _, state = problem.start(x)
+    return (replace(state, l3=state.l3 * top.lambda1, lz=state.lz * top.lambda1),
+            6.0 * float(np.std(problem.residuals(x))) / problem.readings[0].times[-1])
+
+
+def _begun(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, Reals, bool]:
+    """Return attitudes from t = 0 on, unknowns with the first rates, and if turns are known."""
     times, attitudes = parts['attitudes']
     if len(times) < FEWEST:
         raise ValueError(f'{len(times)} attitudes: must be {FEWEST} at least for a fit')
-    q = np.roll(attitudes / np.linalg.norm(attitudes, axis=1)[:, np.newaxis], -1, axis=1).T
-    return Readings('attitude', times - times[0], np.ascontiguousarray(q)), float(times[0])
-
-
-def _told(parts: Mapping[str, tuple[Reals, Reals]]) -> Reals | None:
-    """Return rates (n, 3) or readings of a gyroscope, None if there are none."""
-    _, told = parts.get('rates', parts.get('gyroscope', (None, None)))
-    return told
-
-
-def _first_values(one: Readings, told: Reals | None) -> tuple[Reals, bool, float]:
-    """Return unknowns with the first rates, whether whole turns are known, and the error."""
-    spin, sure = guess.spin_rate(one.times, one.values,
-                                 None if told is None else float(np.median(told[:, 2])))
-    axis, x = np.stack(attitude.axis_in_world(tuple(one.values))), np.zeros(unknowns.UNKNOWNS)
-    *across, error = guess.transverse_rates(one.times, one.values, axis)
-    x[unknowns.RATES] = (*across, spin)
-    return x, sure, error
+    turns, x = Rotation.from_quat(np.roll(attitudes, -1, axis=1)), np.zeros(unknowns.UNKNOWNS)
+    one = Readings('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
+    told = parts.get('rates', parts.get('gyroscope'))
+    hint = told and float(np.median(told[1][:, 2]))
+    spin, sure = unknowns.spin_rate(one.times, one.values, hint)
+    across = np.cross(*turns[:2].apply((0.0, 0.0, 1.0))) / one.times[1]
+    x[unknowns.RATES] = (*turns[0].inv().apply(across)[:2], spin)
+    return one, x, sure
 
 
 def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
@@ -236,8 +205,8 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
         chosen = slice(0, count, math.ceil(count / ENOUGH) if count < last else 1)
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
         free = MOTION if size or count == last else MOTION[:6]
-        precisely = (30, 1e-8) if count == last else (8, 1e-3)
-        found, converged = descend(problem, x, free, *precisely)
+        found, converged = _descend(problem, x, free, *(
+            (30, 1e-8) if count == last else (8, 1e-3)))
         left = float(np.std(problem.residuals(found)))
         if left > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
             growth = math.sqrt(growth)
@@ -245,15 +214,22 @@ def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
         x, done, level, growth = found, count, left, min(growth * growth, GROWTH)
         if left > LARGEST:          # no motion of a top
             break
-    rest = problem.residuals(x).reshape(3, -1)
-    residual = math.sqrt(float(np.sum(rest * rest)) / (rest.size - len(MOTION)))
-    noise, white = whiteness(rest)
-    explained = residual <= EXACT or (white and residual < LARGEST)
-    return _Trial(problem, x, residual, noise, explained,
-                  explained and (converged or residual <= EXACT))
+    return _judged(problem, x, converged)
 
 
-def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
+def _judged(problem: Problem, x: Reals, converged: bool, frozen: Sequence[int] = ()) -> _Trial:
+    """Return unknowns with what the residuals show."""
+    rests = [problem.residual(x, one) for one in problem.readings]
+    levels, white = zip(*map(whiteness, rests), strict=True)
+    small = [np.std(rest) < EXACT + NEGLIGIBLE * (one.kind != 'attitude') * np.std(one.values)
+             for rest, one in zip(rests, problem.readings, strict=True)]
+    residual = math.sqrt(float(np.sum(rests[0] ** 2)) / (rests[0].size - len(MOTION)))
+    explained = residual < LARGEST and all(np.logical_or(white, small))
+    return _Trial(problem, x, residual, levels[0], explained,
+                  explained and (converged or all(small)), frozen)
+
+
+def _descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
             tolerance: float = 1e-8) -> tuple[Reals, bool]:
     """Return the unknowns at the least sum of squares, and whether it was reached."""
     chosen = [*free]
@@ -263,16 +239,9 @@ def descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 
         moved[chosen] = y
         return moved
 
-    def residuals(y: Reals) -> Reals:
-        try:
-            return problem.residuals(at(y))
-        except ValueError:          # no motion begins so: a shorter step
-            return far
-
-    far = np.full(len(problem.residuals(x)), 1e9)
     found = least_squares(
-        residuals, x[chosen], lambda y: problem.jacobian(at(y), chosen), method='lm',
-        x_scale='jac', max_nfev=evaluations, ftol=tolerance, xtol=1e-15, gtol=1e-15)
+        lambda y: problem.residuals(at(y)), x[chosen], lambda y: problem.jacobian(at(y), chosen),
+        method='lm', x_scale='jac', max_nfev=evaluations, ftol=tolerance, xtol=1e-15, gtol=1e-15)
     return at(found.x), found.status > 0
 
 
@@ -286,17 +255,12 @@ def whiteness(rest: Reals) -> tuple[float, bool]:
 
 
 def _add_turns(x: Reals, times: Reals) -> None:
-    """
-    Make the spin the slowest with 0 < lambda3 <= 2 lambda1.
-
-    A spin that is faster by whole turns between evenly spaced attitudes passes through them all.
-    """
+    """Make the spin the slowest with 0 < lambda3 <= 2 lambda1, by whole turns per attitude."""
     step = float(times[-1]) / (len(times) - 1)
     sign, turn = math.copysign(1.0, x[L3]), math.tau / step
-    spin = sign * x[SPIN]
-    if np.max(np.abs(np.diff(times) - step)) < 1e-5 * step and not (
-            0.0 < abs(x[L3]) <= 2.02 * spin):
-        x[SPIN] += sign * turn * math.ceil((0.5 * abs(x[L3]) - spin) / turn)
+    less = 0.5 * abs(x[L3]) - sign * x[SPIN]
+    if np.max(np.abs(np.diff(times) - step)) < 1e-5 * step and less > 0.01 * sign * x[SPIN]:
+        x[SPIN] += sign * turn * math.ceil(less / turn)
 
 
 def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: float) -> _Trial:
@@ -307,26 +271,18 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
             raise ValueError(f'the file has no {name}: the place of the IMU cannot be fitted')
         streams.append(Readings(kind, parts[name][0] - begin,
                                 np.ascontiguousarray(parts[name][1].T)))
-    (one,), problem.readings = problem.readings, streams[:1]
+        streams[-1].sigma = float(np.std(streams[-1].values)) or 1.0
+    (one,), problem.readings = problem.readings, streams
     _, model = problem.motion(x, streams[0])
     problem.mounting = Rotation.align_vectors(model.T, streams[0].values.T)[0].as_quat()
-    for stream, own in zip(streams, ((8, 9, 10, unknowns.LATE), (11, 12, 13)), strict=True):
-        problem.readings = [stream]
-        x, _ = descend(problem, x, own)
+    x, _ = _descend(problem, x, SENSOR)
     problem.readings = [one, *streams]
     free = [k for k in (*MOTION, *SENSOR) if k not in trial.frozen]
     for _ in range(2):          # noise of each, then all with it
         for stream in problem.readings:
-            rest = problem.residual(x, stream)
-            stream.sigma = max(math.sqrt(float(np.mean(rest * rest))), 1e-15)
-        x, converged = descend(problem, x, free)
-    rests = [problem.residual(x, stream) for stream in problem.readings]
-    noise, _ = whiteness(rests[0])
-    residual = math.sqrt(float(np.mean(rests[0] ** 2)))
-    explained = all(whiteness(rest)[1] or np.std(rest) < EXACT + NEGLIGIBLE * np.std(stream.values)
-                    for stream, rest in zip(problem.readings, rests, strict=True))
-    return trial._replace(x=x, residual=residual, noise=noise,
-                          reached=trial.reached and converged and explained)
+            stream.sigma = max(float(np.std(problem.residual(x, stream))), 1e-15)
+        x, converged = _descend(problem, x, free)
+    return _judged(problem, x, trial.reached and converged, trial.frozen)
 
 
 def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fit:
@@ -340,7 +296,12 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     jacobian = problem.jacobian(at, free, central=True) * sizes
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
     told = singular > max(1.0 / VAGUE, (1e-6 if frozen else 1e-9) * singular[0])
-    values, slopes = _public(problem, x)[free], _slopes(problem, x, free, sizes)
+    values = _public(problem, x)[free]
+    steps = 1e-6 * sizes[:, np.newaxis] * np.eye(len(free), len(x))
+    slopes = np.stack([(_public(problem, x + step) - _public(problem, x - step))[free]
+                       for step in steps], axis=1)
+    slopes[[*ANGLES]] = np.remainder(slopes[[*ANGLES]] + math.pi, math.tau) - math.pi
+    slopes *= 0.5e6
     half = slopes @ (directions[told].T / singular[told])
     deviations = np.sqrt(np.sum(half * half, axis=1))
     allowed = VAGUE * np.array([1.0, rate, 1.0, 1.0, rate, rate, abs(values[RATIO]), rate * rate,
@@ -349,8 +310,9 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     deviations[np.any(hidden, axis=1) | ~(deviations < allowed)] = math.inf
     names = [list(NAMES)[k] for k in free]
     top, start = _scaled(values[:8].tolist(), lambda1, gravity)
-    mx, my, mz, mw = np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])).tolist()
-    return Fit(top, start, (mw, mx, my, mz), tuple(x[unknowns.PLACE].tolist()), begin,
+    mx, my, mz, mw = turned(problem.mounting, x[unknowns.MOUNTING]).as_quat().tolist()
+    arm_x, arm_y, arm_z = x[unknowns.PLACE].tolist()
+    return Fit(top, start, (mw, mx, my, mz), (arm_x, arm_y, arm_z), begin,
                dict(zip(names, values.tolist(), strict=True)),
                dict(zip(names, deviations.tolist(), strict=True)), half @ half.T,
                tuple(_not_told(names, values, deviations, hidden)), trial.residual, trial.noise,
@@ -377,9 +339,7 @@ def _without_unseen_nutation(problem: Problem, x: Reals,
                              residual: float) -> tuple[Reals, tuple[int, ...]]:
     """
     Return the steady or sleeping motion with lambda3 = lambda1 next to one whose nutation may be
-    noise, and the unknowns that such a motion does not tell.
-
-    If the nutation is not noise, the unknowns are returned as they are, and ().
+    noise, and the unknowns that it does not tell; the unknowns as they are and () if it is none.
     """
     motion = ExactSolution(*problem.start(x))
     low, high = motion.theta_min, motion.theta_max
@@ -402,22 +362,10 @@ def _without_unseen_nutation(problem: Problem, x: Reals,
 def _public(problem: Problem, x: Reals) -> Reals:
     """Return the values of NAMES."""
     _, state = problem.start(x)
-    mounting = Rotation.from_quat(np.ravel(turned(problem.mounting, x[unknowns.MOUNTING])))
+    mounting = turned(problem.mounting, x[unknowns.MOUNTING])
     return np.array([state.theta, state.theta_dot, state.phi, state.psi, state.l3, state.lz,
                      state.l3 / (float(x[SPIN]) or 1e-300), x[P], *mounting.as_rotvec(),
                      *x[unknowns.PLACE], x[unknowns.LATE]])
-
-
-def _slopes(problem: Problem, x: Reals, free: Sequence[int], sizes: Reals) -> Reals:
-    """Return the derivatives of the values of NAMES by the unknowns, in units of their sizes."""
-    columns = []
-    for k, size in zip(free, sizes, strict=True):
-        step = np.zeros(unknowns.UNKNOWNS)
-        step[k] = 1e-6 * size
-        change = (_public(problem, x + step) - _public(problem, x - step))[[*free]]
-        change[[*ANGLES]] = np.remainder(change[[*ANGLES]] + math.pi, math.tau) - math.pi
-        columns.append(change / 2e-6)
-    return np.stack(columns, axis=1)
 
 
 def _scaled(values: Sequence[float], lambda1: float, gravity: float) -> tuple[Top, State]:

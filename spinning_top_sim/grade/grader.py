@@ -9,17 +9,15 @@ import numpy as np
 
 from spinning_top_sim.exam.measures import convergence_order
 from spinning_top_sim.grade import dynamics, sensors
-from spinning_top_sim.grade.motion import MARGIN, Motion
+from spinning_top_sim.grade.motion import InvalidTrajectoryError, Motion, Trajectory
 from spinning_top_sim.grade.report import Fault, Report
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Reals, Scene, Start
-from spinning_top_sim.grade.trajectory import InvalidTrajectoryError, Trajectory, equally_spaced
 from spinning_top_sim.physics.top import State, Top
 
 Run = Callable[[Body, Start, Reals, float], Any]
 # The largest error of an attitude that is no fault [rad].
 TOLERANCE = math.radians(0.1)
 MOST = 0.7              # that the top turns in a step [rad]: in longer ones rates are not known
-WRONG_ENERGY = 0.1      # of the change of the potential energy
 
 
 def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[Scene] = SCENES,
@@ -37,28 +35,15 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
     dt : float
         The step [s].  Samples are dt apart, also where the order of convergence is measured with
         smaller steps.  A scene in which the top turns by more than 0.7 rad in a step is left out.
-    body : Body
-        The top and the IMU on it.
-    scenes : sequence of Scene
-        Motions to run.
+    body, scenes : Body, sequence of Scene
+        The top and the IMU on it, and the motions to run.
     seed : int
         Determines how the top is turned at the start.
-    tolerance : float
-        Largest error of an attitude that is no fault [rad].
-    subject : str, optional
-        Name of the simulator; default: that of `run`.
+    tolerance, subject : float, str
+        Largest error of an attitude that is no fault [rad]; name, by default that of `run`.
 
-    Returns
-    -------
-    Report
-        The faults with their evidence, and the measures.
-
-    Raises
-    ------
-    TypeError
-        If `run` cannot be called.
-    ValueError
-        Naming the argument, its value and what is allowed.
+    Raises TypeError if `run` cannot be called, ValueError naming the argument, its value and what
+    is allowed.
     """
     if not callable(run):
         raise TypeError(f'run = {run!r}: must be run(top, start, times, dt)')
@@ -67,7 +52,7 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
     name = str(subject or getattr(run, '__name__', type(run).__name__))
     faults: list[Fault] = []
     motions: list[Motion] = []
-    orders: dict[str, float] = {}
+    orders = {}
     for scene in scenes:
         start = scene.start_of(body, seed)
         if dt * max(*map(abs, start.rates), abs(start.state_of(body).l3) / body.lambda1) > MOST:
@@ -108,27 +93,14 @@ def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
         Times [s], equally spaced; default: the `t` of the trajectory.
     dt : float, optional
         Step of the simulator [s]; default: the time between two samples.
-    tolerance : float
-        As of `grade`.
-    subject : str
-        As of `grade`.
-    **imu :
-        Parameters of `Body` beside those of the top: `lever_arm`, `mounting`, ...
+    tolerance, subject, **imu :
+        As of `grade`; parameters of `Body` beside those of the top: `lever_arm`, `mounting`, ...
 
-    Raises
-    ------
-    ValueError
-        Naming what is no motion, and why.
+    Raises ValueError naming what is no motion, and why.
     """
     body = Body.of(top, **imu)
-    if isinstance(start, State):
-        start = Start.of(body, start)
-    if times is None:
-        times = trajectory.get('t') if isinstance(trajectory, Mapping) else getattr(
-            trajectory, 't', None)
-        if times is None:
-            raise ValueError('times = None: must be given, the trajectory has no t')
-    motion = Motion(subject, body, start, Trajectory.of(trajectory, equally_spaced(times)))
+    start = Start.of(body, start) if isinstance(start, State) else start
+    motion = Motion(subject, body, start, Trajectory.of(trajectory, times))
     return _judge(subject, [motion], {}, [], dt or motion.trajectory.step, tolerance)
 
 
@@ -150,9 +122,10 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
     marks = {f'{name}: {motion.name}': value for motion in motions
              for name, value in motion.marks.items()}
     marks.update({f'order: {name}': order for name, order in orders.items()})
-    kinematic = any(fault.name == 'rates_scale' for fault in faults)
-    faults += _motion_faults(motions, orders, dt, tolerance, kinematic)
-    faults += _energy_fault(motions[0])
+    known = any(fault.name == 'rates_scale' for fault in faults)
+    faults += [one for one in _motion_faults(motions, orders, dt, tolerance)
+               if not (known and one.name == 'inaccurate')]
+    faults += dynamics.energy_fault(motions[0])
     for kind in sensors.KINDS:
         more, found = sensors.judge(kind, motions)
         faults, marks = [*faults, *more], {**marks, **found}
@@ -160,8 +133,8 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
 
 
 def _motion_faults(motions: Sequence[Motion], orders: Mapping[str, float], dt: float,
-                   tolerance: float, kinematic: bool) -> Iterator[Fault]:
-    """Yield what is wrong with the motions; `kinematic`: a fault of the rates explains it."""
+                   tolerance: float) -> Iterator[Fault]:
+    """Yield what is wrong with the motions."""
     worst = max(motions, key=lambda motion: motion.worst)
     if worst.worst <= tolerance:
         return
@@ -173,18 +146,5 @@ def _motion_faults(motions: Sequence[Motion], orders: Mapping[str, float], dt: f
     causes = [fault for fault in dynamics.faults_of(motions, dt)
               if not (first and fault.name == 'first_order')]
     yield from (fault._replace(evidence=f'{text}; {fault.evidence}') for fault in causes)
-    if not (first or causes or kinematic):
+    if not (first or causes):
         yield Fault('inaccurate', text, math.degrees(worst.worst))
-
-
-def _energy_fault(motion: Motion) -> Iterator[Fault]:
-    """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
-    if motion.trajectory.energy is None:
-        return
-    energy, _, _ = motion.data.constants(motion.body) or (0.0, 0.0, 0.0)
-    off = float(np.ptp(motion.trajectory.energy[MARGIN:-MARGIN] - energy))
-    share = off / (float(np.ptp(motion.body.gravity_torque * motion.data.height)) or 1.0)
-    if share > WRONG_ENERGY:
-        yield Fault('energy', f'{motion.name}: the energy told differs from that of attitude and '
-                    f'rates by up to {100.0 * share:.3g} % of the change of the potential energy',
-                    share)

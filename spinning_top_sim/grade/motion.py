@@ -1,104 +1,164 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compares a motion with the exact one: errors, drifts, rates."""
+"""What a simulator returns, checked, beside the exact motion: errors, drifts, rates."""
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.scenes import Body, Reals, Start
-from spinning_top_sim.grade.trajectory import Trajectory
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools.analysis import Attitudes, measure
 
+# Columns of each part.
+_PARTS = {'attitudes': (4,), 'rates': (3,), 'accelerations': (3,), 'gyroscope': (3,),
+          'magnetometer': (3,), 'increments': (6,), 'energy': ()}
+LEAST_SAMPLES = 20
 # Sixth-order central differences, for samples -3 .. 3.
 _WEIGHTS = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
 MARGIN = 3
 
 
+class InvalidTrajectoryError(ValueError):
+    """A simulator has returned no motion; the text names what and why."""
+
+
+@dataclass
+class Trajectory:
+    """
+    A motion at n equally spaced times t [s], as a simulator tells it; None: not told.
+
+    attitudes : (n, 4), q(world <- body) as w, x, y, z
+    rates : (n, 3), angular velocity in the body frame [rad/s]
+    accelerations, gyroscope, magnetometer : (n, 3), readings in the frame of the IMU [m/s^2, +g
+        upwards at rest], [rad/s], [T]
+    increments : (n, 6), rotation [rad] and velocity [m/s] in the frame of the IMU over the
+        interval that ends at each time; the first row is not used
+    energy : (n,), kinetic and potential energy, but for a constant [J]
+    covariance : (3, 3) that are told of 'gyroscope' and 'accelerations', by name; a single matrix
+        is meant for both
+    """
+
+    t: Reals
+    attitudes: Reals
+    rates: Reals | None = None
+    accelerations: Reals | None = None
+    gyroscope: Reals | None = None
+    magnetometer: Reals | None = None
+    increments: Reals | None = None
+    energy: Reals | None = None
+    covariance: Mapping[str, Reals] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, said: Any, times: Any = None) -> Self:
+        """Return what a run has said, by default at its `t`.  Raises InvalidTrajectoryError."""
+        if hasattr(said, 'attitudes'):
+            said = {name: getattr(said, name, None) for name in cls.__dataclass_fields__}
+        elif not isinstance(said, Mapping):
+            said = {'attitudes': said}
+        if 'attitudes' not in said:
+            raise InvalidTrajectoryError(f'the mapping has {sorted(map(str, said))}: must have '
+                                         'attitudes')
+        times = said.get('t') if times is None else times
+        if times is None:
+            raise InvalidTrajectoryError('times = None: must be given, the trajectory has no t')
+        t = _numbers('times', times, (max(np.size(times), LEAST_SAMPLES),))
+        steps, usual = np.diff(t), np.median(np.diff(t))
+        for at in np.flatnonzero(~(np.abs(steps - usual) <= 1e-3 * usual))[:1]:
+            raise InvalidTrajectoryError(f'times[{at + 1}] - times[{at}] = {steps[at]:g} s after '
+                                         f'{usual:g} s: must be equally spaced')
+        parts = {name: _numbers(name, said[name], (len(t), *columns))
+                 for name, columns in _PARTS.items() if said.get(name) is not None}
+        attitudes = parts.pop('attitudes')
+        norms = np.linalg.norm(attitudes, axis=1, keepdims=True)
+        for at in np.flatnonzero(~(np.abs(norms - 1.0) < 1e-2)):
+            raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
+                                         'must be 1')
+        attitudes /= norms
+        flips = np.cumprod(np.where(np.sum(attitudes[1:] * attitudes[:-1], axis=1) < 0.0, -1, 1))
+        attitudes[1:] *= flips[:, np.newaxis]
+        told = said.get('covariance')
+        if not isinstance(told, Mapping):
+            told = {} if told is None else {'gyroscope': told, 'accelerations': told}
+        return cls(t, attitudes, **parts, covariance={
+            name: _numbers(f'covariance of {name}', matrix, (3, 3))
+            for name, matrix in told.items()})
+
+    def __post_init__(self) -> None:
+        self.step = float(self.t[-1] - self.t[0]) / (len(self.t) - 1)       # [s]
+        self.rotation = Rotation.from_quat(self.attitudes[:, [1, 2, 3, 0]])
+
+
+def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
+    """Return an array of this shape.  Raises InvalidTrajectoryError."""
+    try:
+        numbers = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InvalidTrajectoryError(f'{name}: {error}') from error
+    if numbers.shape != shape:
+        raise InvalidTrajectoryError(f'{name} has shape {numbers.shape}: must be {shape}')
+    for at in np.argwhere(~np.isfinite(numbers))[:1]:
+        raise InvalidTrajectoryError(f'{name}{at.tolist()} = {numbers[tuple(at)]}: must be finite')
+    return numbers
+
+
 def errors_of(rotation: Rotation, truth: Rotation) -> dict[str, Reals]:
     """
-    Split the rotation between two attitudes world <- body, simulated and exact (n,) [rad].
+    Return the angle between attitudes world <- body (n,), and its parts [rad].
 
-    A small rotation is split in directions that are regular at the poles: `precession` turns about
-    the vertical, times sin(theta); `nutation` is that of theta; `spin` turns about the axis.
-    `total` is the angle of the whole rotation.
+    precession : about the vertical, times sin(theta); nutation : of theta; spin : about the axis
     """
-    tips, tilts = [], []
-    for one in (rotation, truth):
-        x, y, z = one.apply((0.0, 0.0, 1.0)).T
-        tips.append(x + 1j * y)
-        tilts.append(np.arctan2(np.hypot(x, y), z))
+    axes = [one.apply((0.0, 0.0, 1.0)).T for one in (rotation, truth)]
+    tip, right = (x + 1j * y for x, y, _ in axes)
+    tilt, right_tilt = (np.arctan2(np.hypot(x, y), z) for x, y, z in axes)
     between = truth.inv() * rotation
     _, _, z, w = between.as_quat().T
-    return {'total': between.magnitude(), 'precession': np.unwrap(np.angle(
-                tips[0] * np.conj(tips[1]))) * np.abs(tips[1]),
-            'nutation': tilts[0] - tilts[1], 'spin': np.unwrap(2.0 * np.arctan2(z, w))}
+    return {'total': between.magnitude(),
+            'precession': np.unwrap(np.angle(tip * np.conj(right))) * np.abs(right),
+            'nutation': tilt - right_tilt, 'spin': np.unwrap(2.0 * np.arctan2(z, w))}
 
 
 @dataclass
 class Motion:
     """
-    A motion of a scene, and the exact one that starts in the same state.
+    A motion beside the exact one from the same state.
 
-    told : rates (n, 3) that the simulator tells, where they are right
+    rates : body rates at all samples but `MARGIN` at each end (n - 6, 3), from the attitudes
+        unless those told are right
+    derived : whether they are from the attitudes
     """
 
     name: str
     body: Body
     start: Start
     trajectory: Trajectory
-    told: Reals | None = None
+    derived: bool = True
 
-    @cached_property
-    def solution(self) -> ExactSolution:
-        return ExactSolution(self.body, self.start.state_of(self.body))
-
-    @cached_property
-    def truth(self) -> States:
-        """The exact states at the times of the samples."""
-        return self.solution.states_at_seconds(self.trajectory.t)
-
-    @cached_property
-    def errors(self) -> dict[str, Reals]:
-        """Errors of the attitude, as `errors_of` has them."""
-        return errors_of(self.trajectory.rotation, Rotation.from_quat(self.truth.quaternion))
-
-    @property
-    def worst(self) -> float:
-        """Largest error of the attitude [rad]."""
-        return float(np.max(self.errors['total']))
-
-    @property
-    def rates(self) -> Reals:
-        """Body rates at all samples but `MARGIN` at each end (n - 6, 3): told, or `derived`."""
-        return self.derived if self.told is None else self.told[MARGIN:-MARGIN]
-
-    @cached_property
-    def derived(self) -> Reals:
-        """
-        Body rates from the attitudes.
-
-        What is differentiated is the rotation from the exact attitudes, which turns slowly.
-        """
-        error = Rotation.from_quat(self.truth.quaternion).inv() * self.trajectory.rotation
-        inner, n = slice(MARGIN, -MARGIN), len(self.trajectory.t) - 2 * MARGIN
-        here = error[inner].inv()
-        total: Reals = sum(weight * (here * error[at:at + n]).as_rotvec()
-                           for at, weight in enumerate(_WEIGHTS) if weight)
-        return total / self.trajectory.step + here.apply(self.truth.angular_velocity[inner])
+    def __post_init__(self) -> None:
+        self.solution = ExactSolution(self.body, self.start.state_of(self.body))
+        self.truth: States = self.solution.states_at_seconds(self.trajectory.t)
+        right = Rotation.from_quat(self.truth.quaternion)
+        self.errors = errors_of(self.trajectory.rotation, right)
+        self.worst = float(np.max(self.errors['total']))        # [rad]
+        # The rotation from the exact attitudes turns slowly.
+        error, n = right.inv() * self.trajectory.rotation, len(self.trajectory.t) - 2 * MARGIN
+        here = error[MARGIN:-MARGIN].inv()
+        total = sum(weight * (here * error[at:at + n]).as_rotvec()
+                    for at, weight in enumerate(_WEIGHTS) if weight)
+        self.rates: Reals = total / self.trajectory.step + here.apply(
+            self.truth.angular_velocity[MARGIN:-MARGIN])
 
     @property
     def accelerations(self) -> Reals:
         """Angular accelerations (n - 12, 3)."""
         inner, n = slice(MARGIN, -MARGIN), len(self.trajectory.t) - 4 * MARGIN
         off = self.rates - self.truth.angular_velocity[inner]
-        total: Reals = sum(weight * off[at:at + n] for at, weight in enumerate(_WEIGHTS) if weight)
-        return (total / self.trajectory.step
-                + self.truth.angular_acceleration[2 * MARGIN:-2 * MARGIN])
+        total = sum(weight * off[at:at + n] for at, weight in enumerate(_WEIGHTS) if weight)
+        return total / self.trajectory.step + self.truth.angular_acceleration[inner][inner]
 
     @property
     def data(self) -> Attitudes:

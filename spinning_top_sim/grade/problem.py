@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The least-squares problem of the fit: readings against the exact motion of a top.
+The least-squares problem of the fit: readings against the exact motion of a top; first values.
 
 Attitudes do not depend on the scale of the inertia: the unknowns are those of a top with
 lambda1 = 1.  They are regular at the poles: attitude and angular velocity of the body at t = 0,
@@ -9,10 +9,12 @@ L3/lambda1 and P/lambda1; and of an IMU its mounting, its place and how late its
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.scenes import Reals
 from spinning_top_sim.physics import attitude
@@ -28,6 +30,7 @@ MOUNTING, PLACE, LATE = slice(8, 11), slice(11, 14), 14
 MOTION, SENSOR = range(8), range(8, 15)
 UNKNOWNS = 15
 ROUNDING = 1e-14            # of rates
+FAR = 1e9
 CHANGE = 1e-6               # of the readings by a step of finite differences [rad], [rad/s], ..
 
 
@@ -54,8 +57,7 @@ class Problem:
     """
     Residuals and Jacobian of readings.
 
-    reference, mounting : q(world <- body) at t = 0 and q(body <- IMU), from which the unknown
-        rotations count, as x, y, z, w
+    reference, mounting : q(world <- body) at t = 0 and q(body <- IMU) before the unknown turns
     """
 
     def __init__(self, readings: Sequence[Readings], reference: Reals, gravity: float) -> None:
@@ -65,16 +67,19 @@ class Problem:
 
     def start(self, x: Reals) -> tuple[Top, State]:
         """Return top and state with lambda1 = lambda3 = 1: its spin is L3, not omega_3."""
-        q = turned(self.reference, x[TURN])
-        rates = np.ravel(attitude.in_world(q, (x[3], x[4], x[L3])))
+        turn = turned(self.reference, x[TURN])
+        rates = turn.apply((x[3], x[4], x[L3]))
         rates[np.abs(rates) < ROUNDING * np.max(np.abs(rates))] = 0.0   # an upright top may rest
         top = Top(lambda1=1.0, lambda3=1.0, mass=1.0, com_distance=float(x[P]), gravity=1.0)
-        return top, state_of(top, np.ravel(q), rates)
+        return top, state_of(top, turn.as_quat(), rates)
 
     def residuals(self, x: Reals) -> Reals:
-        """Return (readings - model)/sigma (m,).  Raises ValueError where there is no motion."""
-        return np.concatenate([self.residual(x, one).ravel() / one.sigma
-                               for one in self.readings])
+        """Return (readings - model)/sigma (m,); they are FAR where no motion begins so."""
+        try:
+            return np.concatenate([self.residual(x, one).ravel() / one.sigma
+                                   for one in self.readings])
+        except ValueError:
+            return np.full(3 * sum(len(one.times) for one in self.readings), FAR)
 
     def jacobian(self, x: Reals, free: Sequence[int], central: bool = False) -> Reals:
         """Return the derivatives of the residuals (m, len(free)), by finite differences."""
@@ -98,8 +103,7 @@ class Problem:
             turn = np.stack(attitude.product((-a, -b, -c, d), tuple(one.values)))
             return np.stack(attitude.rotation_vector(tuple(np.where(turn[3] < 0.0, -turn, turn))))
         model = w if one.kind == 'rates' else self._force(x, q, w)
-        return one.values - np.stack(attitude.in_body(
-            turned(self.mounting, x[MOUNTING]), tuple(model)))
+        return one.values - turned(self.mounting, x[MOUNTING]).inv().apply(model.T).T
 
     def motion(self, x: Reals, one: Readings) -> tuple[Reals, Reals]:
         """Return attitudes (4, n), and for an IMU rates in the body (3, n), at its times."""
@@ -131,8 +135,50 @@ class Problem:
         return force + self.gravity * z
 
 
-def turned(reference: Sequence[float] | Reals, vector: Reals) -> attitude.Quaternion:
-    """Return the attitude after a rotation vector in the body, components (1,)."""
-    a, b, c, d = np.reshape(reference, (4, 1))
-    x, y, z = np.reshape(vector, (3, 1))
-    return attitude.product((a, b, c, d), attitude.quaternion_of_vector((x, y, z)))
+def turned(reference: Sequence[float] | Reals, vector: Reals) -> Rotation:
+    """Return the attitude after a rotation vector in the body."""
+    return Rotation.from_quat(reference) * Rotation.from_rotvec(vector)
+
+
+def spin_rate(times: Reals, q: Reals, hint: float | None) -> tuple[float, bool]:
+    """
+    Return omega_3 [rad/s] from attitudes (4, n), and whether the hint tells its whole turns.
+
+    If not, it is the slowest of those that pass through evenly sampled attitudes.
+    """
+    x, y, z, w = q[:, :-1]
+    _, _, dz, dw = attitude.product((-x, -y, -z, w), tuple(q[:, 1:]))
+    turn, dt = 2.0 * np.arctan2(dz, dw), np.diff(times)
+    step = float(np.median(dt))
+    usual = np.abs(dt - step) < 0.1 * step
+    rate = float(np.angle(np.mean(np.exp(1j * turn[usual])))) / step
+    turns = 0.0 if hint is None else (hint - rate) * step / math.tau
+    sure = hint is not None and abs(turns - round(turns)) < 0.1
+    rate += math.tau / step * round(turns) if sure else 0.0
+    rest = np.remainder(turn - rate * dt + math.pi, math.tau) - math.pi
+    return rate + float(np.sum(rest) / np.sum(dt)), sure
+
+
+def small_nutation(times: Reals, q: Reals) -> Iterator[tuple[float, float]]:
+    """
+    Yield (L3/lambda1, P/lambda1) of a small nutation, from its strongest frequency.
+
+    About a steady precession W at the tilt theta, W^2 sin^2 theta + (L3 - 2 W cos theta)^2 is the
+    square of the frequency, and P = L3 W - W^2 cos theta.
+    """
+    axis = attitude.axis_in_world(tuple(q))
+    phi = np.unwrap(np.arctan2(axis[1], axis[0]))
+    rate, first = np.polyfit(times, phi, 1)
+    height, dt = float(np.mean(axis[2])), float(np.median(np.diff(times)))
+    sine = math.sqrt(max(1.0 - height * height, 0.0))
+    even = np.arange(times[0], times[-1], dt)
+    rest = (np.interp(even, times, height - axis[2]) / max(sine, 1e-3)
+            + 1j * sine * np.interp(even, times, phi - first - rate * times))
+    power = np.abs(np.fft.fft((rest - np.mean(rest)) * np.hanning(len(even)), 4 * len(even)))
+    frequency = math.tau * np.fft.fftfreq(len(power), dt)
+    best = abs(float(frequency[np.argmax(power)]))
+    for alias in (best, math.tau / dt - best, math.tau / dt + best):
+        within = alias * alias - (rate * sine) ** 2
+        for sign in (1.0, -1.0) if within > 0.0 else ():
+            l3 = 2.0 * rate * height + sign * math.sqrt(within)
+            yield l3, l3 * rate - rate * rate * height

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Explains a discrepancy by as few causes as possible: small least-squares fits."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,20 +17,14 @@ TINY = 1e-6             # rms of an effect that cannot be seen
 NEAR = 0.25             # of a coefficient to the value that it has for a fault
 AS_GOOD = 2.0           # a cause with fewer columns may leave so many times more
 
-# From the coefficients of a cause to the fault; None for what is no fault.
-Judge = Callable[[Reals], Fault | None]
+Judge = Callable[[Reals], Fault | None]     # of the coefficients of a cause; None: no fault
 
 
 class Cause(NamedTuple):
-    """
-    A possible cause of a discrepancy.
+    """A possible cause of a discrepancy: names of its effects, and what names its fault."""
 
-    columns : (k, N, 3), the change of what is compared by each of k effects of size 1
-    judge : names the fault
-    """
-
-    columns: Sequence[Reals]
-    judge: Judge
+    effects: Sequence[str]
+    judge: Judge | None = None
 
 
 def instead(name: str, evidence: str) -> Judge:
@@ -40,41 +34,42 @@ def instead(name: str, evidence: str) -> Judge:
     return judge
 
 
-def explain(target: Reals, causes: Sequence[Cause],
+def pooled(parts: Iterable[tuple[Reals, Mapping[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
+    """Return the discrepancy and the effects of all parts."""
+    targets, effects = zip(*parts, strict=True)
+    return np.concatenate(targets), {name: np.concatenate([one[name] for one in effects])
+                                     for name in effects[0]}
+
+
+def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause],
             floor: float = 0.0) -> tuple[list[Fault], Reals]:
     """
-    Explain a discrepancy (N, 3) by causes, the best one first.
+    Explain a discrepancy (N, 3) by causes, the best one first; return faults and what is left.
 
+    effects : by name, change of what is compared by an effect of size 1 (N, 3)
     floor : rms of the noise in the target
-
-    Returns the faults, and what they leave of the discrepancy.
     """
     chosen: list[Cause] = []
-    residual, fitted = target, np.empty(0)
+    residual, found, others = target, np.empty(0), [*causes]
     enough = max(ENOUGH * beyond(target, floor), 0.1 * floor)
-    others = [*causes]
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
-        tried = [least_squares(target, [column for cause in (*chosen, one)
-                                        for column in cause.columns]) for one in others]
+        tried = [fitted(target, [effects[name] for cause in (*chosen, one)
+                                        for name in cause.effects]) for one in others]
         after = [beyond(left, floor) for _, left in tried]
         good = max(AS_GOOD * min(after), 0.02 * before)
-        _, left, best = min((len(one.columns), left, k) for k, (one, left) in enumerate(
+        _, left, best = min((len(one.effects), left, k) for k, (one, left) in enumerate(
             zip(others, after, strict=True)) if left <= good)
         if left > WORTHWHILE * before:
             break
-        fitted, residual = tried[best]
+        found, residual = tried[best]
         chosen.append(others.pop(best))
-    ends = np.cumsum([len(one.columns) for one in chosen], dtype=int)[:-1]
-    judged = [one.judge(found) for one, found in zip(chosen, np.split(fitted, ends), strict=False)]
-    return [fault for fault in judged if fault is not None], residual
+    ends = np.cumsum([len(one.effects) for one in chosen], dtype=int)[:-1]
+    return [fault for one, part in zip(chosen, np.split(found, ends), strict=False)
+            if one.judge is not None and (fault := one.judge(part)) is not None], residual
 
 
-def least_squares(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
-    """
-    Return the coefficients (k,) of columns (N, 3) by least squares, and the residual.
-
-    The coefficient of a column that is TINY is 0.
-    """
+def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
+    """Return the coefficients (k,) of columns (N, 3), 0 for a TINY one, and the residual."""
     matrix = np.stack([column.ravel() for column in columns], axis=1)
     size = np.sqrt(np.sum(matrix * matrix, axis=0))
     size[size <= TINY * np.sqrt(len(matrix))] = np.inf
@@ -85,3 +80,8 @@ def least_squares(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals
 def beyond(values: Reals, floor: float) -> float:
     """Return the rms beyond that of noise."""
     return float(np.sqrt(max(rms(values) ** 2 - floor ** 2, 0.0)))
+
+
+def listed(values: Iterable[float]) -> str:
+    """Return numbers for a reader."""
+    return ', '.join(f'{value:.4g}' for value in values)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of grading a simulator, as text and JSON."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+from spinning_top_sim.tools.verdict import Verdict, number
 
 # docs/grade.md defines them.
 FAULTS = (
@@ -20,69 +20,32 @@ FAULTS = (
 
 
 class Fault(NamedTuple):
-    """
-    A fault of a simulator.
-
-    Parameters
-    ----------
-    name : str
-        One of FAULTS.
-    evidence : str
-        Why it is reported.
-    number : float
-        What was measured, such as a lag or a coefficient; NaN where there is none.
-    """
+    """A fault: its name, one of FAULTS, why it is reported, what was measured, such as a lag."""
 
     name: str
     evidence: str
     number: float = math.nan
 
 
-@dataclass(frozen=True)
-class Report:
+class Report(Verdict):
     """
-    The result of grading a simulator; `str(report)` is readable.
+    The result of grading a simulator, the `subject`; `str(report)` is readable.
 
-    Parameters
-    ----------
-    subject : str
-        Name of the simulator.
-    faults : sequence of Fault
-        The faults with their evidence.
-    marks : mapping
-        Measures by name, as docs/grade.md defines them; NaN: could not be measured.
+    passed, faults, names : whether none was found; with their evidence; their names, each once
+    marks : measures by name, as docs/grade.md defines them; NaN: could not be measured
     """
 
-    subject: str
-    faults: Sequence[Fault]
-    marks: Mapping[str, float]
+    @property
+    def faults(self) -> Sequence[Fault]:
+        return self.found
 
     @property
-    def passed(self) -> bool:
-        """Whether no fault was found."""
-        return not self.faults
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the faults, each once."""
-        return list(dict.fromkeys(fault.name for fault in self.faults))
-
-    def __str__(self) -> str:
-        lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.names)}']
-        lines += [f'  {fault.name}: {fault.evidence}' for fault in self.faults]
-        lines += [f'  {name:<40}{value:>12.4g}' for name, value in self.marks.items()
-                  if not math.isnan(value)]
-        return '\n'.join(lines)
+    def marks(self) -> Mapping[str, float]:
+        return self.measures
 
     def as_dict(self) -> dict[str, Any]:
         """Return subject, passed, faults (name, evidence, number) and marks; None: no number."""
-        def number(value: float) -> float | None:
-            return value if math.isfinite(value) else None
         return {'subject': self.subject, 'passed': self.passed,
                 'faults': [{**fault._asdict(), 'number': number(fault.number)}
                            for fault in self.faults],
                 'marks': {name: number(value) for name, value in self.marks.items()}}
-
-    def as_json(self) -> str:
-        """Return `as_dict` as JSON."""
-        return json.dumps(self.as_dict(), indent=2)

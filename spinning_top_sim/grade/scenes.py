@@ -15,8 +15,6 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
 Reals = NDArray[np.float64]
-# What is no field of `Top`: numbers, and vectors with their length.
-_LENGTHS = {'lever_arm': 3, 'mounting': 4, 'field': 3}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,17 +22,12 @@ class Body(Top):
     """
     A top with an IMU on it.  The pivot is the origin of the body frame, e3 the axis.
 
-    Parameters
-    ----------
-    lever_arm : (3,) float
-        Position of the IMU in the body frame [m].
-    mounting : (4,) float
-        q(body <- IMU) as w, x, y, z.
-    field : (3,) float
-        Magnetic field in the world [T].
-    gyroscope_noise_density, accelerometer_noise_density : float
-        Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
-        sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
+    lever_arm : position of the IMU in the body frame [m]
+    mounting : q(body <- IMU) as w, x, y, z
+    field : magnetic field in the world [T]
+    gyroscope_noise_density, accelerometer_noise_density : of white noise [rad/s/sqrt(Hz)],
+        [m/s^2/sqrt(Hz)]: a sample has the density over sqrt(interval between the samples) as its
+        standard deviation; 0: no noise, None: unknown
     """
 
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -45,7 +38,7 @@ class Body(Top):
 
     def __post_init__(self) -> None:
         Top(**{one.name: getattr(self, one.name) for one in fields(Top)})
-        for name, length in _LENGTHS.items():
+        for name, length in (('lever_arm', 3), ('mounting', 4), ('field', 3)):
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (length,) or not np.all(np.isfinite(value)):
                 raise ValueError(f'{name} = {getattr(self, name)!r}: must be {length} finite '
@@ -60,10 +53,7 @@ class Body(Top):
     @classmethod
     def of(cls, top: Top, **imu: object) -> Self:
         """Return the body of a top; `imu` are the other parameters, by default those above."""
-        if isinstance(top, cls) and not imu:
-            return top
-        given = {one.name: getattr(top, one.name) for one in fields(top)}
-        return cls(**{**given, **imu})
+        return top if isinstance(top, cls) and not imu else cls(**{**vars(top), **imu})
 
     @property
     def inertia(self) -> tuple[float, float, float]:
@@ -86,14 +76,9 @@ class Start:
     """
     How the top starts.
 
-    Parameters
-    ----------
-    attitude : (4,) float
-        q(world <- body) as w, x, y, z; z of the world points up.
-    rates : (3,) float
-        Angular velocity in the body frame [rad/s].
-    state : State, optional
-        The same in Euler angles and momenta; `of` and `state_of` convert.
+    attitude : q(world <- body) as w, x, y, z; z of the world points up
+    rates : angular velocity in the body frame [rad/s]
+    state : the same in Euler angles and momenta; `of` and `state_of` convert
     """
 
     attitude: tuple[float, float, float, float]
@@ -104,26 +89,22 @@ class Start:
     def of(cls, top: Top, state: State) -> Self:
         """Return the start of a state."""
         first = ExactSolution(top, state).states_at_seconds(np.zeros(1))
-        x, y, z, w = first.quaternion[0].tolist()
-        return cls((w, x, y, z), tuple(first.angular_velocity[0].tolist()), state)
+        return cls(tuple(np.roll(first.quaternion[0], 1).tolist()),
+                   tuple(first.angular_velocity[0].tolist()), state)
 
     def state_of(self, top: Top) -> State:
         """Return the start as a state of `top`."""
         if self.state is not None:
             return self.state
-        w, x, y, z = self.attitude
-        return state_of(top, np.array((x, y, z, w)), Rotation.from_quat((x, y, z, w)).apply(
-            self.rates))
+        turn = Rotation.from_quat(np.roll(self.attitude, -1))
+        return state_of(top, turn.as_quat(), turn.apply(self.rates))
 
 
 @dataclass(frozen=True)
 class Scene:
     """
-    A motion that is graded.
+    A motion that is graded, from l3, lz, theta and theta_dot of its start, for so long [s].
 
-    name : of the motion
-    start : l3, lz, theta and theta_dot of the start
-    duration : [s]
     divided : numbers by which dt is divided, 1 first; more than one give the order of convergence
     """
 

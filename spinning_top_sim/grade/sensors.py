@@ -8,16 +8,17 @@ The error of the motion does not matter.
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
+from spinning_top_sim.grade import regression
 from spinning_top_sim.grade.motion import MARGIN, Motion
-from spinning_top_sim.grade.regression import NEAR, Cause, beyond, explain, instead, least_squares
+from spinning_top_sim.grade.regression import NEAR, Cause, beyond, fitted, instead, listed, pooled
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
@@ -25,8 +26,7 @@ LAGS = range(-3, 31)        # samples that are tried
 LATE = 0.75                 # steps
 # Of the reading, beside its noise: it is not what it should be.  Velocities are means over a step,
 # compared with those of its ends; rates of the state may be those of the middle of a step.
-STRANGE = {'rates': 2e-2, 'velocities': 5e-2}
-STRANGE_ELSE = 2e-3
+STRANGE = {'rates': 2e-2, 'velocities': 5e-2}       # others 2e-3
 CONSISTENT = 1e-3           # of the reading: the lag is not looked for
 TURNED = 0.02               # of the discrepancy is left at most by a turn of the axes
 UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
@@ -44,14 +44,10 @@ _rate = partial(np.gradient, axis=0)        # change per step of values (m, 3)
 
 class Readings(NamedTuple):
     """
-    What a sensor reads in one motion, and what it should read, over its `size`.
+    What a sensor reads in one motion (n, 3), and what it should read, over its rms `size`.
 
-    reading : (n, 3)
-    first : index of the reading that the effects begin with
-    effects : by name (m, 3): terms of the right reading, their sum `total`, and its change by
-        causes of size 1
-    terms : names of the terms
-    size : rms of the reading
+    effects : by name (m, 3), beginning with reading `first`: `terms` of the right reading, their
+        sum `total`, and its change by causes of size 1
     """
 
     reading: Reals
@@ -60,13 +56,14 @@ class Readings(NamedTuple):
     terms: Sequence[str]
     size: float
 
-    def late(self, lag: int) -> tuple[Reals, slice]:
-        """Return what is wrong `lag` samples after the effects, and the rows of the effects."""
+    def late(self, lag: int, names: Sequence[str] = ()) -> tuple[Reals, dict[str, Reals]]:
+        """Return what is wrong `lag` samples after the effects, and the effects there."""
         total, begin = self.effects['total'], self.first + lag
         end = min(begin + len(total), len(self.reading))
         skip = max(0, -begin)
         part = slice(skip, end - begin)
-        return self.reading[begin + skip:end] - total[part], part
+        return self.reading[begin + skip:end] - total[part], {
+            name: self.effects[name][part] for name in names or self.effects}
 
 
 def _readings_of(kind: str, motion: Motion) -> Readings | None:
@@ -77,10 +74,9 @@ def _readings_of(kind: str, motion: Motion) -> Readings | None:
     if reading is None:
         return None
     rotation, first, arms = said.rotation[inner], MARGIN, np.empty((0, len(w), 3))
-    mounting = Rotation.from_quat((*body.mounting[1:], body.mounting[0]))
-    if kind == 'rates':
-        terms, mounting = {'rates': w}, Rotation.identity()
-    elif kind == 'gyroscope':
+    mounting = (Rotation.identity() if kind == 'rates' else
+                Rotation.from_quat(np.roll(body.mounting, -1)))
+    if kind in ('rates', 'gyroscope'):
         terms = {'rates': w}
     elif kind == 'magnetometer':
         terms = {'field': rotation.inv().apply(body.field)}
@@ -105,16 +101,15 @@ def _readings_of(kind: str, motion: Motion) -> Readings | None:
     effects |= {'step': _rate(total), 'world': (world := turn.apply(total)),
                 'reversed': turn.apply(world)}
     if kind in FORCES:
-        kinematic = total - effects['gravity']
-        back, forth = turn.inv().apply, turn.apply
-        effects |= {'kinematic': kinematic, 'difference': back(_rate(forth(kinematic))),
+        back, kinematic = turn.inv().apply, total - effects['gravity']
+        effects |= {'kinematic': kinematic, 'difference': back(_rate(turn.apply(kinematic))),
                     'turned': back(_rate(world)) - effects['step'],
                     'tangential step': _rate(effects['tangential']),
                     **{f'fixed {k}': 0.0 * total + axis for k, axis in enumerate(np.eye(3))},
                     **{f'arm {k}': mounting.inv().apply(arm) for k, arm in enumerate(arms)}}
     size = rms(reading) or 1.0
-    return Readings(reading / size, first, {name: effect / size for name, effect in
-                                            effects.items()}, [*terms], size)
+    return Readings(reading / size, first, {
+        name: effect / size for name, effect in effects.items()}, [*terms], size)
 
 
 def faults_of_rates(motions: Sequence[Motion]) -> list[Fault]:
@@ -124,44 +119,40 @@ def faults_of_rates(motions: Sequence[Motion]) -> list[Fault]:
     for motion in motions:
         said = motion.trajectory
         if said.rates is not None and first in ('rates_scale', 'rates_in_world'):
-            motion.told = (said.rates if first == 'rates_scale' else
-                           said.rotation.inv().apply(said.rates))
+            motion.derived, motion.rates = False, (
+                said.rates if first == 'rates_scale' else
+                said.rotation.inv().apply(said.rates))[MARGIN:-MARGIN]
     return faults
 
 
 def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, float]]:
-    """
-    Compare the readings of a sensor, if there are any, with what they should be.
-
-    kind : one of KINDS, or 'rates'
-
-    Returns the faults and the measures.
-    """
-    runs = [one for motion in motions if (one := _readings_of(kind, motion)) is not None]
+    """Return faults and measures of the readings of one of KINDS, or of the rates told."""
+    runs = [one for motion in motions if (one := _readings_of(kind, motion))]
     if not runs:
         return [], {}
-    said, lag = motions[0].trajectory, 0 if kind == 'velocities' else _lag(runs)
-    target, effects = _pooled(runs, lag, runs[0].effects)
+    said, means = motions[0].trajectory, kind == 'velocities'       # means over a step
+    lag, late = (0, 0.0) if means else _lag(runs)
+    target, effects = pooled(run.late(lag) for run in runs)
     noise = np.array([_white(run.late(lag)[0]) for run in runs])
     sizes, floor = np.array([run.size for run in runs]), rms(noise)
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
     most = floor * math.sqrt(1.05 + 2.0 * doubt)
-    before, late = beyond(target, most), lag - _fraction(kind, target, effects)
+    before = beyond(target, most)
     marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(sizes * noise)),
              f'{kind}_discrepancy': before}
     faults, residual = [], target
     if abs(late) > LATE:
         faults.append(Fault('imu_one_step_late', f'readings belong to the motion of {late:.3g} '
                             f'steps ({1e3 * late * said.step:.3g} ms) before', late))
-    strange = STRANGE.get(kind, STRANGE_ELSE)
-    if motions[0].told is None and kind != 'rates':
+    strange = STRANGE.get(kind, 2e-3)
+    if motions[0].derived and kind != 'rates':
         # Rates of the attitudes may be half a step apart from those of the simulator.
         turns = (one.trajectory.rotation[:2] for one in motions)
         strange += 0.25 * max(float((a.inv() * b).magnitude()) ** 2 for a, b in turns)
     rest = 0.0
     if before > strange:
-        found, residual = explain(target, _causes(kind, effects, motions[0].body),
-                                  math.hypot(floor, 0.5 * strange))
+        found, residual = regression.explain(target, effects, _causes(kind, motions[0].body),
+                                             math.hypot(floor, 0.5 * strange))
         turned, left = _turned(target, effects['total'])
         if beyond(left, most) < min(TURNED * before, 0.1 * beyond(residual, most)):
             found, residual = turned, left
@@ -182,32 +173,14 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     return [fault._replace(evidence=f'{kind}: {fault.evidence}') for fault in faults], marks
 
 
-def _pooled(runs: Sequence[Readings], lag: int,
-            names: Iterable[str]) -> tuple[Reals, dict[str, Reals]]:
-    """Return what is wrong in all motions (N, 3), and effects."""
-    targets, parts = zip(*(run.late(lag) for run in runs), strict=True)
-    return np.concatenate(targets), {name: np.concatenate([
-        run.effects[name][part] for run, part in zip(runs, parts, strict=True)]) for name in names}
-
-
 def _turned(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
     """Return the fault that the axes are not those of the IMU, and what it leaves (m, 3)."""
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')     # vectors along one line allow many turns
         turn, _ = Rotation.align_vectors(target + total, total)
-    turns = ', '.join(f'{part:.3g}' for part in turn.inv().as_rotvec())
-    return [Fault('mounting', f'the readings are in axes that are turned by ({turns}) rad from '
-                  'those of the IMU', turn.magnitude())], target + total - turn.apply(total)
-
-
-def _fraction(kind: str, target: Reals, effects: Mapping[str, Reals]) -> float:
-    """Return by how many steps a reading is early, 0 if that does not explain it."""
-    if kind == 'velocities':
-        return 0.0
-    # The acceleration of a step may be that of its begin, without a lag of the reading.
-    fractions, left = least_squares(target, [effects[name] for name in (
-        'step', 'tangential step') if name in effects])
-    return float(fractions[0]) if 1e-6 < rms(target) > 2.0 * rms(left) else 0.0
+    text = f'the readings are in axes that are turned by ({listed(turn.inv().as_rotvec())}) rad'
+    return [Fault('mounting', f'{text} from those of the IMU', turn.magnitude())], (
+        target + total - turn.apply(total))
 
 
 def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residual: Reals,
@@ -215,7 +188,7 @@ def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residua
     """Compare noise with what is declared and with normal noise; `band`: of the ratio to 1."""
     density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
                motion.body.accelerometer_noise_density)
-    covariance = (motion.trajectory.covariance or {}).get(kind)
+    covariance = motion.trajectory.covariance.get(kind)
     root = math.sqrt(motion.trajectory.step)
     text = f'the noise has a standard deviation of {noise:.4g}'
     told = math.nan if covariance is None else math.sqrt(abs(np.trace(covariance)) / 3.0)
@@ -237,19 +210,23 @@ def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residua
                         'noise has 3, uniform noise 1.8', kurtosis)
 
 
-def _lag(runs: Sequence[Readings]) -> int:
-    """Return the number of samples by which readings are late, with any size of their terms."""
+def _lag(runs: Sequence[Readings]) -> tuple[int, float]:
+    """Return by how many samples readings are late, with any size of their terms, and by what."""
     def left(lag: int) -> float:
-        target, effects = _pooled(runs, lag, (*runs[0].terms, 'step'))
-        return rms(least_squares(target, [*effects.values()])[1])
+        target, effects = pooled(run.late(lag, (*run.terms, 'step')) for run in runs)
+        return rms(fitted(target, [*effects.values()])[1])
 
-    floor, now = rms(np.array([_white(run.late(0)[0]) for run in runs])), left(0)
-    if now ** 2 < 1.1 * floor ** 2 + CONSISTENT ** 2:
-        return 0
-    found = {0: now} | {lag: left(lag) for lag in LAGS if lag < len(
-        runs[0].effects['total']) // 4}
-    best = min(found, key=lambda lag: found[lag])
-    return best if found[best] < 0.5 * now else 0
+    floor, now, best = rms(np.array([_white(run.late(0)[0]) for run in runs])), left(0), 0
+    if now ** 2 >= 1.1 * floor ** 2 + CONSISTENT ** 2:
+        most = len(runs[0].effects['total']) // 4
+        found = {lag: left(lag) for lag in LAGS if lag < most}
+        best = min(found, key=lambda lag: found[lag])
+        best = best if found[best] < 0.5 * now else 0
+    target, effects = pooled(run.late(best) for run in runs)
+    # The acceleration of a step may be that of its begin, without a lag of the reading.
+    steps, rest = fitted(target, [effects[name] for name in (
+        'step', 'tangential step') if name in effects])
+    return best, best - (float(steps[0]) if 1e-6 < rms(target) > 2.0 * rms(rest) else 0.0)
 
 
 def _white(rows: Reals) -> float:
@@ -257,24 +234,20 @@ def _white(rows: Reals) -> float:
     return rms(np.diff(rows, 6, axis=0)) / math.sqrt(924.0)
 
 
-def _causes(kind: str, effects: Mapping[str, Reals], body: Body) -> list[Cause]:
+def _causes(kind: str, body: Body) -> list[Cause]:
     """Return what may be wrong with the readings of a sensor."""
-    def only(judge: Any, *names: str) -> Cause:
-        return Cause([effects[name] for name in names], judge)
-
     in_world = 'rates_in_world' if kind in ('gyroscope', 'rates') else 'reading_in_world'
     text = 'the readings are in axes of '
-    causes = [only(partial(_scale, kind), 'total'), only(lambda found: None, 'step'),
-              only(instead(in_world, f'{text}the world, not of the IMU'), 'total', 'world'),
-              only(instead('rotation_reversed', f'{text}a sensor that turns against the IMU'),
-                   'total', 'reversed')]
-    if kind in FORCES:
-        causes += [only(partial(_term, name), name) for name in _TERMS]
-        causes += [only(partial(_gravity_frame, body), 'gravity', 'fixed 0', 'fixed 1', 'fixed 2'),
-                   only(_difference, 'difference'), only(lambda found: None, 'tangential step'),
-                   only(lambda found: None, 'turned'),
-                   only(partial(_arm, body), 'arm 0', 'arm 1', 'arm 2')]
-    return causes
+    causes = [Cause(['total'], partial(_scale, kind)), Cause(['step']), Cause(
+        ['total', 'world'], instead(in_world, f'{text}the world, not of the IMU')), Cause(
+        ['total', 'reversed'], instead('rotation_reversed', f'{text}a sensor that turns against '
+                                       'the IMU'))]
+    if kind not in FORCES:
+        return causes
+    return [*causes, *(Cause([name], partial(_term, name)) for name in _TERMS),
+            Cause(['gravity', 'fixed 0', 'fixed 1', 'fixed 2'], partial(_gravity_frame, body)),
+            Cause(['difference'], _difference), Cause(['tangential step']), Cause(['turned']),
+            Cause(['arm 0', 'arm 1', 'arm 2'], partial(_arm, body))]
 
 
 def _scale(kind: str, found: Reals) -> Fault:
@@ -302,9 +275,9 @@ def _term(term: str, found: Reals) -> Fault:
 
 def _gravity_frame(body: Body, found: Reals) -> Fault | None:
     fixed = float(np.linalg.norm(found[1:]))
-    other = abs(found[0] + 1.0) > NEAR or abs(fixed / body.gravity - 1.0) > NEAR
-    return None if other else Fault('gravity_frame', f'gravity, {fixed:.4g} m/s^2, does not turn '
-                                    'with the IMU', fixed)
+    there = abs(found[0] + 1.0) <= NEAR and abs(fixed / body.gravity - 1.0) <= NEAR
+    text = f'gravity, {fixed:.4g} m/s^2, does not turn with the IMU'
+    return Fault('gravity_frame', text, fixed) if there else None
 
 
 def _difference(found: Reals) -> Fault | None:
@@ -322,6 +295,5 @@ def _arm(body: Body, found: Reals) -> Fault:
         return _term('kinematic', np.array([share - 1.0]))
     of = ', the centre of mass' if np.linalg.norm(point - body.com) < 0.1 * max(
         size, abs(body.com_distance)) else ''
-    shown = [', '.join(f'{x:.3g}' for x in one) for one in (point, arm)]
-    return Fault('no_lever_arm', f'the readings are those at ({shown[0]}) m{of}, not at '
-                 f'({shown[1]}) m', float(np.linalg.norm(found)))
+    return Fault('no_lever_arm', f'the readings are those at ({listed(point)}) m{of}, not at '
+                 f'({listed(arm)}) m', float(np.linalg.norm(found)))
