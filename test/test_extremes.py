@@ -180,7 +180,8 @@ def short_life(rng):
             return 'stopped'
         now = range(max(simulation.now_ns, 0), max(simulation.now_ns, 0) + 1)
         for one in streams():
-            _, rows = one.encode(Samples(simulation.path, now, simulation.epoch_ns))
+            _, rows = one.encode(Samples(
+                simulation.path, [(simulation.segment, now)], simulation.epoch_ns))
             for field in one.template.decode(rows.tobytes()):
                 shown = field[:, :COMPARABLE.get(one.topic)]
                 assert np.isfinite(shown).all(), (one.topic, shown)

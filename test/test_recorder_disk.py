@@ -304,11 +304,11 @@ def disk(monkeypatch):
 def test_a_full_disk_stops_the_recording_and_costs_what_is_not_written(
         tmp_path, disk, monkeypatch, room, max_loss):
     """A torn chunk is cut off, and where it stood there is room for the summary; or only that."""
-    monkeypatch.setattr(writer, 'QUEUE_BYTES', 4_000_000)
+    monkeypatch.setattr(writer, 'QUEUE_BYTES', 400_000)
     path, rng = tmp_path / 'run.mcap', random.Random(3)
     at_end = max_loss < 1.0
     recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0, max_loss=max_loss)
-    for number in range(2000):      # half full, so that chunks of 1 MB are made
+    for number in range(2000):      # many times half of the queue: chunks of 1 MB
         recorder.write(0, number, rng.randbytes(1000))
     eventually(lambda: recorder.counters.messages > (1999 if at_end else 1000))
     disk.size = recorder.counters.bytes + room

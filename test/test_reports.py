@@ -15,7 +15,7 @@ from builtin_interfaces.msg import Time
 
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.nodes.reports import NodeStatus
-from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
+from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 
@@ -109,7 +109,7 @@ def test_the_status_line(clock, reported):
     assert ' | 12 messages | ' in reported.report.status_line()
     reported.loop.resume()
     assert re.search(r' \| x\d+\.\d\d \| ', reported.report.status_line())
-    reported.loop.state = LoopState.WAITING
+    reported.report.waits_for_clock = True
     assert ' waiting for /clock | ' in reported.report.status_line()
     assert status_of(reported)[:2] == (1, 'waiting for /clock')
     reported.loop.fail('at a pole')

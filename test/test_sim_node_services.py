@@ -156,8 +156,14 @@ def test_a_recording_overwrites_nothing_and_is_made_where_the_node_runs(peer, se
 # ------------------------------------------------------------------------------------- /clock
 
 def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagnostics, tmp_path):
-    """Before the clock, with it, and where it steps back."""
+    """Before the clock, with it, when it stops, and steps back."""
     clock = DrivenClock(peer, '/driven', 1_000_000_000_000)     # /clock is that of `served`
+
+    def waits():
+        status = diagnostics.wait_for(node, 'a warning', lambda s: 'waiting' in s.message)
+        assert (status.level, status.message) == (b'\x01', 'waiting for /clock')
+        wait_for('the status line', lambda: ' s waiting for /clock | ' in
+                 node.out.splitlines()[-1])
 
     def is_ahead():
         assert all(stamp_of(data) <= clock.now_ns for data in pose.raw[-1:])
@@ -165,10 +171,7 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
 
     with SimNode(tmp_path, {'use_sim_time': True, 'status_period': 0.2, 'time_scale': 2.0},
                  namespace='/follower', arguments=('-r', '/clock:=/driven')) as node:
-        status = diagnostics.wait_for(node, 'a warning', lambda s: 'waiting' in s.message)
-        assert (status.level, status.message) == (b'\x01', 'waiting for /clock')
-        wait_for('the status line', lambda: ' s waiting for /clock | ' in
-                 node.out.splitlines()[-1])
+        waits()
         refused = peer.set_together(node, spin__l3=2.0)     # it would send t = 0 to nobody
         assert not refused.successful and 'waiting for /clock' in refused.reason
         assert 'follows another /clock' in peer.set_together(node, clock__enabled=True).reason
@@ -184,6 +187,9 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
         assert clock.now_ns - SECOND // 2 < stamp_of(pose.raw[-1]) <= clock.now_ns
         assert set(stamps_of(pose) % PERIODS_NS['pose']) == {0}
         clock.drive('no warning', lambda: 'waiting' not in diagnostics.statuses(node)[-1].message)
+        waits()                             # it has stopped
+        count = len(pose.raw)
+        clock.drive('the motion', is_ahead)
         count = len(pose.raw)
         clock.now_ns -= 400 * SECOND        # as where a log is played in a loop
         clock.drive('samples', lambda: len(pose.raw) > count + 50)

@@ -28,6 +28,7 @@ class NodeStatus:
         self._described: object = None          # the segment that `_regime` names
         self._regime = ''
         self._read_at, self._read_ns = time.monotonic(), 0
+        self.waits_for_clock = False            # whether /clock has not begun, or has stopped
 
     def diagnostics(self, stamp: Time, name: str, max_error: float) -> DiagnosticArray:
         """Return the message for /diagnostics; `max_error` = 0 leaves out the error."""
@@ -35,7 +36,7 @@ class NodeStatus:
         error = simulation.orientation_error if max_error else math.nan
         states = (      # whether it holds, its level, its message
             (True, DiagnosticStatus.OK, 'paused' if loop.paused else 'running'),
-            (loop.state is LoopState.WAITING, DiagnosticStatus.WARN, 'waiting for /clock'),
+            (self.waits_for_clock, DiagnosticStatus.WARN, 'waiting for /clock'),
             (self.overloaded, DiagnosticStatus.WARN, 'this machine cannot keep up'),
             (error > max_error > 0.0, DiagnosticStatus.WARN,
              f'orientation error {error:.3g} rad: more than max_error = {max_error:g} rad'),
@@ -89,8 +90,8 @@ class NodeStatus:
             self._described, motion = simulation.segment, simulation.describe()
             self._regime = motion.name if motion else ''
         theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
-        flag = (' FAILED' if loop.failure else ' waiting for /clock'
-                if loop.state is LoopState.WAITING else ' paused' if loop.paused else '')
+        flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
+                else ' paused' if loop.paused else '')
         is_running = loop.state is LoopState.RUNNING and not math.isnan(self._speed)
         # The most important parts come first: a terminal shows as much as fits.
         return ' | '.join(filter(None, (

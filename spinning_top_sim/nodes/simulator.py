@@ -90,7 +90,6 @@ class Simulator(Node):
 
     def _begin(self) -> None:
         if self._date.now_ns() == 0:
-            self._log.warning('waiting for /clock (use_sim_time is set)', once=True)
             return
         if self.values['max_error'] > 0.0:
             _ = self.simulation.segment.exact    # its modules take a while to import
@@ -327,6 +326,7 @@ class Simulator(Node):
         return self.create_timer(period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish_diagnostics(self) -> None:
+        self._check_clock()
         self._check_recording()
         if self._session.warning:
             self._log.warning(f'recording: {self._session.warning}', throttle_duration_sec=10.0)
@@ -342,6 +342,14 @@ class Simulator(Node):
                 self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),
                 self.values['max_error'])
         self._diagnostics.publish(message)
+
+    def _check_clock(self) -> None:
+        """Warn when the /clock that is followed stops; say when it goes on."""
+        waits = self._date.is_missing()
+        if waits != self._report.waits_for_clock:
+            self._report.waits_for_clock = waits
+            self._log.warning('waiting for /clock (use_sim_time is set)' if waits else
+                              '/clock goes on')
 
     def _check_recording(self) -> None:
         reason = self._session.check()
