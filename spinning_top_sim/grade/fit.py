@@ -38,7 +38,7 @@ ANGLES, RATIO = (2, 3), 6   # of NAMES: those that may change by a turn, lambda3
 EXACT = 1e-7                # residual that needs no noise: quaternions in single precision [rad]
 NEGLIGIBLE = 1e-5           # of readings: errors of a simulator's steps
 LARGEST = 0.3               # noise [rad]
-ONCE_IN = 1000.0            # noise that is called a residue of the motion
+ONCE_IN = 10000.0           # noise that is called a residue of the motion
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
@@ -246,7 +246,9 @@ def _descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int =
 
 def whiteness(rest: Reals) -> tuple[float, bool]:
     """Return the level of the white part of residuals (rows, n), and whether they are white."""
-    power = np.abs(np.fft.rfft(rest, axis=1)[:, 1:]) ** 2 / rest.shape[1]
+    n = rest.shape[1]
+    # Without the mean and the Nyquist frequency, whose lines are real: their power scatters more.
+    power = np.abs(np.fft.rfft(rest, axis=1)[:, 1:(n + 1) // 2]) ** 2 / n
     level = float(np.median(power)) / math.log(2.0)
     # A line of white noise exceeds the mean by the factor ln(lines/p) with the probability p.
     strongest = float(np.max(power)) / max(float(np.mean(power)), 1e-300)
