@@ -47,7 +47,7 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
     Explain a discrepancy (N, 3) by causes, the best one first; return faults and what is left.
 
     effects : by name, change of what is compared by an effect of size 1 (N, 3)
-    floor : rms of the noise in the target
+    floor : rms of the noise in the target, 0 if it is not known
     """
     chosen: list[Cause] = []
     residual, found, others = target, np.empty(0), [*causes]
@@ -56,7 +56,7 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
         tried = [fitted(target, [effects[name] for cause in (*chosen, one)
                                         for name in cause.effects]) for one in others]
         after = [beyond(left, floor) for _, left in tried]
-        good = max(AS_GOOD * min(after), 0.02 * before)
+        good = max(AS_GOOD * min(after), min(0.02 * before, floor or np.inf))
         _, left, best = min((len(one.effects), left, k) for k, (one, left) in enumerate(
             zip(others, after, strict=True)) if left <= good)
         if left > WORTHWHILE * before:

@@ -133,8 +133,10 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     said, means = motions[0].trajectory, kind == 'velocities'       # means over a step
     lag, late = (0, 0.0) if means else _lag(runs)
     target, effects = pooled(run.late(lag) for run in runs)
-    noise = np.array([_white(run.late(lag)[0]) for run in runs])
-    sizes, floor = np.array([run.size for run in runs]), rms(noise)
+    wrong = [run.late(lag)[0] for run in runs]
+    lengths, noise = [*map(len, wrong)], np.array([*map(_white, wrong)])
+    sizes = np.array([run.size for run in runs])
+    floor = math.sqrt(np.average(noise ** 2, weights=lengths))
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
     most = floor * math.sqrt(1.05 + 2.0 * doubt)
     before = beyond(target, most)
@@ -164,8 +166,8 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
         faults.append(Fault(name, f'{100.0 * rest:.3g} % of the reading is not that of the '
                             'motion', rest))
     elif kind in ('gyroscope', 'accelerations') and not scaled:
-        ends = np.cumsum([len(run.late(lag)[0]) for run in runs])[:-1]
-        noises = [size * one for size, one in zip(sizes, np.split(residual, ends), strict=True)]
+        noises = [size * one for size, one in zip(
+            sizes, np.split(residual, np.cumsum(lengths)[:-1]), strict=True)]
         # A cause that is found has taken fast motion away, or has left some.
         level = float(np.mean(np.minimum(sizes * noise, [*map(_white, noises)])))
         faults += _noise_faults(kind, motions[0], level, level > NOISY * sizes[0],
