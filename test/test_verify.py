@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`inspect --verify`: logs are computed again, and each difference is found and named."""
 
+import dataclasses
 import math
 import re
 
@@ -11,7 +12,8 @@ from mcap.reader import make_reader
 
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import journal
+from spinning_top_sim.streams import cdr, journal, parameters
+from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import recorded_run
 
 
@@ -108,6 +110,25 @@ def test_a_missing_message_and_a_changed_journal_are_found(short, tmp_path, caps
         short, tmp_path / 'cut.mcap', lambda topic, number, data: (
             data.replace(b'"l3": 1.7', b'"l3"; 1.7') if topic.endswith('/events') else data)))
     assert not verdict['identical'] and verdict['first']['topic'].endswith('/events')
+
+
+def test_each_change_that_takes_effect_at_once_is_replayed(short):
+    with LogReader(short) as reader:
+        run = recorded_run.read_run_description(reader)
+    for parameter in parameters.TABLE:
+        change = {parameter.name: run.values_at_start[parameter.name]}
+        event = recorded_run.Event('parameters', run.epoch_ns + 1, 1, 1, change)
+        events = [event for _, event in recorded_run.rerun(
+            dataclasses.replace(run, events=[event]), run.epoch_ns + 2)]
+        assert (event in events) is (parameter.effect is parameters.Effect.NOW), parameter.name
+
+
+def test_a_type_without_names_is_told():
+    values = parameters.checked({})
+    stream = Stream(values, 'pose', 'other', 'a_package/msg/New',
+                    cdr.Template(cdr.CdrWriter().header('').field(1)))
+    with pytest.raises(LookupError, match='no names for a_package/msg/New in recorded_run'):
+        recorded_run.field_names(stream)
 
 
 def test_another_machine_is_warned_of(short, capsys, monkeypatch):

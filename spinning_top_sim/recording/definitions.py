@@ -24,5 +24,6 @@ def find_definition(type_name: str) -> tuple[str, str]:
     try:
         text, type_hash = definitions()[type_name]
     except KeyError:
-        raise RecordingError(f'there is no definition of {type_name}') from None
+        raise RecordingError(f'there is no definition of {type_name} in recording/definitions.json'
+                             ) from None
     return text, type_hash

@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
-from spinning_top_sim.solvers.dormand_prince import SteppedMotion
 from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.theta_values import MOST
@@ -19,8 +20,27 @@ from spinning_top_sim.solvers.transport import TransportMotion
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
-# A motion from its start at t = 0; `SteppedMotion` says what its members do.
-Propagator = ExactSolution | SteppedMotion
+
+
+class Propagator(Protocol):
+    """A motion from its start at t = 0; `SteppedMotion` says what its members do."""
+
+    top: Top
+    start: State
+    ns_limit: int
+    steps: int
+    evaluations: int
+
+    @property
+    def reached_ns(self) -> int: ...
+
+    def reach(self, ns: int, max_steps: int | None = None) -> bool: ...
+
+    def release(self, before_ns: int) -> None: ...
+
+    def states(self, times_ns: NDArray[np.int64] | range) -> States: ...
+
+    def states_at_seconds(self, t: Column) -> States: ...
 
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',

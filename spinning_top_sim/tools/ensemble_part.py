@@ -50,7 +50,7 @@ def versions() -> dict[str, str]:
 def _column_names(stream: Stream) -> Sequence[str]:
     """Return the names of the numbers in a message, '' for those that are not kept."""
     names = []
-    for field, count in zip(field_names(stream) or (), stream.template.counts, strict=True):
+    for field, count in zip(field_names(stream), stream.template.counts, strict=True):
         labels = LABELS.get(stream.topic) or ('xyzw'[:count] if count <= 4 else range(count))
         # REP-145: a message may say that it has no orientation.
         is_kept = field != 'orientation' or getattr(stream, 'has_orientation', True)

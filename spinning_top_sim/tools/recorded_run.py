@@ -52,9 +52,12 @@ FIELDS = {
 }
 
 
-def field_names(stream: Stream) -> Sequence[str] | None:
-    """Return the names of the fields of a stream's template, None if they are not in FIELDS."""
-    return FIELDS.get(stream.topic) or FIELDS.get(stream.type_name)
+def field_names(stream: Stream) -> Sequence[str]:
+    """Return the names of the fields of a stream's template.  Raises LookupError."""
+    names = FIELDS.get(stream.topic) or FIELDS.get(stream.type_name, ())
+    if stream.template.counts and not names:
+        raise LookupError(f'no names for {stream.type_name} in recorded_run.FIELDS')
+    return names
 
 
 class ForeignLogError(Exception):
@@ -237,7 +240,7 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     if samples:
         yield from play(run.begun_ns, ())
     simulation.now_ns = run.begun_ns
-    at_once = {stream.rate_parameter for stream in simulation.streams}
+    at_once = {one.name for one in parameters.TABLE if one.effect is parameters.Effect.NOW}
     simulation.apply({name: run.values_at_recording[name] for name in at_once})
     yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
 

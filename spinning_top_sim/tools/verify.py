@@ -138,8 +138,7 @@ def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
     if number < 0:
         what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
     else:
-        names = field_names(stream)
-        what = f'{names[number] if names else f"array {number}"}[{element}]'
+        what = f'{field_names(stream)[number]}[{element}]'
         code, text = '<d', '{!r}'
     one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))
     return Difference(*key, what, one, two, at)
