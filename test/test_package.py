@@ -203,13 +203,16 @@ def test_every_source_says_its_license():
 # ------------------------------------------------------------------------------------- scenes
 
 
-@pytest.mark.parametrize('name', ['simulate', 'inspect', 'examine'])
-def test_a_command_whose_library_is_missing_names_it_and_the_remedy(name, monkeypatch, capsys):
+@pytest.mark.parametrize('name, arguments', [
+    ('simulate', ['--help']), ('inspect', ['--help']),
+    ('examine', ['run.mcap', '--topic', 'imu/data'])])
+def test_a_command_whose_library_is_missing_names_it_and_the_remedy(
+        name, arguments, monkeypatch, capsys):
     for module in [one for one in sys.modules if one.startswith('spinning_top_sim')]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, 'mcap.exceptions', None)
     monkeypatch.setitem(sys.modules, 'mcap.records', None)
     monkeypatch.setitem(sys.modules, 'mcap.opcode', None)
-    assert import_module('spinning_top_sim.__main__').main([name, '--help']) == 1
+    assert import_module('spinning_top_sim.__main__').main([name, *arguments]) == 1
     assert re.fullmatch(f'spinning-top {name}: it needs mcap, which is not installed: '
                         rf"\S+ -m pip install 'mcap[^']*'\n", capsys.readouterr().err)

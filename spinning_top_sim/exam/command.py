@@ -104,7 +104,8 @@ def _report(arguments: argparse.Namespace) -> Report:
     if arguments.imu is not None:
         (options['imu'],) = scene_file.chosen_files(argparse.Namespace(imu=arguments.imu))
     if subject == 'a log':
-        from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
+        with needed('it'):
+            from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
 
         options['north'] = options.pop('heading', None)
         return examine_log(arguments.log, **options)

@@ -134,8 +134,8 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     lag, late = (0, 0.0) if means else _lag(runs)
     target, effects = pooled(run.late(lag) for run in runs)
     wrong = [run.late(lag)[0] for run in runs]
-    lengths, noise = [*map(len, wrong)], np.array([*map(_white, wrong)])
-    sizes = np.array([run.size for run in runs])
+    lengths, sizes = [*map(len, wrong)], np.array([run.size for run in runs])
+    noise = np.array([*map(_white, wrong)])
     floor = math.sqrt(np.average(noise ** 2, weights=lengths))
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
     most = floor * math.sqrt(1.05 + 2.0 * doubt)
