@@ -28,8 +28,10 @@ Publishers are RELIABLE and KEEP_LAST with depth 10. The parameters
 AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | yes | `ground_truth_odom.enabled` |
 | `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | yes | |
 
-- `pose`: attitude q(world ← body) in `world_frame`; the position is the pivot, (0, 0, 0).
-- `joint_states`: {joints}: φ, θ, ψ [rad], unwrapped, and their rates [rad/s].
+- `pose`: attitude q(world ← body) in `world_frame`; the position is that of the pivot,
+  (0, 0, 0) while it rests in the origin.
+- `joint_states`: {joints}: φ, θ, ψ [rad] and their rates [rad/s]. The angles are
+  unwrapped while the pivot rests; once it has moved, θ is in [0, π] and φ and ψ may jump by whole turns.
 - `imu/data_raw` (REP-145): angular velocity [rad/s] and specific force [m/s²] in `imu.frame_id`, +g
   upwards at rest; `orientation_covariance[0]` = −1, because it has no orientation. With
   `increments.enabled`, or `imu.sampling` = mean, `imu.rate` must be at least {slowest:g}.
@@ -85,8 +87,8 @@ recording, or only at the start of the node (read-only).
 |---|---|---|---|---|---|
 """
 
-COMMANDS = ('sim_node', 'replay_node', 'simulate', 'inspect', 'recover', 'export', 'examine',
-            'ensemble', 'view')
+COMMANDS = ('sim_node', 'replay_node', 'simulate', 'inspect', 'recover', 'export', 'ensemble',
+            'examine', 'grade', 'view')
 AFTER_PARAMETERS = """
 ## Commands
 

@@ -19,7 +19,8 @@ def provenance(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
     values_at_start : parameters at the start of the motion (the last reset)
     epoch_ns : stamp of t = 0
     begun_ns : simulated time at which the recording begins
-    history : commands and states applied before, as `Simulation.history`
+    history : commands, states, rates of the IMU and velocities of the pivot applied before, as
+        `Simulation.history`
     values_at_recording : parameters when the recording begins, with later changes
     """
     return {

@@ -227,7 +227,8 @@ TABLE: tuple[Parameter, ...] = (
     _at_start('publish_clock', False, 'Publish /clock (the same as clock.enabled)'),
     _at_start('simulation_interfaces', True, 'Offer the services of simulation_interfaces if that '
               'package is installed'),
-    _at_start('world_frame', 'world', 'Frame of the pivot, z up'),
+    _at_start('world_frame', 'world', 'Frame of the world, z up; its origin is the pivot at '
+              't = 0, or that of the waypoints'),
     _at_start('body_frame', 'base_link', 'Frame of the body, z along its axis'),
     _at_reset('seed', 0, 'Seed of the noise', '', 0, 2 ** 63 - 1),
     *(parameter for row in STREAM_DEFAULTS for parameter in _stream(*row)),
