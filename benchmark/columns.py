@@ -35,6 +35,6 @@ def simulated(params: Sequence[str | Mapping[str, Any]], streams: Sequence[str],
             'runs': 1, 'duration': duration, 'streams': list(streams),
             'params': [*params, {'solver.method': 'exact'}],
             'sample': {'seed': {'values': [seed]}}}))
-        run_module('spinning_top_sim', (
-            'ensemble', str(spec), '-o', f'{folder}/runs', '--workers', '1', '--quiet'))
+        run_module('spinning_top_sim.tools.ensemble', (
+            str(spec), '-o', f'{folder}/runs', '--workers', '1', '--quiet'))
         return Columns(pyarrow.dataset.dataset(f'{folder}/runs/data').to_table())

@@ -51,8 +51,8 @@ Costs = dict[str, list[float]]
 def simulate(duration: float, *arguments: str) -> Callable[[Path, Path], float]:
     """Return what measures `simulate` of three streams at 1 kHz."""
     def cost(checkout: Path, folder: Path) -> float:
-        return run_module('spinning_top_sim', (
-            'simulate', '-o', str(folder / 'run.mcap'), '--duration', str(duration), '--quiet',
+        return run_module('spinning_top_sim.tools.simulate', (
+            '-o', str(folder / 'run.mcap'), '--duration', str(duration), '--quiet',
             *arguments,
             '-p', f'record.streams:=[{", ".join(STREAMS)}]',
             *(item for name in STREAMS for item in ('-p', f'{name}.rate:=1000.0'))), checkout)
@@ -91,9 +91,9 @@ def ensemble(checkout: Path, folder: Path) -> float:
     if not (checkout / 'scripts/ensemble').exists():
         return float('nan')
     (folder / 'spec.yaml').write_text(ENSEMBLE.format(config=ROOT / 'config'))
-    return run_module('spinning_top_sim', (
-        'ensemble', str(folder / 'spec.yaml'), '-o', str(folder / 'runs'), '--workers', '1',
-        '--quiet'), checkout)
+    return run_module('spinning_top_sim.tools.ensemble', (
+        str(folder / 'spec.yaml'), '-o', str(folder / 'runs'), '--workers', '1', '--quiet'),
+        checkout)
 
 
 def in_turns(cost: Callable[[Path, Path], float]) -> Callable[[Checkouts, int], Costs]:
