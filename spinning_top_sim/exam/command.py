@@ -144,7 +144,3 @@ def _own_filter(given: str) -> Callable[[], Filter]:
     except KeyError:
         raise ValueError(f'--filter {given}: there is no {name} in {path}') from None
     return made
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -227,8 +227,8 @@ class _Exam(Responses):
         self.measures['order'] = measures.convergence_order(self.finer, moved)
         self.measures['integration_error_deg'] = math.degrees(moved[0])
         # A filter that does not use the step turns by the number of samples.
-        off = abs(gains[-1] - gains[0]) / max(abs(gains[0]), STEP)
-        if off > STEP and abs(gains[-1] / self.finer[-1] - gains[0]) < 0.25 * abs(gains[0]):
+        apart = abs(gains[-1] - gains[0]) / max(abs(gains[0]), STEP)
+        if apart > STEP and abs(gains[-1] / self.finer[-1] - gains[0]) < 0.25 * abs(gains[0]):
             # A wrong step turns up as a wrong scale at one rate.
             self.faults = [fault for fault in self.faults if not (
                 fault.name == 'gyroscope_wiring' and 'time_step' in dict(self.faults))]
@@ -260,6 +260,7 @@ class _Exam(Responses):
         if effect > diagnosis.LEVER_ARM:
             self.faults.append(Fault('lever_arm', f'10 cm off the axis adds {degrees(effect)}: '
                                      'motion is mistaken for gravity'))
+
 
 class _OneFilterExam(_Exam):
     """The runs of an exam of one filter that is never restarted, at the one rate of its IMU."""

@@ -103,10 +103,10 @@ class Hypothesis(NamedTuple):
 
 def changed(names: Sequence[str], change: ChangeRows) -> ChangeReadings:
     """Return what changes the readings (n, 3) of these sensors."""
-    def changed(run: Run) -> Run:
+    def with_changes(run: Run) -> Run:
         readings: Any = {name: change(getattr(run, name)) for name in names}
         return replace(run, **readings)
-    return changed
+    return with_changes
 
 
 WITHOUT_FIELD = changed(('magnetometer',), lambda rows: np.full_like(rows, np.nan))

@@ -17,7 +17,6 @@ What a file may contain is in docs/grade_files.md.
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -168,7 +167,3 @@ def _even(times: Sequence[Reals], notes: list[str]) -> Reals:
         return grid
     notes.append('stamps are not evenly spaced: interpolated')
     return even
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -38,8 +38,9 @@ ANGLES, RATIO = (2, 3), 6   # of NAMES: those that may change by a turn, lambda3
 EXACT = 1e-7                # residual that needs no noise: quaternions in single precision [rad]
 NEGLIGIBLE = 1e-5           # of readings: errors of a simulator's steps
 LARGEST = 0.3               # noise [rad]
-ONCE_IN = 10000.0           # noise that is called a residue of the motion
+ONCE_IN = 10000.0           # residuals of noise alone, one is judged not to be noise
 SEEN = 6.0                  # standard deviations of its amplitude: a smaller nutation may be noise
+STEP = 1e-6                 # of an unknown's natural size: for derivatives of the values
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
 BEGIN = 16, 32, 64          # attitudes that tell the start of a known top, whatever follows
@@ -298,11 +299,11 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
     told = singular > max(1.0 / VAGUE, (1e-6 if frozen else 1e-9) * singular[0])
     values = _public(problem, x)[free]
-    steps = 1e-6 * sizes[:, np.newaxis] * np.eye(len(free), len(x))
+    steps = STEP * sizes[:, np.newaxis] * np.eye(len(free), len(x))
     slopes = np.stack([(_public(problem, x + step) - _public(problem, x - step))[free]
                        for step in steps], axis=1)
     slopes[[*ANGLES]] = np.remainder(slopes[[*ANGLES]] + math.pi, math.tau) - math.pi
-    slopes *= 0.5e6
+    slopes *= 0.5 / STEP
     half = slopes @ (directions[told].T / singular[told])
     deviations = np.sqrt(np.sum(half * half, axis=1))
     allowed = VAGUE * np.array([1.0, rate, 1.0, 1.0, rate, rate, abs(values[RATIO]), rate * rate,

@@ -132,11 +132,9 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
         return [], {}
     said, means = motions[0].trajectory, kind == 'velocities'       # means over a step
     lag, late = (0, 0.0) if means else _lag(runs)
-    target, effects = pooled(run.late(lag) for run in runs)
-    wrong = [run.late(lag)[0] for run in runs]
-    lengths, sizes = [*map(len, wrong)], np.array([run.size for run in runs])
-    noise = np.array([*map(_white, wrong)])
-    floor = math.sqrt(np.average(noise ** 2, weights=lengths))
+    parts, sizes = [run.late(lag) for run in runs], np.array([run.size for run in runs])
+    (target, effects), wrong = pooled(parts), [one for one, _ in parts]
+    noise, floor = np.array([*map(_white, wrong)]), _white(*wrong)
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
     most = floor * math.sqrt(1.05 + 2.0 * doubt)
     before = beyond(target, most)
@@ -167,7 +165,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
                             'motion', rest))
     elif kind in ('gyroscope', 'accelerations') and not scaled:
         noises = [size * one for size, one in zip(
-            sizes, np.split(residual, np.cumsum(lengths)[:-1]), strict=True)]
+            sizes, np.split(residual, np.cumsum([*map(len, wrong)])[:-1]), strict=True)]
         # A cause that is found has taken fast motion away, or has left some.
         level = float(np.mean(np.minimum(sizes * noise, [*map(_white, noises)])))
         faults += _noise_faults(kind, motions[0], level, level > NOISY * sizes[0],
@@ -218,7 +216,7 @@ def _lag(runs: Sequence[Readings]) -> tuple[int, float]:
         target, effects = pooled(run.late(lag, (*run.terms, 'step')) for run in runs)
         return rms(fitted(target, [*effects.values()])[1])
 
-    floor, now, best = rms(np.array([_white(run.late(0)[0]) for run in runs])), left(0), 0
+    floor, now, best = _white(*(run.late(0)[0] for run in runs)), left(0), 0
     if now ** 2 >= 1.1 * floor ** 2 + CONSISTENT ** 2:
         most = len(runs[0].effects['total']) // 4
         found = {lag: left(lag) for lag in LAGS if lag < most}
@@ -228,12 +226,12 @@ def _lag(runs: Sequence[Readings]) -> tuple[int, float]:
     # The acceleration of a step may be that of its begin, without a lag of the reading.
     steps, rest = fitted(target, [effects[name] for name in (
         'step', 'tangential step') if name in effects])
-    return best, best - (float(steps[0]) if 1e-6 < rms(target) > 2.0 * rms(rest) else 0.0)
+    return best, best - (float(steps[0]) if rms(target) > max(1e-6, 2.0 * rms(rest)) else 0.0)
 
 
-def _white(rows: Reals) -> float:
+def _white(*runs: Reals) -> float:
     """Return the standard deviation of white noise, by differences in which motions vanish."""
-    return rms(np.diff(rows, 6, axis=0)) / math.sqrt(924.0)
+    return rms(np.concatenate([np.diff(rows, 6, axis=0) for rows in runs])) / math.sqrt(924.0)
 
 
 def _causes(kind: str, body: Body) -> list[Cause]:

@@ -188,7 +188,7 @@ class AcceleratedMotion(ExactSolution):
 
 
 class _Chain(AcceleratedMotion):
-    """Motions of one kind as one, each at `counts` of the times."""
+    """Motions of one kind, each at `counts` of the times, for states only: it has no posture."""
 
     def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int]) -> None:
         self.top, self.start, self._turns = motions[0].top, motions[0].start, 0
