@@ -55,11 +55,18 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     of the errors in motion, of each trial and their means.  `invalid_output` is the only fault
     that can be found.
 
+    Parameters
+    ----------
     make_filter, subject : as for `examine`
-    folder : with files of BROAD: .mat, or .hdf5, which need h5py
-    show : is called with the number of trials that are done
+    folder : path
+        With files of BROAD: .mat, or .hdf5, which need h5py.
+    show : callable, optional
+        Is called with the number of trials that are done.
 
-    Raises ValueError if there is no folder, no trial in it, or a file is none.
+    Raises
+    ------
+    ValueError
+        If there is no folder, no trial in it, or a file is none.
     """
     return judge(make_filter, map(read_trial, trials_in(folder)), 'data', subject, show=show)
 

@@ -37,7 +37,16 @@ CONSISTENT = 0.9999             # probability of the NEES band
 
 
 class Fault(NamedTuple):
-    """A fault of a filter: its name, one of FAULTS, and why the exam reports it."""
+    """
+    A fault of a filter.
+
+    Parameters
+    ----------
+    name : str
+        One of FAULTS.
+    evidence : str
+        Why the exam reports it.
+    """
 
     name: str
     evidence: str

@@ -60,19 +60,44 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     """
     Examine an attitude filter.
 
-    make_filter : returns a new filter, for every run: its class, a function, or one of
-        `adapters.FILTERS`; it has the method ``update`` of `trial.Filter`
-    level : 'quick'; 'full' has more seeds, and a seed of the scenes of 'field'
-    imu : parameters imu.* and mag.* by name, or the path of a parameter file such as those in
-        config/imu; by default `scenarios.CALIBRATED`, the noise of a calibrated device
-    seeds : of the noisy runs, or their number; by default SEEDS of the level
-    subject : name in the report; by default that of the filter's class
-    isolated : False runs the filter in this process, where a debugger can reach it; one that
-        crashes or never returns then ends the exam
-    restart : False makes one filter, in this process, and uses it for all runs
+    The filter has a method ``update(gyroscope, accelerometer, magnetometer, dt)``: the mean
+    angular velocity over the step [rad/s], specific force [m/s^2, +g upwards at rest] and field
+    [T, or None] at its end, in the frame of the sensor, and the length of the step [s].  It
+    returns the attitude at the end of the step, q(world <- sensor) in the order x, y, z, w; x of
+    the world is east, y north and z up.  Attributes `covariance` and `bias` are optional, see
+    `trial.Filter`.
 
-    Returns faults with their evidence, and measures.  Raises TypeError if `make_filter` cannot be
-    called, such as a filter itself, and ValueError if level, parameter or seed is not allowed.
+    Parameters
+    ----------
+    make_filter : callable
+        Returns a new filter: its class, a function, or one of `adapters.FILTERS`.  It is called
+        for every run.
+    level : {'quick', 'full', 'field'}
+        'full' has more seeds, and a seed of the scenes of 'field'.
+    imu : mapping or path, optional
+        Parameters imu.* and mag.* by name, or the path of a parameter file such as those in
+        config/imu.  The default, `scenarios.CALIBRATED`, is the noise of a calibrated device.
+    seeds : int or iterable of int, optional
+        Seeds of the noisy runs, or their number.  The default, SEEDS, depends on the level.
+    subject : str, optional
+        Name in the report.  The default is the name of the filter's class.
+    isolated : bool, optional
+        If False, the filter runs in this process, where a debugger can reach it.  A filter that
+        crashes or never returns then ends the exam.
+    restart : bool, optional
+        If False, one filter is made, in this process, and used for all runs.
+
+    Returns
+    -------
+    Report
+        Faults with their evidence, and measures.
+
+    Raises
+    ------
+    TypeError
+        If `make_filter` cannot be called, such as a filter itself.
+    ValueError
+        If the level, a parameter or a seed is not allowed.
     """
     if not callable(make_filter):
         raise TypeError(f'make_filter = {one_line(repr(make_filter))}: pass the class of the '

@@ -50,12 +50,24 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
     """
     Examine a ROS node.
 
-    topic : of its attitudes, sensor_msgs/Imu, each with the stamp of its sample
-    command : starts the node for each run, without a shell; by default the node runs
-    level, imu, seeds : as for `examine`
+    Parameters
+    ----------
+    topic : str
+        Topic of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
+    command : str, optional
+        Command that starts the node for each run, without a shell; default: the node runs.
+    level, imu, seeds : optional
+        As for `examine`.
 
-    Returns faults with their evidence, and measures.  Raises NodeError if the node is not found,
-    or other nodes publish on its topics.
+    Returns
+    -------
+    Report
+        Faults with their evidence, and measures.
+
+    Raises
+    ------
+    NodeError
+        If the node is not found, or other nodes publish on its topics.
     """
     with NodeExam(topic, command) as node:
         return examine(node.start, level, imu, seeds, subject=command or topic,

@@ -49,13 +49,26 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     """
     Examine the attitudes of a topic.
 
-    path : of an MCAP file
-    topic : of the attitudes q(world <- sensor); its type must be one of LAYOUTS
-    truth : topic of the truth; by default the first of TRUTHS
-    north : 'true' or 'magnetic', from which the heading counts; by default it need only be steady
+    Parameters
+    ----------
+    path : Path
+        An MCAP file.
+    topic : str
+        Topic of the attitudes q(world <- sensor); its type must be one of LAYOUTS.
+    truth : str, optional
+        Topic of the truth; default: the first of TRUTHS.
+    north : {'true', 'magnetic'}, optional
+        From which the heading counts; by default it needs only be steady.
 
-    Returns the faults that show in a log, and measures.  Raises LogError or ValueError if the file
-    is no log, or lacks what the exam needs.
+    Returns
+    -------
+    Report
+        Faults that show in a log, and measures.
+
+    Raises
+    ------
+    LogError, ValueError
+        If the file is no log, or lacks what the exam needs.
     """
     with LogReader(path) as reader:
         examined = _topic(reader, topic)

@@ -15,7 +15,16 @@ WIDTH, LINE = 130, 0.15         # of the text: characters, and the height of a l
 
 
 def draw_page(report: Report, path: Path) -> None:
-    """Draw a page about a report of `examine`; the suffix of the path decides the format."""
+    """
+    Draw a page about a report.
+
+    Parameters
+    ----------
+    report : Report
+        What `examine` has returned.
+    path : pathlib.Path
+        Of the file; its suffix decides the format.
+    """
     lines = [line for fault in report.found
              for line in textwrap.wrap(f'{fault.name}: {fault.evidence}', WIDTH)]
     lines += ['', *report.measure_lines()]

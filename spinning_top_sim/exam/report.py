@@ -42,10 +42,16 @@ class Report(Verdict):
     """
     The result of an exam; `str(report)` is readable.
 
-    subject : name of the filter
-    found : the faults with their evidence
-    measures : by name, as docs/exam.md defines them; NaN: could not be measured
-    outcomes : output of the filter in the runs, for pictures
+    Parameters
+    ----------
+    subject : str
+        Name of the filter.
+    found : sequence of Fault
+        The faults with their evidence.
+    measures : mapping
+        Measures by name, as docs/exam.md defines them; NaN: could not be measured.
+    outcomes : sequence of Outcome
+        Output of the filter in the runs, for pictures.
     """
 
     outcomes: Sequence[Outcome] = field(default=(), repr=False)

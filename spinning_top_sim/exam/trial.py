@@ -34,12 +34,21 @@ class Filter(Protocol):
         """
         Take the readings of a step; return the attitude at its end.
 
-        gyroscope : mean angular velocity over the step (3,) [rad/s]
-        accelerometer : specific force at its end (3,) [m/s^2], +g upwards at rest
-        magnetometer : field at its end (3,) [T], or None
-        dt : length of the step [s]
+        Parameters
+        ----------
+        gyroscope : (3,) array
+            Mean angular velocity over the step [rad/s].
+        accelerometer : (3,) array
+            Specific force at its end [m/s^2], +g upwards at rest.
+        magnetometer : (3,) array or None
+            Field at its end [T].
+        dt : float
+            Length of the step [s].
 
-        Returns q(world <- sensor) as x, y, z, w (4,); x of the world is east, y north and z up.
+        Returns
+        -------
+        (4,) array_like
+            q(world <- sensor) as x, y, z, w; x of the world is east, y north and z up.
         """
 
 

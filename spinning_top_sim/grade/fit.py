@@ -52,16 +52,26 @@ class Fit:
     """
     A fitted motion; `lines` tells it.
 
-    top, start : at the first attitude; lambda1 is as given: attitudes tell ratios only
-    mounting, lever_arm : of the IMU, as `Body` has them
-    begin : time of the first attitude [s]
-    values, deviations : estimates and standard deviations by the names of NAMES; inf where the
-        readings do not tell the value
-    covariance : (k, k), of the values
-    undetermined : what the readings cannot tell apart
-    residual, noise : rms of a component of the attitude residual, and of its white part [rad]
-    reached : whether the fit has converged and the residuals are noise; if not, the intervals
-        mean nothing
+    Attributes
+    ----------
+    top, start : Top, State
+        At the first attitude.  lambda1 is as given: attitudes tell ratios only.
+    mounting, lever_arm : tuple of float
+        Of the IMU, as `Body` has them.
+    begin : float
+        Time of the first attitude [s].
+    values, deviations : dict
+        Estimates and standard deviations by the names of NAMES; inf where the readings do not
+        tell the value.
+    covariance : (k, k) array
+        Of the values.
+    undetermined : tuple of str
+        What the readings cannot tell apart.
+    residual, noise : float
+        Root mean square of a component of the attitude residual, and of its white part [rad].
+    reached : bool
+        Whether the fit has converged and the residuals are noise.  If not, the intervals mean
+        nothing.
     """
 
     top: Top
@@ -122,7 +132,10 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     imu : bool
         Whether mounting, lever arm and offset of the stamps of the IMU are fitted.
 
-    Raises ValueError if there are too few attitudes, or no readings.
+    Raises
+    ------
+    ValueError
+        If there are too few attitudes, or no readings.
     """
     (one, first, sure), trials = _begun(parts), []
     small = [(0, *pair) for pair in unknowns.small_nutation(one.times, one.values)]

@@ -35,15 +35,28 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
     dt : float
         The step [s].  Samples are dt apart, also where the order of convergence is measured with
         smaller steps.  A scene in which the top turns by more than 0.7 rad in a step is left out.
-    body, scenes : Body, sequence of Scene
-        The top and the IMU on it, and the motions to run.
+    body : Body
+        The top and the IMU on it.
+    scenes : sequence of Scene
+        Motions to run.
     seed : int
         Determines how the top is turned at the start.
-    tolerance, subject : float, str
-        Largest error of an attitude that is no fault [rad]; name, by default that of `run`.
+    tolerance : float
+        Largest error of an attitude that is no fault [rad].
+    subject : str, optional
+        Name of the simulator; default: that of `run`.
 
-    Raises TypeError if `run` cannot be called, ValueError naming the argument, its value and what
-    is allowed.
+    Returns
+    -------
+    Report
+        The faults with their evidence, and the measures.
+
+    Raises
+    ------
+    TypeError
+        If `run` cannot be called.
+    ValueError
+        Naming the argument, its value and what is allowed.
     """
     if not callable(run):
         raise TypeError(f'run = {run!r}: must be run(top, start, times, dt)')
@@ -93,10 +106,17 @@ def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
         Times [s], equally spaced; default: the `t` of the trajectory.
     dt : float, optional
         Step of the simulator [s]; default: the time between two samples.
-    tolerance, subject, **imu :
-        As of `grade`; parameters of `Body` beside those of the top: `lever_arm`, `mounting`, ...
+    tolerance : float
+        As of `grade`.
+    subject : str
+        As of `grade`.
+    **imu :
+        Parameters of `Body` beside those of the top: `lever_arm`, `mounting`, ...
 
-    Raises ValueError naming what is no motion, and why.
+    Raises
+    ------
+    ValueError
+        Naming what is no motion, and why.
     """
     body = Body.of(top, **imu)
     start = Start.of(body, start) if isinstance(start, State) else start

@@ -30,17 +30,26 @@ class InvalidTrajectoryError(ValueError):
 @dataclass
 class Trajectory:
     """
-    A motion at n equally spaced times t [s], as a simulator tells it; None: not told.
+    A motion at n equally spaced times, as a simulator tells it.
 
-    attitudes : (n, 4), q(world <- body) as w, x, y, z
-    rates : (n, 3), angular velocity in the body frame [rad/s]
-    accelerations, gyroscope, magnetometer : (n, 3), readings in the frame of the IMU [m/s^2, +g
-        upwards at rest], [rad/s], [T]
-    increments : (n, 6), rotation [rad] and velocity [m/s] in the frame of the IMU over the
-        interval that ends at each time; the first row is not used
-    energy : (n,), kinetic and potential energy, but for a constant [J]
-    covariance : (3, 3) that are told of 'gyroscope' and 'accelerations', by name; a single matrix
-        is meant for both
+    Parameters
+    ----------
+    t : (n,) array
+        Times [s].
+    attitudes : (n, 4) array
+        q(world <- body) as w, x, y, z.
+    rates : (n, 3) array, optional
+        Angular velocity in the body frame [rad/s].
+    accelerations, gyroscope, magnetometer : (n, 3) array, optional
+        Readings in the frame of the IMU [m/s^2, +g upwards at rest], [rad/s], [T].
+    increments : (n, 6) array, optional
+        Rotation [rad] and velocity [m/s] in the frame of the IMU over the interval that ends at
+        each time; the first row is not used.
+    energy : (n,) array, optional
+        Kinetic and potential energy, but for a constant [J].
+    covariance : mapping, optional
+        Covariances (3, 3) that the simulator tells of 'gyroscope' and 'accelerations'; a single
+        matrix is meant for both.
     """
 
     t: Reals

@@ -20,7 +20,18 @@ FAULTS = (
 
 
 class Fault(NamedTuple):
-    """A fault: its name, one of FAULTS, why it is reported, what was measured, such as a lag."""
+    """
+    A fault of a simulator.
+
+    Parameters
+    ----------
+    name : str
+        One of FAULTS.
+    evidence : str
+        Why it is reported.
+    number : float
+        What was measured, such as a lag or a coefficient; NaN where there is none.
+    """
 
     name: str
     evidence: str
@@ -29,18 +40,26 @@ class Fault(NamedTuple):
 
 class Report(Verdict):
     """
-    The result of grading a simulator, the `subject`; `str(report)` is readable.
+    The result of grading a simulator; `str(report)` is readable.
 
-    passed, faults, names : whether none was found; with their evidence; their names, each once
-    marks : measures by name, as docs/grade.md defines them; NaN: could not be measured
+    Attributes
+    ----------
+    subject : str
+        Name of the simulator.
+    faults : sequence of Fault
+        The faults with their evidence.
+    marks : mapping
+        Measures by name, as docs/grade.md defines them; NaN: could not be measured.
     """
 
     @property
     def faults(self) -> Sequence[Fault]:
+        """The faults with their evidence."""
         return self.found
 
     @property
     def marks(self) -> Mapping[str, float]:
+        """Measures by name."""
         return self.measures
 
     def as_dict(self) -> dict[str, Any]:
