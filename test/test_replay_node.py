@@ -328,9 +328,9 @@ def test_a_strangers_log_is_played_over_dds_with_its_qos_or_another(peer, tmp_pa
 def test_a_signal_ends_it_while_it_waits_or_plays(peer, tmp_path):
     write_log(tmp_path / 'run.mcap', 100, step_ns=SECOND)
     for options, number, times in ((('--wait-for-subscribers', '99'), signal.SIGTERM, 1),
-                                   (('--rate', '20', '--clock'), signal.SIGINT, 2)):
+                                   (('--rate', '0.5', '--clock'), signal.SIGINT, 2)):
         with Replay(tmp_path, tmp_path / 'run.mcap', *options) as node:
-            # It serves before it plays.
+            # It serves before it plays, and plays for longer than the switch is repeated.
             assert peer.switch(node, 'set_pause', False).success
             assert node.end(number, times) == 0, node.err
         assert 'Traceback' not in node.err
