@@ -2,8 +2,8 @@
 """
 Elementary functions of `decimal.Decimal` numbers, to the precision of the current context.
 
-The standard library has sqrt, exp and ln only, and a slow sqrt.  Results are accurate relative to themselves, also
-for small arguments; `sin_cos` loses the digits that cancel next to other multiples of pi/2.
+The standard library has exp and ln, and a slow sqrt.  Results are accurate relative to themselves,
+also for small arguments; `sin_cos` loses the digits that cancel next to other multiples of pi/2.
 """
 
 import math

@@ -256,7 +256,8 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decima
         swing = turn * roots.gap21 * (form.mean.quarter_period / form.theta1.leading) ** 2
         alpha, beta = factors[::sense]
         return ThetaMotion(
-            alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / pi(), quarter0=quarter0, offset0=y0 * 2 / pi(),
+            alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / pi(), quarter0=quarter0,
+            offset0=y0 * 2 / pi(),
             u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
             momentum=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
             swing=(-swing * form.theta4.leading ** 2,

@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -136,13 +136,16 @@ class AcceleratedMotion(ExactSolution):
     """
 
     def __init__(self, top: Top, posture: Posture, acceleration: Exact) -> None:
-        self.vertical, start = about_vertical(top, posture, acceleration)
-        self.top, self.start = self.vertical.top(top), rounded(start)
-        self._posture, self._momenta = posture, (start.l3, start.lz)
+        self.vertical, self._halves = about_vertical(top, posture, acceleration)
+        self.top, self._posture = self.vertical.top(top), posture
         self._turns, self._sign, self._half_turn = 0, 1.0, 0.0
-        self._motion = set_up(top, self.vertical.gravity, start)
+        self._motion = set_up(top, self.vertical.gravity, self._halves)
         with precision(DIGITS):
-            self._take_constants(self._motion, *self._momenta)
+            self._take_constants(self._motion, *self._halves[-2:])
+
+    @cached_property
+    def start(self) -> State:       # type: ignore[override]
+        return rounded(self._halves)
 
     def _across_of(self, states: _ExactStates) -> Column:
         if self._theta.real or not self._theta.u_dot.any():
@@ -179,9 +182,9 @@ class AcceleratedMotion(ExactSolution):
         with precision(DIGITS + 2):
             vertical = self.vertical
             alpha, beta, u_dot = _cayley_klein(self._motion, Decimal(ns).scaleb(-9))
-            across = _across(exact(self.top.lambda1), *self._momenta, alpha, beta, u_dot)
+            across = _across(exact(self.top.lambda1), *self._halves[-2:], alpha, beta, u_dot)
             alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
-            return Posture(alpha, beta, across, self.start.l3)
+            return Posture(alpha, beta, across, self._posture.l3)
 
 
 class _Chain(AcceleratedMotion):
@@ -199,7 +202,7 @@ def chained(motions: Sequence[AcceleratedMotion], counts: Sequence[int],
     """Return the states of motions of one kind, of each at so many of the times [ns]."""
     states = _ExactStates(_Chain(motions, counts), Times.from_ns(times_ns))
     states._lz, states._gravity, states._torque = np.repeat(np.array([
-        (motion.start.lz, motion.top.gravity, motion.top.gravity_torque)
+        (float(motion._halves.lz), motion.top.gravity, motion.top.gravity_torque)
         for motion in motions]).T, counts, axis=1)
     return states
 
