@@ -19,6 +19,7 @@ from spinning_top_sim.solvers.vertical import (
     AcceleratedMotion,
     Posture,
     about_vertical,
+    in_gravity,
     posture_of,
     rounded,
 )
@@ -323,7 +324,7 @@ def _begun(top: Top, start: State | Posture, start_ns: int, values: Mapping[str,
                    atol=values['solver.atol'])
     if pivot is None:
         assert isinstance(start, State)
-        return Segment(step(top, start), start_ns, start)
+        return Segment(step(top, start), start_ns)
     posture, piece = start, pivot.lasting(start_ns)
     if isinstance(posture, State):
         posture = posture_of(top, posture)
@@ -333,5 +334,5 @@ def _begun(top: Top, start: State | Posture, start_ns: int, values: Mapping[str,
         vertical = solver.vertical
     else:
         vertical, halves = about_vertical(top, posture, piece.acceleration)
-        solver = step(vertical.top(top), rounded(halves))
-    return Segment(solver, start_ns, ride=Ride(top, vertical, piece))
+        solver = step(in_gravity(top, float(vertical.gravity)), rounded(halves))
+    return Segment(solver, start_ns, Ride(top, vertical, piece))
