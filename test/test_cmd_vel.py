@@ -38,7 +38,7 @@ def sent_offline(values, drives, until_ns):
     simulation, sent = simulation_of(**values), []
     for t_ns, velocity in (*drives, (until_ns, None)):
         for block in simulation.play(simulation.streams, t_ns):
-            sent += [(t, one.topic, row.tobytes()) for one, times, rows in block.parts
+            sent += [(t, one.topic, row.tobytes()) for one, times, rows in block.messages
                      for t, row in zip(times.tolist(), rows, strict=True)]
         if velocity:
             simulation.drive(velocity)
@@ -74,13 +74,13 @@ def test_increments_along_a_shuttle_add_up_to_its_motion(method, arm, seconds):
     taken = {'imu/dq': [], 'imu/dv': [], 'ground_truth/imu_odom': []}
     streams = [one for one in simulation.streams if one.topic in taken]
     for block in simulation.play(streams, seconds * S):
-        for one, _, rows in block.parts:
+        for one, _, rows in block.messages:
             taken[one.topic].append(np.hstack(one.template.decode(rows.tobytes())))
     turns, pushes, truth = (np.vstack(taken[topic]) for topic in taken)
     q, velocities = tuple(truth[0, 3:7, np.newaxis]), [world(truth[0])]
     dt, gravity = 1 / 200, np.array((0.0, 0.0, -9.80665))
     for turn, push in zip(turns[1:], pushes[1:], strict=True):
-        velocities.append(velocities[-1] + np.ravel(attitude.in_world(q, push)) + gravity * dt)
+        velocities.append(velocities[-1] + np.ravel(attitude.rotated(q, push)) + gravity * dt)
         q = attitude.product(q, turn)
     last = truth[-1]
     assert attitude.angle_between(q, tuple(last[3:7, np.newaxis])).max() < 1e-12
@@ -112,7 +112,7 @@ def integral(values, points=8):
 
 def world(row):
     """Return the velocity in the world of a row of odometry."""
-    return np.ravel(attitude.in_world(tuple(row[3:7, np.newaxis]), row[7:10]))
+    return np.ravel(attitude.rotated(tuple(row[3:7, np.newaxis]), row[7:10]))
 
 
 def test_the_specific_force_is_that_of_the_place_in_the_world():
@@ -127,7 +127,7 @@ def test_the_specific_force_is_that_of_the_place_in_the_world():
          play(simulation_of(**values), S // 2, 'ground_truth/imu_odom'))))
     q = simulation.segment.states(range(0, S // 2 + 1, 10 ** 6)).rows_quaternion
     acceleration = (place[2:] - 2 * place[1:-1] + place[:-2]) * 1e6
-    expected = attitude.in_body(tuple(part[1:-1] for part in q),
+    expected = attitude.rotated_back(tuple(part[1:-1] for part in q),
                                 tuple((acceleration + np.array((0.0, 0.0, 9.80665))).T))
     assert np.stack(expected, axis=-1) == pytest.approx(force[1:-1], abs=2e-2)
 
@@ -237,7 +237,7 @@ def test_odometry_has_the_twist_in_the_frame_of_the_body():
     pivot, state = simulation.segment.pivot(np.array([S])), simulation.state()
     assert (position[0] == pivot.position[:, 0]).all() and (q == state.quaternion).all()
     assert (rates == state.angular_velocity).all()
-    assert np.ravel(attitude.in_world(tuple(q.T), tuple(velocity.T))) == pytest.approx(
+    assert np.ravel(attitude.rotated(tuple(q.T), tuple(velocity.T))) == pytest.approx(
         pivot.velocity[:, 0], abs=1e-15)
 
 

@@ -18,7 +18,7 @@ def pose_and_twist(state):
     """Return quaternion and angular velocity in the world of a state, by the exact solver."""
     states = propagate(TOP, state, method='exact').states(range(1))
     q = states.rows_quaternion
-    return np.concatenate(q), np.concatenate(attitude.in_world(q, states.rows_angular_velocity))
+    return np.concatenate(q), np.concatenate(attitude.rotated(q, states.rows_angular_velocity))
 
 
 @pytest.mark.parametrize('seed', range(6))

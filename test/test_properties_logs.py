@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from spinning_top_sim.exam.log import LAYOUTS, examine_log
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import messages
 
 

@@ -162,7 +162,8 @@ def test_the_specific_force_of_a_moving_frame_is_that_in_the_world():
     middle, before, after = found.position
     acceleration = (after - 2 * middle + before) / (step / S) ** 2
     q = tuple(found.quaternion[:1].T)
-    force = np.array(attitude.in_body(q, acceleration + np.array((0.0, 0.0, TOP.gravity)))).ravel()
+    up = acceleration + np.array((0.0, 0.0, TOP.gravity))
+    force = np.array(attitude.rotated_back(q, up)).ravel()
     assert abs(force - found.force[0]).max() < 1e-5
     at_pivot = Ride(TOP, GENERAL, path, 2 * S).at(times).force
     assert np.linalg.norm(at_pivot, axis=1) == pytest.approx(math.hypot(3.0, 2.0, 10.80665),
@@ -172,7 +173,7 @@ def test_the_specific_force_of_a_moving_frame_is_that_in_the_world():
 def test_in_free_fall_the_angular_momentum_in_the_world_is_constant():
     path = PivotPath([(S, (0.0, 0.0, -TOP.gravity))])
     found = Ride(TOP, GENERAL, path, S).at(range(0, S, S // 10))
-    momentum = attitude.in_world(tuple(found.quaternion.T), (
+    momentum = attitude.rotated(tuple(found.quaternion.T), (
         TOP.lambda1 * found.omega[:, 0], TOP.lambda1 * found.omega[:, 1],
         TOP.lambda3 * found.omega[:, 2]))
     assert max(map(np.ptp, momentum)) < 2e-15
