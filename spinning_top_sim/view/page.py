@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: scene, words and plots, made with viser; the same for logs and for a running node."""
+"""
+The page: scene, words and plots, made with viser; the same for logs and for a running node.
+
+On the page are tops whose motions began at different dates.  `page_ns` is a stamp of the first
+one; a stamp of another is `page_ns + shift_ns`, so that the t = 0 of all coincide.
+"""
 
 import math
 import time
