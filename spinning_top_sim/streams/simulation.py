@@ -319,7 +319,9 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
     try:
         with np.errstate(over='ignore', invalid='ignore'):
             segment = _new_segment(top, start, start_ns, values, pivot)
-            if isinstance(start, State) and not math.isfinite(segment.energy):
+            # Steps are asked for their energy as long as the first one is kept.
+            if ((isinstance(start, State) or values['solver.method'] != 'exact')
+                    and not math.isfinite(segment.energy)):
                 raise ValueError(f'the energy would be {segment.energy!r} J')
         if not segment.reach(start_ns + 1, FIRST_STEPS):
             raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
@@ -347,16 +349,15 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
                    atol=values['solver.atol'])
     if pivot is None:
         assert isinstance(start, State)
-        return Segment(step(top, start), start, start_ns)
+        return Segment(step(top, start), start_ns, start)
     posture, piece = start, pivot.lasting(start_ns)
     if isinstance(posture, State):
         posture = posture_of(top, posture)
     solver: Propagator
     if values['solver.method'] == 'exact':
         solver = AcceleratedMotion(top, posture, piece.acceleration)
-        vertical, state = solver.vertical, solver.start
+        vertical = solver.vertical
     else:
         vertical, halves = about_vertical(top, posture, piece.acceleration)
-        state = rounded(halves)
-        solver = step(vertical.top(top), state)
-    return Segment(solver, state, start_ns, Ride(top, vertical, piece))
+        solver = step(vertical.top(top), rounded(halves))
+    return Segment(solver, start_ns, ride=Ride(top, vertical, piece))
