@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.exam import measures
-from spinning_top_sim.exam.diagnosis import Fault
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import Run
@@ -29,6 +28,7 @@ from spinning_top_sim.exam.trial import (
     one_line,
 )
 from spinning_top_sim.installation import needed
+from spinning_top_sim.tools.verdict import Fault
 
 SUFFIXES = '.mat', '.hdf5', '.h5'
 # Arrays of a trial with their columns; the field is in microtesla, quaternions are w, x, y, z.

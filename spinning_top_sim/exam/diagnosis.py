@@ -9,7 +9,7 @@ disappears, it was the cause.
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.exam import measures, scenarios
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.trial import ChangeRows, Hypothesis, Outcome, changed
+from spinning_top_sim.tools.verdict import Fault
 
 FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component_order',
           'frame_ned', 'gravity_sign', 'gyroscope_wiring', 'accelerometer_wiring',
@@ -33,23 +34,6 @@ FIRST_ORDER_LEFT = 0.5          # of that error, with rates for which first-orde
 LEVER_ARM = np.radians(1.0)     # between the attitudes with and without the lever arm
 AHEAD, DELAYED = -1.5, 0.75     # steps; a filter that corrects before its step is ahead by one
 BIAS_LEFT_S = 0.05              # error relative to the bias that causes it [rad/(rad/s)]
-CONSISTENT = 0.9999             # probability of the NEES band
-
-
-class Fault(NamedTuple):
-    """
-    A fault of a filter.
-
-    Parameters
-    ----------
-    name : str
-        One of FAULTS.
-    evidence : str
-        Why the exam reports it.
-    """
-
-    name: str
-    evidence: str
 
 
 def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
@@ -159,13 +143,13 @@ def nees_marks(found: Mapping[str, measures.Nees]) -> dict[str, float]:
     """Return the result of `consistency` as measures."""
     names = {'tilt': 'nees', 'attitude': 'nees_attitude'}
     return {f'{names[what]}{end}': value for what, nees in found.items()
-            for end, value in zip(('', '_low', '_high'), (nees.ratio, *nees.band()), strict=True)}
+            for end, value in zip(('', '_low', '_high'), (nees.ratio, *nees.band), strict=True)}
 
 
 def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
     """Judge the result of `consistency`."""
     for what, nees in found.items():
-        low, high = nees.band(CONSISTENT)
+        low, high = nees.band
         if not low <= nees.ratio <= high:
             name = 'covariance_small' if nees.ratio > high else 'covariance_large'
             return Fault(name, f'the squared error of the {what} is {nees.ratio:.3g} times what '

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import diagnosis, measures, scenarios
-from spinning_top_sim.exam.diagnosis import Fault, degrees
-from spinning_top_sim.exam.excitation import off, words
+from spinning_top_sim.exam.diagnosis import degrees
+from spinning_top_sim.exam.excitation import from_identity, words
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.report import Report
@@ -33,6 +33,7 @@ from spinning_top_sim.exam.trial import (
 )
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
+from spinning_top_sim.tools.verdict import Fault
 
 # Seeds of the noisy runs.
 SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
@@ -218,7 +219,7 @@ class _Exam(Responses):
         self.measures['stamp_offset_s'] = diagnosis.stamp_fault(
             first.last(), self._absolute)[0].seconds
         large = diagnosis.inaccuracy(first, self._absolute)
-        if large and not self.faults and off(self._early) > SLIGHT:
+        if large and not self.faults and from_identity(self._early) > SLIGHT:
             large = Fault('gyroscope_wiring', f'{words(self._early)}; {large.evidence}')
         if large and (large.name == 'diverges' or not self.faults):
             self.faults.append(large)
@@ -255,8 +256,9 @@ class _Exam(Responses):
         apart = abs(gains[-1] - gains[0]) / max(abs(gains[0]), STEP)
         if apart > STEP and abs(gains[-1] / self.finer[-1] - gains[0]) < 0.25 * abs(gains[0]):
             # A wrong step turns up as a wrong scale at one rate.
+            names = [fault.name for fault in self.faults]
             self.faults = [fault for fault in self.faults if not (
-                fault.name == 'gyroscope_wiring' and 'time_step' in dict(self.faults))]
+                fault.name == 'gyroscope_wiring' and 'time_step' in names)]
             self.faults.append(Fault(
                 'time_step', f'at {" and ".join(run.name for run in runs)} turns move it '
                 f'{" and ".join(f"{gain:.3g}" for gain in gains)} times as far as the sensor: the '
