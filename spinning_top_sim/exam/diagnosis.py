@@ -78,8 +78,8 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
             for outcome, one in zip(settled, errors, strict=True)])))}
 
 
-def quality(outcomes: Sequence[Outcome], unaided: Sequence[measures.Rmse],
-            imu: Mapping[str, Any], absolute: bool) -> dict[str, float]:
+def quality(outcomes: Sequence[Outcome], imu: Mapping[str, Any],
+            absolute: bool) -> dict[str, float]:
     """
     Return ratios of errors to the least that white noise allows, and to those without a filter.
 
@@ -89,6 +89,7 @@ def quality(outcomes: Sequence[Outcome], unaided: Sequence[measures.Rmse],
     rate, force, field = (imu.get(f'{name}noise_density', 0.0)
                           for name in ('imu.gyroscope_', 'imu.accelerometer_', 'mag.'))
     horizontal = math.hypot(*imu.get('mag.field', scenarios.FIELD)[:2])
+    unaided = [measures.unaided(one.run, slice(len(one.run.t) // 2, None)) for one in outcomes]
     found: dict[str, float] = {}
     for what, variance in (('tilt', 2.0 * rate * force / scenarios.GRAVITY), (
             'heading', rate * field / max(horizontal, 1e-12)))[:1 + absolute]:
@@ -160,8 +161,7 @@ def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
 
 def inaccuracy(outcome: Outcome, absolute: bool) -> Fault | None:
     """Judge the error in the last quarter, and whether it grows from quarter to quarter."""
-    error = outcome.errors.attitude(True) if absolute else outcome.errors.tilt
-    quarters = [rms(part) for part in np.array_split(error, 4)]
+    quarters = [rms(part) for part in np.array_split(outcome.errors.known(absolute), 4)]
     if quarters[-1] < DIVERGED:
         return None
     if all(later >= GROWS * one for one, later in itertools.pairwise(quarters[1:])):

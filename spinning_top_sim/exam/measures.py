@@ -29,6 +29,10 @@ class Errors(NamedTuple):
         """Return tilt and heading error combined (n,); see `turned`."""
         return np.hypot(self.tilt, self.turned(absolute))
 
+    def known(self, absolute: bool) -> Reals:
+        """Return tilt and heading error combined (n,), the tilt alone unless `absolute`."""
+        return np.hypot(self.tilt, absolute * self.turned(True))
+
     def turned(self, absolute: bool) -> Reals:
         """Return the heading error in [-pi, pi] (n,), relative to its mean unless `absolute`."""
         phase = np.exp(1j * self.heading)

@@ -373,13 +373,8 @@ class Responses:
         motion, size = self._given.motion, float(np.linalg.norm(BIAS))
         run = self._excited.part(slice(motion.stop))
         outcome = self._respond((), replace(run, gyroscope=run.gyroscope + BIAS))
-        one, other = (Rotation.from_quat(rows[:motion.stop])
-                      for rows in (outcome.estimates, self._outcome.estimates))
-        if self._absolute:
-            apart = (one * other.inv()).magnitude()
-        else:
-            verticals = [turn.inv().apply((0.0, 0.0, 1.0)) for turn in (one, other)]
-            apart = np.linalg.norm(verticals[0] - verticals[1], axis=1)
+        apart = measures.errors_of(
+            outcome.estimates, self._outcome.estimates[:motion.stop]).known(self._absolute)
         estimates = outcome.biases - self._outcome.biases[:motion.stop]
         estimates = estimates[np.isfinite(estimates[:, 0])]
         if not len(estimates):
