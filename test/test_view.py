@@ -27,7 +27,7 @@ from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import simulate, svg
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import command, plots, shapes, text
-from spinning_top_sim.view.track import Series, Track, state_of
+from spinning_top_sim.view.track import Series, Track, constants_and_state
 
 pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')
 
@@ -236,7 +236,7 @@ def test_a_live_track_names_the_motion_from_its_samples(start, words):
         track.detect_motion()
     (motion,) = track.motions           # one: rounding begins no other
     assert motion.description.name == words
-    (energy, l3, lz), _ = state_of(track.top, rows[50])
+    (energy, l3, lz), _ = constants_and_state(track.top, rows[50])
     assert (energy, l3, lz) == pytest.approx((moved.energy[50], start.l3, start.lz), abs=1e-9)
 
 

@@ -196,7 +196,7 @@ class Track:
         stamps_ns, rows = self.rates
         if not len(rows):
             return
-        constants, state = state_of(self.top, rows[-1])
+        constants, state = constants_and_state(self.top, rows[-1])
         if pivot_moves := self.moves:     # L3 alone is constant
             constants = 0.0, constants[1], 0.0
         if self._constants is not None and _same(self.top, constants, self._constants):
@@ -210,7 +210,8 @@ class Track:
             int(stamps_ns[-1]), self.top, state, description, pivot_moves=pivot_moves)]
 
 
-def state_of(top: Top, row: NDArray[np.float64]) -> tuple[tuple[float, float, float], State]:
+def constants_and_state(top: Top, row: NDArray[np.float64],
+                        ) -> tuple[tuple[float, float, float], State]:
     """
     Return energy, L3 and Lz of a row of RATES, and its state.
 
