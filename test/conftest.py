@@ -8,7 +8,7 @@ import pytest
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """
     Begin with the files of the longest tests, so that at the end no worker waits for one.
 
@@ -18,7 +18,7 @@ def pytest_collection_modifyitems(items):
     long = {f'test_{name}.py' for name in (
         'attitude_filter', 'docs', 'tour', 'view_node', 'sim_node_life', 'grade_files', 'recover')}
     items.sort(key=lambda item: item.path.name not in long)
-    for item in items:
+    for item in items if config.pluginmanager.hasplugin('xdist') else ():
         if not vars(item.module).keys().isdisjoint(item.fixturenames):
             item.add_marker(pytest.mark.xdist_group(item.path.name))
 

@@ -23,10 +23,8 @@ from stress import tops
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers import propagator
-from spinning_top_sim.solvers.cubic import cubic_roots
-from spinning_top_sim.solvers.decimal_math import precision
 from spinning_top_sim.solvers.exact import BLOCK, ExactSolution
-from spinning_top_sim.solvers.times import LARGEST_NS, Rates, Times
+from spinning_top_sim.solvers.times import Times
 
 BOUND = 5e-15
 G = 9.81
@@ -304,42 +302,6 @@ def test_times_are_exact():
     times = Times.from_seconds(np.array(t))
     assert times.high.tolist() == times.seconds.tolist() == t
     assert times.low == 0.0
-
-
-def test_a_phase_keeps_its_fraction_of_a_turn():
-    """After 2^50 turns as after none, and at times that are no doubles."""
-    rng = random.Random(6)
-    for _ in range(300):
-        per_second = Decimal(10.0 ** rng.uniform(-3.0, 9.0)) + Decimal(rng.random()) / 10 ** 15
-        turns = 2.0 ** rng.uniform(0.0, 50.0)
-        ns = rng.choice((1, -1)) * min(round(turns / float(per_second) * 1e9), LARGEST_NS - 77)
-        high, rest = Rates([per_second]).products(Times.from_ns(np.array([ns])))
-        with precision(60):
-            apart = per_second * ns / 10 ** 9 - Decimal(float(high[0, 0]))
-            apart -= Decimal(float(rest[0, 0]))
-            assert abs(apart) <= Decimal('1e-17')
-
-
-@pytest.mark.parametrize('seed', range(2))
-def test_the_roots_of_the_cubic_are_right_relative_to_themselves(seed):
-    """However far they and their gaps are apart in size."""
-    rng = random.Random(seed)
-
-    def size():
-        return Decimal(rng.uniform(1.0, 10.0)) * Decimal(10) ** rng.choice((
-            0, -1, -15, -58, -130, -300, -600))
-    for _ in range(40):
-        with precision(2000):
-            f3, gap32 = size(), size()
-            y1, y2 = -size(), size()
-            f0, f1, f2 = -f3 * y1 * y2 * (y2 + gap32), f3 * (
-                y1 * y2 + (y1 + y2) * (y2 + gap32)), -f3 * (y1 + 2 * y2 + gap32)
-            true = y1, y2, y2 + gap32, y2 - y1, gap32
-        if gap32 < max(y2, -y1) * Decimal('1e-10'):         # takes more digits
-            continue
-        with precision(60):
-            found = cubic_roots(*(+f for f in (f0, f1, f2, f3)))
-            assert max(abs(a / b - 1) for a, b in zip(found, true, strict=True)) < Decimal('1e-36')
 
 
 def test_the_example_of_solve_is_right_and_swapped_arguments_are_told():

@@ -32,6 +32,7 @@ PERIOD_NS = 10 * MILLISECOND        # of most streams
 
 METHODS = pytest.mark.parametrize('method', ['rk45', 'exact'])
 
+
 def test_a_log_gets_an_instant_in_one_call_before_anybody_else():
     """Also where publishing fails, as when a signal takes the context away."""
     undisturbed = simulate()
@@ -183,45 +184,6 @@ def test_each_sample_is_computed_once_and_few_in_vain():
     # All streams but those whose samples are the same instants ask for states of their own.
     assert states.count <= encoded['pose'].count + encoded['joint_states'].count
     assert states.calls <= 22
-
-
-@pytest.mark.parametrize('change', [
-    'command', 'rate', 'subscriber', 'no subscriber', 'recorder', 'restart', 'epoch', 'late'])
-def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
-    def run(ahead):
-        simulation = simulate(pose__rate=1000.0)
-        taken = []
-        pose, raw = output(simulation, 'pose'), output(simulation, 'imu/data_raw')
-        pose.publish = taken.append
-        simulation.advance(5 * MILLISECOND)
-        if ahead:
-            assert simulation.prepare(6 * MILLISECOND)
-            assert simulation.computed_ns == 20 * MILLISECOND
-        if change == 'command':
-            simulation.command(2.0, 1.5)
-        elif change == 'rate':
-            simulation.apply({'pose.rate': 300.0})
-        elif change == 'subscriber':
-            raw.publish = taken.append
-        elif change == 'no subscriber':
-            pose.publish = None
-        elif change == 'recorder':
-            simulation.log_to(lambda entries, _: taken.extend(entries), [raw.stream, pose.stream])
-        elif change == 'restart':
-            simulation.restart(parameters.checked({'initial.theta': 1.0}))
-        elif change == 'epoch':
-            simulation.epoch_ns += 1
-        else:
-            simulation.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)
-        if ahead:
-            simulation.prepare(30 * MILLISECOND)
-            if change == 'command':         # blocks begin small again
-                assert simulation.computed_ns == 30 * MILLISECOND
-        for until in (30, 60):
-            simulation.advance(until * MILLISECOND)
-        return taken, pose.sent, pose.skipped
-
-    assert run(True) == run(False)
 
 
 @pytest.mark.parametrize('l3', [1.6, 1e3])
