@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tarfile
 import tempfile
 import zipfile
 from importlib import metadata
@@ -45,8 +44,7 @@ def wheel(tmp_path_factory):
 
     build('build_sdist', ROOT)
     (archive,) = folder.glob('*.tar.gz')
-    with tarfile.open(archive) as sdist:
-        sdist.extractall(folder, filter='data')
+    shutil.unpack_archive(archive, folder)
     build('build_wheel', *folder.glob('spinning_top_sim-*/'))
     (made,) = folder.glob('*.whl')
     return made
