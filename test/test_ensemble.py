@@ -18,7 +18,7 @@ from helpers.reference import ROOT
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools import ensemble_part, ensemble_spec
+from spinning_top_sim.tools import ensemble_spec
 from spinning_top_sim.tools.ensemble import main
 from spinning_top_sim.tools.ensemble_part import compute_part, table
 
@@ -186,6 +186,11 @@ def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
     assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(manifest['versions'])
     assert ensemble_spec.parse(manifest['specification'], 'test') == ensemble_spec.read(path)
     assert sorted(entry.name for entry in folder.iterdir()) == ['data', 'manifest.json']
+    # A row alone is computed from the manifest.
+    one, every = tmp_path / 'one.parquet', parquet.read_table(data)
+    assert main([str(folder), '--row', '31', '-o', str(one)]) == 0
+    assert parquet.read_table(one).equals(
+        every.filter(every['run'].to_numpy() == 31).combine_chunks())
 
 
 def test_the_same_command_goes_on_after_an_interruption(
@@ -230,19 +235,6 @@ def test_a_cluster_whose_scheduler_is_killed(whole, tmp_path, capsys):
             assert main([str(whole[1]), '-o', str(folder), '--scheduler', address]) == 1
     assert capsys.readouterr().err.splitlines()[-1] == (
         'spinning-top ensemble: the scheduler is lost')
-
-
-def test_a_row_alone_is_computed_from_the_manifest(whole, tmp_path):
-    data, path = whole
-    from dataclasses import asdict
-    (tmp_path / 'manifest.json').write_text(json.dumps({
-        'format': 1, 'versions': ensemble_part.versions(),
-        'specification': asdict(ensemble_spec.read(path))}))
-    assert main([str(tmp_path), '--row', '31', '-o', str(tmp_path / 'one.parquet')]) == 0
-    every = parquet.read_table(data)
-    assert parquet.read_table(tmp_path / 'one.parquet').equals(
-        every.filter(every['run'].to_numpy() == 31).combine_chunks())
-    assert main([str(tmp_path), '--row', '31', '-o', str(tmp_path / 'one.parquet')]) == 1
 
 
 def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):
@@ -343,6 +335,8 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
     ({'runs': 1.5}, 'runs = 1.5: must be an integer >= 1'),
     ({'duration': 0.0}, 'duration = 0.0: must be a number >= 1e-09'),
     ({'run': 3}, "'run'")])
+
+
 def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, changes, said):
     path = written(tmp_path, **changes)
     code = main([str(path), '-o', str(tmp_path / 'out')])

@@ -186,6 +186,31 @@ def test_each_sample_is_computed_once_and_few_in_vain():
     assert states.calls <= 22
 
 
+CHANGES = {
+    'command': lambda one, taken: one.command(2.0, 1.5),
+    'subscriber': lambda one, taken: setattr(output(one, 'imu/data_raw'), 'publish', taken.append),
+    'recorder': lambda one, taken: one.log_to(
+        lambda entries, _: taken.extend(entries), [output(one, 'imu/data_raw').stream]),
+    'epoch': lambda one, taken: setattr(one, 'epoch_ns', one.epoch_ns + 1),
+    'late': lambda one, taken: one.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)}
+
+
+@pytest.mark.parametrize('change', CHANGES)
+def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
+    def run(ahead):
+        simulation, taken = simulate(pose__rate=1000.0), []
+        pose = output(simulation, 'pose')
+        pose.publish = taken.append
+        simulation.advance(5 * MILLISECOND)
+        assert not ahead or simulation.prepare(6 * MILLISECOND)
+        CHANGES[change](simulation, taken)
+        for until in (30, 60):
+            simulation.advance(until * MILLISECOND)
+        return taken, pose.sent, pose.skipped
+
+    assert run(True) == run(False)
+
+
 @pytest.mark.parametrize('l3', [1.6, 1e3])
 def test_however_far_is_computed_ahead_the_present_state_can_be_read(l3):
     """Also where a tick takes many steps, and where the clock stands still meanwhile."""

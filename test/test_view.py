@@ -316,15 +316,6 @@ def test_a_log_without_attitudes_is_refused(log, tmp_path):
         logs.read_logs([path])
 
 
-def test_a_page_as_a_file_is_never_overwritten(log, tmp_path, capsys):
-    path = tmp_path / 'a.html'
-    path.write_text('mine')
-    assert command.main([str(log), '--html', str(path)]) == 1
-    assert capsys.readouterr().err == (
-        f'spinning-top view: cannot write {path}: it exists, and nothing is overwritten\n')
-    assert path.read_text() == 'mine'
-
-
 def test_a_player_follows_its_buttons_and_the_slider(shown, page):
     player = logs.Player(page, [shown])
     assert player.length == pytest.approx(6.0)
