@@ -5,8 +5,6 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from importlib.util import find_spec
@@ -58,19 +56,6 @@ def parts_of(specification, folder):
     for part in range(specification.parts):
         failed |= compute_part(specification, part, str(folder))
     return failed
-
-
-@contextlib.contextmanager
-def process(*arguments):
-    """Run Python in a session of its own, and kill what is left of it."""
-    running = subprocess.Popen([sys.executable, *map(str, arguments)], start_new_session=True,
-                               text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    try:
-        yield running
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(running.pid, signal.SIGKILL)
-        running.communicate()
 
 
 def wait_for(folder, parts):
@@ -193,48 +178,35 @@ def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
         every.filter(every['run'].to_numpy() == 31).combine_chunks())
 
 
-def test_the_same_command_goes_on_after_an_interruption(
+def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_scheduler(
         whole, tmp_path, ensemble, monkeypatch, capsys):
     """A part that is there is not computed again; a torn one is."""
-    from spinning_top_sim.tools import ensemble_cluster
+    from distributed.client import Future
+    from distributed.comm import CommClosedError
 
-    def interrupted(client, task, numbers):
-        yield from compute(client, task, numbers[:3])
-        raise KeyboardInterrupt
+    (data, path), folder, ordinary = whole, tmp_path / 'other', Future.result
+    for error, code, said in ((CommClosedError('gone'), 1, 'the scheduler is lost'),
+                              (KeyboardInterrupt(), 130, 'interrupted')):
+        results = []
 
-    (data, path), folder, compute = whole, tmp_path / 'other', ensemble_cluster.compute
-    with monkeypatch.context() as patch:
-        patch.setattr(ensemble_cluster, 'compute', interrupted)
-        assert ensemble(path, '-o', folder) == 130
-    assert capsys.readouterr().err == 'spinning-top ensemble: interrupted\n'
+        def result(future, error=error, results=results):
+            results.append(future)
+            if len(results) > 3:
+                raise error
+            return ordinary(future)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Future, 'result', result)
+            assert ensemble(path, '-o', folder) == code
+        assert capsys.readouterr().err == f'spinning-top ensemble: {said}\n'
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
     torn, *kept = sorted((folder / 'data').iterdir())
-    assert len(kept) == 2
+    assert len(kept) >= 2
     then = [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept]
     torn.write_bytes(torn.read_bytes()[:-1])
     assert ensemble(path, '-o', folder) == 0
     assert contents(folder / 'data') == contents(data)
     assert [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept] == then
-
-
-def test_a_cluster_whose_scheduler_is_killed(whole, tmp_path, capsys):
-    folder, place = tmp_path / 'other', tmp_path / 'scheduler.json'
-    common = ('--scheduler-file', place, '--host', '127.0.0.1', '--no-dashboard')
-    with process('-m', 'dask', 'scheduler', '--port', 0, *common) as scheduler, process(
-            '-m', 'dask', 'worker', '--nthreads', 1, '--no-nanny', *common):
-        end = time.monotonic() + PATIENCE
-        while not (place.exists() and place.read_text()) and time.monotonic() < end:
-            time.sleep(0.01)
-        address = json.loads(place.read_text())['address']
-
-        def kill():
-            wait_for(folder, 3)
-            scheduler.kill()
-
-        with meanwhile(kill):
-            assert main([str(whole[1]), '-o', str(folder), '--scheduler', address]) == 1
-    assert capsys.readouterr().err.splitlines()[-1] == (
-        'spinning-top ensemble: the scheduler is lost')
 
 
 def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):

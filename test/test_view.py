@@ -364,25 +364,6 @@ def page():
     page.close()
 
 
-def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
-    stamp_ns = shown.origin_ns + NANOSECONDS
-    page.set_tracks([shown])
-    page._trace.value = page._bounds.value = False
-    page.draw(stamp_ns, shown.origin_ns)
-    (top,) = page._tops
-    page.arrows[0].value = True
-    page.draw(stamp_ns, shown.origin_ns)
-    assert top._arrows[0].points[0, 1] == pytest.approx(
-        model.arrow(shown, model.ARROWS[0], stamp_ns), abs=1e-6)
-    page._bounds.value = True
-    assert 'trace' not in page.legend() and 'angular momentum' in page.legend()
-    assert top._stand.wxyz == pytest.approx([1, 0, 0, 0])
-    page.draw(stamp_ns, shown.origin_ns)
-    for bound, theta in zip(top._bounds, top._limits, strict=True):
-        assert bound.visible
-        assert (bound.points == model.circle(model.reach(shown), theta)).all()
-
-
 def test_a_page_of_another_site_is_refused(page):
     """Raw handshakes, as a browser sends them for a page that it has from elsewhere."""
     port = page.server.get_port()
