@@ -38,7 +38,7 @@ def test_the_specific_force_is_that_of_the_place_in_the_world():
          play(simulation_of(**values), S // 2, 'ground_truth/imu_odom'))))
     q = simulation.segment.states(range(0, S // 2 + 1, 10 ** 6)).rows_quaternion
     acceleration = (place[2:] - 2 * place[1:-1] + place[:-2]) * 1e6
-    expected = attitude.in_body(tuple(part[1:-1] for part in q),
+    expected = attitude.rotated_back(tuple(part[1:-1] for part in q),
                                 tuple((acceleration + np.array((0.0, 0.0, 9.80665))).T))
     assert np.stack(expected, axis=-1) == pytest.approx(force[1:-1], abs=2e-2)
 
@@ -148,7 +148,7 @@ def test_odometry_has_the_twist_in_the_frame_of_the_body():
     pivot, state = simulation.segment.pivot(np.array([S])), simulation.state()
     assert (position[0] == pivot.position[:, 0]).all() and (q == state.quaternion).all()
     assert (rates == state.angular_velocity).all()
-    assert np.ravel(attitude.in_world(tuple(q.T), tuple(velocity.T))) == pytest.approx(
+    assert np.ravel(attitude.rotated(tuple(q.T), tuple(velocity.T))) == pytest.approx(
         pivot.velocity[:, 0], abs=1e-15)
 
 

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.log import examine_log
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.simulate import main as simulate
 
 IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (

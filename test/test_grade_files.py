@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.grade.command import main, trajectory_of
 from spinning_top_sim.grade.scenes import Start
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools import motion_files
 from spinning_top_sim.tools.simulate import main as simulate

@@ -40,8 +40,8 @@ from rosbags.rosbag2 import Reader
 
 from spinning_top_sim.recording.chunks import CHUNK_BYTES, ChunkBuilder
 from spinning_top_sim.recording.errors import RecordingError
+from spinning_top_sim.recording.recorder import McapRecorder, create_file
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
-from spinning_top_sim.recording.writer import McapRecorder, create_file
 
 COMPRESSIONS = ('zstd', 'lz4', 'none')
 SUMMARY_OPCODES = (

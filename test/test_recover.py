@@ -38,7 +38,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.recording.recorder import create_file
 
 
 @pytest.fixture(scope='module')

@@ -19,8 +19,8 @@ from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.physics.regimes import SENTENCES
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.topics import all_streams

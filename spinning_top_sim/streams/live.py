@@ -235,7 +235,7 @@ class LiveSimulation(Simulation):
     def _append(self, block: Block) -> None:
         """Put the messages of a block into the queue; what is done here is not done by a tick."""
         instants: defaultdict[int, Instant] = defaultdict(Instant)
-        for stream, times_ns, rows in block.parts:
+        for stream, times_ns, rows in block.messages:
             output = next(one for one in self.outputs if one.stream is stream)
             data, size = rows.tobytes(), stream.size
             for t_ns, begin in zip(times_ns.tolist(), range(0, len(data), size), strict=True):

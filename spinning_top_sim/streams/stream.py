@@ -180,8 +180,11 @@ class Stream:
         t_ns, epoch_ns = np.concatenate([one.t_ns for one in parts]), parts[0].epoch_ns
         stamps_ns = (epoch_ns + t_ns if self._timing is None
                      else self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns))
-        rows = self.template.encode_parts(stamps_ns, [
-            (len(one.times), self.fields(one)) for one in parts])
+        try:
+            rows = self.template.encode_parts(stamps_ns, [
+                (len(one.times), self.fields(one)) for one in parts])
+        except ValueError as error:
+            raise ValueError(f'fields of {self.topic}: {error}') from error
         if self._timing is None:
             return t_ns, rows
         copies = self._timing.copies(t_ns, self.period_ns)

@@ -10,7 +10,7 @@ from typing import Any
 
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.recording.reader import LogReader, LogTopic
-from spinning_top_sim.recording.writer import METADATA_NAME
+from spinning_top_sim.recording.recorder import METADATA_NAME
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.blocks import Block

@@ -218,7 +218,7 @@ def state_of(top: Top, row: NDArray[np.float64]) -> tuple[tuple[float, float, fl
     """
     quaternion, omega = row[:4], row[4:7]
     state = placement.state_of(top, quaternion, np.array(
-        attitude.in_world(tuple(quaternion), tuple(omega))))
+        attitude.rotated(tuple(quaternion), tuple(omega))))
     up = float(attitude.vertical_in_body(tuple(quaternion))[2])
     moments = np.array((top.lambda1, top.lambda1, top.lambda3))
     energy = 0.5 * float(moments @ omega ** 2) + top.gravity_torque * up

@@ -105,10 +105,10 @@ def _euler_step(top, torque, q, across, spin, dt, method, turn):
 def _world_inertia(top, q, across, spin):
     w, x, y, z = q
     quaternion, rates = ([x], [y], [z], [w]), ([across.real], [across.imag], [spin])
-    a, b, c = attitude.in_world([np.array(one) for one in quaternion],
+    a, b, c = attitude.rotated([np.array(one) for one in quaternion],
                                 [np.array(one) for one in rates])
     share = (top.lambda1 - top.lambda3) / top.lambda1
-    change = attitude.in_body([np.array(one) for one in quaternion],
+    change = attitude.rotated_back([np.array(one) for one in quaternion],
                               (share * b * c, -share * a * c, 0.0 * a))
     gravity = -1j * top.gravity_torque / top.lambda1 * _up(q)[0]
     return complex(change[0][0], change[1][0]) + gravity

@@ -65,7 +65,7 @@ class Ride:
         motion = self.motions[k]
         states = motion.states(range(t - self.pieces[k].start_ns, t - self.pieces[k].start_ns + 1))
         q = attitude.product(motion.vertical.rows, states.rows_quaternion)
-        arm = np.stack(attitude.in_world(q, point), axis=-1)
+        arm = np.stack(attitude.rotated(q, point), axis=-1)
         pivot = kinematics(self.path, [t])
         return (np.stack(q, axis=-1), states.angular_velocity, states.angular_acceleration,
                 pivot.position + arm)
