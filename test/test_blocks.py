@@ -59,8 +59,7 @@ SCENES = {
     'through a pole': {'initial.theta': 0.5, 'spin.l3': 0.2, 'spin.lz': 0.2},
     'planar rotation': scene_parameters('planar_pendulum'),
 }
-CASES = (('a sensor elsewhere', 'exact'), ('planar rotation', 'exact'),
-         ('a filtered sensor', 'rk45'), ('many changes', 'exact'),
+CASES = (('planar rotation', 'exact'), ('a filtered sensor', 'rk45'), ('many changes', 'exact'),
          ('cusps', 'euler'), ('a sensor elsewhere', 'rk45'), ('through a pole', 'rk45'))
 DURATION_NS = 500_000_000
 # Commands, changes of rates, a velocity of the pivot and a state, and when they come [ns].

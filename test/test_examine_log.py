@@ -117,6 +117,18 @@ def test_faults_of_attitudes_in_a_log_are_named(beside, name, said, options):
     assert report.faults == [name], report
 
 
+@pytest.mark.parametrize('topic', ['/ground_truth/imu', '/estimate'])
+def test_a_message_that_is_cut_is_refused_in_a_line(log, tmp_path, topic):
+    with LogReader(log) as reader:
+        rows = [(number, message.log_time, message.data) for message in reader.messages(
+            ['/ground_truth/imu']) for number in (0, 1)]
+    number = ('/ground_truth/imu', '/estimate').index(topic)
+    path = write(tmp_path / 'cut.mcap', (('/ground_truth/imu', IMU), ('/estimate', IMU)),
+                 [*rows, (number, rows[-1][1] + 1, rows[-1][2][:50])])
+    with pytest.raises(ValueError, match=f'a message of {topic} cannot be read: .*$'):
+        examine_log(path, 'estimate', north='true')
+
+
 def test_the_truth_may_be_of_the_body(log):
     """The IMU is turned on the body."""
     report = examine_log(log, '/ground_truth/imu', 'ground_truth/odom', north='true')

@@ -316,15 +316,6 @@ def test_a_log_without_attitudes_is_refused(log, tmp_path):
         logs.read_logs([path])
 
 
-def test_a_page_as_a_file_is_never_overwritten(log, tmp_path, capsys):
-    path = tmp_path / 'a.html'
-    path.write_text('mine')
-    assert command.main([str(log), '--html', str(path)]) == 1
-    assert capsys.readouterr().err == (
-        f'spinning-top view: cannot write {path}: it exists, and nothing is overwritten\n')
-    assert path.read_text() == 'mine'
-
-
 def test_a_player_follows_its_buttons_and_the_slider(shown, page):
     player = logs.Player(page, [shown])
     assert player.length == pytest.approx(6.0)
@@ -371,25 +362,6 @@ def page():
     page = pages.Page('one', '127.0.0.1', None)
     yield page
     page.close()
-
-
-def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
-    stamp_ns = shown.epoch_ns + NANOSECONDS
-    page.set_tracks([shown])
-    page._trace.value = page._bounds.value = False
-    page.draw(stamp_ns, shown.epoch_ns)
-    (top,) = page._tops
-    page.arrows[0].value = True
-    page.draw(stamp_ns, shown.epoch_ns)
-    assert top._arrows[0].points[0, 1] == pytest.approx(
-        shapes.arrow(shown, shapes.ARROWS[0], stamp_ns), abs=1e-6)
-    page._bounds.value = True
-    assert 'trace' not in page.legend() and 'angular momentum' in page.legend()
-    assert top._stand.wxyz == pytest.approx([1, 0, 0, 0])
-    page.draw(stamp_ns, shown.epoch_ns)
-    for bound, theta in zip(top._bounds, top._limits, strict=True):
-        assert bound.visible
-        assert (bound.points == shapes.circle(shapes.reach(shown), theta)).all()
 
 
 def test_a_page_of_another_site_is_refused(page):

@@ -5,7 +5,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
@@ -171,21 +170,6 @@ class Stepped:
         return attitudes, w, np.gradient(w, times, axis=0, edge_order=2)
 
 
-def dop853(top, start, times, dt):
-    """Return the motion by SciPy's DOP853."""
-    def slope(t, y):
-        a, b, c, d, x, y_, z = y
-        change, _ = right_torque(top, z, complex(x, y_), *_up((a, b, c, d)))
-        return (-0.5 * (b * x + c * y_ + d * z), 0.5 * (a * x + c * z - d * y_),
-                0.5 * (a * y_ - b * z + d * x), 0.5 * (a * z + b * y_ - c * x),
-                change.real, change.imag, 0.0)
-    states = solve_ivp(slope, (0.0, times[-1]), (*start.attitude, *start.rates), method='DOP853',
-                       t_eval=times, rtol=1e-11, atol=1e-12).y.T
-    w = states[:, 4:]
-    norm = np.linalg.norm(states[:, :4], axis=1, keepdims=True)
-    return (states[:, :4] / norm)[:, [1, 2, 3, 0]], w, np.gradient(w, times, axis=0, edge_order=2)
-
-
 # ---------------------------------------------------------------------------------- readings
 
 
@@ -286,14 +270,8 @@ class Imu:
         """carla-simulator/carla#2939: the gyroscope reads in axes of the world."""
         said['gyroscope'] += self.rotation.apply(self.w) - self.mounting.inv().apply(self.w)
 
-    def states_in_world(self, said):
-        said['rates'] = self.rotation.apply(self.w)
-
     def in_degrees(self, said):
         said['gyroscope'] = np.degrees(said['gyroscope'])
-
-    def states_in_degrees(self, said):
-        said['rates'] = np.degrees(said['rates'])
 
     def mounting_ignored(self, said):
         """opensim-org/opensim-core#3366: rates do not turn with the frame of the IMU."""
@@ -321,9 +299,6 @@ class Imu:
 
     def gyroscope_twice(self, said):
         said['gyroscope'] *= 2.0
-
-    def field_sign(self, said):
-        said['magnetometer'] = -said['magnetometer']
 
     def residuals(self, said):
         """microsoft/AirSim#4661: noise that is declared as none."""
@@ -399,11 +374,8 @@ OTHER = {
     'without_gravity': ('no_gravity',),
     'in_g': ('units',),
     'in_degrees': ('units',),
-    'states_in_world': ('rates_in_world',),
-    'states_in_degrees': ('units',),
     'late_by_seven': ('imu_one_step_late',),
     'gyroscope_sign': ('reading_sign',),
-    'field_sign': ('reading_sign',),
     'field_in_world': ('reading_in_world',),
     'gyroscope_twice': ('reading_scale',),
     'times_root_two': ('noise_scale',),
@@ -432,4 +404,4 @@ STEPPED = {
     'upwards': (Stepped(upwards), ('gravity_sign',)),
     'damped': (Stepped(damped), ('damping',)),
     'offset': (Stepped(offset_com((0.003, -0.002, 0.004))), ('com_offset',))}
-RIGHT = {'exact': exact, 'rk45': rk45, 'DOP853': dop853, 'RK4': Stepped()}
+RIGHT = {'exact': exact, 'rk45': rk45, 'RK4': Stepped()}
