@@ -20,7 +20,7 @@ WINDOW = 3.0                    # autocorrelation times over which correlations 
 
 
 class Errors(NamedTuple):
-    """Attitude errors [rad]: tilt (n,) >= 0, and heading (n,), continuous in time."""
+    """Attitude errors [rad]: tilt (n,) >= 0, and heading (n,) in [-pi, pi]."""
 
     tilt: Reals
     heading: Reals
@@ -31,13 +31,12 @@ class Errors(NamedTuple):
 
     def known(self, absolute: bool) -> Reals:
         """Return tilt and heading error combined (n,), the tilt alone unless `absolute`."""
-        return np.hypot(self.tilt, absolute * self.turned(True))
+        return np.hypot(self.tilt, absolute * self.heading)
 
     def turned(self, absolute: bool) -> Reals:
         """Return the heading error in [-pi, pi] (n,), relative to its mean unless `absolute`."""
         phase = np.exp(1j * self.heading)
-        turned: Reals = np.angle(phase if absolute else phase * np.conj(np.mean(phase)))
-        return turned
+        return self.heading if absolute else np.angle(phase * np.conj(np.mean(phase)))
 
 
 def errors_of(estimates: Reals, truth: Reals) -> Errors:
@@ -46,11 +45,9 @@ def errors_of(estimates: Reals, truth: Reals) -> Errors:
 
     estimates, truth : q(world <- sensor) as x, y, z, w (n, 4)
     """
-    x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat().T
-    heading = np.unwrap(2.0 * np.arctan2(z, w))
-    # Remove whole turns, so that the last heading is in [-pi, pi].
-    heading -= 2.0 * np.pi * np.rint(heading[-1] / (2.0 * np.pi))
-    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), heading)
+    x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat(
+        canonical=True).T
+    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), 2.0 * np.arctan2(z, w))
 
 
 class Rmse(NamedTuple):
@@ -65,7 +62,7 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
     """Return what BROAD's evaluation says of attitudes (n, 4); the heading is absolute."""
     total = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).magnitude()
     errors = errors_of(estimates, truth)
-    return Rmse(*(math.degrees(rms(one)) for one in (total, errors.turned(True), errors.tilt)))
+    return Rmse(*(math.degrees(rms(one)) for one in (total, errors.heading, errors.tilt)))
 
 
 def unaided(run: Run, rows: slice | NDArray[np.intp]) -> Rmse:

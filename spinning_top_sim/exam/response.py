@@ -126,7 +126,7 @@ class Responses:
     def _clean(self, outcome: Outcome, *places: Any) -> Reals:
         """Return errors of tilt and heading, by default at rest, then in motion, rms [rad]."""
         errors = outcome.errors
-        heading = self._absolute * errors.turned(True)
+        heading = self._absolute * errors.heading
         return np.array([rms(error[rows]) for rows in places or (self._rests, self._given.motion)
                          for error in (errors.tilt, heading)])
 
