@@ -17,6 +17,7 @@ from helpers.simulations import MILLISECOND, play, record, simulate
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.topics import all_streams
 
 # ---------------------------------------------------------------------------------- scenarios
 
@@ -58,8 +59,7 @@ SCENES = {
     'through a pole': {'initial.theta': 0.5, 'spin.l3': 0.2, 'spin.lz': 0.2},
     'planar rotation': scene_parameters('planar_pendulum'),
 }
-CASES = (('a sensor elsewhere', 'exact'), ('planar rotation', 'exact'),
-         ('a filtered sensor', 'rk45'), ('many changes', 'exact'),
+CASES = (('planar rotation', 'exact'), ('a filtered sensor', 'rk45'), ('many changes', 'exact'),
          ('cusps', 'euler'), ('a sensor elsewhere', 'rk45'), ('through a pole', 'rk45'))
 DURATION_NS = 500_000_000
 # Commands, changes of rates, a velocity of the pivot and a state, and when they come [ns].
@@ -147,7 +147,8 @@ def test_any_division_of_a_run_gives_the_same_bytes(scene, method):
     """Offline in large blocks and divided anywhere, and live; what is published is recorded."""
     whole = offline(scene, method)
     assert len(whole['pose']) > 125 and len(whole['imu/data_raw']) > 175
-    assert len(whole) == 21 and min(map(len, whole.values())) > 5
+    assert len(whole) == len(all_streams(parameters.checked({})))
+    assert min(map(len, whole.values())) > 5
     assert first_difference(offline(scene, method, random_splits(3, 5)), whole) is None
     recorded, published = restless(scene, method, random_splits(2, 20), seed=2)
     assert first_difference(recorded, whole) is None

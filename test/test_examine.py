@@ -62,15 +62,6 @@ def slow():
     return scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))
 
 
-def test_tilt_and_heading_are_those_of_the_world():
-    truth = Rotation.from_euler('xyz', (0.4, 0.5, 0.6))
-    for axis, tilt, heading in (('x', 0.2, 0.0), ('y', 0.2, 0.0), ('z', 0.0, 0.2)):
-        estimate = Rotation.from_euler(axis, 0.2) * truth
-        errors = measures.errors_of(estimate.as_quat()[None], truth.as_quat()[None])
-        assert errors.tilt == pytest.approx(tilt, abs=1e-7)
-        assert errors.heading == pytest.approx(heading, abs=1e-7)
-
-
 def test_the_gyroscope_reads_the_mean_over_its_step_and_a_delay_is_measured():
     scenario = replace(scenarios.FAST, duration=4.0, reversals=())
     coarse, fine = (scenarios.record(replace(scenario, rate=rate), {}, 1)
@@ -156,8 +147,8 @@ def test_a_filter_without_faults_passes(report):
 
 
 def test_vqf_passes_with_and_without_magnetometer(report):
-    found = report('vqf', seeds=None)
-    assert found.passed and len(found.outcomes) == 3, found
+    found = report('vqf')
+    assert found.passed, found
     assert found.measures['tilt_rms_deg'] < 0.05 and 'nees' not in found.measures
     without = report('vqf-6d')
     assert without.passed and without.measures['heading_rms_deg'] < 0.1, without
@@ -305,12 +296,6 @@ def test_what_makes_no_filter_is_refused(filter_):
         examine(filter_)
 
 
-def test_the_command_examines_a_published_filter(capsys):
-    assert main(['--filter', 'vqf', '--seeds', '1', '--imu',
-                 str(ROOT / 'config/imu/adis16470.yaml')]) == 0
-    assert 'vqf: passed' in capsys.readouterr().out
-
-
 def test_the_command_examines_a_class_in_a_file(tmp_path, capsys):
     (tmp_path / 'neighbour.py').write_text('UP = [0.0, 0.0, 0.0, 1.0]\n')
     (tmp_path / 'mine.py').write_text('from neighbour import UP\n\n\nclass Still:\n'
@@ -325,11 +310,11 @@ def test_the_command_examines_a_class_in_a_file(tmp_path, capsys):
 
 @pytest.mark.parametrize(('arguments', 'says'), [
     ([], 'give either a'), (['x', '--topic', '/pose', '--filter', 'vqf'], 'give either a'),
-    (['--filter', 'vqf', '--seeds', '0'], 'seeds = 0'),
+    (['--filter', 'vqf', '--seeds', '0'], 'seeds = 0'), (['--data', '.'], 'give either a'),
+    (['x', '--data', '.'], 'give either a'),
+    (['--filter', 'vqf', '--data', '.', '--level', 'full'], '--level: --data takes --data only'),
     (['x', '--topic', '/pose', '--level', 'quick'],
      '--level: a log takes --topic, --truth, --heading only')])
 def test_wrong_arguments_of_the_command(capsys, arguments, says):
     assert main(arguments) == 2
     assert says in capsys.readouterr().err
-
-

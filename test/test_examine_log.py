@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.log import examine_log
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.simulate import main as simulate
 
 IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (
@@ -115,6 +115,18 @@ def test_attitudes_of_every_type_are_read(beside, type_name):
 def test_faults_of_attitudes_in_a_log_are_named(beside, name, said, options):
     report = examine_log(beside(said, **options), '/estimate', north='true')
     assert report.faults == [name], report
+
+
+@pytest.mark.parametrize('topic', ['/ground_truth/imu', '/estimate'])
+def test_a_message_that_is_cut_is_refused_in_a_line(log, tmp_path, topic):
+    with LogReader(log) as reader:
+        rows = [(number, message.log_time, message.data) for message in reader.messages(
+            ['/ground_truth/imu']) for number in (0, 1)]
+    number = ('/ground_truth/imu', '/estimate').index(topic)
+    path = write(tmp_path / 'cut.mcap', (('/ground_truth/imu', IMU), ('/estimate', IMU)),
+                 [*rows, (number, rows[-1][1] + 1, rows[-1][2][:50])])
+    with pytest.raises(ValueError, match=f'a message of {topic} cannot be read: .*$'):
+        examine_log(path, 'estimate', north='true')
 
 
 def test_the_truth_may_be_of_the_body(log):

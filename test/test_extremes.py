@@ -86,13 +86,9 @@ def test_any_sizes_of_all_numbers_give_the_start_exactly_or_a_reason(changed, lz
 
 HUGE, TINY = 1e300, 1e-300
 OUT_OF_RANGE = [
-    ('status_period', TINY), ('duration', HUGE), ('pose.rate', TINY), ('pose.rate', 1e5),
-    ('time_scale', TINY), ('imu.gyroscope_noise_density', HUGE), ('imu.accelerometer_range', TINY),
-    ('imu.gyroscope_M', (*8 * (0.0,), HUGE)), ('imu.clock_drift', -HUGE), ('imu.drop_rate', 1.0),
-    ('imu.bias_instability_band', (0.0, 1.0)), ('mag.field', (HUGE, 0.0, 0.0)),
-    ('imu.lever_arm', (1.0, 2.0)), ('top.mass', HUGE), ('top.lambda1', 'big'),
-    ('solver.method', 'rk4'), ('pose.enabled', 1), ('spin.l3', None), ('step.count', 0),
-    ('tick_rate', math.nan), ('record.min_free_bytes', 2 ** 63), ('seed', 10 ** 400)]
+    ('status_period', TINY), ('pose.rate', 1e5), ('imu.gyroscope_M', (*8 * (0.0,), HUGE)),
+    ('imu.clock_drift', -HUGE), ('imu.bias_instability_band', (0.0, 1.0)), ('top.mass', HUGE),
+    ('step.count', 0), ('record.min_free_bytes', 2 ** 63), ('seed', 10 ** 400)]
 
 
 @pytest.mark.parametrize(('name', 'value'), OUT_OF_RANGE)
@@ -107,15 +103,12 @@ def test_what_no_arithmetic_holds_is_refused_by_the_table(name, value):
     ({'spin.l3': HUGE}, '1e+300'), ({'initial.theta_dot': 1e12}, '1000000000000.0'),
     ({'top.lambda3': 5e-324}, 'lambda3=5e-324')])
 @pytest.mark.parametrize('method', ['exact', 'rk45'])
-def test_what_turns_too_fast_is_refused_at_the_start_at_a_reset_and_by_simulate(
+def test_what_turns_too_fast_is_refused_at_the_start_and_by_simulate(
         given, named, method, tmp_path, capsys):
     values = parameters.checked({**given, 'solver.method': method})
-    running = simulate(solver__method=method)
-    for refuse in (lambda: LiveSimulation(values), lambda: running.restart(values)):
-        with pytest.raises(ValueError, match='no motion from') as refusal:
-            refuse()
-        assert named in str(refusal.value)
-    assert running.advance(SECOND)
+    with pytest.raises(ValueError, match='no motion from') as refusal:
+        LiveSimulation(values)
+    assert named in str(refusal.value)
     log = tmp_path / 'run.mcap'
     arguments = [part for name, value in values.items() if name in (*given, 'solver.method')
                  for part in ('-p', f'{name}:={value}')]

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top
 from spinning_top_sim.grade import Body, Start, grade, grade_trajectory
-from spinning_top_sim.grade.motion import InvalidTrajectoryError, Trajectory, errors_of
+from spinning_top_sim.grade.motion import InvalidTrajectoryError, errors_of
 from spinning_top_sim.grade.pytest_plugin import pass_grade  # noqa: F401, a fixture
 from spinning_top_sim.grade.report import FAULTS
 from spinning_top_sim.grade.scenes import SCENES, WHEEL
@@ -278,10 +278,3 @@ def test_wrong_parameters_and_trajectories_are_refused():
 def test_a_body_is_a_top():
     assert Body.of(WHEEL) is WHEEL and WHEEL.com == (0.0, 0.0, 0.15)
     assert WHEEL.inertia_at_com == pytest.approx((0.078, 0.078, 0.15))
-
-
-def test_attitudes_keep_their_sign_from_sample_to_sample():
-    right, _ = trajectory_of(Imu())
-    right['attitudes'][100:] *= -1.0
-    said = Trajectory.of(right, right['t'])
-    assert np.min(np.sum(said.attitudes[1:] * said.attitudes[:-1], axis=1)) > 0.99

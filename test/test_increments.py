@@ -112,6 +112,13 @@ def test_increments_connect_the_samples_of_the_lever_arms_end(method):
     assert velocity == pytest.approx(np.cross(rates, arm), abs=1e-13)
 
 
+@BOTH
+def test_increments_connect_the_samples_along_a_path_of_the_pivot(method):
+    _, found = run({**MOUNTED, 'solver.method': method, 'pivot.path': (
+        0.7, 1.0, 0.5, 9.0, 0.9025, -1.0, 0.0, -9.0)}, 2 * SECOND, *TOPICS)
+    assert_they_connect(found, 1e-14 if method == 'exact' else 3e-12)
+
+
 # ---------------------------------------------------------------------------------- errors
 
 def test_the_noise_of_increments_is_that_of_the_readings():

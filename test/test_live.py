@@ -32,6 +32,7 @@ PERIOD_NS = 10 * MILLISECOND        # of most streams
 
 METHODS = pytest.mark.parametrize('method', ['rk45', 'exact'])
 
+
 def test_a_log_gets_an_instant_in_one_call_before_anybody_else():
     """Also where publishing fails, as when a signal takes the context away."""
     undisturbed = simulate()
@@ -185,38 +186,24 @@ def test_each_sample_is_computed_once_and_few_in_vain():
     assert states.calls <= 22
 
 
-@pytest.mark.parametrize('change', [
-    'command', 'rate', 'subscriber', 'no subscriber', 'recorder', 'restart', 'epoch', 'late'])
+CHANGES = {
+    'command': lambda one, taken: one.command(2.0, 1.5),
+    'subscriber': lambda one, taken: setattr(output(one, 'imu/data_raw'), 'publish', taken.append),
+    'recorder': lambda one, taken: one.log_to(
+        lambda entries, _: taken.extend(entries), [output(one, 'imu/data_raw').stream]),
+    'epoch': lambda one, taken: setattr(one, 'epoch_ns', one.epoch_ns + 1),
+    'late': lambda one, taken: one.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)}
+
+
+@pytest.mark.parametrize('change', CHANGES)
 def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
     def run(ahead):
-        simulation = simulate(pose__rate=1000.0)
-        taken = []
-        pose, raw = output(simulation, 'pose'), output(simulation, 'imu/data_raw')
+        simulation, taken = simulate(pose__rate=1000.0), []
+        pose = output(simulation, 'pose')
         pose.publish = taken.append
         simulation.advance(5 * MILLISECOND)
-        if ahead:
-            assert simulation.prepare(6 * MILLISECOND)
-            assert simulation.computed_ns == 20 * MILLISECOND
-        if change == 'command':
-            simulation.command(2.0, 1.5)
-        elif change == 'rate':
-            simulation.apply({'pose.rate': 300.0})
-        elif change == 'subscriber':
-            raw.publish = taken.append
-        elif change == 'no subscriber':
-            pose.publish = None
-        elif change == 'recorder':
-            simulation.log_to(lambda entries, _: taken.extend(entries), [raw.stream, pose.stream])
-        elif change == 'restart':
-            simulation.restart(parameters.checked({'initial.theta': 1.0}))
-        elif change == 'epoch':
-            simulation.epoch_ns += 1
-        else:
-            simulation.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)
-        if ahead:
-            simulation.prepare(30 * MILLISECOND)
-            if change == 'command':         # blocks begin small again
-                assert simulation.computed_ns == 30 * MILLISECOND
+        assert not ahead or simulation.prepare(6 * MILLISECOND)
+        CHANGES[change](simulation, taken)
         for until in (30, 60):
             simulation.advance(until * MILLISECOND)
         return taken, pose.sent, pose.skipped

@@ -40,7 +40,7 @@ from mcap.writer import MCAP0_MAGIC
 from spinning_top_sim.recording import reader as reader_module
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.recording.recorder import create_file
 
 
 def test_extra_fields_and_unknown_kinds_are_no_damage(tmp_path):

@@ -17,8 +17,8 @@ from spinning_top_sim.recording import log_file
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.recovery import recover
-from spinning_top_sim.recording.writer import create_file
 
 ROOT = Path(__file__).parents[1]
 

@@ -36,10 +36,10 @@ from rosbags.typesys import Stores, get_typestore
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import replay_node
-from spinning_top_sim.nodes.pacing import ROUND_GAP_NS
+from spinning_top_sim.nodes.playback import ROUND_GAP_NS
 from spinning_top_sim.nodes.replayer import Replayer, message_class, open_log
+from spinning_top_sim.recording.recorder import McapRecorder
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
-from spinning_top_sim.recording.writer import McapRecorder
 
 EPOCH_NS = 1_700_000_000_123_456_789
 JAZZY = get_typestore(Stores.ROS2_JAZZY)

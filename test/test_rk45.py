@@ -17,12 +17,7 @@ from helpers.reference import CASES, angle, quaternion_of, scene_parameters, sta
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers import dormand_prince
-from spinning_top_sim.solvers.dormand_prince import (
-    ERROR,
-    STAGES,
-    IntegrationError,
-    unrolled_step,
-)
+from spinning_top_sim.solvers.dormand_prince import ERROR, STAGES, IntegrationError
 from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.propagator import propagate
@@ -44,45 +39,6 @@ def test_tableau_satisfies_the_order_conditions_exactly():
 
 SECOND = 1_000_000_000
 LOOPING = CASES['loop-a']
-
-
-def fixed_steps(motion, count, t_end):
-    """Return y after `count` equal steps, without step control or projection."""
-    y = motion._kept[0].y0
-    step, derivative = unrolled_step(len(y), isinstance(y[0], complex)), motion.derivative(*y)
-    for _ in range(count):
-        y, derivative, _ = step(motion.derivative, t_end / count, y, derivative)
-    return y
-
-
-both_equations = pytest.mark.parametrize('motion_type', [TransportMotion, EulerMotion])
-
-
-@both_equations
-def test_global_error_falls_with_the_fifth_power_of_the_step(motion_type):
-    motion = motion_type(top_of(LOOPING), start_of(LOOPING), 1e-9, 0.0)
-    truth = np.array(fixed_steps(motion, 12800, 4.0))
-    counts = np.array([100, 200, 400, 800, 1600])
-    errors = [np.abs(np.array(fixed_steps(motion, n, 4.0)) - truth).max() for n in counts]
-    slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
-    assert -5.2 <= slope <= -4.8
-
-
-@both_equations
-def test_dense_output_is_as_good_as_the_steps(motion_type):
-    """Its own error falls with the sixth power of the step, as the error of a step does."""
-    case = CASES['loop-c-thd+']
-    errors = []
-    for h in (0.08, 0.04, 0.02):
-        motion = motion_type(top_of(case), start_of(case), 1e-9, 0.0)
-        motion.errors = lambda y, y_new, difference: (0.9 ** 5,)    # accept, keep the step
-        motion._next_step = h
-        truth = np.array(fixed_steps(motion, 64, 0.37 * h)).view(float)
-        motion._take_step()
-        middle = motion._interpolated(np.array([0.37 * h]))[1][:, 0]
-        errors.append(np.abs(middle - truth).max())
-    ratios = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    assert np.all(ratios > 5.5)
 
 
 # Near a separatrix neighbouring motions part like exp(k t): 1e-13 grows beyond 1e-6.
@@ -345,7 +301,7 @@ def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
         assert column(stepped)[away] == pytest.approx(column(exact)[away], abs=bound)
 
 
-@both_equations
+@pytest.mark.parametrize('motion_type', [TransportMotion, EulerMotion])
 def test_an_error_that_is_no_number_is_no_small_error(motion_type, monkeypatch):
     motion = motion_type(top_of(LOOPING), start_of(LOOPING), 1e-9, 1e-10)
     y = motion._kept[0].y0

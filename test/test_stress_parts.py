@@ -9,7 +9,7 @@ import pytest
 from stress import runner
 
 
-@pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0), ('sensor', 1)])
+@pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0)])
 def test_a_seed(tmp_path, monkeypatch, request, part, seed):
     pytest.importorskip('rclpy')
     module = importlib.import_module(f'stress.{part}')
@@ -19,7 +19,7 @@ def test_a_seed(tmp_path, monkeypatch, request, part, seed):
     assert module.check(seed, tmp_path)
 
 
-PATIENCE_S = 4.0
+PATIENCE_S = 2.0
 MEMORY_MB = 500
 
 
@@ -42,7 +42,7 @@ def test_the_runner_sees_errors_hangs_deaths_and_memory():
     assert result.seeds == 7
     assert result.outcomes == {'fine': 3, 'FAILED': 4}
     for seed, (failure, words) in enumerate(zip(sorted(result.failures), (
-            ('ValueError', 'a fault', 'in check'), ('not done after 4 s',),
+            ('ValueError', 'a fault', 'in check'), ('not done after 2 s',),
             ('died with code -6',), ('MemoryError',)), strict=True), start=1):
         assert failure.startswith(f'broken: seed {seed}: ')
         assert failure.endswith(f'python test/stress broken --first {seed} --count 1')

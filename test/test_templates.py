@@ -166,18 +166,6 @@ def test_many_messages_are_single_ones_one_after_the_other():
             assert np.array_equal(found, np.reshape(given, found.shape))
 
 
-def test_a_byte_is_found_in_its_stamp_or_in_an_element_of_its_field():
-    template = messages.stamped('', 3)      # header, stamp, length and NUL of a string, padding
-    assert [template.field_at(at) for at in (3, 4, 11, 12, 19, 20, 31, 43)] == [
-        None, (-1, 0, 4), (-1, 0, 4), None, None, (0, 0, 20), (0, 1, 28), (0, 2, 36)]
-
-
-@pytest.mark.parametrize('fields', [(), ((np.zeros(1),),), ((np.zeros(1),) * 3,)])
-def test_a_field_that_lacks_a_column_or_has_one_too_many_is_refused(fields):
-    with pytest.raises(ValueError, match='zip'):
-        messages.float64_multi_array(('a', 'b')).encode(np.array([0]), *fields)
-
-
 # -------------------------------------------------------------------------------- the streams
 
 def test_every_stream_sends_a_message_of_its_type_with_the_frames_of_the_parameters():

@@ -12,8 +12,7 @@ from mcap.reader import make_reader
 
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import cdr, journal, parameters
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.tools import recorded_run
 
 
@@ -121,14 +120,6 @@ def test_each_change_that_takes_effect_at_once_is_replayed(short):
         events = [event for _, event in recorded_run.rerun(
             dataclasses.replace(run, events=[event]), run.epoch_ns + 2)]
         assert (event in events) is (parameter.effect is parameters.Effect.NOW), parameter.name
-
-
-def test_a_type_without_names_is_told():
-    values = parameters.checked({})
-    stream = Stream(values, 'pose', 'other', 'a_package/msg/New',
-                    cdr.Template(cdr.CdrWriter().header('').field(1)))
-    with pytest.raises(LookupError, match='no names for a_package/msg/New in recorded_run'):
-        recorded_run.field_names(stream)
 
 
 def test_another_machine_is_warned_of(short, capsys, monkeypatch):

@@ -133,26 +133,6 @@ def stamp_of(poses):
     return str(seconds), f'{nanoseconds:09d}'
 
 
-def test_log(browser, tmp_path):
-    log = write_log(tmp_path / 'cusp.mcap', '120')      # longer than a slow browser takes to pause
-    poses = poses_of(log)
-    view = SimNode(tmp_path, program=(*VIEW, str(log)))
-    with view, Visit(browser, address_of(view)) as visit:
-        if visit.page.get_by_role('button', name='Pause').count():      # it is not at its end
-            visit.press('Pause')
-        visit.page.get_by_role('button', name='Play').wait_for()
-        visit.put('time [s]', 1.25)
-        visit.read(r't = 1\.250')
-        visit.read('[Cc]usps')
-        seconds, nanoseconds = map(int, visit.read(STAMP))
-        assert apart(visit.attitude(), poses[seconds * 10 ** 9 + nanoseconds]) < 1e-6
-        visit.press('Next command')
-        visit.read(r't = 2\.500')
-        visit.read('[Ll]oops')
-        assert visit.errors == []
-        assert visit.hosts <= {'127.0.0.1', None}
-
-
 def test_file_without_a_network(browser, tmp_path):
     page, ride = tmp_path / 'page.html', tmp_path / 'ride.mcap'
     assert simulate.main(['--scene', 'shuttle', '--duration', '6', '-o', str(ride)]) == 0

@@ -22,8 +22,8 @@ from helpers.definitions import add_definitions
 from helpers.recordings import METADATA
 from spinning_top_sim.recording import chunks
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.recover import main
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
