@@ -14,8 +14,6 @@ from spinning_top_sim.exam.scenarios import Reals, Run
 
 CONVERGED_DEG = 1.0
 CONSISTENT = 0.9999             # probability of the NEES band
-# Runs from which their spread is known, and how much of it has another reason than chance.
-FEWEST_RUNS, APART = 3, 5.0
 WINDOW = 3.0                    # autocorrelation times over which correlations are summed
 
 
@@ -152,9 +150,10 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
     Return the NEES of the runs (Bar-Shalom et al. 2001, 5.4.2).
 
     The errors of a run are correlated: the number of independent tilts is smaller by the
-    integrated autocorrelation time.  The heading changes so slowly that the attitudes of a run
-    count as one.  The covariance may refer to the axes of the sensor or of the world: the
-    assumption with the greater likelihood counts.
+    integrated autocorrelation time, which is long for errors that are constant in a run, such as
+    that of a bias.  The heading changes so slowly that the attitudes of a run count as one.  The
+    covariance may refer to the axes of the sensor or of the world: the assumption with the greater
+    likelihood counts.
 
     runs : estimates (n, 4), truth (n, 4) and covariances (n, 3, 3) [rad^2] of each run
     absolute : False leaves out the heading
@@ -171,19 +170,11 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
         values = np.stack([squares[:shortest] for squares, _ in parts])
         mean = max(float(np.mean(values)), 1e-300)
         time = autocorrelation_time(values)
-        independent, known = (len(runs), 1e9) if absolute else (
+        independent, known = (len(runs), math.inf) if absolute else (
             values.size / time, values.size / (2.0 * WINDOW * time + 1.0))    # Sokal, sect. 3
-        if len(runs) >= FEWEST_RUNS:
-            # A constant error, such as that of a bias, is one draw a run: then the means of the
-            # runs differ by more than the errors in a run let expect.
-            spread = float(np.var(np.mean(values, axis=1), ddof=1)) / mean ** 2
-            draws = 2.0 * len(runs) / max(dimensions * spread, 1e-12)
-            if draws < independent / APART:
-                independent, known = draws, len(runs) - 1
         # Negative log-likelihood for the best common factor of the covariances.
         unlikely = dimensions * math.log(mean) + float(np.mean([size for _, size in parts]))
-        found.append((unlikely, Nees(
-                mean / dimensions, dimensions * independent, known)))
+        found.append((unlikely, Nees(mean / dimensions, dimensions * independent, known)))
     return min(found)[1] if found else None
 
 
