@@ -33,6 +33,8 @@ class Excitation(NamedTuple):
     """
     Rests between turns, the slow motion, and two kicks of the gyroscope alone at rest.
 
+    run : with the kicks
+    still : without them
     rests : index of the last sample of each rest (n,); the first and the last but one are equal
     turns : index of the first sample of each turn (n,)
     motion : where the slow motion is judged
@@ -40,6 +42,7 @@ class Excitation(NamedTuple):
     """
 
     run: Run
+    still: Run
     rests: NDArray[np.intp]
     turns: NDArray[np.intp]
     motion: slice
@@ -64,14 +67,15 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
     lead = scenarios.along(path(np.arange(ends[-1] + 1)), imu)
     end = len(lead.t) + len(motion.t)
     last = np.tile(motion.truth[-1], (3 * answer + 1, 1))
-    run = replace(scenarios.along(Rotation.from_quat(last), imu).after(motion.after(lead)),
-                  name='excitation')
-    run.gyroscope[:] += NEVER_ZERO
+    still = replace(scenarios.along(Rotation.from_quat(last), imu).after(motion.after(lead)),
+                    name='excitation')
+    still.gyroscope[:] += NEVER_ZERO
+    run = replace(still, gyroscope=still.gyroscope.copy())
     kick = Rotation.from_quat(last[0]).inv().apply(KICK) / KICK_S
     for number, first in enumerate(kicks := (end + answer, end + 2 * answer)):
         run.gyroscope[first:first + round(KICK_S * rate)] += (-1.0) ** number * kick
-    return Excitation(run, ends - 1, ends[:len(TURNS)], slice(end - len(motion.t) // 2, end),
-                      kicks)
+    return Excitation(run, still, ends - 1, ends[:len(TURNS)],
+                      slice(end - len(motion.t) // 2, end), kicks)
 
 
 def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Reals, int]:
