@@ -7,17 +7,6 @@ from typing import Any, NamedTuple
 
 from spinning_top_sim.tools.verdict import Verdict, number
 
-# docs/grade.md defines them.
-FAULTS = (
-    'invalid_output', 'not_deterministic', 'first_order', 'explicit_gyroscopic_term',
-    'implicit_damping', 'coriolis_sign', 'no_gyroscopic_term', 'inertia_frame', 'inertia',
-    'com_offset', 'gravity_sign', 'damping', 'inaccurate', 'rates_in_world', 'rates_scale',
-    'imu_one_step_late', 'mounting', 'rotation_reversed', 'reading_sign', 'units',
-    'reading_in_world', 'reading_scale', 'no_lever_arm', 'no_tangential_term',
-    'no_centripetal_term', 'acceleration_scale', 'no_gravity', 'gravity_frame',
-    'finite_differences', 'inconsistent_reading', 'energy', 'noise_scale', 'uniform_noise',
-    'covariance_zero')
-
 
 class Fault(NamedTuple):
     """
@@ -26,7 +15,7 @@ class Fault(NamedTuple):
     Parameters
     ----------
     name : str
-        One of FAULTS.
+        As docs/grade.md defines it.
     evidence : str
         Why it is reported.
     number : float
@@ -39,18 +28,7 @@ class Fault(NamedTuple):
 
 
 class Report(Verdict):
-    """
-    The result of grading a simulator; `str(report)` is readable.
-
-    Attributes
-    ----------
-    subject : str
-        Name of the simulator.
-    faults : sequence of Fault
-        The faults with their evidence.
-    marks : mapping
-        Measures by name, as docs/grade.md defines them; NaN: could not be measured.
-    """
+    """The result of grading a simulator; `str(report)` is readable."""
 
     @property
     def faults(self) -> Sequence[Fault]:
@@ -59,7 +37,7 @@ class Report(Verdict):
 
     @property
     def marks(self) -> Mapping[str, float]:
-        """Measures by name."""
+        """Measures by name, as docs/grade.md defines them; NaN: could not be measured."""
         return self.measures
 
     def as_dict(self) -> dict[str, Any]:
