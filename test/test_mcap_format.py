@@ -34,7 +34,7 @@ from helpers.logs import (
 from helpers.mutations import repair
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, MessageIndex, Metadata
+from mcap.records import Attachment, MessageIndex, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import reader as reader_module
@@ -194,20 +194,6 @@ def test_the_search_finds_every_kind_of_record(tmp_path, zeros):
         assert [message.data for message in reader.messages()] == [b'1', b'2']
         assert (reader.metadata, reader.topics[0].type_name) == ({'note': {'a': 'b'}}, 'thing')
         assert reader.damage.lost_bytes == 6 * zeros + len(wild) + len(note) - 1
-
-
-def test_a_channel_without_its_schema_is_not_written(tmp_path):
-    """Readers refuse the whole file for it; schema 0 means that there is none."""
-    path = tmp_path / 'a.mcap'
-    raw = record_bytes(Channel(id=2, topic='/raw', message_encoding='x', metadata={},
-                               schema_id=0))
-    path.write_bytes(closed(HEADER, CHANNEL, raw, chunk_of(
-        message(5, b'lost') + message(5, b'kept', channel=2))))
-    output = recover(path, SOME_LOST)
-    assert seen_by_mcap(output) == [('/raw', 5, b'kept')]
-    with open(output, 'rb') as file:
-        assert [channel.topic for channel in make_reader(file).get_summary().channels.values()
-                ] == ['/raw']
 
 
 def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):

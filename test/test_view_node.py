@@ -109,16 +109,16 @@ def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
             wait_for('the page to listen', lambda: peer.node.count_subscribers(
                 node.topic('ground_truth/odom_throttle')))
             before = diagnostics.next(node)
-            # It hangs for two seconds of simulated time, which is the real time.
+            # It hangs for a second of simulated time, which is the real time.
             os.killpg(view.process.pid, signal.SIGSTOP)
-            poses.wait_more(400)
+            poses.wait_more(200)
             os.killpg(view.process.pid, signal.SIGCONT)
             # Killed while it makes a port of shared memory, as it may when it goes on, it would
             # block all who open that port (Fast DDS).
-            poses.wait_more(200)
+            poses.wait_more(100)
             assert view.alive
             view.kill()
-            poses.wait_more(100)
+            poses.wait_more(50)
         after = diagnostics.next(node)
         assert after['clock slip [s]'] == before['clock slip [s]'] == '0.000'
         assert after['recorder'] == 'recording'
@@ -127,5 +127,5 @@ def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
         stamps = {topic: np.array([message.log_time for message in reader.messages(
             topics=[f'{node.namespace}{topic}'])]) for topic in PERIODS}
     for topic, period in PERIODS.items():
-        assert len(stamps[topic]) > 4.0e9 / period
+        assert len(stamps[topic]) > 1.5e9 / period
         assert (np.diff(stamps[topic]) == period).all(), topic

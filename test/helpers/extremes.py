@@ -35,9 +35,9 @@ def parameter_set(random_: random.Random, allowed: bool = False) -> dict[str, ob
     """
     settable = [row for row in parameters.TABLE if not row.name.startswith('record.')]
     counts = (1, 2, 3, 5, 10, len(settable)) if allowed else (1, 1, 1, 2, 3, 5, 8)
-    chosen = random_.sample(settable, random_.choice(counts))
-    value = _allowed_value if allowed else _value
-    return {row.name: value(random_, row) for row in chosen}
+    return {row.name: _allowed_value(random_, row) if allowed or random_.random() < 0.6
+            else _any_value(random_, row)
+            for row in random_.sample(settable, random_.choice(counts))}
 
 
 def number(random_: random.Random, row: Parameter) -> float | int:
@@ -89,30 +89,17 @@ def _allowed_value(random_: random.Random, row: Parameter) -> object:
     return default if isinstance(default, str | tuple) else number(random_, row)
 
 
-def _value(random_: random.Random, row: Parameter) -> object:
-    """Return a value of the right type as a rule."""
+def _any_value(random_: random.Random, row: Parameter) -> object:
+    """Return a value of the right type as a rule, and of any size."""
     default = row.default
-    if random_.random() < 0.05:
+    if random_.random() < 0.1:
         return random_.choice((True, 'text', 1, 1.5, [1.0], ['a'], [], random_.choice(NOT_FINITE)))
     if isinstance(default, tuple):
-        if isinstance(default[0], str):
-            return [random_.choice(STRINGS) for _ in range(random_.randint(0, 3))]
-        return [_double(random_) for _ in default]
-    if isinstance(default, bool):
-        return random_.random() < 0.5
+        return ([random_.choice(STRINGS) for _ in range(random_.randint(0, 3))]
+                if isinstance(default[0], str) else [_double(random_) for _ in default])
     if isinstance(default, str):
-        return random_.choice(row.choices or STRINGS)
-    return _numeric(random_, row)
-
-
-def _numeric(random_: random.Random, row: Parameter) -> float | int:
-    bounds = [bound for bound in (row.minimum, row.maximum, row.above) if bound is not None]
-    if isinstance(row.default, int):
-        return random_.choice([*INTEGERS, *map(int, bounds)])
-    if bounds and random_.random() < 0.3:
-        return random_.choice([float(bound) for bound in bounds])
-    value = _double(random_)
-    return abs(value) if bounds and random_.random() < 0.9 else value
+        return random_.choice(STRINGS)
+    return random_.choice(INTEGERS) if isinstance(default, int) else _double(random_)
 
 
 def _double(random_: random.Random) -> float:

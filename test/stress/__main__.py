@@ -7,7 +7,6 @@ Stress tests: random inputs and faults, for so long or so many.
     python test/stress nodes --seconds 600      extreme parameters and commands at a real node
     python test/stress grade --count 50         simulators with a defect, and right ones
     python test/stress fit --count 1000         fits of logs with noise: intervals and errors
-    python test/stress wrong --count 95         the exam of filters that are wrong, or right
 
 A failure is told with its seed and the command that repeats it; the exit code says whether.
 """
