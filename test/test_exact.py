@@ -11,7 +11,6 @@ import doctest
 import json
 import math
 import pickle
-import random
 from dataclasses import replace
 from decimal import Context, Decimal, Inexact, localcontext
 from fractions import Fraction
@@ -25,7 +24,6 @@ from stress import tops
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers import propagator
 from spinning_top_sim.solvers.exact import BLOCK, ExactSolution
-from spinning_top_sim.solvers.times import Times
 
 BOUND = 5e-15
 G = 9.81
@@ -303,21 +301,12 @@ def test_the_caller_s_decimal_context_does_not_matter():
     assert (found == expected).all()
 
 
-# ------------------------------------------------------------------------ times and phases
-
-
-def test_times_are_exact():
-    """As sums of two doubles, of nanoseconds from int64 and of seconds from doubles."""
-    rng = random.Random(7)
-    ns = [0, 1, -1, 2 ** 53 + 1, -2 ** 53 - 1, 2 ** 63 - 1, -2 ** 63]
-    ns += [rng.choice((1, -1)) * rng.getrandbits(rng.randint(1, 62)) for _ in range(1000)]
-    times = Times.from_ns(np.array(ns))
-    for count, high, low in zip(ns, times.high.tolist(), times.low.tolist(), strict=True):
-        assert high == float(count) and int(high) + int(low) == count
-    t = [5e-324, *(math.ldexp(rng.random(), rng.randint(-60, 200)) for _ in range(1000))]
-    times = Times.from_seconds(np.array(t))
-    assert times.high.tolist() == times.seconds.tolist() == t
-    assert times.low == 0.0
+def test_after_a_hundred_days_each_nanosecond_counts():
+    """Times beyond 2^53 ns are no doubles: the top turns by 1.5e-6 rad in each."""
+    solution = ExactSolution(*FASTEST_TURNS['sleeping'][:2])
+    first, second = solution.states(np.array([2 ** 53, 2 ** 53 + 1])).quaternion
+    turned = 2.0 * math.asin(0.5 * math.dist(first, second))
+    assert turned == pytest.approx(math.pi * FASTEST_TURNS['sleeping'][2] * 2e-9 / 2.0, rel=1e-6)
 
 
 def test_the_example_of_solve_is_right_and_swapped_arguments_are_told():

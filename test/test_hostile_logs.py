@@ -21,7 +21,7 @@ from helpers.formats import (
     unknown_kind,
     zstd_chunk,
 )
-from helpers.logs import SOME_LOST, seen_by_us
+from helpers.logs import seen_by_us
 from helpers.reference import ROOT
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
@@ -193,21 +193,3 @@ def test_a_search_unpacks_a_limited_amount(tmp_path, monkeypatch):
         assert reader.damage.lost_bytes == path.stat().st_size - len(MCAP0_MAGIC + HEADER)
     assert len(unpacked) > 1
     assert sum(unpacked) < 5 * (path.stat().st_size + max_bytes)
-
-
-@pytest.mark.parametrize('kind', [
-    Opcode.CHUNK, Opcode.METADATA, 0x90])
-def test_a_record_of_many_gigabytes_is_not_read(tmp_path, kind):
-    """It is a hole in the file: to read it, or to copy it, would take minutes and the disk."""
-    path, size = tmp_path / 'a.mcap', 100 << 30
-    start = MCAP0_MAGIC + HEADER + RAW_CHANNEL + chunk_of(message(4, b'a'), 4, 4)
-    end = closed(chunk_of(message(6, b'c'), 6, 6))[len(MCAP0_MAGIC):]
-    with path.open('wb') as file:
-        file.write(start + struct.pack('<BQ', kind, size))
-        file.seek(size, os.SEEK_CUR)
-        file.write(end)
-    output = recover(path, SOME_LOST)
-    assert [data for _, _, data in seen_by_us(output)] == [b'a', b'c']
-    with LogReader(path) as reader:
-        (loss,) = reader.damage.losses
-        assert loss.bytes == 9 + size

@@ -103,21 +103,6 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
     assert synced == [str(path), str(tmp_path)]
 
 
-def test_closing_twice_changes_nothing(tmp_path):
-    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
-    recorder.write(0, 1, pose_cdr(1))
-    first = recorder.close()
-    content = first.path.read_bytes()
-    recorder.write(0, 2, pose_cdr(2))
-    second = recorder.close()
-    assert recorder.state == 'closed'
-    assert (first.counts, first.bytes, first.error, first.lost) == (
-        second.counts, second.bytes, None, 0)
-    assert is_indexed(first.path)
-    assert second.lost == recorder.counters.lost == 1
-    assert first.bytes == len(content) == len(second.path.read_bytes())
-
-
 def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monkeypatch):
     """The thread that writes has the error; the caller gets it, and can still finish the file."""
     file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='zstd')

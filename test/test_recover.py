@@ -21,7 +21,6 @@ from helpers.logs import (
     TOPICS,
     metadata_of,
     places,
-    records_of,
     run,
     seen_by_mcap,
     seen_by_rosbags,
@@ -222,23 +221,6 @@ def test_what_can_be_decoded_is_kept_and_the_rest_is_told(tmp_path, log, case):
     assert seen_by_us(output) == seen_by_mcap(output) == seen_by_rosbags(output) == wanted
     if kept == (0, 1, 2):
         check_with_all_readers(output, wanted)
-
-
-def test_a_wild_length_that_seems_to_lead_to_a_record_takes_no_other_chunk(tmp_path):
-    """It leads to data in the next chunk that look like the head of metadata."""
-    path = tmp_path / 'run.mcap'
-    decoy = struct.pack('<BQ', Opcode.METADATA, 5) + bytes(40)
-    file = create_file(path, TOPICS[1:2], {}, compression='none')
-    for number, data in enumerate((b'first', decoy, b'third')):
-        file.append(0, number, data)
-        file.write_chunk()
-    content = path.read_bytes()
-    file.finish()
-    lost = next(start for opcode, start, _ in records_of(path.read_bytes())
-                if opcode == Opcode.CHUNK)
-    length = content.index(decoy) - lost - 9
-    path.write_bytes(content[:lost + 1] + struct.pack('<Q', length) + content[lost + 9:])
-    assert [data for _, _, data in seen_by_us(path)] == [decoy, b'third']
 
 
 @pytest.mark.parametrize('compression', ['zstd', 'none'])

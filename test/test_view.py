@@ -240,19 +240,6 @@ def test_a_live_track_names_the_motion_from_its_samples(start, words):
     assert (energy, l3, lz) == pytest.approx((moved.energy[50], start.l3, start.lz), abs=1e-9)
 
 
-def test_each_of_two_logs_has_its_own_time(page, tmp_path):
-    paths = [tmp_path / f'{epoch}.mcap' for epoch in (1, 1000)]
-    for path in paths:
-        assert simulate.main(['--quiet', '--duration', '2', '-o', str(path), '--epoch',
-                              path.stem]) == 0
-    player = logs.Player(page, logs.read_logs(paths))
-    player.draw_next(0.5)
-    assert player.length == 2.0
-    assert page._words.content.count('t = 0.500 s, stamp ') == 2
-    assert page._plots.content.count('aria-label="Tilt"') == 1
-    assert page._plots.content.count('stroke-dasharray="5 3"') >= 4       # of the second log
-
-
 def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
     path = tmp_path / 'shuttle.mcap'
     assert simulate.main(['--scene', 'shuttle', '--duration', '3', '-o', str(path)]) == 0
