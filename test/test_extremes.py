@@ -20,8 +20,6 @@ from spinning_top_sim.streams.cdr import LAST_STAMP_NS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.tools.simulate import main
 
-# ------------------------------------------------------------------------------- one top
-
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.8}
 START = {'theta': 0.6, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
 METHODS = ({'method': 'exact'}, {'method': 'rk45', 'rtol': 1e-6},
@@ -78,8 +76,6 @@ def test_any_sizes_of_all_numbers_give_the_start_exactly_or_a_reason(changed, lz
                 1.0, abs(values[name])), name
 
 
-# ------------------------------------------------------------------------------- parameters
-
 HUGE, TINY = 1e300, 1e-300
 OUT_OF_RANGE = [
     ('status_period', TINY), ('pose.rate', 1e5), ('imu.gyroscope_M', (*8 * (0.0,), HUGE)),
@@ -112,8 +108,6 @@ def test_what_turns_too_fast_is_refused_at_the_start_and_by_simulate(
     assert 'no motion from' in capsys.readouterr().err
     assert not log.exists()
 
-
-# -------------------------------------------------------------------------------------- stamps
 
 def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys):
     simulation = simulate()

@@ -58,13 +58,6 @@ def test_the_truth_is_the_path_of_the_pivot_on_the_ellipsoid():
     assert np.median(error) < 1e-6 and error.max() < 0.05
 
 
-def test_a_pivot_at_rest_is_at_the_origin():
-    _, found = run({'gnss.enabled': True, 'gnss.origin': (-33.9, 151.2, 12.0)}, SECOND, FIX,
-                   VELOCITY)
-    assert found[FIX][2] == pytest.approx(np.tile((-33.9, 151.2, 12.0), (11, 1)), abs=1e-9)
-    assert not found[VELOCITY][2].any()
-
-
 def test_noise_is_white_with_the_standard_deviations(noisy):
     for topic, exact, convert, levels in (
             (FIX, TRUE_FIX, enu, (1.5, 1.5, 3.0)),

@@ -18,7 +18,6 @@ from helpers.formats import (
     closed,
     message,
     recover,
-    unknown_kind,
     zstd_chunk,
 )
 from helpers.logs import seen_by_us
@@ -126,21 +125,13 @@ def long_names() -> bytes:
         for number in numbers) + message(5, b'')) for numbers in ((2,), (3, 4), (5,), (6,)))
 
 
-def many_keys() -> bytes:
-    channel = record_bytes(Channel(id=2, topic='/b', message_encoding='x', metadata={},
-                                   schema_id=0))
-    entries = b''.join(b'\x07\0\0\0%07d\0\0\0\0' % number for number in range(1_200_000))
-    content = channel[9:-4] + struct.pack('<I', len(entries)) + entries
-    return zstd_chunk(unknown_kind(Opcode.CHANNEL, content))
-
-
 def overlapping() -> bytes:
     return zstd_chunk(message(5, b'') + message(6, bytes(25_000_000)) + message(9, b''), 9) * 3
 
 
 def test_memory_has_a_ceiling(tmp_path):
     """Small files that unpack to much, read one after the other in one process."""
-    bombs = {tiny_messages: '300000', long_names: 'lost: chunk', many_keys: 'lost: chunk',
+    bombs = {tiny_messages: '300000', long_names: 'lost: chunk',
              overlapping: 'overlap in time'}
     paths = []
     for bomb in bombs:

@@ -114,9 +114,6 @@ def links_of(node):
     return re.findall(r'<link name="([^"]*)"', text)
 
 
-# ------------------------------------------------------------------------------------- sim.launch
-
-
 def test_a_scene_is_started_with_its_parameters(installed):
     scene = 'looping'
     run = started('sim', scene=scene)
@@ -168,16 +165,6 @@ def test_what_is_set_replaces_what_files_say(installed, tmp_path):
     assert 'xyz="0.1 0.0 0.2"' in tf['robot_description'].args[0]
 
 
-def test_a_path_is_a_scene_too(installed, tmp_path):
-    path = tmp_path / 'mine.yaml'
-    path.write_text('/**: {ros__parameters: {top.mass: 0.0}}')
-    run = started('sim', scene=str(path), record='true')
-    values = parameters_of(run.nodes['spinning_top_sim/sim_node'])
-    assert (values['top.mass'], values['record.enabled'], values['record.uri']) == (0.0, True, '')
-    (warning,) = run.said
-    assert 'top.mass = 0.0 kg' in warning
-
-
 @pytest.mark.parametrize(('given', 'said'), [
     ({'scene': 'nope'}, "scene = 'nope'.*one of braking"), ({'set': 'spin.l3'}, 'NAME:=VALUE'),
     ({'set': 'top.mass:=-1'}, r'top\.mass = -1'), ({'params_file': 'none.yaml'}, r'none\.yaml'),
@@ -223,9 +210,6 @@ def test_overrides_win_over_integers_in_files(installed, tmp_path):
     assert (given['spin.l3'], given['top.mass'], given['record.uri']) == (1.5, 2.5, 'a b')
 
 
-# ---------------------------------------------------------------------------------- replay.launch
-
-
 def options_of(node):
     from spinning_top_sim.nodes.replay_node import _parser
 
@@ -248,8 +232,6 @@ def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(installed, 
     assert tf.remappings == [('joint_states', '/a/b/joint_states')]
     assert ('/markers', '/a/b/markers') in run.nodes['rviz2/rviz2'].remappings
 
-
-# ---------------------------------------------------------------------------------- the real thing
 
 @pytest.fixture
 def launch(tmp_path):

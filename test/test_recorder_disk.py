@@ -12,7 +12,6 @@ import threading
 import time
 from contextlib import closing
 from operator import ge
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -26,6 +25,7 @@ from helpers.recordings import (
     rows_of,
     some_messages,
 )
+from helpers.reference import ROOT
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
@@ -37,7 +37,6 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import McapRecorder, create_file
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 
-ROOT = Path(__file__).parents[1]
 PATIENCE_S = 20.0  # for what happens at once on an idle machine
 
 

@@ -7,20 +7,18 @@ import signal
 import subprocess
 import sys
 import tracemalloc
-from pathlib import Path
 
 import pytest
 from helpers.logs import ALL_KEPT, FAILED, SOME_LOST, TOPICS, run, small_log
+from helpers.recordings import write_rows
+from helpers.reference import ROOT
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.log_file import LogFile
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.recovery import recover
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope='module')
@@ -83,12 +81,8 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
     """Twenty times as many chunks: no more than their index, less than a fifth of the file."""
     peaks = []
     for chunks in (10, 200):
-        path = tmp_path / f'{chunks}.mcap'
-        file = create_file(path, TOPICS[1:2], {}, compression='none')
-        for number in range(chunks):
-            file.append(0, number, random.Random(number).randbytes(50_000))
-            file.write_chunk()
-        file.finish()
+        path = write_rows(tmp_path / f'{chunks}.mcap', TOPICS[1:2], (
+            (0, number, random.Random(number).randbytes(50_000)) for number in range(chunks)), 1)
         path.write_bytes(path.read_bytes()[:-100])
         tracemalloc.start()
         try:

@@ -116,8 +116,6 @@ def test_free_motion_and_equilibria_take_no_steps(name):
     assert angle(states.quaternion[0], quaternion_of(state)) < 1e-12
 
 
-# ------------------------------------------------------------------- the paper's equations
-
 ONE_TOP = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=9.8)
 
 
@@ -153,8 +151,6 @@ def test_away_from_the_poles_the_literal_equations_are_right(name):
         assert motion.phi[i] == pytest.approx(float(state['phi']), abs=1e-8)
         assert motion.psi[i] == pytest.approx(float(state['psi']), abs=1e-8)
 
-
-# ------------------------------------------------------------------------- bad arguments
 
 @pytest.mark.parametrize(('arguments', 'message'), [
     ({'method': 'rk4'}, "method = 'rk4'"), ({'equations': 'newton'}, "equations = 'newton'"),
@@ -215,8 +211,6 @@ def test_a_free_planar_rotation_counts_its_turns(theta_dot):
     assert np.abs(motion.quaternion - expected).max() <= 5e-14
 
 
-# --------------------------------------------------------------------- steps that are kept
-
 def looping_motion():
     return propagate(top_of(LOOPING), start_of(LOOPING), method='rk45')
 
@@ -251,8 +245,6 @@ def test_so_many_steps_are_kept_at_most(monkeypatch):
     with pytest.raises(IntegrationError, match='oldest'):
         motion.states(range(1))
 
-
-# ------------------------------------------------------------------------- unwrapped phases
 
 @pytest.mark.parametrize(('rtol', 'bound'), [(1e-3, 0.5), (1e-9, 1e-4)])
 @pytest.mark.parametrize(('l3', 'lz'), [

@@ -79,8 +79,6 @@ def test_recordings_start_and_stop(peer, diagnostics, served):
     assert peer.switch(node, 'record', False).message == 'not recording'
 
 
-# ------------------------------------------------------------------------------------- /clock
-
 def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagnostics, tmp_path):
     """Before the clock, with it, and when it stops."""
     clock = DrivenClock(peer, '/driven', 1_000_000_000_000)     # /clock is that of `served`

@@ -119,8 +119,6 @@ def test_a_node_without_standard_streams_leaves_a_whole_log(tmp_path):
     assert len(log_of(the_log(tmp_path))[0]['/pose']) == 31
 
 
-# ----------------------------------------------------------- values that are given twice
-
 def write_scene(path, **values):
     path.write_text('/**:\n  ros__parameters:\n' + ''.join(
         f'    {name.replace("__", ".")}: {value}\n' for name, value in values.items()))
@@ -192,8 +190,6 @@ def test_a_dump_of_the_parameters_gives_the_same_start(tmp_path):
     file.write_text(yaml.dump({'/**': {'ros__parameters': dumped}}))
     assert start_values('--params-file', str(file)) == expected
 
-
-# ---------------------------------------------------------------------- names and QoS
 
 def test_remapping_and_qos_overrides_work(tmp_path):
     arguments = ['-r', '__ns:=/ns', '-r', 'pose:=attitude', '-p',

@@ -11,15 +11,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from helpers.recordings import write_rows
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim import State, solve
+from spinning_top_sim import solve
 from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.physics.regimes import SENTENCES
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -27,7 +27,7 @@ from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import simulate, svg
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import command, model, plots, text
-from spinning_top_sim.view.track import Samples, Track, state_of
+from spinning_top_sim.view.track import Samples, Track
 
 pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')
 
@@ -130,19 +130,6 @@ def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     assert len(model.trace(track, 3)) == 2
 
 
-def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
-    moved = solve(shown.top, parameters.start_state(shown.values), np.arange(20) * 0.04)
-    track = Track('', shown.values)
-    track.add('joint_states', Samples(np.arange(20) * 40_000_000, np.column_stack(
-        (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
-    stamps_ns, axis, joined = model.path(track, 0, NANOSECONDS)
-    track.detect_motion()
-    assert track.motions[0].description.name == 'cusps'     # as at the start
-    assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
-    exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
-    assert axis == pytest.approx(np.column_stack(exact.rows_axis), abs=1e-4)
-
-
 def plotted(shown, stamp_ns):
     """Return the lines of the plots of 2.5 s, by plot and name."""
     top = plots.Shown(shown, stamp_ns, shown.origin_ns, stamp_ns, shown.origin_ns)
@@ -221,25 +208,6 @@ def test_every_scene_has_words_and_plots(scene):
         assert 'nan' not in svg.draw(plot)
 
 
-@pytest.mark.parametrize(('start', 'words'), [
-    (State(theta=0.5, l3=1.6, lz=1.6 * math.cos(0.5)), 'cusps'),
-    (State(theta=0.0, l3=2.0, lz=2.0), 'sleeping'),
-    (State(theta=0.7, theta_dot=1.0, l3=1.6, lz=1.6), 'through the top'),
-    (State(theta=1.0, theta_dot=0.5, l3=0.0, lz=0.0), 'planar pendulum, swinging')])
-def test_a_live_track_names_the_motion_from_its_samples(start, words):
-    values = parameters.checked({})
-    track = Track('', values)
-    moved = solve(track.top, start, np.arange(200) * 0.01)
-    rows = np.column_stack((moved.quaternion, moved.angular_velocity, moved.phi_dot))
-    for k, row in enumerate(rows):
-        track.add('joint_states', Samples(np.array([k]), row[np.newaxis]))
-        track.detect_motion()
-    (motion,) = track.motions           # one: rounding begins no other
-    assert motion.description.name == words
-    (energy, l3, lz), _ = state_of(track.top, rows[50])
-    assert (energy, l3, lz) == pytest.approx((moved.energy[50], start.l3, start.lz), abs=1e-9)
-
-
 def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
     path = tmp_path / 'shuttle.mcap'
     assert simulate.main(['--scene', 'shuttle', '--duration', '3', '-o', str(path)]) == 0
@@ -272,13 +240,10 @@ def foreign(log, path, topics):
     """Write a log as another program would: topics of `log`, and their new names."""
     with LogReader(log) as reader:
         types = {topic.name: topic.type_name for topic in reader.topics}
-        file = create_file(path, [RecordedTopic(name, types[topic])
-                                  for topic, name in topics.items()], {}, compression='none')
-        for message in reader.messages(topics=topics):
-            file.append(list(topics).index(message.topic), message.log_time, message.data)
-    file.write_chunk()
-    file.finish()
-    return path
+        return write_rows(
+            path, [RecordedTopic(name, types[topic]) for topic, name in topics.items()],
+            [(list(topics).index(message.topic), message.log_time, message.data)
+             for message in reader.messages(topics=topics)])
 
 
 @pytest.mark.parametrize('topic', ['/pose', '/ground_truth/imu', '/ground_truth/odom'])

@@ -87,10 +87,7 @@ def test_live(browser, peer, tmp_path):
             visit.press('Resume')
             visit.read('pause: running')
             # The plots have data, and a switched-on arrow is in the scene.
-            titles = visit.wait("(found => found.length === 6 && found)([...document"
-                                ".querySelectorAll('.plot .title')].map(e => e.textContent))")
-            assert {'Effective potential V(θ)', 'Energy', 'Tilt', 'Precession rate'} < set(titles)
-            assert visit.page.locator('.plot polyline').count() >= 7
+            visit.wait("document.querySelectorAll('.plot polyline').length >= 7")
             visit.tick('torque')
             visit.wait("[...document.querySelectorAll('.top-legend')].some("
                        "e => e.textContent.includes('torque'))")

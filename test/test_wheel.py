@@ -10,14 +10,13 @@ import sys
 import tempfile
 import zipfile
 from importlib import metadata
-from pathlib import Path
 
 import pytest
+from helpers.reference import ROOT
 from packaging.requirements import Requirement
 
 from spinning_top_sim.__main__ import COMMANDS, main
 
-ROOT = Path(__file__).parents[1]
 NAME = 'spinning_top_sim'
 BUILD = 'import sys, setuptools.build_meta as m; getattr(m, sys.argv[1])(sys.argv[2])'
 

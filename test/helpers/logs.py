@@ -141,8 +141,6 @@ STRANGERS = {
     'unchunked': {'use_chunking': False},
     'lz4': {'compression': CompressionType.LZ4},
     'no index': {'index_types': IndexType.NONE},
-    'no index of metadata': {'index_types': IndexType.CHUNK | IndexType.MESSAGE},
-    'no statistics': {'use_statistics': False},
     'nothing repeated': {'repeat_channels': False, 'repeat_schemas': False},
     'nothing but messages': {
         'use_chunking': False, 'use_statistics': False, 'use_summary_offsets': False,

@@ -91,8 +91,6 @@ def period_of(solution):
         natural_rate(solution.top, solution.start) or 1.0)
 
 
-# ------------------------------------------------------------------------ the exact solution
-
 COLUMNS = ('quaternion', 'theta', 'theta_dot', 'phi', 'psi', 'phi_dot', 'psi_dot',
            'angular_velocity', 'angular_acceleration', 'energy')
 
@@ -205,8 +203,6 @@ def check_integrations(found, cases, motions, times):
                     (EXACT * unit + own_rate)[told])
 
 
-# ------------------------------------------------------------------------------ the integrator
-
 MAGNIFIED = 'rk45: magnified where the nutation turns back'
 
 
@@ -303,8 +299,6 @@ def check_steps(found, case, solution, motion, times):
                     200.0 + 60.0 * max(turned, 2.0 * math.pi * INSTANTS[-1] * waiting))
 
 
-# ---------------------------------------------------------------------------------- symmetries
-
 def check_symmetries(found, case, motion, times):
     """Motions that must be the same but for a rotation, a mirror, a direction or a scale."""
     top, start = case.top, case.start
@@ -339,8 +333,6 @@ def check_symmetries(found, case, motion, times):
     found.check(case, "faster: theta'", np.abs(0.25 * other.theta_dot - motion.theta_dot),
                 2.0 * EXACT * natural_rate(top, start))
 
-
-# --------------------------------------------------------------------------------------- runs
 
 def check_block(seeds):
     """Make every check on these tops."""
