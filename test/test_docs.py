@@ -36,6 +36,7 @@ NOT_RUN = {
                                          for block in doc_blocks.blocks(page))])
 def test_the_code_of_a_page_runs_and_prints_what_it_says(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv('COLUMNS', '118')
     runner, said, last = doc_blocks.Runner(name), None, None
     try:
         for block in doc_blocks.blocks(PAGES[name]):

@@ -181,7 +181,9 @@ def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
             simulation.advance(until * MILLISECOND)
         return taken, pose.sent, pose.skipped
 
-    assert run(True) == run(False)
+    expected = run(False)
+    assert run(True) == expected
+    assert change not in ('subscriber', 'recorder') or len(expected[0]) > 70
 
 
 @pytest.mark.parametrize('l3', [1.6, 1e3])

@@ -7,6 +7,7 @@ deviations of the estimate.  `python test/stress sensor` does the same for many 
 """
 
 import math
+from itertools import combinations
 from statistics import NormalDist
 
 import numpy as np
@@ -16,8 +17,10 @@ from helpers.simulations import MILLISECOND, SECOND
 from scipy.special import chdtri
 from stress import sensor as statistics
 
+from spinning_top_sim.physics.attitude import rotation_vector
 from spinning_top_sim.streams import noise, parameters
 from spinning_top_sim.streams.imu import Sensor
+from spinning_top_sim.streams.magnetometer import Magnetometer
 
 ALL_BIASES = {f'imu.{kind}_{name}': value for kind in ('gyroscope', 'accelerometer')
               for name, value in (('random_walk', 1e-2), ('bias_stddev', 0.1),
@@ -68,6 +71,30 @@ def test_the_bias_begins_with_the_turn_on_bias_and_walks_with_its_density():
             deviations * math.sqrt(apart), rel=5.0 / math.sqrt(2.0 * len(far)))
     seams = np.flatnonzero(np.diff(np.arange(40_000) * 5 // 512))
     assert np.abs(np.diff(biases, axis=0)[seams] / deviations).max() < 5.0
+
+
+def test_no_two_kinds_of_noise_have_a_number_in_common():
+    """Of deviation 1: white noise, turn-on bias, steps of walks, noise of the orientation."""
+    period_ns = noise.DRAWN_TOGETHER * noise.STEP_NS
+    times, root = range(0, 100 * period_ns, period_ns), math.sqrt(1e-9 * period_ns)
+
+    def imu(name, value):
+        return read({f'imu.{kind}_{name}': value for kind in ('gyroscope', 'accelerometer')},
+                    times)[0]
+
+    def magnetometer(name, value):
+        values = parameters.checked({'mag.field': 3 * (0.0,), f'mag.{name}': value})
+        return np.array(Magnetometer(values, period_ns).read(3 * (np.zeros(100),), times))
+
+    sensor = Sensor(parameters.checked({'imu.orientation_stddev': 3 * (0.01,)}), period_ns)
+    turned = rotation_vector(sensor.orientation((0.0, 0.0, 0.0, 1.0), times))
+    turn_on = imu('turn_on_bias', 1.0)[0]
+    assert np.ptp(turn_on) > 0.1
+    kinds = (turn_on, imu('noise_density', root), magnetometer('noise_density', root),
+             np.diff(imu('random_walk', 1.0 / root), axis=0),
+             np.diff(magnetometer('random_walk', 1.0 / root)), 100.0 * np.array(turned))
+    for one, two in combinations(map(np.ravel, kinds), 2):
+        assert np.abs(one[:, np.newaxis] - two).min() > 1e-8
 
 
 def test_a_gauss_markov_bias_has_its_variance_and_its_correlation_time():

@@ -130,6 +130,17 @@ def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     assert len(model.trace(track, 3)) == 2
 
 
+def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
+    moved = solve(shown.top, parameters.start_state(shown.values), np.arange(20) * 0.04)
+    track = Track('', shown.values)
+    track.add('joint_states', Samples(np.arange(20) * 40_000_000, np.column_stack(
+        (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
+    stamps_ns, axis, joined = model.path(track, 0, NANOSECONDS)
+    assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
+    exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
+    assert axis == pytest.approx(np.column_stack(exact.rows_axis), abs=1e-4)
+
+
 def plotted(shown, stamp_ns):
     """Return the lines of the plots of 2.5 s, by plot and name."""
     top = plots.Shown(shown, stamp_ns, shown.origin_ns, stamp_ns, shown.origin_ns)

@@ -104,14 +104,8 @@ def test_live(browser, peer, tmp_path):
             visit.choose('scene', 'wavy')
             visit.read('wavy, reset: at t = 0')
             visit.read('[Ww]aves')
-            visit.choose('scene', 'cusp')
-            visit.read('cusp, reset: at t = 0')
-            visit.tick('record')
-            visit.read('record: ')
-            wait_for('a log', lambda: list(tmp_path.glob('*.mcap')))
             visit.press('Reset')
-            visit.read('reset: at t = 0')
-            visit.read('[Cc]usps')
+            visit.read('(^|[^ ] ?)reset: at t = 0')
             assert visit.errors == []
             assert visit.hosts <= {'127.0.0.1', None}
 
