@@ -39,7 +39,7 @@ def test_the_specific_force_is_that_of_the_place_in_the_world():
     q = simulation.segment.states(range(0, S // 2 + 1, 10 ** 6)).rows_quaternion
     acceleration = (place[2:] - 2 * place[1:-1] + place[:-2]) * 1e6
     expected = attitude.rotated_back(tuple(part[1:-1] for part in q),
-                                tuple((acceleration + np.array((0.0, 0.0, 9.80665))).T))
+                                     tuple((acceleration + np.array((0.0, 0.0, 9.80665))).T))
     assert np.stack(expected, axis=-1) == pytest.approx(force[1:-1], abs=2e-2)
 
 
@@ -59,6 +59,14 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops(method):
     # Half a ramp of 0.4 s at each end, and 1.1 s of cruise.
     assert np.ravel(found.position) == pytest.approx((0.0, 0.8 * 1.5, 0.0), abs=1e-12)
     assert simulation.history == [(S, 0.0, 0.8, 0.0, 5 * S // 2)]
+    # Repeated while it brakes, it is another command: the pivot goes on from there.
+    simulation.drive((0.0, 0.8, 0.0))
+    list(simulation.play((), 11 * S + S // 5))
+    before = simulation.segment.pivot(np.array([simulation.now_ns]))
+    assert simulation.drive((0.0, 0.8, 0.0)) == 12 * S + S // 5
+    after = simulation.segment.pivot(np.array([simulation.now_ns]))
+    assert 0.0 < before.velocity[1] < 0.8 and len(simulation.history) == 3
+    assert after.velocity[1] == before.velocity[1] and after.position[1] == before.position[1]
 
 
 def test_a_velocity_of_zero_brakes_a_pivot_that_moves():

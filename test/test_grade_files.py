@@ -99,7 +99,11 @@ def test_a_trajectory_of_tum_needs_no_names(tmp_path):
 def test_readings_are_known_by_their_names(tmp_path, names, unit):
     path = table(tmp_path / 'a.csv', {
         'time': T, **imu(RATES / unit, names=names), **wxyz('qw', 'qx', 'qy', 'qz')})
-    parts = motion_files.read(path).parts
+    recorded = motion_files.read(path)
+    parts = recorded.parts
+    assert {f'gyroscope of {", ".join(names[:3])}', f'accelerations of {", ".join(names[3:])}',
+            'attitudes of qw, qx, qy, qz'} == {
+                note.removesuffix(': 600 from 0 to 2.995 s') for note in recorded.notes}
     assert parts['gyroscope'][1] == pytest.approx(RATES)
     assert parts['accelerations'][1] == pytest.approx(FORCE)
 
@@ -143,7 +147,7 @@ def test_rows_may_be_uneven_out_of_order_or_without_some_sensors(tmp_path):
     assert [len(recorded.parts[name][0]) for name in ('attitudes', 'gyroscope', 'accelerations')
             ] == [600, 600, 300]
     even = trajectory_of(recorded, EXACT)
-    assert 'not evenly spaced' in recorded.notes[0]
+    assert 'not evenly spaced' in recorded.notes[-1]
     right = Rotation.from_quat(solve(TOP, START, even.t).quaternion)
     assert (right.inv() * even.rotation).magnitude().max() < 1e-4
 

@@ -107,7 +107,7 @@ def test_a_gauss_markov_bias_has_its_variance_and_its_correlation_time():
 def test_a_gauss_markov_bias_is_stationary_at_any_time(time):
     """At the start, at a second and after three years it has one variance: 2400 numbers each."""
     times_ns = np.array([0, SECOND, 94_608_000 * SECOND])
-    rows = np.concatenate([noise.Path(seed, noise.Purpose.GAUSS_MARKOV, (120 * (time,),),
+    rows = np.concatenate([noise.RandomPath(seed, noise.Purpose.GAUSS_MARKOV, (120 * (time,),),
                                       (120 * (2.0,),)).at(times_ns) for seed in range(20)])
     assert np.std(rows, axis=0) == pytest.approx(2.0, rel=4.0 / math.sqrt(2.0 * len(rows)))
     correlation = np.mean(rows[:, 0] * rows[:, 1]) / 4.0

@@ -71,9 +71,9 @@ def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypa
         assert live._track.span[1] == epoch_ns + NANOSECONDS // 2
         assert live._page._tops[0].drawn[0] == epoch_ns + NANOSECONDS // 2
     # The trace begins with the last reset.
-    live._origin_ns = epoch_ns + NANOSECONDS // 4
+    live._epoch_ns = epoch_ns + NANOSECONDS // 4
     live._draw_once()
-    assert live._track.span[0] == live._origin_ns
+    assert live._track.span[0] == live._epoch_ns
 
 
 def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):

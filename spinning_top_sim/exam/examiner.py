@@ -13,8 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import diagnosis, measures, scenarios
-from spinning_top_sim.exam.diagnosis import Fault, degrees
-from spinning_top_sim.exam.excitation import off, words
+from spinning_top_sim.exam.diagnosis import degrees
+from spinning_top_sim.exam.excitation import from_identity, words
+from spinning_top_sim.exam.field import examine_field
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.report import Report
@@ -33,6 +34,7 @@ from spinning_top_sim.exam.trial import (
 )
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
+from spinning_top_sim.tools.verdict import Fault
 
 # Seeds of the noisy runs.
 SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
@@ -110,13 +112,10 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     if level == 'field' and not restart:
         raise ValueError("level = 'field': the filter must be made anew for each scene")
     run_feed = feed_apart if isolated and restart else feed
-
-    def in_field(seeds: Iterable[int]) -> Report:
-        from spinning_top_sim.exam.field import examine_field  # noqa: PLC0415 - slow
-
-        return examine_field(make_filter, seeds, subject=subject,
-                             imu=None if imu is None else values, feed=run_feed)
-
+    subject = one_line(subject or getattr(make_filter, '__name__', 'filter'))
+    # The scenes have a device of their own, whose parameters `imu` replaces.
+    in_field = partial(examine_field, make_filter, subject, imu=values if imu else {},
+                       feed=run_feed)
     if level == 'field':
         return in_field(numbers)
     exam = (_Exam(make_filter, run_feed, values, numbers) if restart else
@@ -124,8 +123,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     exam.sit()
     if level == 'full' and restart and exam.outcomes:
         exam.measures |= in_field(numbers[:1]).measures
-    return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
-                  tuple(diagnosis.one_of_each(exam.faults)), exam.measures, exam.outcomes)
+    return Report(subject, tuple(diagnosis.one_of_each(exam.faults)), exam.measures,
+                  exam.outcomes)
 
 
 def _imu_parameters(imu: Mapping[str, Any] | str | Path | None) -> Mapping[str, Any]:
@@ -160,7 +159,6 @@ class _Exam(Responses):
         super().__init__(make_filter, feed, imu)
         self._seeds = seeds
         self.outcomes: list[Outcome] = []
-        self._unaided: list[measures.Rmse] = []
 
     def sit(self) -> None:
         """Do all runs."""
@@ -208,17 +206,15 @@ class _Exam(Responses):
                 break
 
     def _do_noisy_run(self, seed: int) -> None:
-        run = self._record(scenarios.SLOW, seed)
-        self.outcomes.append(self._run(run))
-        self._unaided.append(measures.unaided(run, slice(len(run.t) // 2, None)))
+        self.outcomes.append(self._run(self._record(scenarios.SLOW, seed)))
 
     def _judge_noisy_runs(self) -> None:
         first = self.outcomes[0]
-        self.measures |= diagnosis.quality(self.outcomes, self._unaided, self._imu, self._absolute)
+        self.measures |= diagnosis.quality(self.outcomes, self._imu, self._absolute)
         self.measures['stamp_offset_s'] = diagnosis.stamp_fault(
             first.last(), self._absolute)[0].seconds
         large = diagnosis.inaccuracy(first, self._absolute)
-        if large and not self.faults and off(self._early) > SLIGHT:
+        if large and not self.faults and from_identity(self._early) > SLIGHT:
             large = Fault('gyroscope_wiring', f'{words(self._early)}; {large.evidence}')
         if large and (large.name == 'diverges' or not self.faults):
             self.faults.append(large)
@@ -255,8 +251,9 @@ class _Exam(Responses):
         apart = abs(gains[-1] - gains[0]) / max(abs(gains[0]), STEP)
         if apart > STEP and abs(gains[-1] / self.finer[-1] - gains[0]) < 0.25 * abs(gains[0]):
             # A wrong step turns up as a wrong scale at one rate.
+            names = [fault.name for fault in self.faults]
             self.faults = [fault for fault in self.faults if not (
-                fault.name == 'gyroscope_wiring' and 'time_step' in dict(self.faults))]
+                fault.name == 'gyroscope_wiring' and 'time_step' in names)]
             self.faults.append(Fault(
                 'time_step', f'at {" and ".join(run.name for run in runs)} turns move it '
                 f'{" and ".join(f"{gain:.3g}" for gain in gains)} times as far as the sensor: the '

@@ -8,13 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import gammaincinv
+from scipy.special import gammainccinv, gammaincinv, ndtr, stdtrit
 
 from spinning_top_sim.exam.scenarios import Reals, Run
 
 CONVERGED_DEG = 1.0
+CONSISTENT = 0.9999             # probability of the NEES band
 # Runs from which their spread is known, and how much of it has another reason than chance.
 FEWEST_RUNS, APART = 3, 5.0
+WINDOW = 3.0                    # autocorrelation times over which correlations are summed
 
 
 class Errors(NamedTuple):
@@ -26,6 +28,10 @@ class Errors(NamedTuple):
     def attitude(self, absolute: bool) -> Reals:
         """Return tilt and heading error combined (n,); see `turned`."""
         return np.hypot(self.tilt, self.turned(absolute))
+
+    def known(self, absolute: bool) -> Reals:
+        """Return tilt and heading error combined (n,), the tilt alone unless `absolute`."""
+        return np.hypot(self.tilt, absolute * self.turned(True))
 
     def turned(self, absolute: bool) -> Reals:
         """Return the heading error in [-pi, pi] (n,), relative to its mean unless `absolute`."""
@@ -126,17 +132,22 @@ def time_offset(estimates: Reals, truth: Reals, rates: Reals, absolute: bool) ->
 
 
 class Nees(NamedTuple):
-    """Mean of the NEES divided by its expectation, and the degrees of freedom of the mean."""
+    """
+    Mean of the NEES divided by its expectation, and its degrees of freedom.
+
+    known : degrees of freedom of the variance from which the former are estimated
+    """
 
     ratio: float
     degrees: float
+    known: float
 
-    def band(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the limits between which a consistent ratio lies with this probability."""
-        tail = 0.5 * (1.0 - probability)
-        # Quantiles of the chi-squared distribution; scipy.stats would take long to import.
-        low, high = 2.0 * gammaincinv(0.5 * self.degrees, (tail, 1.0 - tail)) / self.degrees
-        return float(low), float(high)
+    @property
+    def band(self) -> tuple[float, float]:
+        """The limits between which a consistent ratio lies with the probability CONSISTENT."""
+        # Student's t for the estimate: as many standard deviations of a known chi-squared.
+        tail, half = ndtr(-stdtrit(self.known, 0.5 + 0.5 * CONSISTENT)), 0.5 * self.degrees
+        return float(gammaincinv(half, tail) / half), float(gammainccinv(half, tail) / half)
 
 
 def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees | None:
@@ -162,16 +173,20 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
         shortest = min(len(squares) for squares, _ in parts)
         values = np.stack([squares[:shortest] for squares, _ in parts])
         mean = max(float(np.mean(values)), 1e-300)
-        independent = len(runs) if absolute else values.size / autocorrelation_time(values)
+        time = autocorrelation_time(values)
+        independent, known = (len(runs), 1e9) if absolute else (
+            values.size / time, values.size / (2.0 * WINDOW * time + 1.0))    # Sokal, sect. 3
         if len(runs) >= FEWEST_RUNS:
             # A constant error, such as that of a bias, is one draw a run: then the means of the
             # runs differ by more than the errors in a run let expect.
             spread = float(np.var(np.mean(values, axis=1), ddof=1)) / mean ** 2
             draws = 2.0 * len(runs) / max(dimensions * spread, 1e-12)
-            independent = draws if draws < independent / APART else independent
+            if draws < independent / APART:
+                independent, known = draws, len(runs) - 1
         # Negative log-likelihood for the best common factor of the covariances.
         unlikely = dimensions * math.log(mean) + float(np.mean([size for _, size in parts]))
-        found.append((unlikely, Nees(mean / dimensions, dimensions * independent)))
+        found.append((unlikely, Nees(
+                mean / dimensions, dimensions * independent, known)))
     return min(found)[1] if found else None
 
 
@@ -197,7 +212,7 @@ def autocorrelation_time(values: Reals) -> float:
     """
     Return the integrated autocorrelation time of rows (runs, n) [samples], at least 1.
 
-    The sum ends at the first lag of at least 5 times its present value (Sokal 1997, sect. 3).
+    The sum ends at the first lag of at least WINDOW times its present value (Sokal 1997, sect. 3).
     """
     centred = values - np.mean(values)
     largest = float(np.max(np.abs(centred)))
@@ -208,5 +223,5 @@ def autocorrelation_time(values: Reals) -> float:
     power = np.mean(np.abs(np.fft.rfft(centred / largest, 2 * n)) ** 2, axis=0)     # no overflow
     correlations = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
     times = 2.0 * np.cumsum(correlations / correlations[0]) - 1.0
-    ends = np.flatnonzero(np.arange(n) >= 5.0 * times)
+    ends = np.flatnonzero(np.arange(n) >= WINDOW * times)
     return max(float(times[ends[0] if len(ends) else -1]), 1.0)

@@ -133,8 +133,9 @@ class ReferenceFilter:
             self._correct(h, residual, MOVING_FORCE ** 2 / dt, NO_FORCE_BIAS)
             return
         h[:, 6:] = self._to_world
-        # A white density N leaves N^2 / (4 BAND_S) in the band.
-        density = max(4.0 * BAND_S * self._force_noise.add(square, dt), LEAST[1] ** 2)
+        # Samples of a white density N leave 2 N^2 BAND_S^2 / (2 BAND_S + dt)^3 in the band.
+        density = max((2.0 * BAND_S + dt) ** 3 / (2.0 * BAND_S ** 2)
+                      * self._force_noise.add(square, dt), LEAST[1] ** 2)
         self._correct(h, residual, density / dt,
                       1.0 if gyroscope @ gyroscope > TURNING ** 2 else NO_FORCE_BIAS)
 
@@ -164,8 +165,8 @@ class ReferenceFilter:
         horizontal = self._field.real
         if self._disturbed_s > 0.0 or not horizontal:
             return
-        # East, unknown, deviates as the two other parts.  White noise leaves N^2 / (2 FIELD_S).
-        density = max(2.0 * FIELD_S * self._field_noise.add(
+        # East, unknown, deviates as the two other parts.  White noise leaves N^2/(2 FIELD_S + dt).
+        density = max((2.0 * FIELD_S + dt) * self._field_noise.add(
             0.5 * (abs(self._deviation) / horizontal) ** 2, dt), LEAST[2] ** 2)
         h = np.zeros((1, 9))
         h[0, 1:3] = -self._field.imag / horizontal, 1.0

@@ -31,7 +31,7 @@ MOTION, SENSOR = range(8), range(8, 15)
 UNKNOWNS = 15
 ROUNDING = 1e-14            # of rates
 FAR = 1e9
-CHANGE = 1e-6               # of the readings by a step of finite differences [rad], [rad/s], ..
+CHANGE = 1e-5               # of the readings by a step of finite differences [rad], [rad/s], ..
 
 
 @dataclass

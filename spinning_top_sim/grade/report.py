@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of grading a simulator, as text and JSON."""
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-from spinning_top_sim.tools.verdict import Verdict, number
+from spinning_top_sim.tools.verdict import Fault, Verdict, number
 
 # docs/grade.md defines them.
 FAULTS = (
@@ -17,25 +16,6 @@ FAULTS = (
     'no_centripetal_term', 'acceleration_scale', 'no_gravity', 'gravity_frame',
     'finite_differences', 'inconsistent_reading', 'energy', 'noise_scale', 'uniform_noise',
     'covariance_zero')
-
-
-class Fault(NamedTuple):
-    """
-    A fault of a simulator.
-
-    Parameters
-    ----------
-    name : str
-        One of FAULTS.
-    evidence : str
-        Why it is reported.
-    number : float
-        What was measured, such as a lag or a coefficient; NaN where there is none.
-    """
-
-    name: str
-    evidence: str
-    number: float = math.nan
 
 
 class Report(Verdict):

@@ -137,7 +137,7 @@ class Imu:
         else:
             w1, w2, w3, f1, f2, f3 = np.concatenate([
                 self._low_pass.filtered(segment, times, self._signal)
-                for segment, times in samples.parts], axis=1)
+                for segment, times in samples.shares], axis=1)
             exact = (w1, w2, w3), (f1, f2, f3)
         if self._vibration.is_off:
             return exact
@@ -174,7 +174,7 @@ class Imu:
         """Return the increments over the intervals that end at these samples, n of each."""
         path, point = samples.path, self._lever_arm
         found: list[Increments] = []
-        for segment, times in samples.parts:
+        for segment, times in samples.shares:
             # Those that may be shorter, or contain a command, are computed one by one.
             since_ns = max(self._since_ns, segment.start_ns)
             single = len(range(times.start, since_ns + self.length_ns + 1, times.step))
@@ -305,9 +305,9 @@ def _six(values: Mapping[str, Any], error: str) -> tuple[float, ...]:
     return 3 * (rate,) + 3 * (force,)
 
 
-def _bias_paths(values: Mapping[str, Any]) -> list[noise.Path]:
+def _bias_paths(values: Mapping[str, Any]) -> list[noise.RandomPath]:
     """Return the parts of the bias that vary with time."""
-    path, paths = partial(noise.Path, values['seed']), []
+    path, paths = partial(noise.RandomPath, values['seed']), []
     if any(walk := _six(values, 'random_walk')):
         paths.append(path(noise.Purpose.WALK, (6 * (math.inf,),), (walk,)))
     if any(deviation := _six(values, 'bias_stddev')):

@@ -35,7 +35,7 @@ class Magnetometer:
         self._noise = noise.SensorNoise(
             seed, noise.Purpose.MAG_WHITE, period_ns, np.full((3, 1), deviation),
             np.array(values['mag.hard_iron'])[:, np.newaxis],
-            [noise.Path(seed, noise.Purpose.MAG_WALK, (3 * (math.inf,),), (3 * (walk,),))]
+            [noise.RandomPath(seed, noise.Purpose.MAG_WALK, (3 * (math.inf,),), (3 * (walk,),))]
             if walk else ())
         self._events = [np.reshape(values[f'mag.disturbance.{frame}'], (-1, 5)).tolist()
                         for frame in ('world', 'body')]

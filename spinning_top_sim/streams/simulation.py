@@ -40,6 +40,33 @@ OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 4 << 20, 100 * NANOSECONDS, 20_
 MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
 
 
+class Command(NamedTuple):
+    """Momenta that were commanded [kg m^2/s], and when [ns]."""
+
+    t_ns: int
+    l3: float
+    lz: float
+
+
+class NewState(NamedTuple):
+    """A `State` that was set, and when [ns]."""
+
+    t_ns: int
+    theta: float
+    theta_dot: float
+    phi: float
+    psi: float
+    l3: float
+    lz: float
+
+
+class ImuRate(NamedTuple):
+    """Another `imu.rate` [Hz], and from when on [ns]."""
+
+    t_ns: int
+    rate: float
+
+
 class Drive(NamedTuple):
     """A velocity of the pivot in the world [m/s], applied at a time, and when it brakes [ns]."""
 
@@ -59,9 +86,7 @@ class Simulation:
     streams : every stream, whether it is switched on or not
     path : the motion
     now_ns : every sample up to here is done (-1: not even that of t = 0); may be set
-    history : what was applied since the start: commands as (t_ns, l3, lz), states that were set as
-        t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate), velocities of the
-        pivot as `Drive`
+    history : what was applied since the start
     pivot_path : of the pivot; None while it rests at the origin
     lz : as last commanded, about the vertical of the world [kg m^2/s]
     epoch_ns : stamp of t = 0 [ns]
@@ -100,7 +125,7 @@ class Simulation:
         self.imu = Imu(values)
         self.values, self.top = dict(values), top
         self.streams = all_streams(values, self.imu)
-        self.history: list[tuple[Any, ...]] = []
+        self.history: list[Command | NewState | ImuRate | Drive] = []
         self.now_ns = -1
         # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
@@ -180,7 +205,7 @@ class Simulation:
         imu, rate = self.imu, changes.get('imu.rate')
         if rate is not None and imu.set_rate(rate, max(self.now_ns, 0)):
             self.path.keep_steps_ns = imu.keep_ns
-            self.history.append((max(self.now_ns, 0), rate))
+            self.history.append(ImuRate(max(self.now_ns, 0), rate))
         for stream in self.streams:
             stream.apply(changes)
         self.version += 1
@@ -205,7 +230,7 @@ class Simulation:
         self._continue(ContinuedState(
             theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
             psi=float(now.psi[0]), l3=l3, lz=lz))
-        self.history.append((self.now_ns, l3, lz))
+        self.history.append(Command(self.now_ns, l3, lz))
 
     def set_state(self, state: State) -> None:
         """
@@ -215,7 +240,7 @@ class Simulation:
         """
         self._settle()
         self._continue(state)
-        self.history.append((self.now_ns, *astuple(state)))
+        self.history.append(NewState(self.now_ns, *astuple(state)))
 
     def drive(self, velocity: Sequence[float], stop_ns: int | None = None) -> int | None:
         """
@@ -294,7 +319,9 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
     try:
         with np.errstate(over='ignore', invalid='ignore'):
             segment = _new_segment(top, start, start_ns, values, pivot)
-            if isinstance(start, State) and not math.isfinite(segment.energy):
+            # Steps are asked for their energy as long as the first one is kept.
+            if ((isinstance(start, State) or values['solver.method'] != 'exact')
+                    and not math.isfinite(segment.energy)):
                 raise ValueError(f'the energy would be {segment.energy!r} J')
         if not segment.reach(start_ns + 1, FIRST_STEPS):
             raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
@@ -322,16 +349,15 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
                    atol=values['solver.atol'])
     if pivot is None:
         assert isinstance(start, State)
-        return Segment(step(top, start), start, start_ns)
+        return Segment(step(top, start), start_ns, start)
     posture, piece = start, pivot.lasting(start_ns)
     if isinstance(posture, State):
         posture = posture_of(top, posture)
     solver: Propagator
     if values['solver.method'] == 'exact':
         solver = AcceleratedMotion(top, posture, piece.acceleration)
-        vertical, state = solver.vertical, solver.start
+        vertical = solver.vertical
     else:
         vertical, halves = about_vertical(top, posture, piece.acceleration)
-        state = rounded(halves)
-        solver = step(vertical.top(top), state)
-    return Segment(solver, state, start_ns, Ride(top, vertical, piece))
+        solver = step(vertical.top(top), rounded(halves))
+    return Segment(solver, start_ns, ride=Ride(top, vertical, piece))

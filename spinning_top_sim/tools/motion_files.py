@@ -63,6 +63,7 @@ LATEST_START_S = 1.0        # an earlier first stamp counts from the start, a la
 
 Reals = NDArray[np.float64]
 Table = Mapping[str, Sequence[Any]]
+Part = tuple[Reals, Sequence[str]]      # values (n, k), and the names of their columns
 
 
 @dataclass
@@ -91,12 +92,13 @@ class Recorded:
             origin = origin if abs(origin) > LATEST_START_S else Decimal(0)
         for name, (stamps, parts) in read.items():
             times = (stamps - origin).astype(float)
-            for kind, values in parts.items():
+            for kind, (values, names) in parts.items():
                 known = np.isfinite(times) & np.all(np.isfinite(values), axis=1)
                 at, first = np.unique(times[known], return_index=True)
                 if len(at) and kind not in self.parts:
                     self.parts[kind] = at, values[known][first]
-                    self.notes += [f'{kind} of {name}'] if name else []
+                    self.notes.append(f'{kind} of {name or ", ".join(names)}: {len(at)} from '
+                                      f'{at[0]:.6g} to {at[-1]:.6g} s')
 
 
 def read(path: Path, topic: str | None = None) -> Recorded:
@@ -193,10 +195,10 @@ def _kind(words: Sequence[str]) -> tuple[str, str]:
     return '', ''
 
 
-def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Reals]]:
-    """Return stamps (n,), decimals [s], and the parts (n, k) that these columns make."""
+def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Part]]:
+    """Return stamps (n,), decimals [s], and the parts that these columns make."""
     stamps: dict[str, Sequence[Any]] = {}
-    groups: dict[tuple[str, str], dict[str, Reals]] = defaultdict(dict)
+    groups: dict[tuple[str, str], dict[str, tuple[Reals, str]]] = defaultdict(dict)
     for name, cells in columns.items():
         words, unit = _words(name)
         if TIMES & {*words}:
@@ -204,19 +206,23 @@ def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Reals]]:
         elif (named := _kind(words))[0]:
             kind, component = named
             groups[kind, '' if kind == ANGLES else ' '.join(words[:-1])].setdefault(
-                component, UNITS.get(unit, 1.0) * np.array([_number(cell) for cell in cells]))
+                component, (UNITS.get(unit, 1.0) * np.array([_number(cell) for cell in cells]),
+                            name))
     if not stamps:
         raise ValueError(f'no column of times among {", ".join(columns)}: must be t, time, '
                          'timestamp or stamp')
-    parts: dict[str, Reals] = {}
+    parts: dict[str, Part] = {}
     for (kind, _), group in groups.items():
         order = {ATTITUDES: 'wxyz', ANGLES: 'abc'}.get(kind, 'xyz')
         if group.keys() >= {*order}:
-            parts.setdefault(kind, np.stack([group[part] for part in order], axis=1))
+            parts.setdefault(kind, (np.stack([group[part][0] for part in order], axis=1),
+                                    [group[part][1] for part in order]))
     if ANGLES in parts:
-        turns = Rotation.from_euler('ZYZ', np.nan_to_num(angles := parts.pop(ANGLES)))
+        angles, names = parts.pop(ANGLES)
+        turns = Rotation.from_euler('ZYZ', np.nan_to_num(angles))
         known = np.isfinite(np.sum(angles, axis=1, keepdims=True))
-        parts.setdefault(ATTITUDES, np.where(known, np.roll(turns.as_quat(), 1, axis=1), np.nan))
+        parts.setdefault(ATTITUDES, (
+            np.where(known, np.roll(turns.as_quat(), 1, axis=1), np.nan), names))
     if {RATES, ACCELERATIONS} <= parts.keys() and GYROSCOPE not in parts:
         parts[GYROSCOPE] = parts.pop(RATES)     # wx .. az are those of an IMU
     return _seconds(stamps), parts
@@ -272,7 +278,7 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
     recorded.add({' '.join(filter(None, one)): tables[one] for one in chosen}, origin)
     for topic, message in first.items():
         recorded.covariance.update((kind, matrix) for kind, matrix in _covariances(message)
-                                   if f'{kind} of {topic}' in recorded.notes)
+                                   if f'{kind} of {topic}: ' in ''.join(recorded.notes))
     return recorded
 
 

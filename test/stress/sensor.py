@@ -163,9 +163,9 @@ def correlations(seeds, count):
             (purpose.WHITE, 6), (purpose.ORIENTATION, 3), (purpose.MAG_WHITE, 3),
             (purpose.TIMING, 3))]
         # Correlation times far below a step: every step is new.
-        columns += [noise.Path(seed, one, (3 * (1e-5,),), (3 * (1.0,),)).at(numbers * MILLISECOND)
-                    for one in (purpose.GAUSS_MARKOV, purpose.FLICKER, purpose.WALK,
-                                purpose.MAG_WALK)]
+        columns += [noise.RandomPath(seed, one, (3 * (1e-5,),), (3 * (1.0,),)).at(
+            numbers * MILLISECOND) for one in (
+                purpose.GAUSS_MARKOV, purpose.FLICKER, purpose.WALK, purpose.MAG_WALK)]
         drawn.append(np.concatenate(columns))
     drawn = np.array(drawn)                     # (seeds, columns, numbers)
 
