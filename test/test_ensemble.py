@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ensembles: what a run is, and a dataset that is the same however it was computed."""
 
-import contextlib
 import json
 import os
 import signal
-import threading
-import time
 from importlib.util import find_spec
 
 import numpy as np
@@ -34,7 +31,6 @@ SPEC = {
                'params': {'values': [str(ROOT / f'config/imu/{name}.yaml')
                                      for name in ('bmi088', 'adis16470', 'perfect')]}},
     'streams': ['imu', 'ground_truth_imu']}
-PATIENCE = 150.0            # s, with a machine that is busy otherwise
 
 
 def written(folder, **changes):
@@ -56,22 +52,6 @@ def parts_of(specification, folder):
     for part in range(specification.parts):
         failed |= compute_part(specification, part, str(folder))
     return failed
-
-
-def wait_for(folder, parts):
-    """Wait until so many parts are complete."""
-    end = time.monotonic() + PATIENCE
-    while len(list((folder / 'data').glob('part-*'))) < parts:
-        assert time.monotonic() < end
-        time.sleep(0.002)
-
-
-@contextlib.contextmanager
-def meanwhile(act):
-    thread = threading.Thread(target=act)
-    thread.start()
-    yield
-    thread.join()
 
 
 @pytest.fixture(scope='module')
@@ -151,17 +131,21 @@ def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
 
 
 def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
-        whole, tmp_path, cluster, ensemble):
+        whole, tmp_path, cluster, ensemble, monkeypatch):
+    from distributed.client import Future
+
     data, path = whole
-    folder = tmp_path / 'other'
+    folder, killed, ordinary = tmp_path / 'other', [], Future.result
     first, _ = cluster.run(os.getpid).values()
 
-    def kill():
-        wait_for(folder, 2)
-        os.kill(first, signal.SIGKILL)
+    def result(future):
+        if not killed:
+            killed.append(os.kill(first, signal.SIGKILL))
+        return ordinary(future)
 
-    with meanwhile(kill):
-        assert ensemble(path, '-o', folder) == 0
+    monkeypatch.setattr(Future, 'result', result)
+    assert ensemble(path, '-o', folder) == 0
+    assert killed
     assert contents(folder / 'data') == contents(data)
     manifest = json.loads((folder / 'manifest.json').read_text())
     assert manifest['complete'] and manifest['failed'] == {}

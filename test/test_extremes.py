@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Extreme tops, parameters and commands: they run, or are refused in one clear line."""
 
+import math
 import re
 import warnings
 
@@ -91,6 +92,38 @@ def test_what_no_arithmetic_holds_is_refused_by_the_table(name, value):
     assert str(refusal.value).startswith(f'{name} = {value!r}: must be ')
 
 
+SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.repeat': True}
+
+
+@pytest.mark.parametrize(('values', 'words'), [
+    ({'imu.bandwidth': 0.5}, 'imu.bandwidth.*must be a number 0 or >= 1 and <= 100000'),
+    ({'imu.bandwidth_order': 3}, 'imu.bandwidth_order.*<= 2'),
+    ({'imu.vibration.force_psd': (20.0, 0.1)}, 'force_psd.*two or more ascending'),
+    ({'imu.vibration.rate_psd': (20.0, 0.1, 20.0, 0.1)}, 'rate_psd.*two or more ascending'),
+    ({'imu.vibration.rate_psd': (20.0, 0.1, 30.0)}, 'a list of 2 numbers, or a multiple'),
+    ({'mag.disturbance.body': (2.0, 1.0, 0.0, 0.0, 0.0)}, 'must not end before'),
+    ({'mag.disturbance.world': ()}, 'world.*a list of 5 numbers, or a multiple'),
+    ({'imu.bandwidth': 9.0, 'imu.sampling': 'mean'}, 'imu.bandwidth = 9.0: must be 0 with'),
+    ({'increments.enabled': True, 'imu.rate': 0.5}, r'imu\.rate = 0\.5: must be >= 1'),
+    ({'imu.sampling': 'mean', 'imu.rate': 0.5}, r'imu\.rate = 0\.5: must be >= 1'),
+    ({'gnss.origin': (90.5, 0.0, 0.0)}, 'gnss.origin'),
+    ({'gnss.origin': (0.0, -181.0, 0.0)}, 'gnss.origin'),
+    ({'gnss.outages': (1.0,)}, 'gnss.outages'), ({'gnss.outages': (2.0, 1.0)}, 'gnss.outages'),
+    ({'gnss.outages': (1.0, 3.0, 2.0, 4.0)}, 'gnss.outages'),
+    ({'gnss.position_noise': (1.0, math.nan)}, 'gnss.position_noise'),
+    ({'pivot.path': (1.0, 2.0, 3.0)}, 'pivot.path = .*4 numbers, or a multiple'),
+    ({'pivot.path': (1e-6, 0.0, 0.0, 0.0)}, 'duration 1e-06 s: must be >= 0.001'),
+    ({'pivot.path': (1.0, 1.0, 0.0, 0.0), 'pivot.repeat': True}, 'changes the velocity'),
+    ({'pivot.waypoints': (1.0, 1.0, 0.0)}, 'two different points'),
+    ({'pivot.waypoints': (1.0, 1.0, 0.0, 2.0)}, '3 numbers, or a multiple'),
+    ({'pivot.waypoints': (1.0, math.nan, 0.0)}, 'pivot.waypoints = .*nan.*a list of 3 numbers'),
+    ({'pivot.path': (1.0, 0.0, 0.0, 1.0), **SHUTTLE}, 'must be zeros with pivot.path')])
+def test_what_makes_no_sense_is_refused_in_words(values, words):
+    with pytest.raises(ValueError, match=words):
+        parameters.checked(values)
+    parameters.checked({'imu.rate': 0.5})
+
+
 @pytest.mark.parametrize(('given', 'named'), [
     ({'spin.l3': HUGE}, '1e+300'), ({'initial.theta_dot': 1e12}, '1000000000000.0'),
     ({'top.lambda3': 5e-324}, 'lambda3=5e-324')])
@@ -109,7 +142,7 @@ def test_what_turns_too_fast_is_refused_at_the_start_and_by_simulate(
     assert not log.exists()
 
 
-def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys):
+def test_a_run_offline_whose_stamps_would_end_is_refused_before():
     simulation = simulate()
     simulation.epoch_ns = LAST_STAMP_NS - SECOND + 1
     with pytest.raises(IntegrationError, match='2038'):
@@ -118,8 +151,3 @@ def test_a_run_offline_whose_stamps_would_end_is_refused_before(tmp_path, capsys
     for epoch_ns in (LAST_STAMP_NS - 5, -1, 2 ** 70):
         with pytest.raises(ValueError, match='must be >= 0 and < 2147483648 s'):
             LiveSimulation(parameters.checked({'duration': 1.0}), epoch_ns)
-    for epoch in ('2147483647.5', '-3', '1e300', 'nan'):
-        log = tmp_path / 'run.mcap'
-        assert main(['-o', str(log), '--duration', '1', '--quiet', '--epoch', epoch]) == 2
-        assert 'must be >= 0 and < 2147483648 s' in capsys.readouterr().err
-        assert not log.exists()

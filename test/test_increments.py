@@ -144,10 +144,3 @@ def test_switched_on_while_running_the_first_interval_is_a_whole_one(method):
     assert times_ns[0] == SECOND + 5 * MILLISECOND
     assert 2.0 * np.linalg.norm(dq[0, :3]) == pytest.approx(
         5e-3 * np.linalg.norm(rates[0]), rel=1e-3)
-
-
-def test_a_rate_that_no_interval_may_have_is_refused():
-    for values in ({'increments.enabled': True}, {'imu.sampling': 'mean'}):
-        with pytest.raises(ValueError, match=r'imu\.rate = 0\.5: must be >= 1'):
-            parameters.checked({**values, 'imu.rate': 0.5})
-    parameters.checked({'imu.rate': 0.5})

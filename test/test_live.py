@@ -80,18 +80,6 @@ def test_giving_way_in_a_long_integration_loses_nothing_and_leaves_a_state_to_re
     assert taken == expected
 
 
-def test_without_a_sink_nothing_is_encoded_and_the_solver_is_not_sampled():
-    simulation = simulate()
-    encoded, states = messages_of(simulation), states_of(simulation)
-    for tick in range(1, 101):
-        simulation.advance(tick * PERIOD_NS)
-        simulation.prepare((tick + 1) * PERIOD_NS)
-    assert simulation.now_ns == SECOND
-    assert states.count == 0
-    assert {counted.count for counted in encoded.values()} == {0}
-    assert all(one.sent == one.skipped == 0 for one in simulation.outputs)
-
-
 @pytest.mark.parametrize('topic', ['pose', '/clock'])
 def test_a_sample_of_a_stream_with_a_sink_is_encoded_once_for_all_its_sinks(topic):
     simulation = simulate()

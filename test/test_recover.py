@@ -19,6 +19,7 @@ from helpers.logs import (
     POINT,
     SOME_LOST,
     TOPICS,
+    flipped,
     metadata_of,
     places,
     run,
@@ -105,12 +106,6 @@ def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
         (content,) = contents
         output.write_bytes(content)
         check_with_all_readers(output, log.messages[:whole_chunks * MESSAGES_PER_CHUNK])
-
-
-def flipped(content: bytes, position: int, bit: int) -> bytes:
-    changed = bytearray(content)
-    changed[position] ^= 1 << bit
-    return bytes(changed)
 
 
 def test_a_flipped_bit_is_never_passed_over(tmp_path, log, no_sync):

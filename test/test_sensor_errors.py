@@ -46,14 +46,6 @@ def test_the_chain_by_hand():
     assert rows.tolist() == 2 * [[5.5, 2.0, -7.0, 10.3, 10.5, 10.0]]
 
 
-def test_a_perfect_sensor_hands_on_what_is_exact():
-    exact = ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
-    sensor = Sensor(parameters.checked({}), MILLISECOND)
-    assert sensor.read(exact, range(3)) is exact
-    quaternion = (0.0, 0.0, 0.0, 1.0)
-    assert sensor.orientation(quaternion, range(3)) is quaternion
-
-
 def test_the_bias_begins_with_the_turn_on_bias_and_walks_with_its_density():
     walk = {'imu.gyroscope_random_walk': 2e-4, 'imu.accelerometer_random_walk': 3e-3}
     turn_on = {'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_turn_on_bias': 0.05}

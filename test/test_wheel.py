@@ -152,11 +152,6 @@ def test_what_is_missing_is_told_with_its_remedy(empty, answers):
         assert len(set(words)) == len(words)
 
 
-def test_python_m_is_the_same_command(empty, tmp_path):
-    code, out, _ = run(empty / 'bin/python', '-m', 'spinning_top_sim', '--version', cwd=tmp_path)
-    assert (code, out) == (0, f'spinning-top {metadata.version("spinning_top_sim")}\n')
-
-
 def test_the_shell_completes_commands_and_options(empty):
     def completed(line):
         _, out, _ = run('sh', '-c', f'"{sys.executable}" -m spinning_top_sim 8>&1 9>/dev/null',

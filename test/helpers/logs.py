@@ -69,6 +69,12 @@ def write_anew(path, content):
     path.write_bytes(content)
 
 
+def flipped(content: bytes, position: int, bit: int = 0) -> bytes:
+    changed = bytearray(content)
+    changed[position] ^= 1 << bit
+    return bytes(changed)
+
+
 def records_of(content: bytes) -> list[tuple[int, int, int]]:
     """Return opcode, start and end of every record, of a whole file."""
     found = []
