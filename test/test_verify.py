@@ -21,8 +21,8 @@ from spinning_top_sim.tools import recorded_run
 def columns(tmp_path_factory):
     """The exact solution in columns, with a command between two stretches; several chunks."""
     return log_of(tmp_path_factory.mktemp('log') / 'columns.mcap', '--duration', 11, '--command',
-                  '3.1:1.7:1.4', '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01',
-                  '-p', 'markers.enabled:=true')
+                  '3.1:1.7:1.4', '-p', 'solver.method:=exact', '-p', 'markers.enabled:=true',
+                  '-p', 'imu.accelerometer_random_walk:=0.01')
 
 
 def chunks_of(path):
