@@ -46,3 +46,17 @@ def diagnostics(peer):
     from helpers.node_harness import Diagnostics
 
     return Diagnostics(peer)
+
+
+@pytest.fixture(scope='session')
+def stepped(tmp_path_factory):
+    from helpers.inspected import stepped_log
+
+    return stepped_log(tmp_path_factory.mktemp('log') / 'stepped.mcap')
+
+
+@pytest.fixture(scope='session')
+def short(tmp_path_factory):
+    from helpers.inspected import short_log
+
+    return short_log(tmp_path_factory.mktemp('log') / 'short.mcap')

@@ -101,7 +101,7 @@ def test_live_it_follows_a_node_and_ends_by_itself_or_by_sigint(example, tmp_pat
             str(EXAMPLE), '--filter', 'vqf', '--settle', '0']) as other):
         wait_for('the start', lambda: 'waiting for /waves/imu/data_raw' in other.err)
         with SimNode(tmp_path / 'top', namespace='/waves', arguments=files):
-            assert example.main(['it', '--duration', '4', '--settle', '2',
+            assert example.main(['it', '--duration', '3', '--settle', '1.5',
                                  '--ros-args', '-r', '__ns:=/waves']) == 0
             wait_for('a report', lambda: len(re.findall(r'vqf at', other.err)) >= 2)
             assert other.end(signal.SIGINT) == 0
@@ -109,5 +109,5 @@ def test_live_it_follows_a_node_and_ends_by_itself_or_by_sigint(example, tmp_pat
                       capfd.readouterr().out)
     # Two degrees of bias of the force at most; a load that makes samples late costs poses.
     assert float(found[1]) < 3.0
-    assert int(found[2]) > 100
+    assert int(found[2]) > 80
     assert 'heading drift' in other.out and 'Traceback' not in other.err

@@ -104,19 +104,6 @@ def test_a_bad_velocity_is_refused_with_its_value(velocity):
     assert not simulation.history
 
 
-@pytest.mark.parametrize(('values', 'words'), [
-    ({'pivot.path': (1.0, 2.0, 3.0)}, 'pivot.path = .*4 numbers, or a multiple'),
-    ({'pivot.path': (1e-6, 0.0, 0.0, 0.0)}, 'duration 1e-06 s: must be >= 0.001'),
-    ({'pivot.path': (1.0, 1.0, 0.0, 0.0), 'pivot.repeat': True}, 'changes the velocity'),
-    ({'pivot.waypoints': (1.0, 1.0, 0.0)}, 'two different points'),
-    ({'pivot.waypoints': (1.0, 1.0, 0.0, 2.0)}, '3 numbers, or a multiple'),
-    ({'pivot.waypoints': (1.0, math.nan, 0.0)}, 'pivot.waypoints = .*nan.*a list of 3 numbers'),
-    ({'pivot.path': (1.0, 0.0, 0.0, 1.0), **SHUTTLE}, 'must be zeros with pivot.path')])
-def test_a_bad_path_is_refused_in_words(values, words):
-    with pytest.raises(ValueError, match=words):
-        parameters.checked(values)
-
-
 def test_commands_of_the_spin_count_about_the_vertical_of_the_world():
     simulation = simulation_of(**{'solver.method': 'exact', **SHUTTLE})
     list(simulation.play((), S // 2))

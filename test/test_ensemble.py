@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ensembles: what a run is, and a dataset that is the same however it was computed."""
 
-import contextlib
 import json
 import os
 import signal
-import threading
-import time
 from importlib.util import find_spec
 
 import numpy as np
@@ -34,7 +31,6 @@ SPEC = {
                'params': {'values': [str(ROOT / f'config/imu/{name}.yaml')
                                      for name in ('bmi088', 'adis16470', 'perfect')]}},
     'streams': ['imu', 'ground_truth_imu']}
-PATIENCE = 150.0            # s, with a machine that is busy otherwise
 
 
 def written(folder, **changes):
@@ -56,22 +52,6 @@ def parts_of(specification, folder):
     for part in range(specification.parts):
         failed |= compute_part(specification, part, str(folder))
     return failed
-
-
-def wait_for(folder, parts):
-    """Wait until so many parts are complete."""
-    end = time.monotonic() + PATIENCE
-    while len(list((folder / 'data').glob('part-*'))) < parts:
-        assert time.monotonic() < end
-        time.sleep(0.002)
-
-
-@contextlib.contextmanager
-def meanwhile(act):
-    thread = threading.Thread(target=act)
-    thread.start()
-    yield
-    thread.join()
 
 
 @pytest.fixture(scope='module')
@@ -97,9 +77,6 @@ def whole(tmp_path_factory):
     path = written(folder)
     assert parts_of(ensemble_spec.read(path), folder) == {}
     return folder / 'data', path
-
-
-# ------------------------------------------------------------------------------------- a dataset
 
 
 def test_every_stream_has_columns_or_is_left_out():
@@ -154,17 +131,21 @@ def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
 
 
 def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
-        whole, tmp_path, cluster, ensemble):
+        whole, tmp_path, cluster, ensemble, monkeypatch):
+    from distributed.client import Future
+
     data, path = whole
-    folder = tmp_path / 'other'
+    folder, killed, ordinary = tmp_path / 'other', [], Future.result
     first, _ = cluster.run(os.getpid).values()
 
-    def kill():
-        wait_for(folder, 2)
-        os.kill(first, signal.SIGKILL)
+    def result(future):
+        if not killed:
+            killed.append(os.kill(first, signal.SIGKILL))
+        return ordinary(future)
 
-    with meanwhile(kill):
-        assert ensemble(path, '-o', folder) == 0
+    monkeypatch.setattr(Future, 'result', result)
+    assert ensemble(path, '-o', folder) == 0
+    assert killed
     assert contents(folder / 'data') == contents(data)
     manifest = json.loads((folder / 'manifest.json').read_text())
     assert manifest['complete'] and manifest['failed'] == {}
@@ -227,9 +208,6 @@ def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):
     assert set(parquet.read_table(part)['run'].to_pylist()) == {0, 1, 2}
 
 
-# --------------------------------------------------------------------------------- what is drawn
-
-
 def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names():
     given = {'runs': 2000, 'duration': 1.0, 'seed': 3}
     one = ensemble_spec.parse({**given, 'sample': {
@@ -288,9 +266,6 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
             {None}, {None}, {1.4}, {1.4}]
 
 
-# -------------------------------------------------------------------------------------- bad input
-
-
 @pytest.mark.parametrize(('changes', 'said'), [
     ({'sample': {'spin.l4': {'uniform': [1, 2]}}},
      'there is no parameter spin.l4; did you mean spin.l'),
@@ -332,13 +307,9 @@ def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble
     error = capsys.readouterr().err
     assert f'{folder} has another ensemble' in error
     assert error.endswith(': choose a new folder, or --overwrite\n')
-    turned = written(tmp_path, runs=1, duration=0.05, sample={      # it is another grid
-        'spin.l3': {'values': [1.5, 1.7]}, 'initial.theta': {'values': [0.3, 0.6]}})
-    assert ensemble(turned, '-o', folder) == 2
-    assert 'has another ensemble' in capsys.readouterr().err
-    assert contents(folder) == before
     (folder / 'notes').write_text('mine')
-    assert ensemble(turned, '-o', folder, '--overwrite') == 0
+    other = written(tmp_path, runs=1, duration=0.05, sample={'spin.l3': {'values': [1.5, 1.7]}})
+    assert ensemble(other, '-o', folder, '--overwrite') == 0
     after = contents(folder)
     assert after.pop('notes') == b'mine'
     assert after.keys() == before.keys() and not after.items() & before.items()

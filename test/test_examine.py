@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from helpers.faulty_filters import FAULTY, MISREADINGS
 from helpers.reference import ROOT
-from helpers.wrong_filters import TABLE
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import (
@@ -84,6 +83,17 @@ def test_the_autocorrelation_time_is_the_direct_sum():
     assert measures.autocorrelation_time(np.ones((3, 7))) == 1.0
 
 
+def test_the_autocorrelation_time_is_the_direct_sum():
+    values = np.cumsum(np.random.default_rng(1).standard_normal((3, 1000)), axis=1)
+    centred, expected = values - np.mean(values), 1.0
+    for lag in range(1, 1000):
+        expected += 2.0 * np.mean(centred[:, lag:] * centred[:, :-lag]) / np.mean(centred ** 2)
+        if lag >= 5.0 * expected:
+            break
+    assert measures.autocorrelation_time(values) == pytest.approx(expected, rel=1e-9)
+    assert measures.autocorrelation_time(np.ones((3, 7))) == 1.0
+
+
 @pytest.mark.parametrize(('factor', 'fault'), [
     (0.5, 'covariance_small'), (1.0, None), (2.0, 'covariance_large')])
 def test_covariances_may_be_about_the_axes_of_sensor_or_world(report, factor, fault):
@@ -123,11 +133,9 @@ def test_a_fault_of_the_method_is_named(report, name):
         assert report(name, 'component_order').faults == ['component_order', name]
 
 
-@pytest.mark.parametrize('name', ['mahony, right', 'mahony, no gravity', 'mahony, bias clamped'])
-def test_another_filter_is_blamed_for_its_fault_only(name):
-    make, causes = TABLE[name]
-    found = examine(make, seeds=1, isolated=False)
-    assert bool(found.faults) == bool(causes) and causes.issuperset(found.faults), found
+@pytest.mark.parametrize('name', ['gyroscope_wiring', 'hard_iron', 'lag'])
+def test_another_filter_is_blamed_for_its_fault_only(report, name):
+    assert report('reference', name).faults == [name]
 
 
 def test_a_filter_without_faults_passes(report):

@@ -58,13 +58,6 @@ def test_the_truth_is_the_path_of_the_pivot_on_the_ellipsoid():
     assert np.median(error) < 1e-6 and error.max() < 0.05
 
 
-def test_a_pivot_at_rest_is_at_the_origin():
-    _, found = run({'gnss.enabled': True, 'gnss.origin': (-33.9, 151.2, 12.0)}, SECOND, FIX,
-                   VELOCITY)
-    assert found[FIX][2] == pytest.approx(np.tile((-33.9, 151.2, 12.0), (11, 1)), abs=1e-9)
-    assert not found[VELOCITY][2].any()
-
-
 def test_noise_is_white_with_the_standard_deviations(noisy):
     for topic, exact, convert, levels in (
             (FIX, TRUE_FIX, enu, (1.5, 1.5, 3.0)),
@@ -128,15 +121,6 @@ def test_a_log_is_verified(tmp_path, capsys):
             report, at_ns = topics[f'/{topic}'], SECOND + 10 * PERIOD_NS + late_ns
             assert (report.count, report.missing) == (count - lost, lost)
             assert report.gaps_ns == lost * [(at_ns, at_ns)]
-
-
-@pytest.mark.parametrize(('name', 'value'), [
-    ('gnss.origin', (90.5, 0.0, 0.0)), ('gnss.origin', (0.0, -181.0, 0.0)),
-    ('gnss.outages', (1.0,)), ('gnss.outages', (2.0, 1.0)), ('gnss.outages', (1.0, 3.0, 2.0, 4.0)),
-    ('gnss.latency', -0.1), ('gnss.position_noise', (1.0, math.nan))])
-def test_bad_values_are_refused(name, value):
-    with pytest.raises(ValueError, match=name):
-        parameters.checked({name: value})
 
 
 def test_the_library_is_needed_only_with_a_receiver(monkeypatch):

@@ -30,8 +30,6 @@ from spinning_top_sim.streams.live import (
 
 PERIOD_NS = 10 * MILLISECOND        # of most streams
 
-METHODS = pytest.mark.parametrize('method', ['rk45', 'exact'])
-
 
 def test_a_log_gets_an_instant_in_one_call_before_anybody_else():
     """Also where publishing fails, as when a signal takes the context away."""
@@ -82,18 +80,6 @@ def test_giving_way_in_a_long_integration_loses_nothing_and_leaves_a_state_to_re
     assert taken == expected
 
 
-def test_without_a_sink_nothing_is_encoded_and_the_solver_is_not_sampled():
-    simulation = simulate()
-    encoded, states = messages_of(simulation), states_of(simulation)
-    for tick in range(1, 101):
-        simulation.advance(tick * PERIOD_NS)
-        simulation.prepare((tick + 1) * PERIOD_NS)
-    assert simulation.now_ns == SECOND
-    assert states.count == 0
-    assert {counted.count for counted in encoded.values()} == {0}
-    assert all(one.sent == one.skipped == 0 for one in simulation.outputs)
-
-
 @pytest.mark.parametrize('topic', ['pose', '/clock'])
 def test_a_sample_of_a_stream_with_a_sink_is_encoded_once_for_all_its_sinks(topic):
     simulation = simulate()
@@ -105,16 +91,6 @@ def test_a_sample_of_a_stream_with_a_sink_is_encoded_once_for_all_its_sinks(topi
     assert all(a is b for (_, a), (_, _, b) in zip(published, recorded, strict=True))
     assert states.count == (0 if topic == '/clock' else 100)
     assert all(counted.count == 0 for counted in encoded.values())
-
-
-@METHODS
-def test_streams_of_one_rate_share_the_states(method):
-    simulation = simulate(solver__method=method)
-    taken = record(simulation, 'pose', 'joint_states', 'ground_truth/odom')
-    states = states_of(simulation)
-    simulation.advance(SECOND)
-    assert len(taken) == 3 * 101
-    assert states.count == 101
 
 
 def test_ticks_leave_nothing_behind():
@@ -152,21 +128,6 @@ def test_a_block_is_bounded_in_time_and_in_samples():
     assert simulation.computed_ns == (LARGEST_BLOCK - 1) * MILLISECOND
     assert not simulation.advance(60 * SECOND, give_way=lambda: True)
     assert simulation.now_ns == (LARGEST_BLOCK - 1) * MILLISECOND
-
-
-def test_a_block_without_time_goes_on_with_the_next_call():
-    simulation = simulate()
-    taken = record(simulation, 'pose', 'joint_states')
-    simulation.advance(0)
-    calls = 1
-    while not simulation.prepare(SECOND // 10, budget_ns=0):
-        assert simulation.computed_ns == 0, 'nothing is ready before all is'
-        calls += 1
-    assert 2 < calls < 100
-    assert simulation.prepare(SECOND // 10, budget_ns=0), 'there is nothing left to do'
-    states = states_of(simulation)
-    simulation.advance(SECOND // 10)
-    assert (states.count, len(taken)) == (0, 22)
 
 
 def test_each_sample_is_computed_once_and_few_in_vain():
@@ -208,7 +169,9 @@ def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
             simulation.advance(until * MILLISECOND)
         return taken, pose.sent, pose.skipped
 
-    assert run(True) == run(False)
+    expected = run(False)
+    assert run(True) == expected
+    assert change not in ('subscriber', 'recorder') or len(expected[0]) > 70
 
 
 @pytest.mark.parametrize('l3', [1.6, 1e3])

@@ -143,8 +143,6 @@ def test_an_upright_top_sleeps_above_the_critical_momentum(l3, name):
     assert regime(top, State(theta=0.0, l3=l3, lz=l3)) == name
 
 
-# ------------------------------------------------------------------- a motion in numbers
-
 def described(**values):
     """Return the description of a motion, its top and its start state."""
     simulation = Simulation(parameters.checked(

@@ -12,7 +12,6 @@ import threading
 import time
 from contextlib import closing
 from operator import ge
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -26,6 +25,7 @@ from helpers.recordings import (
     rows_of,
     some_messages,
 )
+from helpers.reference import ROOT
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
@@ -37,7 +37,6 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import McapRecorder, create_file
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 
-ROOT = Path(__file__).parents[1]
 PATIENCE_S = 20.0  # for what happens at once on an idle machine
 
 
@@ -101,21 +100,6 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
     file.write_chunk()
     file.finish()
     assert synced == [str(path), str(tmp_path)]
-
-
-def test_closing_twice_changes_nothing(tmp_path):
-    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
-    recorder.write(0, 1, pose_cdr(1))
-    first = recorder.close()
-    content = first.path.read_bytes()
-    recorder.write(0, 2, pose_cdr(2))
-    second = recorder.close()
-    assert recorder.state == 'closed'
-    assert (first.counts, first.bytes, first.error, first.lost) == (
-        second.counts, second.bytes, None, 0)
-    assert is_indexed(first.path)
-    assert second.lost == recorder.counters.lost == 1
-    assert first.bytes == len(content) == len(second.path.read_bytes())
 
 
 def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monkeypatch):

@@ -8,9 +8,7 @@ serialized by rosbags.
 
 import io
 import json
-import os
 import random
-import textwrap
 import zlib
 from contextlib import closing
 
@@ -183,19 +181,6 @@ def test_bag_metadata_agrees_with_the_messages(tmp_path, monkeypatch, count):
         assert entry['topic_metadata']['offered_qos_profiles'][0]['history'] == 'keep_last'
     assert bag['topics_with_message_count'][1]['topic_metadata']['offered_qos_profiles'][0][
         'reliability'] == 'best_effort'
-
-
-def test_a_bag_folder_made_of_the_embedded_metadata_is_read(tmp_path):
-    """The record holds what rosbag2 would have put into metadata.yaml."""
-    record(tmp_path / 'run.mcap', some_messages(100))
-    with open(tmp_path / 'run.mcap', 'rb') as file:
-        text = next(item.metadata['serialized_metadata']
-                    for item in make_reader(file).iter_metadata() if item.name == 'rosbag2')
-    (tmp_path / 'metadata.yaml').write_text(
-        'rosbag2_bagfile_information:\n' + textwrap.indent(text, '  '))
-    with Reader(tmp_path) as reader:
-        assert reader.message_count == len(list(reader.messages())) == 100
-        assert reader.ros_distro == os.environ.get('ROS_DISTRO', 'jazzy')
 
 
 def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):

@@ -70,8 +70,6 @@ def test_the_published_orientation_error_is_the_one_computed_from_the_log(finish
     assert published == pytest.approx(computed, rel=1e-6, abs=2e-15)
 
 
-# ------------------------------------------------------------------------------------ the end
-
 @pytest.mark.parametrize('numbers', [
     (signal.SIGINT, signal.SIGINT), (signal.SIGHUP, signal.SIGQUIT)], ids=['int', 'hup'])
 def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, numbers):
@@ -119,8 +117,6 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(monkeypa
         terminal.show('one')
         terminal.show('two')
 
-
-# ------------------------------------------------------------------------- overload, faults
 
 def test_overload_skips_what_is_live_records_everything_and_stays_reachable(tmp_path, capfd):
     streams = ('pose', 'joint_states', 'ground_truth_odom')

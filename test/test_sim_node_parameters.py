@@ -38,8 +38,6 @@ def recorded(node):
     return log_of(path)[0]
 
 
-# ------------------------------------------------------------------------------- commands
-
 def as_message(node, l3, lz):
     node.command(l3, lz)
 
@@ -104,8 +102,6 @@ def test_refused_commands_and_parameters_change_nothing(node, capfd):
     node.step(10)
     assert commands_in(recorded(node)) == []
 
-
-# ------------------------------------------------------------------------ other parameters
 
 def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
     """YAML 1.1 takes 1e-9 for a text, and so do `ros2 param set` and `ros2 param load`."""

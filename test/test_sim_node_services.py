@@ -2,7 +2,6 @@
 """The services and topics of running nodes, seen from another process; and /clock."""
 
 import math
-import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -80,10 +79,8 @@ def test_recordings_start_and_stop(peer, diagnostics, served):
     assert peer.switch(node, 'record', False).message == 'not recording'
 
 
-# ------------------------------------------------------------------------------------- /clock
-
 def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagnostics, tmp_path):
-    """Before the clock, with it, when it stops, and steps back."""
+    """Before the clock, with it, and when it stops."""
     clock = DrivenClock(peer, '/driven', 1_000_000_000_000)     # /clock is that of `served`
 
     def waits():
@@ -94,7 +91,7 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
 
     def is_ahead():
         assert all(stamp_of(data) <= clock.now_ns for data in pose.raw[-1:])
-        return len(pose.raw) > count + 50
+        return len(pose.raw) > 50
 
     with SimNode(tmp_path, {'use_sim_time': True, 'status_period': 0.2, 'time_scale': 2.0},
                  namespace='/follower', arguments=('-r', '/clock:=/driven')) as node:
@@ -107,21 +104,12 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
         pose = peer.listen(node.topic('pose'), PoseStamped)
         assert peer.set_together(node, time_scale=1.0).successful
         clock.now_ns += 3_000_000           # not on the grid of the stamps
-        count = 0
         clock.drive('the motion', is_ahead)
         # It has gone as far as the clock has, to the last point of its grid.
         settled(pose)
         assert clock.now_ns - SECOND // 2 < stamp_of(pose.raw[-1]) <= clock.now_ns
         assert set(stamps_of(pose) % PERIODS_NS['pose']) == {0}
-        clock.drive('no warning', lambda: 'waiting' not in diagnostics.statuses(node)[-1].message)
         waits()                             # it has stopped
-        count = len(pose.raw)
-        clock.drive('the motion', is_ahead)
-        count = len(pose.raw)
-        clock.now_ns -= 400 * SECOND        # as where a log is played in a loop
-        clock.drive('samples', lambda: len(pose.raw) > count + 50)
-        wait_for('a warning', lambda: re.search(r'/clock stepped back by (399|40)', node.err))
-        assert (np.diff(stamps_of(pose)) > 0).all()
         assert_clean_end(node, node.end())
     assert TRACEBACK not in node.err
     peer.stop_listening(pose)

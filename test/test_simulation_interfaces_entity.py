@@ -134,6 +134,16 @@ def test_a_bad_state_changes_nothing(top, changes, code, text):
     assert top.simulation.segment is segment
 
 
+@pytest.mark.parametrize(('x', 'w', 'theta'), [(3e-9, 1.0, 0.0), (1.0, 3e-9, math.pi)])
+def test_next_to_a_pole_what_is_not_spin_is_nutation(top, x, w, theta):
+    state = upright(top, pose__orientation__x=x, pose__orientation__w=w, twist__angular__x=0.3,
+                    twist__angular__z=2.0)
+    top.done('SetEntityState', entity=NAME, state=state, set_pose=True, set_twist=True)
+    start = top.simulation.segment.start
+    assert start.theta == theta and abs(start.lz) == abs(start.l3)
+    assert start.theta_dot == pytest.approx(0.3)
+
+
 def test_a_state_can_be_set_where_the_pivot_is(top):
     """What the node says of a moving pivot can be sent back to it, and nothing else."""
     top.simulation.drive((0.5, 0.0, 0.0))

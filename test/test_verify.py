@@ -7,7 +7,8 @@ import re
 
 import numpy as np
 import pytest
-from helpers.inspected import as_json, log_of, rewritten, short_log, stepped_log, told
+from helpers.inspected import as_json, log_of, rewritten, told
+from helpers.logs import flipped
 from mcap.reader import make_reader
 
 from spinning_top_sim.recording import provenance
@@ -17,37 +18,16 @@ from spinning_top_sim.tools import recorded_run
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp('inspect')
-
-
-@pytest.fixture(scope='module')
-def stepped(folder):
-    return stepped_log(folder / 'stepped.mcap')
-
-
-@pytest.fixture(scope='module')
-def short(folder):
-    return short_log(folder / 'short.mcap')
-
-
-@pytest.fixture(scope='module')
-def columns(folder):
+def columns(tmp_path_factory):
     """The exact solution in columns, with a command between two stretches; several chunks."""
-    return log_of(folder / 'columns.mcap', '--duration', 11, '--command', '3.1:1.7:1.4',
-                  '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01',
-                  '-p', 'markers.enabled:=true')
+    return log_of(tmp_path_factory.mktemp('log') / 'columns.mcap', '--duration', 11, '--command',
+                  '3.1:1.7:1.4', '-p', 'solver.method:=exact', '-p', 'markers.enabled:=true',
+                  '-p', 'imu.accelerometer_random_walk:=0.01')
 
 
 def chunks_of(path):
     with open(path, 'rb') as file:
         return make_reader(file).get_summary().chunk_indexes
-
-
-def with_flipped_bit(data, byte, bit=0):
-    changed = bytearray(data)
-    changed[byte] ^= 1 << bit
-    return bytes(changed)
 
 
 def verified(capsys, path):
@@ -74,7 +54,7 @@ def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
               for topic in counts}
     verdict = verified(capsys, rewritten(
         path, tmp_path / 'changed.mcap', lambda topic, number, data: (
-            with_flipped_bit(data, *places[topic])
+            flipped(data, *places[topic])
             if topic in places and number == min(1, counts[topic] - 1) else data)))
     first = verdict['first']
     assert verdict['different'] == len(counts)
@@ -85,7 +65,7 @@ def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
 
 def test_a_difference_names_field_stamp_and_both_values(short, tmp_path, capsys):
     path = rewritten(short, tmp_path / 'run.mcap', lambda topic, number, data: (
-        with_flipped_bit(data, len(data) - 8) if (topic, number) == ('/pose', 7) else data))
+        flipped(data, len(data) - 8) if (topic, number) == ('/pose', 7) else data))
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1
     said = re.search(r'first: /pose at 1\.070000000 s, byte \d+, pose\.orientation\[3\]: '

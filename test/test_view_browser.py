@@ -87,10 +87,7 @@ def test_live(browser, peer, tmp_path):
             visit.press('Resume')
             visit.read('pause: running')
             # The plots have data, and a switched-on arrow is in the scene.
-            titles = visit.wait("(found => found.length === 6 && found)([...document"
-                                ".querySelectorAll('.plot .title')].map(e => e.textContent))")
-            assert {'Effective potential V(θ)', 'Energy', 'Tilt', 'Precession rate'} < set(titles)
-            assert visit.page.locator('.plot polyline').count() >= 7
+            visit.wait("document.querySelectorAll('.plot polyline').length >= 7")
             visit.tick('torque')
             visit.wait("[...document.querySelectorAll('.top-legend')].some("
                        "e => e.textContent.includes('torque'))")
@@ -107,14 +104,8 @@ def test_live(browser, peer, tmp_path):
             visit.choose('scene', 'wavy')
             visit.read('wavy, reset: at t = 0')
             visit.read('[Ww]aves')
-            visit.choose('scene', 'cusp')
-            visit.read('cusp, reset: at t = 0')
-            visit.tick('record')
-            visit.read('record: ')
-            wait_for('a log', lambda: list(tmp_path.glob('*.mcap')))
             visit.press('Reset')
-            visit.read('reset: at t = 0')
-            visit.read('[Cc]usps')
+            visit.read('(^|[^ ] ?)reset: at t = 0')
             assert visit.errors == []
             assert visit.hosts <= {'127.0.0.1', None}
 

@@ -8,11 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.simulations import record
-from rclpy.parameter import Parameter
 
 from spinning_top_sim.nodes import throttle
 from spinning_top_sim.recording.reader import LogReader
@@ -78,27 +76,6 @@ def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypa
     assert live._track.span[0] == live._epoch_ns
 
 
-def test_the_page_shows_another_top_when_its_motion_begins(live, monkeypatch):
-    def ask(_, request):
-        values = parameters.checked({'top.mass': mass, 'spin.lz': 1.4})
-        return SimpleNamespace(values=[
-            Parameter(name, value=list(value) if isinstance(value, tuple) else value
-                      ).get_parameter_value()
-            for name in request.names for value in [values[name]]])
-
-    monkeypatch.setattr(live, '_ask', ask)
-    numbers = {'state': 'running', 'recorder': 'off', 'simulated time [s]': '1',
-               'energy drift': '0', 'real-time factor': '1', 'orientation error [rad]': '0'}
-    for seconds, mass in ((1, 2.0), (2, 4.0)):
-        numbers['stamp of t = 0 [ns]'] = str(seconds * NANOSECONDS)
-        live._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(
-            name='spinning_top', values=[KeyValue(key=key, value=value)
-                                         for key, value in numbers.items()])]))
-        assert live._stale
-        live._read_parameters()
-        assert live._track.top.mass == mass and not live._stale
-
-
 def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
     pytest.importorskip('viser')
     path = tmp_path / 'run.mcap'
@@ -109,16 +86,16 @@ def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
             wait_for('the page to listen', lambda: peer.node.count_subscribers(
                 node.topic('ground_truth/odom_throttle')))
             before = diagnostics.next(node)
-            # It hangs for two seconds of simulated time, which is the real time.
+            # It hangs for a second of simulated time, which is the real time.
             os.killpg(view.process.pid, signal.SIGSTOP)
-            poses.wait_more(400)
+            poses.wait_more(200)
             os.killpg(view.process.pid, signal.SIGCONT)
             # Killed while it makes a port of shared memory, as it may when it goes on, it would
             # block all who open that port (Fast DDS).
-            poses.wait_more(200)
+            poses.wait_more(100)
             assert view.alive
             view.kill()
-            poses.wait_more(100)
+            poses.wait_more(50)
         after = diagnostics.next(node)
         assert after['clock slip [s]'] == before['clock slip [s]'] == '0.000'
         assert after['recorder'] == 'recording'
@@ -127,5 +104,5 @@ def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
         stamps = {topic: np.array([message.log_time for message in reader.messages(
             topics=[f'{node.namespace}{topic}'])]) for topic in PERIODS}
     for topic, period in PERIODS.items():
-        assert len(stamps[topic]) > 4.0e9 / period
+        assert len(stamps[topic]) > 1.5e9 / period
         assert (np.diff(stamps[topic]) == period).all(), topic

@@ -10,14 +10,13 @@ import sys
 import tempfile
 import zipfile
 from importlib import metadata
-from pathlib import Path
 
 import pytest
+from helpers.reference import ROOT
 from packaging.requirements import Requirement
 
 from spinning_top_sim.__main__ import COMMANDS, main
 
-ROOT = Path(__file__).parents[1]
 NAME = 'spinning_top_sim'
 BUILD = 'import sys, setuptools.build_meta as m; getattr(m, sys.argv[1])(sys.argv[2])'
 
@@ -151,11 +150,6 @@ def test_what_is_missing_is_told_with_its_remedy(empty, answers):
         assert f'{empty}/bin/python -m {remedy}' in err
         words = err.split()
         assert len(set(words)) == len(words)
-
-
-def test_python_m_is_the_same_command(empty, tmp_path):
-    code, out, _ = run(empty / 'bin/python', '-m', 'spinning_top_sim', '--version', cwd=tmp_path)
-    assert (code, out) == (0, f'spinning-top {metadata.version("spinning_top_sim")}\n')
 
 
 def test_the_shell_completes_commands_and_options(empty):

@@ -10,8 +10,6 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim import solve
 from spinning_top_sim.physics import attitude
 
-# ---------------------------------------------------------------------------------- motions
-
 
 def exact(top, start, times, dt):
     """Return attitudes x y z w, body rates and angular accelerations of the exact motion."""
@@ -168,9 +166,6 @@ class Stepped:
         states = np.array(rows)
         attitudes, w = states[:, [1, 2, 3, 0]], states[:, 4:]
         return attitudes, w, np.gradient(w, times, axis=0, edge_order=2)
-
-
-# ---------------------------------------------------------------------------------- readings
 
 
 class Imu:

@@ -69,6 +69,12 @@ def write_anew(path, content):
     path.write_bytes(content)
 
 
+def flipped(content: bytes, position: int, bit: int = 0) -> bytes:
+    changed = bytearray(content)
+    changed[position] ^= 1 << bit
+    return bytes(changed)
+
+
 def records_of(content: bytes) -> list[tuple[int, int, int]]:
     """Return opcode, start and end of every record, of a whole file."""
     found = []
@@ -141,8 +147,6 @@ STRANGERS = {
     'unchunked': {'use_chunking': False},
     'lz4': {'compression': CompressionType.LZ4},
     'no index': {'index_types': IndexType.NONE},
-    'no index of metadata': {'index_types': IndexType.CHUNK | IndexType.MESSAGE},
-    'no statistics': {'use_statistics': False},
     'nothing repeated': {'repeat_channels': False, 'repeat_schemas': False},
     'nothing but messages': {
         'use_chunking': False, 'use_statistics': False, 'use_summary_offsets': False,
