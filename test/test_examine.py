@@ -83,17 +83,6 @@ def test_the_autocorrelation_time_is_the_direct_sum():
     assert measures.autocorrelation_time(np.ones((3, 7))) == 1.0
 
 
-def test_the_autocorrelation_time_is_the_direct_sum():
-    values = np.cumsum(np.random.default_rng(1).standard_normal((3, 1000)), axis=1)
-    centred, expected = values - np.mean(values), 1.0
-    for lag in range(1, 1000):
-        expected += 2.0 * np.mean(centred[:, lag:] * centred[:, :-lag]) / np.mean(centred ** 2)
-        if lag >= 5.0 * expected:
-            break
-    assert measures.autocorrelation_time(values) == pytest.approx(expected, rel=1e-9)
-    assert measures.autocorrelation_time(np.ones((3, 7))) == 1.0
-
-
 @pytest.mark.parametrize(('factor', 'fault'), [
     (0.5, 'covariance_small'), (1.0, None), (2.0, 'covariance_large')])
 def test_covariances_may_be_about_the_axes_of_sensor_or_world(report, factor, fault):
