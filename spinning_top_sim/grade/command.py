@@ -109,7 +109,7 @@ def _motion(arguments: argparse.Namespace,
 
 def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0) -> Trajectory:
     """
-    Return all parts at the times of the one with most samples, made evenly spaced.
+    Return all parts at the times of the IMU, else of the attitudes, made evenly spaced.
 
     motion : about which attitudes are interpolated; white noise about it is taken away
     begin : time of its start; times are counted from there [s]
@@ -125,7 +125,8 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
         if min(at[-1], times[-1]) - max(at[0], times[0]) < 0.5 * np.ptp(times):
             notes.append(f'{name}: not at the times of the attitudes, left out')
             del parts[name]
-    even = _even([times, *(at for at, _ in parts.values())], notes)
+    first = [parts[name][0] for name in ('gyroscope', 'accelerations') if name in parts]
+    even = _even([*first, times, *(at for at, _ in parts.values())], notes)
     error = turns(times).inv() * Rotation.from_quat(np.roll(attitudes, -1, axis=1))
     level, white = fitting.whiteness(error.as_rotvec().T)
     found = turns(even)
@@ -133,14 +134,11 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
         notes.append(f'the attitudes are exact but for noise of {level:.3g} rad: graded without '
                      'it')
     else:
-        found = found * (error if np.array_equal(even, times) else
-                         RotationSpline(times, error)(even))
+        found = found * RotationSpline(times, error)(even)
     angle = float(abs(motion.start.l3 / motion.top.lambda3)) * (even[1] - even[0])
     readings = {'attitudes': np.roll(found.as_quat(), 1, axis=1)}
     for name, (at, values) in parts.items():
-        if len(at) == len(even) and np.max(np.abs(at - even)) < SAME_S:
-            readings[name] = values
-        elif angle < COARSE:
+        if angle < COARSE or (len(at) == len(even) and np.max(np.abs(at - even)) < SAME_S):
             readings[name] = make_interp_spline(at, values, DEGREE)(even)
         else:
             notes.append(f'{name}: not at the times of the attitudes, and the spin is '
@@ -150,18 +148,17 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
 
 def _longest(name: str, at: Reals, values: Reals, notes: list[str]) -> tuple[Reals, Reals]:
     """Return the longest part without a gap."""
-    steps = np.diff(at)
-    ends = np.array([0, *(np.flatnonzero(steps > GAP * np.median(steps)) + 1), len(at)])
-    if len(ends) > 2:
+    gaps = np.flatnonzero(np.diff(at) > GAP * np.median(np.diff(at))) + 1
+    if len(gaps):
         notes.append(f'{name}: the longest part without a gap is used')
-    chosen = slice(*ends[np.argmax(np.diff(ends)):][:2].tolist())
+    chosen = max(np.split(np.arange(len(at)), gaps), key=len)
     return at[chosen], values[chosen]
 
 
 def _even(times: Sequence[Reals], notes: list[str]) -> Reals:
-    """Return evenly spaced times within all of these, as many as most of them have."""
+    """Return the first of these times within all of them, made evenly spaced."""
     begin, end = max(at[0] for at in times) - SAME_S, min(at[-1] for at in times) + SAME_S
-    grid = max((at[(at >= begin) & (at <= end)] for at in times), key=len)
+    grid = times[0][(times[0] >= begin) & (times[0] <= end)]
     even: Reals = np.linspace(grid[0], grid[-1], len(grid))
     if np.max(np.abs(even - grid)) < EVEN * (even[1] - even[0]):
         return grid

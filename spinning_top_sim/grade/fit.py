@@ -21,13 +21,13 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.grade import problem as unknowns
 from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Readings, turned
 from spinning_top_sim.grade.scenes import Reals, Start
-from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools.verdict import number
 
 FEWEST = 32                 # attitudes that can be fitted
 GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
+SAME = 1.01                 # of the least residual: another fit that finds the same motion
 LOST = 0.05                 # residual of a part that is too long to begin with [rad]
 FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
 NAMES = {'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'psi': 'rad', 'L3/lambda1': 'rad/s',
@@ -43,8 +43,8 @@ SEEN = 6.0                  # standard deviations of its amplitude: a smaller nu
 STEP = 1e-6                 # of an unknown's natural size: for derivatives of the values
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
-BEGIN = 16, 32, 64          # attitudes that tell the start of a known top, whatever follows
-OFF = 0.1                   # rad, or share of the rates: another start
+BEGIN = 64                  # attitudes that tell the start of a known top, whatever follows
+OFF = 0.05                  # rad, and of the angle turned since: another start
 
 
 @dataclass(frozen=True)
@@ -142,9 +142,10 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     for size, l3, p in ((FIRST, first[SPIN], 0.0), *small[:4], (4 * FIRST, first[SPIN], 0.0)):
         first[[L3, P]] = l3, p
         trials.append(_fit_from(one, first, size, gravity))
-        if trials[-1].explained:                # another guess finds the same
-            break
-    best = min(trials, key=lambda trial: trial.residual)
+        best = min(trials, key=lambda trial: trial.residual)
+        others = [trial.residual for trial in trials if trial is not best]
+        if best.explained or min(others, default=math.inf) < SAME * best.residual:
+            break                               # another guess finds the same
     if not sure:
         _add_turns(best.x, one.times)
     best.problem.readings = [replace(one, sigma=max(best.residual, 1e-15))]
@@ -161,36 +162,21 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
 
 def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> State:
     """Return the start of a known top: the fitted one, or if none was found that of the begin."""
-    if found.reached:
-        return replace(Start.of(found.top, found.start), state=None).state_of(top)
-    return _begin_of(parts, top)[0]
+    if not found.reached:
+        times, attitudes = parts['attitudes']
+        found = fit({**parts, 'attitudes': (times[:BEGIN], attitudes[:BEGIN])})
+    return replace(Start.of(found.top, found.start), state=None).state_of(top)
 
 
 def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) -> str:
-    """Return how far the attitudes are from a start at t = 0, '' if they are near it."""
-    right = ExactSolution(top, start).states_at_seconds(parts['attitudes'][0][:1])
-    state, noise = _begin_of({**parts, 'rates': (right.t, right.angular_velocity)}, top)
-    found = ExactSolution(top, state).states_at_seconds(np.zeros(1))
-    apart = float(attitude.angle_between(right.rows_quaternion, found.rows_quaternion)[0])
-    off = float(np.linalg.norm(found.angular_velocity - right.angular_velocity))
-    if apart <= OFF and off <= OFF * np.linalg.norm(right.angular_velocity) + noise:
-        return ''
-    return (f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates '
-            f'{off:.3g} rad/s')
-
-
-def _begin_of(parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> tuple[State, float]:
-    """Return the state of a known top that the first attitudes tell, and doubt of its rates."""
-    one, x, _ = _begun(parts)
-    problem = Problem([], one.values[:, 0], top.gravity)
-    x[P] = top.gravity_torque / top.lambda1
-    for count in BEGIN:
-        problem.readings = [replace(one, times=one.times[:count], values=one.values[:, :count])]
-        x[L3] = top.lambda3 / top.lambda1 * x[SPIN]
-        x, _ = _descend(problem, x, MOTION[:6])
-    _, state = problem.start(x)
-    return (replace(state, l3=state.l3 * top.lambda1, lz=state.lz * top.lambda1),
-            6.0 * float(np.std(problem.residuals(x))) / problem.readings[0].times[-1])
+    """Return how far the first attitudes are from a motion, '' if they are near it."""
+    times, attitudes = (part[:FIRST] for part in parts['attitudes'])
+    right = ExactSolution(top, start).states_at_seconds(times)
+    apart = (Rotation.from_quat(right.quaternion).inv()
+             * Rotation.from_quat(np.roll(attitudes, -1, axis=1))).magnitude()
+    turned = np.linalg.norm(right.angular_velocity[0]) * (times - times[0])
+    return '' if np.all(apart < OFF * (1.0 + turned)) else (
+        f'at its begin the attitude is up to {math.degrees(np.max(apart)):.3g} deg off')
 
 
 def _begun(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, Reals, bool]:
@@ -198,6 +184,8 @@ def _begun(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, Reals, b
     times, attitudes = parts['attitudes']
     if len(times) < FEWEST:
         raise ValueError(f'{len(times)} attitudes: must be {FEWEST} at least for a fit')
+    if not np.any(np.ptp(attitudes, axis=0)):
+        raise ValueError('the attitude never changes: there is no motion to fit')
     turns, x = Rotation.from_quat(np.roll(attitudes, -1, axis=1)), np.zeros(unknowns.UNKNOWNS)
     one = Readings('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
     told = parts.get('rates', parts.get('gyroscope'))
