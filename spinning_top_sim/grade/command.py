@@ -65,7 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     recorded = motion_files.read(arguments.file, arguments.topic)
     body, state, found = _motion(arguments, recorded)
-    trajectory = trajectory_of(recorded, ExactSolution(body, state), found.begin if found else 0.0)
+    trajectory = trajectory_of(recorded, ExactSolution(body, state),
+                               recorded.parts['attitudes'][0][0] if found else 0.0)
     report = grade_trajectory(trajectory, body, state, subject=arguments.file.name)
     if arguments.json:
         print(json.dumps({**report.as_dict(), 'notes': recorded.notes,
