@@ -43,7 +43,6 @@ SEEN = 6.0                  # standard deviations of its amplitude: a smaller nu
 STEP = 1e-6                 # of an unknown's natural size: for derivatives of the values
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
-BEGIN = 64                  # attitudes that tell the start of a known top, whatever follows
 OFF = 0.05                  # rad, and of the angle turned since: another start
 
 
@@ -93,9 +92,8 @@ class Fit:
     def lines(self) -> Iterator[str]:
         """Yield lines for a reader."""
         yield (f'fit: residual {self.residual:.3g} rad, noise {self.noise:.3g} rad' + (
-            '' if self.reached else ': no motion of a top comes near the attitudes' if
-            self.residual > LARGEST else ': the residual is not noise, or the fit has not '
-            'converged; what follows is of the nearest motion, and the intervals mean nothing'))
+            '' if self.reached else ': the residual is not noise, or the fit has not converged; '
+            'what follows is of the nearest motion, and the intervals mean nothing'))
         for name, value in self.values.items():
             spread = INTERVAL * self.deviations[name]
             yield f'  {name:<16}{value:>16.9g} ' + (
@@ -173,7 +171,7 @@ def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> 
     """Return the start of a known top: the fitted one, or if none was found that of the begin."""
     if not found.reached:
         times, attitudes = parts['attitudes']
-        found = fit({**parts, 'attitudes': (times[:BEGIN], attitudes[:BEGIN])})
+        found = fit({**parts, 'attitudes': (times[:4 * FIRST], attitudes[:4 * FIRST])})
     return replace(Start.of(found.top, found.start), state=None).state_of(top)
 
 

@@ -99,8 +99,9 @@ class Problem:
         """Return readings - model (3, n)."""
         q, w = self.motion(x, one)
         if one.kind == 'attitude':
-            turns = Rotation.from_quat(q.T).inv() * Rotation.from_quat(one.values.T)
-            return turns.as_rotvec().T
+            a, b, c, d = q          # SciPy's rotations take ten times as long
+            turn = np.stack(attitude.product((-a, -b, -c, d), tuple(one.values)))
+            return np.stack(attitude.rotation_vector(tuple(np.where(turn[3] < 0.0, -turn, turn))))
         model = w if one.kind == 'rates' else self._force(x, q, w)
         return one.values - turned(self.mounting, x[MOUNTING]).inv().apply(model.T).T
 
