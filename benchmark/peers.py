@@ -272,7 +272,7 @@ class _Quadratic(Runner):
         q = tuple(quaternion.T)
         momentum = y[:, 4], y[:, 5], self.case.start.lz
         top = self.case.top
-        first, second, third = attitude.in_body(q, momentum)
+        first, second, third = attitude.rotated_back(q, momentum)
         return Samples(quaternion, np.stack(
             (first / top.lambda1, second / top.lambda1, third / top.lambda3), axis=1))
 

@@ -25,16 +25,17 @@ MAY_IMPORT = {
 ROS = {'rclpy', 'launch', 'launch_ros', 'rcl_interfaces', 'ament_index_python', 'std_msgs',
        'geometry_msgs', 'sensor_msgs', 'diagnostic_msgs', 'std_srvs'}
 MAY_NOT_IMPORT = {
-    'physics': ROS | {'scipy', 'mcap', 'time', 'os', 'pathlib'},
-    'solvers': ROS | {'scipy', 'mcap', 'time', 'os', 'pathlib'},
-    'streams': ROS | {'scipy', 'mcap', 'os', 'pathlib'},
-    'recording': {'rclpy', 'scipy'},
-    'tools': {'rclpy'},
-    'exam': set(),
-    'grade': {'rclpy'},
+    'physics': ROS | {'scipy', 'mcap', 'time', 'os', 'pathlib', 'viser'},
+    'solvers': ROS | {'scipy', 'mcap', 'time', 'os', 'pathlib', 'viser'},
+    'streams': ROS | {'scipy', 'mcap', 'os', 'pathlib', 'viser'},
+    'recording': {'rclpy', 'scipy', 'viser'},
+    'tools': {'rclpy', 'viser'},
+    'exam': ROS | {'viser'},
+    'grade': {'rclpy', 'viser'},
     'nodes': {'scipy', 'viser'},
-    'view': {'scipy'},
+    'view': ROS | {'scipy'},
 }
+MAY_IMPORT_ROS = {f'{NAME}.{module}' for module in ('exam.live', 'view.live', 'view.command')}
 MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): path
            for path in sorted(PACKAGE.rglob('*.py'))}
 
@@ -74,24 +75,8 @@ def test_a_room_imports_only_what_it_may(name):
         others = {room(other) for other in ours(path)} - {name, None}
         assert others <= MAY_IMPORT[name], module
         top_level = {imported_name.split('.')[0] for imported_name in imported(path)}
-        assert not top_level & MAY_NOT_IMPORT[name], module
-
-
-def test_one_module_of_the_exam_needs_ros():
-    needs = {module for module, path in MODULES.items() if room(module) == 'exam'
-             and any(name.split('.')[0] in ROS for name in imported(path))}
-    assert needs == {f'{NAME}.exam.live'}
-
-
-def test_only_the_page_knows_viser_and_only_the_live_one_ros():
-    for module, path in MODULES.items():
-        top_level = {name.split('.')[0] for name in imported(path)}
-        assert 'viser' not in top_level or room(module) == 'view'
-        if room(module) == 'view':
-            # `view.command` only takes ROS arguments away.
-            assert not top_level & ROS - {'rclpy'} or module == f'{NAME}.view.live'
-            assert 'rclpy' not in top_level or module in {
-                f'{NAME}.view.live', f'{NAME}.view.command'}
+        allowed = ROS if module in MAY_IMPORT_ROS else set()
+        assert not top_level & MAY_NOT_IMPORT[name] - allowed, module
 
 
 def test_imports_have_no_circles():

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """examples/attitude_filter.py: against the truth from logs, and live beside a node."""
 
-import functools
 import importlib.util
 import math
 import re
@@ -16,11 +15,8 @@ from spinning_top_sim.tools.simulate import main as simulate
 
 EXAMPLE = ROOT / 'examples/attitude_filter.py'
 SETTLE = 15.0
-LOGS = {
-    'pivot': ['--duration', '24'],
-    'lever arm': ['--duration', '18', '-p', 'imu.lever_arm:=[0.1, 0.0, 0.0]'],
-    'nine axes': ['--duration', '18', '-p', 'mag.enabled:=true'],
-}
+LOGS = {'lever arm': ('-p', 'imu.lever_arm:=[0.1, 0.0, 0.0]'),
+        'nine axes': ('-p', 'mag.enabled:=true')}
 
 
 @pytest.fixture(scope='module')
@@ -42,29 +38,15 @@ def logs(tmp_path_factory):
     for name, path in paths.items():
         assert simulate(['--quiet', '-o', str(path), '-p', 'imu.rpy:=[0.3, -0.2, 1.0]', '-p',
                          'solver.method:=exact', '--params', str(ROOT / 'config/wavy.yaml'),
-                         *LOGS[name]]) == 0
+                         '--duration', '18', *LOGS[name]]) == 0
     return paths
 
 
 @pytest.fixture(scope='module')
 def summaries(example, logs):
     """Return the function that returns the summaries of filters on one of LOGS, by filter."""
-    @functools.cache
-    def summaries(name, *filters, **options):
-        return {one.name: one.summary(SETTLE)
-                for one in example.compare(logs[name], filters, **options)}
-    return summaries
-
-
-def test_at_the_pivot_a_perfect_imu_leaves_the_filters_own_error(summaries):
-    found = summaries('pivot', 'vqf', 'madgwick', 'ekf')
-    assert found['vqf'].compared == 2400
-    assert found['vqf'].tilt_rms < 0.03 and found['vqf'].converged < 1.0
-    assert abs(found['vqf'].heading_rate) < 0.045
-    assert found['ekf'].tilt_rms < 0.06
-    # Madgwick compares a new force with an old attitude: one sample of lag, 1.4 degrees.
-    assert found['madgwick'].tilt_rms == pytest.approx(1.39, abs=0.1)
-    assert found['ekf'].heading_rate == pytest.approx(found['madgwick'].heading_rate, rel=0.1)
+    return lambda name, *filters, **options: {
+        one.name: one.summary(SETTLE) for one in example.compare(logs[name], filters, **options)}
 
 
 def test_nine_axes_know_the_heading(summaries):
@@ -108,7 +90,7 @@ def test_lost_samples_are_bridged(example):
 def test_a_wrong_settling_time_or_namespace_is_told(example, logs, capsys):
     assert example.main(['it', str(logs['lever arm']), '--settle', '40']) == 1
     assert '--settle 40' in capsys.readouterr().err
-    assert example.main(['it', str(logs['pivot']), '--namespace', 'other']) == 1
+    assert example.main(['it', str(logs['lever arm']), '--namespace', 'other']) == 1
     assert 'no topic /other/imu/data_raw; it has /pose' in capsys.readouterr().err
 
 
@@ -119,7 +101,7 @@ def test_live_it_follows_a_node_and_ends_by_itself_or_by_sigint(example, tmp_pat
             str(EXAMPLE), '--filter', 'vqf', '--settle', '0']) as other):
         wait_for('the start', lambda: 'waiting for /waves/imu/data_raw' in other.err)
         with SimNode(tmp_path / 'top', namespace='/waves', arguments=files):
-            assert example.main(['it', '--duration', '4', '--settle', '2',
+            assert example.main(['it', '--duration', '3', '--settle', '1.5',
                                  '--ros-args', '-r', '__ns:=/waves']) == 0
             wait_for('a report', lambda: len(re.findall(r'vqf at', other.err)) >= 2)
             assert other.end(signal.SIGINT) == 0
@@ -127,5 +109,5 @@ def test_live_it_follows_a_node_and_ends_by_itself_or_by_sigint(example, tmp_pat
                       capfd.readouterr().out)
     # Two degrees of bias of the force at most; a load that makes samples late costs poses.
     assert float(found[1]) < 3.0
-    assert int(found[2]) > 100
+    assert int(found[2]) > 80
     assert 'heading drift' in other.out and 'Traceback' not in other.err

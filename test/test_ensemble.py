@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ensembles: what a run is, and a dataset that is the same however it was computed."""
 
-import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
-import threading
-import time
 from importlib.util import find_spec
 
 import numpy as np
@@ -18,7 +13,7 @@ from helpers.reference import ROOT
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools import ensemble_part, ensemble_spec
+from spinning_top_sim.tools import ensemble_spec
 from spinning_top_sim.tools.ensemble import main
 from spinning_top_sim.tools.ensemble_part import compute_part, table
 
@@ -36,7 +31,6 @@ SPEC = {
                'params': {'values': [str(ROOT / f'config/imu/{name}.yaml')
                                      for name in ('bmi088', 'adis16470', 'perfect')]}},
     'streams': ['imu', 'ground_truth_imu']}
-PATIENCE = 150.0            # s, with a machine that is busy otherwise
 
 
 def written(folder, **changes):
@@ -58,35 +52,6 @@ def parts_of(specification, folder):
     for part in range(specification.parts):
         failed |= compute_part(specification, part, str(folder))
     return failed
-
-
-@contextlib.contextmanager
-def process(*arguments):
-    """Run Python in a session of its own, and kill what is left of it."""
-    running = subprocess.Popen([sys.executable, *map(str, arguments)], start_new_session=True,
-                               text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    try:
-        yield running
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(running.pid, signal.SIGKILL)
-        running.communicate()
-
-
-def wait_for(folder, parts):
-    """Wait until so many parts are complete."""
-    end = time.monotonic() + PATIENCE
-    while len(list((folder / 'data').glob('part-*'))) < parts:
-        assert time.monotonic() < end
-        time.sleep(0.002)
-
-
-@contextlib.contextmanager
-def meanwhile(act):
-    thread = threading.Thread(target=act)
-    thread.start()
-    yield
-    thread.join()
 
 
 @pytest.fixture(scope='module')
@@ -112,9 +77,6 @@ def whole(tmp_path_factory):
     path = written(folder)
     assert parts_of(ensemble_spec.read(path), folder) == {}
     return folder / 'data', path
-
-
-# ------------------------------------------------------------------------------------- a dataset
 
 
 def test_every_stream_has_columns_or_is_left_out():
@@ -169,80 +131,63 @@ def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
 
 
 def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
-        whole, tmp_path, cluster, ensemble):
+        whole, tmp_path, cluster, ensemble, monkeypatch):
+    from distributed.client import Future
+
     data, path = whole
-    folder = tmp_path / 'other'
+    folder, killed, ordinary = tmp_path / 'other', [], Future.result
     first, _ = cluster.run(os.getpid).values()
 
-    def kill():
-        wait_for(folder, 2)
-        os.kill(first, signal.SIGKILL)
+    def result(future):
+        if not killed:
+            killed.append(os.kill(first, signal.SIGKILL))
+        return ordinary(future)
 
-    with meanwhile(kill):
-        assert ensemble(path, '-o', folder) == 0
+    monkeypatch.setattr(Future, 'result', result)
+    assert ensemble(path, '-o', folder) == 0
+    assert killed
     assert contents(folder / 'data') == contents(data)
     manifest = json.loads((folder / 'manifest.json').read_text())
     assert manifest['complete'] and manifest['failed'] == {}
     assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(manifest['versions'])
     assert ensemble_spec.parse(manifest['specification'], 'test') == ensemble_spec.read(path)
     assert sorted(entry.name for entry in folder.iterdir()) == ['data', 'manifest.json']
+    # A row alone is computed from the manifest.
+    one, every = tmp_path / 'one.parquet', parquet.read_table(data)
+    assert main([str(folder), '--row', '31', '-o', str(one)]) == 0
+    assert parquet.read_table(one).equals(
+        every.filter(every['run'].to_numpy() == 31).combine_chunks())
 
 
-def test_the_same_command_goes_on_after_an_interruption(
+def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_scheduler(
         whole, tmp_path, ensemble, monkeypatch, capsys):
     """A part that is there is not computed again; a torn one is."""
-    from spinning_top_sim.tools import ensemble_cluster
+    from distributed.client import Future
+    from distributed.comm import CommClosedError
 
-    def interrupted(client, task, numbers):
-        yield from compute(client, task, numbers[:3])
-        raise KeyboardInterrupt
+    (data, path), folder, ordinary = whole, tmp_path / 'other', Future.result
+    for error, code, said in ((CommClosedError('gone'), 1, 'the scheduler is lost'),
+                              (KeyboardInterrupt(), 130, 'interrupted')):
+        results = []
 
-    (data, path), folder, compute = whole, tmp_path / 'other', ensemble_cluster.compute
-    with monkeypatch.context() as patch:
-        patch.setattr(ensemble_cluster, 'compute', interrupted)
-        assert ensemble(path, '-o', folder) == 130
-    assert capsys.readouterr().err == 'spinning-top ensemble: interrupted\n'
+        def result(future, error=error, results=results):
+            results.append(future)
+            if len(results) > 3:
+                raise error
+            return ordinary(future)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Future, 'result', result)
+            assert ensemble(path, '-o', folder) == code
+        assert capsys.readouterr().err == f'spinning-top ensemble: {said}\n'
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
     torn, *kept = sorted((folder / 'data').iterdir())
-    assert len(kept) == 2
+    assert len(kept) >= 2
     then = [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept]
     torn.write_bytes(torn.read_bytes()[:-1])
     assert ensemble(path, '-o', folder) == 0
     assert contents(folder / 'data') == contents(data)
     assert [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept] == then
-
-
-def test_a_cluster_whose_scheduler_is_killed(whole, tmp_path, capsys):
-    folder, place = tmp_path / 'other', tmp_path / 'scheduler.json'
-    common = ('--scheduler-file', place, '--host', '127.0.0.1', '--no-dashboard')
-    with process('-m', 'dask', 'scheduler', '--port', 0, *common) as scheduler, process(
-            '-m', 'dask', 'worker', '--nthreads', 1, '--no-nanny', *common):
-        end = time.monotonic() + PATIENCE
-        while not (place.exists() and place.read_text()) and time.monotonic() < end:
-            time.sleep(0.01)
-        address = json.loads(place.read_text())['address']
-
-        def kill():
-            wait_for(folder, 3)
-            scheduler.kill()
-
-        with meanwhile(kill):
-            assert main([str(whole[1]), '-o', str(folder), '--scheduler', address]) == 1
-    assert capsys.readouterr().err.splitlines()[-1] == (
-        'spinning-top ensemble: the scheduler is lost')
-
-
-def test_a_row_alone_is_computed_from_the_manifest(whole, tmp_path):
-    data, path = whole
-    from dataclasses import asdict
-    (tmp_path / 'manifest.json').write_text(json.dumps({
-        'format': 1, 'versions': ensemble_part.versions(),
-        'specification': asdict(ensemble_spec.read(path))}))
-    assert main([str(tmp_path), '--row', '31', '-o', str(tmp_path / 'one.parquet')]) == 0
-    every = parquet.read_table(data)
-    assert parquet.read_table(tmp_path / 'one.parquet').equals(
-        every.filter(every['run'].to_numpy() == 31).combine_chunks())
-    assert main([str(tmp_path), '--row', '31', '-o', str(tmp_path / 'one.parquet')]) == 1
 
 
 def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):
@@ -261,9 +206,6 @@ def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):
         assert all('ValueError: no motion from theta' in why for why in failed.values())
     part, = (folder / 'data').iterdir()
     assert set(parquet.read_table(part)['run'].to_pylist()) == {0, 1, 2}
-
-
-# --------------------------------------------------------------------------------- what is drawn
 
 
 def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names():
@@ -324,9 +266,6 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
             {None}, {None}, {1.4}, {1.4}]
 
 
-# -------------------------------------------------------------------------------------- bad input
-
-
 @pytest.mark.parametrize(('changes', 'said'), [
     ({'sample': {'spin.l4': {'uniform': [1, 2]}}},
      'there is no parameter spin.l4; did you mean spin.l'),
@@ -343,6 +282,8 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
     ({'runs': 1.5}, 'runs = 1.5: must be an integer >= 1'),
     ({'duration': 0.0}, 'duration = 0.0: must be a number >= 1e-09'),
     ({'run': 3}, "'run'")])
+
+
 def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, changes, said):
     path = written(tmp_path, **changes)
     code = main([str(path), '-o', str(tmp_path / 'out')])
@@ -366,13 +307,9 @@ def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble
     error = capsys.readouterr().err
     assert f'{folder} has another ensemble' in error
     assert error.endswith(': choose a new folder, or --overwrite\n')
-    turned = written(tmp_path, runs=1, duration=0.05, sample={      # it is another grid
-        'spin.l3': {'values': [1.5, 1.7]}, 'initial.theta': {'values': [0.3, 0.6]}})
-    assert ensemble(turned, '-o', folder) == 2
-    assert 'has another ensemble' in capsys.readouterr().err
-    assert contents(folder) == before
     (folder / 'notes').write_text('mine')
-    assert ensemble(turned, '-o', folder, '--overwrite') == 0
+    other = written(tmp_path, runs=1, duration=0.05, sample={'spin.l3': {'values': [1.5, 1.7]}})
+    assert ensemble(other, '-o', folder, '--overwrite') == 0
     after = contents(folder)
     assert after.pop('notes') == b'mine'
     assert after.keys() == before.keys() and not after.items() & before.items()

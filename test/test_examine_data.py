@@ -147,15 +147,3 @@ def test_an_hdf5_file_is_read_too(run, trial, tmp_path):
         file.attrs['sampling_rate'] = trial['sampling_rate']
     report = examine_data(partial(Known, run, Rotation.identity()), tmp_path)
     assert report.measures['data_rms_deg'] == pytest.approx(0.0, abs=1e-5)
-
-
-@pytest.mark.parametrize('arguments', [
-    ['--data', '.'], ['--data', '.', '--topic', 'imu/data'], ['run.mcap', '--data', '.']])
-def test_data_need_a_filter(capsys, arguments):
-    assert main(arguments) == 2
-    assert 'give either a' in capsys.readouterr().err
-
-
-def test_data_have_no_level(capsys):
-    assert main(['--filter', 'vqf', '--data', '.', '--level', 'full']) == 2
-    assert '--level: --data takes --data only' in capsys.readouterr().err

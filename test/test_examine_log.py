@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from helpers.definitions import add_definitions
+from helpers.recordings import write_rows
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
@@ -17,24 +18,12 @@ from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.log import examine_log
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.simulate import main as simulate
 
 IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (
     'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped', 'geometry_msgs/msg/PoseStamped',
     'geometry_msgs/msg/PoseWithCovarianceStamped', 'nav_msgs/msg/Odometry')
 add_definitions(POSE_COVARIANCE)
-
-
-def write(path, topics, rows, metadata=None):
-    """Write a log of rows (topic's index, stamp [ns], data)."""
-    file = create_file(path, [RecordedTopic(*topic) for topic in topics], metadata or {},
-                       compression='none')
-    for row in rows:
-        file.append(*row)
-    file.write_chunk()
-    file.finish()
-    return path
 
 
 def simulated(path, *options):
@@ -85,8 +74,10 @@ def beside(log, tmp_path_factory):
             header = made('std_msgs/msg/Header', stamp, 'a frame')
             rows.append((1, stamp_ns, bytes(store.serialize_cdr(
                 filled(type_name, header, one, variance), type_name))))
-        return write(tmp_path_factory.mktemp('beside') / 'run.mcap',
-                     (('/ground_truth/imu', IMU), ('/estimate', type_name)), truth + rows)
+        return write_rows(
+            tmp_path_factory.mktemp('beside') / 'run.mcap',
+            (RecordedTopic('/ground_truth/imu', IMU), RecordedTopic('/estimate', type_name)),
+            truth + rows)
     return write_beside
 
 
@@ -117,6 +108,19 @@ def test_faults_of_attitudes_in_a_log_are_named(beside, name, said, options):
     assert report.faults == [name], report
 
 
+@pytest.mark.parametrize('topic', ['/ground_truth/imu', '/estimate'])
+def test_a_message_that_is_cut_is_refused_in_a_line(log, tmp_path, topic):
+    with LogReader(log) as reader:
+        rows = [(number, message.log_time, message.data) for message in reader.messages(
+            ['/ground_truth/imu']) for number in (0, 1)]
+    number = ('/ground_truth/imu', '/estimate').index(topic)
+    rows.append((number, rows[-1][1] + 1, rows[-1][2][:50]))
+    path = write_rows(tmp_path / 'cut.mcap', [
+        RecordedTopic(name, IMU) for name in ('/ground_truth/imu', '/estimate')], rows)
+    with pytest.raises(ValueError, match=f'a message of {topic} cannot be read: .*$'):
+        examine_log(path, 'estimate', north='true')
+
+
 def test_the_truth_may_be_of_the_body(log):
     """The IMU is turned on the body."""
     report = examine_log(log, '/ground_truth/imu', 'ground_truth/odom', north='true')
@@ -134,8 +138,9 @@ def test_a_delay_in_a_log_is_in_steps_of_the_filter(tmp_path):
             stamp_ns = message.log_time + 3_000_000
             stamp = struct.pack('<iI', *divmod(stamp_ns, 10 ** 9))
             rows.append((1, message.log_time, message.data[:4] + stamp + message.data[12:]))
-    report = examine_log(write(tmp_path / 'late.mcap', (
-        ('/ground_truth/imu', IMU), ('/late', IMU)), rows), '/late', north='true')
+    report = examine_log(write_rows(tmp_path / 'late.mcap', [
+        RecordedTopic(name, IMU) for name in ('/ground_truth/imu', '/late')], rows),
+        '/late', north='true')
     assert report.faults == ['stamp_offset']
     assert report.measures['stamp_offset_s'] == pytest.approx(0.003, rel=0.02)
 

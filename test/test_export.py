@@ -171,12 +171,3 @@ def test_a_wrong_kind_is_told_with_the_right_ones(tmp_path, capsys, text):
         simulate.main(['--export', text, '-o', str(tmp_path / 'run.mcap')])
     assert f'{text}: must be KIND:FILE with one of tum, euroc, euroc_imu, kalibr' in (
         capsys.readouterr().err)
-
-
-def test_inspect_refuses_what_the_log_lacks_and_what_is_there(tmp_path, folder, capsys):
-    log = tmp_path / 'run.mcap'
-    assert simulate.main(['--duration', '0.01', '-o', str(log), '--quiet']) == 0
-    assert inspect.main([str(log), *exports(tmp_path, 'tum')]) == 2
-    assert 'no ground_truth/imu_odom' in capsys.readouterr().err
-    assert inspect.main([str(folder / 'run.mcap'), *exports(folder, 'tum')]) == 1
-    assert 'nothing is overwritten' in capsys.readouterr().err

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from helpers.faulty_simulators import Stepped
+from helpers.recordings import write_rows
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
@@ -13,7 +14,6 @@ from spinning_top_sim import State, Top, solve
 from spinning_top_sim.grade.command import main, trajectory_of
 from spinning_top_sim.grade.scenes import Start
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools import motion_files
 from spinning_top_sim.tools.simulate import main as simulate
@@ -158,15 +158,13 @@ def test_rows_may_be_uneven_out_of_order_or_without_some_sensors(tmp_path):
     assert (right.inv() * even.rotation).magnitude().max() < 1e-4
 
 
-def foreign_log(path, late=0, covariance=0.0):
+def foreign_log(path, late):
     """Write a log of another program: poses, and readings that come some steps late."""
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
     make = {name.rpartition('/')[2]: one for name, one in store.types.items()}
-    pose, reading = 'geometry_msgs/msg/PoseStamped', 'sensor_msgs/msg/Imu'
-    file = create_file(path, [RecordedTopic('/body/pose', pose), RecordedTopic('/imu', reading)],
-                       {}, compression='none')
+    pose, reading, rows = 'geometry_msgs/msg/PoseStamped', 'sensor_msgs/msg/Imu', []
 
     def vector(v):
         return make['Vector3'](*map(float, v))
@@ -174,18 +172,16 @@ def foreign_log(path, late=0, covariance=0.0):
     for k, stamp in enumerate(NS.tolist()):
         header = make['Header'](make['Time'](stamp // 10 ** 9, stamp % 10 ** 9), 'world')
         place = make['Pose'](make['Point'](0.0, 0.0, 0.0), make['Quaternion'](*Q[k].tolist()))
-        now = max(k - late, 0)
-        unknown = np.zeros(9)
+        now, unknown = max(k - late, 0), np.zeros(9)
         imu_message = make['Imu'](
             header, make['Quaternion'](0.0, 0.0, 0.0, 1.0), np.array([-1.0, *unknown[1:]]),
-            vector(RATES[now]), unknown + covariance, vector(FORCE[now]), unknown + covariance)
+            vector(RATES[now]), unknown, vector(FORCE[now]), unknown)
         received = stamp + 3_000_000 + 200_000 * (k % 7)
-        file.append(0, received, bytes(store.serialize_cdr(make['PoseStamped'](header, place),
-                                                           pose)))
-        file.append(1, received, bytes(store.serialize_cdr(imu_message, reading)))
-    file.write_chunk()
-    file.finish()
-    return path
+        rows += [(number, received, bytes(store.serialize_cdr(message, kind)))
+                 for number, (message, kind) in enumerate((
+                     (make['PoseStamped'](header, place), pose), (imu_message, reading)))]
+    return write_rows(path, [RecordedTopic('/body/pose', pose), RecordedTopic('/imu', reading)],
+                      rows)
 
 
 def test_transforms_that_move_and_poses_without_a_header_are_read(tmp_path):

@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The presets of config/imu: what they set, the data sheets' figures in SI units, their use."""
 
-import json
 import math
 
 import pytest
 from helpers.reference import ROOT, scene_parameters
 
-from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
-from spinning_top_sim.tools.simulate import main as simulate
 
 FOLDER = ROOT / 'config/imu'
 ERRORS = {name for name in parameters.BY_NAME if name.endswith((
@@ -84,16 +81,3 @@ def test_a_preset_sets_all_errors_of_the_imu_and_nothing_else(name):
         assert sensor(values, kind) == pytest.approx(figures, rel=2e-5), kind
         *_, limit, step = sensor(values, kind)
         assert limit <= 32767.5 * step, 'what 16 bits hold'
-
-
-def test_simulate_takes_a_preset_on_top_of_a_scene(tmp_path):
-    log = tmp_path / 'run.mcap'
-    assert simulate(['--quiet', '-o', str(log), '--duration', '1',
-                     '--params', str(ROOT / 'config/wavy.yaml'),
-                     '--params', str(FOLDER / 'bmi088.yaml')]) == 0
-    with LogReader(log) as reader:
-        used = json.loads(reader.metadata['spinning_top_sim']['parameters'])
-    expected = parameters.checked({**scene_parameters('wavy'),
-                                   **read_scene(FOLDER / 'bmi088.yaml')})
-    assert all(used[name] == expected[name]
-               for name in (*ERRORS, 'spin.l3', 'spin.lz', 'initial.theta'))

@@ -21,7 +21,6 @@ GRAVITY = parameters.checked({})['top.gravity']
 TOPICS = DQ, DV, ODOMETRY = 'imu/dq', 'imu/dv', 'ground_truth/imu_odom'
 BOTH = pytest.mark.parametrize('method', ['exact', 'rk45'])
 
-# ------------------------------------------------------------------------- against 30 digits
 
 @pytest.mark.parametrize('case', CASES, ids=lambda case: f'{case["scene"]}-{case["length_ns"]}')
 def test_increments_and_means_are_those_of_thirty_digits(case):
@@ -44,8 +43,6 @@ def test_increments_and_means_are_those_of_thirty_digits(case):
         error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
         assert error <= bound, (name, error)
 
-
-# -------------------------------------------------------------- against the truth at both ends
 
 def assert_they_connect(found, tolerance):
     """Every increment leads from one sample of the odometry to the next."""
@@ -112,7 +109,12 @@ def test_increments_connect_the_samples_of_the_lever_arms_end(method):
     assert velocity == pytest.approx(np.cross(rates, arm), abs=1e-13)
 
 
-# ---------------------------------------------------------------------------------- errors
+@BOTH
+def test_increments_connect_the_samples_along_a_path_of_the_pivot(method):
+    _, found = run({**MOUNTED, 'solver.method': method, 'pivot.path': (
+        0.7, 1.0, 0.5, 9.0, 0.9025, -1.0, 0.0, -9.0)}, 2 * SECOND, *TOPICS)
+    assert_they_connect(found, 1e-14 if method == 'exact' else 3e-12)
+
 
 def test_the_noise_of_increments_is_that_of_the_readings():
     """Of sample k: the error of the mean, throughout the interval."""
@@ -130,22 +132,6 @@ def test_the_noise_of_increments_is_that_of_the_readings():
     assert np.abs(force - true_force).max() > 0.1
 
 
-def test_instant_readings_have_the_same_noise_as_means():
-    """White noise and bias are numbered by sample, whatever the sample is taken of."""
-    noise, exact = {}, {}
-    for sampling in ('instant', 'mean'):
-        _, found = run({**NOISY, 'imu.sampling': sampling}, SECOND // 4, 'imu/data_raw',
-                       'ground_truth/imu')
-        raw, exact[sampling] = (np.hstack(fields[3:]) for fields in found.values())
-        noise[sampling] = raw - exact[sampling]
-    assert noise['instant'] == pytest.approx(noise['mean'], abs=1e-14)
-    # The first mean is over no time.  Later ones differ from the values at the stamps.
-    assert np.array_equal(exact['instant'][0], exact['mean'][0])
-    assert np.abs(exact['instant'] - exact['mean'])[1:, 0].min() > 1e-4
-
-
-# ------------------------------------------------------------------------------ off, and on
-
 @BOTH
 def test_switched_on_while_running_the_first_interval_is_a_whole_one(method):
     """The messages are those of a run in which they were on from the start."""
@@ -158,10 +144,3 @@ def test_switched_on_while_running_the_first_interval_is_a_whole_one(method):
     assert times_ns[0] == SECOND + 5 * MILLISECOND
     assert 2.0 * np.linalg.norm(dq[0, :3]) == pytest.approx(
         5e-3 * np.linalg.norm(rates[0]), rel=1e-3)
-
-
-def test_a_rate_that_no_interval_may_have_is_refused():
-    for values in ({'increments.enabled': True}, {'imu.sampling': 'mean'}):
-        with pytest.raises(ValueError, match=r'imu\.rate = 0\.5: must be >= 1'):
-            parameters.checked({**values, 'imu.rate': 0.5})
-    parameters.checked({'imu.rate': 0.5})

@@ -15,7 +15,7 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.inspected import as_json, log_of, rewritten, short_log, stepped_log, told
+from helpers.inspected import as_json, log_of, rewritten, told
 from helpers.reference import ROOT, SCENES, scene_parameters
 from mcap.writer import Writer
 
@@ -26,21 +26,6 @@ from spinning_top_sim.tools.survey import survey
 
 # The tilt rests, or nearly: there is no nutation in the data.
 RESTING = {'sleeping', 'steady_fast', 'steady_slow'}
-
-
-@pytest.fixture(scope='module')
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp('inspect')
-
-
-@pytest.fixture(scope='module')
-def stepped(folder):
-    return stepped_log(folder / 'stepped.mcap')
-
-
-@pytest.fixture(scope='module')
-def short(folder):
-    return short_log(folder / 'short.mcap')
 
 
 def surveyed(path):

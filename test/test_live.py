@@ -30,7 +30,6 @@ from spinning_top_sim.streams.live import (
 
 PERIOD_NS = 10 * MILLISECOND        # of most streams
 
-METHODS = pytest.mark.parametrize('method', ['rk45', 'exact'])
 
 def test_a_log_gets_an_instant_in_one_call_before_anybody_else():
     """Also where publishing fails, as when a signal takes the context away."""
@@ -81,18 +80,6 @@ def test_giving_way_in_a_long_integration_loses_nothing_and_leaves_a_state_to_re
     assert taken == expected
 
 
-def test_without_a_sink_nothing_is_encoded_and_the_solver_is_not_sampled():
-    simulation = simulate()
-    encoded, states = messages_of(simulation), states_of(simulation)
-    for tick in range(1, 101):
-        simulation.advance(tick * PERIOD_NS)
-        simulation.prepare((tick + 1) * PERIOD_NS)
-    assert simulation.now_ns == SECOND
-    assert states.count == 0
-    assert {counted.count for counted in encoded.values()} == {0}
-    assert all(one.sent == one.skipped == 0 for one in simulation.outputs)
-
-
 @pytest.mark.parametrize('topic', ['pose', '/clock'])
 def test_a_sample_of_a_stream_with_a_sink_is_encoded_once_for_all_its_sinks(topic):
     simulation = simulate()
@@ -104,16 +91,6 @@ def test_a_sample_of_a_stream_with_a_sink_is_encoded_once_for_all_its_sinks(topi
     assert all(a is b for (_, a), (_, _, b) in zip(published, recorded, strict=True))
     assert states.count == (0 if topic == '/clock' else 100)
     assert all(counted.count == 0 for counted in encoded.values())
-
-
-@METHODS
-def test_streams_of_one_rate_share_the_states(method):
-    simulation = simulate(solver__method=method)
-    taken = record(simulation, 'pose', 'joint_states', 'ground_truth/odom')
-    states = states_of(simulation)
-    simulation.advance(SECOND)
-    assert len(taken) == 3 * 101
-    assert states.count == 101
 
 
 def test_ticks_leave_nothing_behind():
@@ -153,21 +130,6 @@ def test_a_block_is_bounded_in_time_and_in_samples():
     assert simulation.now_ns == (LARGEST_BLOCK - 1) * MILLISECOND
 
 
-def test_a_block_without_time_goes_on_with_the_next_call():
-    simulation = simulate()
-    taken = record(simulation, 'pose', 'joint_states')
-    simulation.advance(0)
-    calls = 1
-    while not simulation.prepare(SECOND // 10, budget_ns=0):
-        assert simulation.computed_ns == 0, 'nothing is ready before all is'
-        calls += 1
-    assert 2 < calls < 100
-    assert simulation.prepare(SECOND // 10, budget_ns=0), 'there is nothing left to do'
-    states = states_of(simulation)
-    simulation.advance(SECOND // 10)
-    assert (states.count, len(taken)) == (0, 22)
-
-
 def test_each_sample_is_computed_once_and_few_in_vain():
     simulation = simulate(pose__rate=1000.0, joint_states__rate=500.0)
     taken = record(simulation, 'pose', 'joint_states')
@@ -185,43 +147,31 @@ def test_each_sample_is_computed_once_and_few_in_vain():
     assert states.calls <= 22
 
 
-@pytest.mark.parametrize('change', [
-    'command', 'rate', 'subscriber', 'no subscriber', 'recorder', 'restart', 'epoch', 'late'])
+CHANGES = {
+    'command': lambda one, taken: one.command(2.0, 1.5),
+    'subscriber': lambda one, taken: setattr(output(one, 'imu/data_raw'), 'publish', taken.append),
+    'recorder': lambda one, taken: one.log_to(
+        lambda entries, _: taken.extend(entries), [output(one, 'imu/data_raw').stream]),
+    'epoch': lambda one, taken: setattr(one, 'epoch_ns', one.epoch_ns + 1),
+    'late': lambda one, taken: one.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)}
+
+
+@pytest.mark.parametrize('change', CHANGES)
 def test_what_was_computed_ahead_is_dropped_when_it_no_longer_holds(change):
     def run(ahead):
-        simulation = simulate(pose__rate=1000.0)
-        taken = []
-        pose, raw = output(simulation, 'pose'), output(simulation, 'imu/data_raw')
+        simulation, taken = simulate(pose__rate=1000.0), []
+        pose = output(simulation, 'pose')
         pose.publish = taken.append
         simulation.advance(5 * MILLISECOND)
-        if ahead:
-            assert simulation.prepare(6 * MILLISECOND)
-            assert simulation.computed_ns == 20 * MILLISECOND
-        if change == 'command':
-            simulation.command(2.0, 1.5)
-        elif change == 'rate':
-            simulation.apply({'pose.rate': 300.0})
-        elif change == 'subscriber':
-            raw.publish = taken.append
-        elif change == 'no subscriber':
-            pose.publish = None
-        elif change == 'recorder':
-            simulation.log_to(lambda entries, _: taken.extend(entries), [raw.stream, pose.stream])
-        elif change == 'restart':
-            simulation.restart(parameters.checked({'initial.theta': 1.0}))
-        elif change == 'epoch':
-            simulation.epoch_ns += 1
-        else:
-            simulation.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)
-        if ahead:
-            simulation.prepare(30 * MILLISECOND)
-            if change == 'command':         # blocks begin small again
-                assert simulation.computed_ns == 30 * MILLISECOND
+        assert not ahead or simulation.prepare(6 * MILLISECOND)
+        CHANGES[change](simulation, taken)
         for until in (30, 60):
             simulation.advance(until * MILLISECOND)
         return taken, pose.sent, pose.skipped
 
-    assert run(True) == run(False)
+    expected = run(False)
+    assert run(True) == expected
+    assert change not in ('subscriber', 'recorder') or len(expected[0]) > 70
 
 
 @pytest.mark.parametrize('l3', [1.6, 1e3])

@@ -32,15 +32,15 @@ from helpers.logs import (
     write_stranger,
 )
 from helpers.mutations import repair
+from helpers.recordings import write_rows
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, MessageIndex, Metadata
+from mcap.records import Attachment, MessageIndex, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import reader as reader_module
 from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.writer import create_file
 
 
 def test_extra_fields_and_unknown_kinds_are_no_damage(tmp_path):
@@ -116,13 +116,7 @@ def test_a_whole_log_is_read_by_its_indexes(tmp_path, monkeypatch):
 def test_a_message_at_time_0_belongs_to_the_span_but_beside_dates(
         tmp_path, stamps, begin, has_summary):
     path = tmp_path / 'a.mcap'
-    file = create_file(path, TOPICS, {}, compression='none')
-    for number, stamp in enumerate(stamps):
-        file.append(0, stamp, b'')
-        if number % 2 == 0:
-            file.write_chunk()
-    file.write_chunk()
-    file.finish()
+    write_rows(path, TOPICS, [(0, stamp, b'') for stamp in stamps], per_chunk=2)
     if not has_summary:
         path.write_bytes(path.read_bytes()[:-50])
     with LogReader(path) as reader:
@@ -132,12 +126,8 @@ def test_a_message_at_time_0_belongs_to_the_span_but_beside_dates(
 
 
 def test_a_summary_that_is_too_large_to_be_parsed_is_no_damage(tmp_path):
-    path = tmp_path / 'a.mcap'
-    file = create_file(path, TOPICS, {}, compression='none')
-    for stamp in range(1, 201):
-        file.append(0, stamp, b'')
-        file.write_chunk()
-    file.finish()
+    path = write_rows(tmp_path / 'a.mcap', TOPICS, [(0, stamp, b'') for stamp in range(1, 201)],
+                      per_chunk=1)
     with LogReader(path, max_bytes=10_000) as reader:
         assert reader.whole and reader.damage.lines() == []
         assert [message.log_time for message in reader.messages()] == list(range(1, 201))
@@ -194,20 +184,6 @@ def test_the_search_finds_every_kind_of_record(tmp_path, zeros):
         assert [message.data for message in reader.messages()] == [b'1', b'2']
         assert (reader.metadata, reader.topics[0].type_name) == ({'note': {'a': 'b'}}, 'thing')
         assert reader.damage.lost_bytes == 6 * zeros + len(wild) + len(note) - 1
-
-
-def test_a_channel_without_its_schema_is_not_written(tmp_path):
-    """Readers refuse the whole file for it; schema 0 means that there is none."""
-    path = tmp_path / 'a.mcap'
-    raw = record_bytes(Channel(id=2, topic='/raw', message_encoding='x', metadata={},
-                               schema_id=0))
-    path.write_bytes(closed(HEADER, CHANNEL, raw, chunk_of(
-        message(5, b'lost') + message(5, b'kept', channel=2))))
-    output = recover(path, SOME_LOST)
-    assert seen_by_mcap(output) == [('/raw', 5, b'kept')]
-    with open(output, 'rb') as file:
-        assert [channel.topic for channel in make_reader(file).get_summary().channels.values()
-                ] == ['/raw']
 
 
 def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):

@@ -14,15 +14,15 @@ import pytest
 import yaml
 from catkin_pkg.changelog import get_changelog_from_path
 from catkin_pkg.package import parse_package
+from helpers.reference import ROOT
+from test_architecture import imported as module_names
 
 from spinning_top_sim.__main__ import COMMANDS
 
 NAME = 'spinning_top_sim'
-ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted(path for path in (ROOT / 'scripts').iterdir() if path.is_file())
 SCENES = sorted((ROOT / 'config').glob('*.yaml'))
-# What builds, environments and runs leave in a checkout.
-NOT_SOURCES = {'build', 'install', 'log', 'logs'}
+SOURCES = ('.ci', 'benchmark', 'docs', 'examples', 'launch', 'scripts', NAME, 'test')
 
 
 @pytest.fixture(scope='module')
@@ -40,24 +40,6 @@ def prefix():
     pytest.skip(f'{NAME} is not installed here, only importable')
 
 
-def sources():
-    for folder in (ROOT, *ROOT.iterdir()):
-        if folder is ROOT or folder.name == '.ci':
-            yield from filter(Path.is_file, folder.iterdir())
-        elif folder.is_dir() and folder.name not in NOT_SOURCES and folder.name[0] != '.':
-            yield from filter(Path.is_file, folder.rglob('*'))
-
-
-def is_program(path):
-    if path.suffix in {'.py', '.sh'} or path.name == 'Makefile':
-        return True
-    with path.open('rb') as file:
-        return file.read(2) == b'#!'
-
-
-# ------------------------------------------------------------------------------- the manifest
-
-
 def test_the_manifest_is_valid():
     warnings: list[str] = []
     package = parse_package(str(ROOT / 'package.xml'), warnings=warnings)
@@ -72,12 +54,9 @@ def test_the_manifest_is_valid():
 def test_the_manifest_names_every_ros_package_that_is_imported():
     declared = {dependency.name for dependency in
                 parse_package(str(ROOT / 'package.xml')).exec_depends}
-    imported = set()
-    for path in (*(ROOT / NAME).rglob('*.py'), *(ROOT / 'launch').glob('*.py')):
-        for line in path.read_text(encoding='utf-8').splitlines():
-            words = line.split()
-            if words[:1] in (['import'], ['from']) and len(words) > 1:
-                imported.add(words[1].split('.')[0])
+    imported = {name.split('.')[0]
+                for path in (*(ROOT / NAME).rglob('*.py'), *(ROOT / 'launch').glob('*.py'))
+                for name in module_names(path)}
     ros = {name for name in imported
            if name in {'rclpy', 'launch', 'launch_ros', 'ament_index_python', 'rcl_interfaces',
                        'xacro'}
@@ -103,9 +82,6 @@ def test_no_private_name_of_rclpy_is_used():
              if private.search(line)]
     assert found == []
     assert private.search('node._parameter_overrides') and private.search('publisher.publish_raw')
-
-
-# -------------------------------------------------------------------------------- executables
 
 
 def test_one_command_is_on_path_and_every_script_is_a_part_of_it(project):
@@ -143,9 +119,6 @@ def test_an_installed_executable_tells_its_version_where_ros2_run_looks(
         assert subprocess.check_output(
             [installed, '--version'], env={**os.environ, 'PATH': search_path}, text=True,
             timeout=60) == said.out
-
-
-# ------------------------------------------------------------------------------ what is there
 
 
 def test_the_share_folder_is_complete(prefix):
@@ -192,15 +165,13 @@ def test_make_help_fits_into_80_columns_and_names_every_scene():
 
 
 def test_every_source_says_its_license():
-    heads = {path: path.read_text(encoding='utf-8').splitlines()[:2]
-             for path in sources() if is_program(path)}
-    assert len(heads) > 30
-    silent = [str(path.relative_to(ROOT)) for path, head in heads.items()
-              if '# SPDX-License-Identifier: Apache-2.0' not in head]
-    assert not silent
-
-
-# ------------------------------------------------------------------------------------- scenes
+    paths = [path for folder in SOURCES for path in (ROOT / folder).rglob('*') if path.is_file()
+             and (path.suffix in ('.py', '.sh') or path.read_bytes().startswith(b'#!'))]
+    paths += [ROOT / 'Makefile', ROOT / 'setup.py']
+    assert len(paths) > 100
+    silent = [path for path in paths if '# SPDX-License-Identifier: Apache-2.0'
+              not in path.read_text(encoding='utf-8').splitlines()[:2]]
+    assert silent == []
 
 
 @pytest.mark.parametrize('name, arguments', [

@@ -9,7 +9,6 @@ from helpers.reference import CASES, SCENES, scene_parameters, start_of, top_of
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import Description, regime
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -102,19 +101,6 @@ def test_energy_and_momenta_are_those_of_the_lagrangian():
         assert state.energy[0] == pytest.approx(kinetic + top.gravity_torque * c)
 
 
-def test_products_and_angles_of_rotations():
-    one, other = Rotation.random(20, random_state=1), Rotation.random(20, random_state=2)
-    p, q = tuple(one.as_quat().T), tuple(other.as_quat().T)
-    turned = Rotation.from_quat(np.stack(attitude.product(p, q), -1))
-    assert (turned * (one * other).inv()).magnitude() == pytest.approx(0.0, abs=1e-14)
-    assert attitude.angle_between(p, q) == pytest.approx((one * other.inv()).magnitude())
-    assert attitude.angle_between(p, tuple(-x for x in p)).tolist() == [0.0] * 20
-    for small in (1e-5, 1e-12):
-        near = one * Rotation.from_rotvec([0.0, 0.6 * small, 0.8 * small])
-        assert attitude.angle_between(p, tuple(near.as_quat().T)) == pytest.approx(
-            small, abs=2e-15)
-
-
 NAMES = {
     'loop-c-thd+': 'loops', 'wavy-a': 'waves', 'fast-1e+08-cusp': 'cusps',
     'cross-top-a': 'through the top', 'cross-bottom-a': 'through the bottom',
@@ -156,8 +142,6 @@ def test_an_upright_top_sleeps_above_the_critical_momentum(l3, name):
     top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=1.0, gravity=1.0)
     assert regime(top, State(theta=0.0, l3=l3, lz=l3)) == name
 
-
-# ------------------------------------------------------------------- a motion in numbers
 
 def described(**values):
     """Return the description of a motion, its top and its start state."""

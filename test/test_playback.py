@@ -7,8 +7,8 @@ from fractions import Fraction
 
 import pytest
 
-from spinning_top_sim.nodes import pacing
-from spinning_top_sim.nodes.pacing import Playback, read_ahead
+from spinning_top_sim.nodes import playback
+from spinning_top_sim.nodes.playback import Playback, read_ahead
 
 EPOCH_NS = 1_700_000_000_123_456_789
 
@@ -52,7 +52,7 @@ def play(messages, rate=1.0, plan=None, cost_ns=0, **options):
         fake.now_ns += cost_ns
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pacing, 'time', fake)
+        patch.setattr(playback, 'time', fake)
         player = Playback(EPOCH_NS, **options)
         player._changed = fake
         player.set_rate(rate)
@@ -113,4 +113,4 @@ def test_reading_ahead_is_bounded_in_order_and_ends():
     first = list(itertools.islice(ahead, 1_000))
     assert [number for number, _, _ in first] == list(range(1_000))
     ahead.close()
-    assert last[0] < 1_000 + (pacing.BATCHES + 3) * pacing.BATCH_MESSAGES
+    assert last[0] < 1_000 + (playback.BATCHES + 3) * playback.BATCH_MESSAGES

@@ -40,8 +40,6 @@ def is_a_line(text):
     return '\n' not in text and text.strip() != ''
 
 
-# ------------------------------------------------------------------------------------ parameters
-
 @examples(60)
 @given(NAMES | LISTS, ANYTHING)
 def test_any_value_of_a_parameter_is_taken_or_refused_by_its_name(name, value):
@@ -71,8 +69,6 @@ def test_a_top_and_a_state_of_any_numbers_are_made_or_refused(top, start):
         else:
             assert all(math.isfinite(number) for number in dataclasses.astuple(made))
 
-
-# ------------------------------------------------------------------------------------------ YAML
 
 YAML_TEXT = st.text(st.sampled_from(string.ascii_letters + string.digits + ' \n\t:-[]{},&*!|>#\'"'
                                     '%@`~.\x00\x85\u2028\ud800\U0001f300'), max_size=60)

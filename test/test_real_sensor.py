@@ -8,8 +8,6 @@ import pytest
 from helpers.readings import command, run
 from helpers.simulations import MILLISECOND, SECOND
 
-from spinning_top_sim.streams import parameters
-
 # A free top whose attitude turns: its rates and forces are sines of two frequencies at most.
 TURNS = 20.0
 FREE = {'top.com_distance': 0.0, 'top.lambda1': 0.1, 'top.lambda3': 0.2, 'initial.theta': 1.0,
@@ -114,21 +112,3 @@ def test_magnetic_events_begin_and_end():
                          np.where((k >= 10) & (k < 20), -3e-6, 0.0),
                          np.where((k >= 15) & (k < 30), 5e-6, 0.0)), axis=-1)
     assert field - exact == pytest.approx(expected, abs=1e-19)
-
-
-@pytest.mark.parametrize(('name', 'value', 'says'), [
-    ('imu.bandwidth', 0.5, 'must be a number 0 or >= 1 and <= 100000'),
-    ('imu.bandwidth_order', 3, '<= 2'),
-    ('imu.vibration.force_psd', (20.0, 0.1), 'two or more ascending'),
-    ('imu.vibration.rate_psd', (20.0, 0.1, 20.0, 0.1), 'two or more ascending'),
-    ('imu.vibration.rate_psd', (20.0, 0.1, 30.0), 'a list of 2 numbers, or a multiple'),
-    ('mag.disturbance.body', (2.0, 1.0, 0.0, 0.0, 0.0), 'must not end before'),
-    ('mag.disturbance.world', (), 'a list of 5 numbers, or a multiple')])
-def test_what_makes_no_sense_is_refused(name, value, says):
-    with pytest.raises(ValueError, match=f'{name}.*{says}'):
-        parameters.checked({name: value})
-
-
-def test_means_have_no_bandwidth():
-    with pytest.raises(ValueError, match=r'imu.bandwidth = 9.0: must be 0 with imu.sampling'):
-        parameters.checked({'imu.bandwidth': 9.0, 'imu.sampling': 'mean'})

@@ -12,7 +12,6 @@ import threading
 import time
 from contextlib import closing
 from operator import ge
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -26,18 +25,18 @@ from helpers.recordings import (
     rows_of,
     some_messages,
 )
+from helpers.reference import ROOT
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
-from spinning_top_sim.recording import writer
+from spinning_top_sim.recording import recorder as recorder_module
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import McapRecorder, create_file
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
-from spinning_top_sim.recording.writer import McapRecorder, create_file
 
-ROOT = Path(__file__).parents[1]
 PATIENCE_S = 20.0  # for what happens at once on an idle machine
 
 
@@ -103,21 +102,6 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
     assert synced == [str(path), str(tmp_path)]
 
 
-def test_closing_twice_changes_nothing(tmp_path):
-    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
-    recorder.write(0, 1, pose_cdr(1))
-    first = recorder.close()
-    content = first.path.read_bytes()
-    recorder.write(0, 2, pose_cdr(2))
-    second = recorder.close()
-    assert recorder.state == 'closed'
-    assert (first.counts, first.bytes, first.error, first.lost) == (
-        second.counts, second.bytes, None, 0)
-    assert is_indexed(first.path)
-    assert second.lost == recorder.counters.lost == 1
-    assert first.bytes == len(content) == len(second.path.read_bytes())
-
-
 def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monkeypatch):
     """The thread that writes has the error; the caller gets it, and can still finish the file."""
     file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='zstd')
@@ -151,7 +135,7 @@ def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
         return append_all(self, messages, size)
 
     monkeypatch.setattr(McapWriter, 'append_all', append_slowly)
-    monkeypatch.setattr(writer, 'QUEUE_BYTES', 10_000)
+    monkeypatch.setattr(recorder_module, 'QUEUE_BYTES', 10_000)
     recorder = McapRecorder(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0)
     recorder.write(0, 0, pose_cdr(0))
@@ -175,7 +159,7 @@ def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, 
     code = f"""
         import os, signal, sys
         from spinning_top_sim.recording.rosbag2 import RecordedTopic
-        from spinning_top_sim.recording.writer import McapRecorder
+        from spinning_top_sim.recording.recorder import McapRecorder
         topics = [RecordedTopic('/a', {ARRAY!r})]
         recorder = McapRecorder(sys.argv[1], topics, {{}}, min_free_bytes=0, max_loss=60.0)
         for number in range(100):
@@ -229,8 +213,8 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(
         on_disk = written
         flushes += 1
 
-    monkeypatch.setattr(writer, 'time', SimpleNamespace(monotonic=lambda: now))
-    monkeypatch.setattr(writer, 'threading', SimpleNamespace(
+    monkeypatch.setattr(recorder_module, 'time', SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(recorder_module, 'threading', SimpleNamespace(
         Event=Event, Thread=Thread, TIMEOUT_MAX=threading.TIMEOUT_MAX))
     recorder = McapRecorder(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=max_loss, min_free_bytes=0)
@@ -304,7 +288,7 @@ def disk(monkeypatch):
 def test_a_full_disk_stops_the_recording_and_costs_what_is_not_written(
         tmp_path, disk, monkeypatch, room, max_loss):
     """A torn chunk is cut off, and where it stood there is room for the summary; or only that."""
-    monkeypatch.setattr(writer, 'QUEUE_BYTES', 400_000)
+    monkeypatch.setattr(recorder_module, 'QUEUE_BYTES', 400_000)
     path, rng = tmp_path / 'run.mcap', random.Random(3)
     at_end = max_loss < 1.0
     recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0, max_loss=max_loss)

@@ -17,7 +17,8 @@ from std_srvs.srv import SetBool
 from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.simulator import Simulator
-from spinning_top_sim.recording import provenance, writer
+from spinning_top_sim.recording import provenance
+from spinning_top_sim.recording import recorder as recorder_module
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.live import LiveSimulation
@@ -67,14 +68,14 @@ def test_a_name_with_a_slash_is_a_folder_and_a_second_start_or_stop_does_nothing
 def slow_disk(monkeypatch):
     """Have a log opened no sooner than `go_on` is set; `opening` says that it is at it."""
     disk = SimpleNamespace(opening=threading.Event(), go_on=threading.Event())
-    ordinary = writer.McapRecorder
+    ordinary = recorder_module.McapRecorder
 
     def opened(*arguments, **options):
         disk.opening.set()
         assert disk.go_on.wait(PATIENCE_S)
         return ordinary(*arguments, **options)
 
-    monkeypatch.setattr(writer, 'McapRecorder', opened)
+    monkeypatch.setattr(recorder_module, 'McapRecorder', opened)
     return disk
 
 

@@ -7,20 +7,18 @@ import signal
 import subprocess
 import sys
 import tracemalloc
-from pathlib import Path
 
 import pytest
 from helpers.logs import ALL_KEPT, FAILED, SOME_LOST, TOPICS, run, small_log
+from helpers.recordings import write_rows
+from helpers.reference import ROOT
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording import log_file
 from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.log_file import LogFile
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recovery import recover
-from spinning_top_sim.recording.writer import create_file
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope='module')
@@ -83,12 +81,8 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
     """Twenty times as many chunks: no more than their index, less than a fifth of the file."""
     peaks = []
     for chunks in (10, 200):
-        path = tmp_path / f'{chunks}.mcap'
-        file = create_file(path, TOPICS[1:2], {}, compression='none')
-        for number in range(chunks):
-            file.append(0, number, random.Random(number).randbytes(50_000))
-            file.write_chunk()
-        file.finish()
+        path = write_rows(tmp_path / f'{chunks}.mcap', TOPICS[1:2], (
+            (0, number, random.Random(number).randbytes(50_000)) for number in range(chunks)), 1)
         path.write_bytes(path.read_bytes()[:-100])
         tracemalloc.start()
         try:
@@ -161,31 +155,19 @@ def test_what_cannot_be_opened_is_named(tmp_path):
 
 
 def test_a_disk_that_fails_while_it_is_read_is_an_error(tmp_path, log, monkeypatch):
-    (tmp_path / 'run.mcap').write_bytes(log.content)
-    real = open
+    path, read = tmp_path / 'run.mcap', LogFile.read
+    path.write_bytes(log.content[:log.chunks[-1][2]] + bytes(40))
 
-    def open_bad(path, *arguments, **options):
-        file = real(path, *arguments, **options)
+    def fail(self, offset, length):
+        if offset < log.chunks[1][1]:
+            return read(self, offset, length)
+        with self._access():
+            raise OSError(5, os.strerror(5))
 
-        class Bad:
-            def __getattr__(self, name):
-                return getattr(file, name)
-
-            def read(self, size):
-                if file.tell() >= log.chunks[1][1]:
-                    raise OSError(5, os.strerror(5))
-                return file.read(size)
-
-        return Bad()
-
-    torn = log.content[:log.chunks[-1][2]]
-    (tmp_path / 'run.mcap').write_bytes(torn + bytes(40))
-    monkeypatch.setattr(log_file, 'open', open_bad, raising=False)
-    code, _, err = run(tmp_path / 'run.mcap')
-    assert code == FAILED
-    assert err == ('spinning-top recover: '
-                   f'cannot read {tmp_path / "run.mcap"}: Input/output error\n')
-    assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']
+    monkeypatch.setattr(LogFile, 'read', fail)
+    assert run(path) == (FAILED, '', f'spinning-top recover: cannot read {path}: '
+                                     'Input/output error\n')
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_ctrl_c_leaves_nothing_behind(tmp_path, log, monkeypatch):

@@ -46,7 +46,7 @@ def test_an_uncalibrated_device_is_calibrated_and_the_covariance_says_how_well()
     assert max(tilts) < 0.05
     nees = diagnosis.consistency(outcomes, absolute=True)
     for what in ('tilt', 'attitude'):
-        low, high = nees[what].band(diagnosis.CONSISTENT)
+        low, high = nees[what].band
         assert low < nees[what].ratio < high, what
 
 

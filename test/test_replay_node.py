@@ -2,8 +2,7 @@
 """
 Replay nodes over real DDS.
 
-Logs are written by the recorder of this package and by rosbags, which nobody here wrote.  No test
-is decided by how long something took, except that nothing may come before its time.
+No test is decided by how long something took, except that nothing may come before its time.
 """
 
 import contextlib
@@ -23,23 +22,14 @@ from helpers.own_node import InThisProcess, run_main
 from mcap.writer import Writer as McapWriter
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import replay_node
-from spinning_top_sim.nodes.pacing import ROUND_GAP_NS
+from spinning_top_sim.nodes.playback import ROUND_GAP_NS
 from spinning_top_sim.nodes.replayer import Replayer, message_class, open_log
+from spinning_top_sim.recording.recorder import McapRecorder
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
-from spinning_top_sim.recording.writer import McapRecorder
 
 EPOCH_NS = 1_700_000_000_123_456_789
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
@@ -60,46 +50,29 @@ def twist_cdr(number):
     return JAZZY.serialize_cdr(twist, TWIST).tobytes()
 
 
-def write_bag(folder, connections, messages):
-    """Let rosbags write a log; messages: (index of the connection, time, CDR) as they come."""
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        opened = [bag.add_connection(name, kind, typestore=JAZZY, offered_qos_profiles=qos)
-                  for name, kind, qos in connections]
-        for index, at_ns, data in messages:
-            bag.write(opened[index], at_ns, data)
-    return next(folder.glob('*.mcap'))
+OURS = (('/ours/text', STRING), ('/ours/twist', TWIST))
 
 
-@pytest.fixture(scope='module')
-def strangers_log(tmp_path_factory):
-    """Two topics of a stranger in one file, out of order; what should come is (log, in order)."""
-    order = [*range(20, 40), *range(20), *range(40, 60)]
-    messages = [(n % 2, EPOCH_NS + n * 20_000_000, (string_cdr, twist_cdr)[n % 2](n))
-                for n in order]
-    qos = [Qos(QosHistory.KEEP_LAST, 7, QosReliability.BEST_EFFORT, QosDurability.VOLATILE,
-               QosTime(9223372036, 854775807), QosTime(9223372036, 854775807),
-               QosLiveliness.AUTOMATIC, QosTime(9223372036, 854775807),
-               avoid_ros_namespace_conventions=False)]
-    path = write_bag(tmp_path_factory.mktemp('stranger') / 'bag',
-                     [('/chatter', STRING, ()), ('/robot/cmd_vel', TWIST, qos)], messages)
-    in_order = sorted(messages, key=lambda message: message[1])
-    return path, [[data for index, _, data in in_order if index == topic] for topic in (0, 1)]
-
-
-def write_log(path, count, step_ns=2_000_000, padding=0, **options):
-    """Record strings and twists in turn with our recorder; return what is in, by topic."""
+def write_log(path, count, step_ns=2_000_000, padding=0, topics=OURS, **options):
+    """Record strings and twists in turn; return what is in, by topic."""
     messages = [(n % 2, EPOCH_NS + n * step_ns,
                  twist_cdr(n) if n % 2 else string_cdr(n, padding)) for n in range(count)]
-    topics = [RecordedTopic('/ours/text', STRING),
-              RecordedTopic('/ours/twist', TWIST, {'depth': 3, 'durability': 1})]
+    (text, _), (twist, _) = topics
     with contextlib.closing(McapRecorder(
-            path, topics, {}, **{'min_free_bytes': 0} | options)) as recorder:
+            path, [RecordedTopic(text, STRING),
+                   RecordedTopic(twist, TWIST, {'depth': 7, 'reliability': 2})],
+            {}, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
             recorder.write(*message)
     return [[data for index, _, data in messages if index == topic] for topic in (0, 1)]
 
 
-OURS = (('/ours/text', STRING), ('/ours/twist', TWIST))
+@pytest.fixture(scope='module')
+def second_log(tmp_path_factory):
+    """Return a log of 1.18 s and what is in, by topic."""
+    path = tmp_path_factory.mktemp('log') / 'run.mcap'
+    return path, write_log(path, 60, 20_000_000, topics=(
+        ('/chatter', STRING), ('/robot/cmd_vel', TWIST)))
 
 
 def assert_same(found, wanted):
@@ -169,8 +142,8 @@ def test_all_bytes_are_sent_to_the_last_message_and_none_before_its_time(tmp_pat
     assert said.err == ''
 
 
-def test_start_and_topics_choose_what_is_played(strangers_log, capfd):
-    path, wanted = strangers_log
+def test_start_and_topics_choose_what_is_played(second_log, capfd):
+    path, wanted = second_log
     raw, _ = play_all(path, '--topics', '/chatter', '/nobody', 'cmd_vel', '--start', '0.4',
                       '--rate', '100', topics=[('/chatter', STRING)])
     assert_same(raw, [wanted[0][10:]])
@@ -244,10 +217,10 @@ def test_a_torn_log_is_refused_with_a_hint_and_played_in_part(tmp_path, capfd):
         assert_same([found], [all_of_it[:len(found)]])
 
 
-def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, strangers_log, capfd):
+def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, second_log, capfd):
     text = tmp_path / 'text.mcap'
     text.write_text('no log')
-    path, _ = strangers_log
+    path, _ = second_log
     for options, says in (
             ((tmp_path / 'missing.mcap',), 'No such file'),
             ((text,), 'no MCAP'),
@@ -294,9 +267,9 @@ class Replay(SimNode):
         self.name = f'{self.namespace}/replay'
 
 
-def test_a_strangers_log_is_played_over_dds_with_its_qos_or_another(peer, tmp_path, strangers_log):
+def test_a_log_is_played_over_dds_with_its_qos_or_another(peer, tmp_path, second_log):
     """It waits for two subscribers and the resume; /clock tells the time of the log meanwhile."""
-    path, wanted = strangers_log
+    path, wanted = second_log
     names = ('/chatter', '/elsewhere/vel', '/clock')
     with Replay(tmp_path, path, '--start-paused', '--clock', '200', '--rate', '2', '-d', '0.1',
                 '--wait-for-subscribers', '3', arguments=(

@@ -26,7 +26,6 @@ ALL_BIASES = {f'imu.{kind}_{name}': value for kind in ('gyroscope', 'acceleromet
               for name, value in (('random_walk', 1e-2), ('bias_stddev', 0.1),
                                   ('turn_on_bias', 0.2), ('bias_instability', 0.05))}
 
-# ------------------------------------------------------------------------- deterministic errors
 
 def test_matrices_g_sensitivity_bias_and_iron_are_found_by_least_squares():
     """All 45 numbers from one run, each within 3 of its standard deviations."""
@@ -46,26 +45,6 @@ def test_the_chain_by_hand():
     # x: 2 + 1 + 2.5 = 5.5; z: -9 + 0.3 of the true force = -8.7, cut at the code 7.0 within 7.2.
     assert rows.tolist() == 2 * [[5.5, 2.0, -7.0, 10.3, 10.5, 10.0]]
 
-
-def test_a_perfect_sensor_hands_on_what_is_exact():
-    exact = ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
-    sensor = Sensor(parameters.checked({}), MILLISECOND)
-    assert sensor.read(exact, range(3)) is exact
-    quaternion = (0.0, 0.0, 0.0, 1.0)
-    assert sensor.orientation(quaternion, range(3)) is quaternion
-
-
-@pytest.mark.parametrize('error', [name for name in parameters.BY_NAME if name.startswith((
-    'imu.gyroscope_', 'imu.accelerometer_')) and not name.endswith('_time')])
-def test_a_sensor_with_one_error_is_not_perfect(error):
-    default = parameters.BY_NAME[error].default
-    value = (2.0, *default[1:]) if isinstance(default, tuple) else 0.5
-    rows, _ = read({error: value}, range(0, 20 * MILLISECOND, MILLISECOND),
-                   ((0.8, 0.9, 1.1), (0.7, 0.8, 1.2)))
-    assert not np.array_equal(rows, np.broadcast_to((0.8, 0.9, 1.1, 0.7, 0.8, 1.2), (20, 6)))
-
-
-# ------------------------------------------------------------------------------------ the bias
 
 def test_the_bias_begins_with_the_turn_on_bias_and_walks_with_its_density():
     walk = {'imu.gyroscope_random_walk': 2e-4, 'imu.accelerometer_random_walk': 3e-3}
@@ -120,7 +99,7 @@ def test_a_gauss_markov_bias_has_its_variance_and_its_correlation_time():
 def test_a_gauss_markov_bias_is_stationary_at_any_time(time):
     """At the start, at a second and after three years it has one variance: 2400 numbers each."""
     times_ns = np.array([0, SECOND, 94_608_000 * SECOND])
-    rows = np.concatenate([noise.Path(seed, noise.Purpose.GAUSS_MARKOV, (120 * (time,),),
+    rows = np.concatenate([noise.RandomPath(seed, noise.Purpose.GAUSS_MARKOV, (120 * (time,),),
                                       (120 * (2.0,),)).at(times_ns) for seed in range(20)])
     assert np.std(rows, axis=0) == pytest.approx(2.0, rel=4.0 / math.sqrt(2.0 * len(rows)))
     correlation = np.mean(rows[:, 0] * rows[:, 1]) / 4.0
@@ -170,8 +149,6 @@ def test_a_change_of_the_rate_leaves_the_bias_on_its_path():
     assert np.array_equal(np.hstack((rates, force)), steady[times_ns // MILLISECOND])
 
 
-# ------------------------------------------------------------------------------------ covariances
-
 @pytest.mark.parametrize('number', range(3), ids=('orientation', 'imu/data', 'imu/data_raw'))
 def test_errors_are_distributed_as_published(squares, number):
     """NEES: chi-square of each axis, and in the share of its own band in 100 parts of a run."""
@@ -190,8 +167,6 @@ def test_errors_are_distributed_as_published(squares, number):
 def squares():
     return statistics.nees(0, 50 * SECOND)
 
-
-# ----------------------------------------------------------------------------------- independence
 
 def test_axes_sensors_samples_and_seeds_are_uncorrelated():
     """Near or far apart; of m correlations the largest is below its bound but once in 10 000."""

@@ -14,6 +14,7 @@ import yaml
 from helpers.node_logs import TRACEBACK, log_of, the_log
 from helpers.own_node import OwnNode, as_a_process, run_main
 from rclpy.executors import SingleThreadedExecutor
+from test_scene_file import scene
 
 from spinning_top_sim.nodes import executable, replay_node, sim_node
 from spinning_top_sim.recording.reader import LogReader
@@ -119,14 +120,6 @@ def test_a_node_without_standard_streams_leaves_a_whole_log(tmp_path):
     assert len(log_of(the_log(tmp_path))[0]['/pose']) == 31
 
 
-# ----------------------------------------------------------- values that are given twice
-
-def write_scene(path, **values):
-    path.write_text('/**:\n  ros__parameters:\n' + ''.join(
-        f'    {name.replace("__", ".")}: {value}\n' for name, value in values.items()))
-    return str(path)
-
-
 def start_values(*arguments):
     """Return the values that a node starts with in the namespace /last."""
     argv = ['--ros-args', '-r', '__ns:=/last', *arguments]
@@ -141,20 +134,21 @@ def start_values(*arguments):
 
 def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(tmp_path):
     """Of one name, rclpy takes an integer rather than a double that comes later."""
-    file = write_scene(tmp_path / 'a.yaml', spin__l3=3, max_error=1, time_scale=2, imu__rate=250,
-                       imu__lever_arm='[1, 2, 3]')
+    file = scene(tmp_path / 'a.yaml', **{
+        'spin.l3': 3, 'max_error': 1, 'time_scale': 2, 'imu.rate': 250,
+        'imu.lever_arm': '[1, 2, 3]'})
     given = ['spin.l3:=2.25', 'max_error:=1e-7', 'imu.rate:=0.4e3', 'top.mass:=1e0',
              'imu.lever_arm:=[0, 0, 1]']
     options = [word for rule in given for word in ('-p', rule)]
     assert simulate.main(['-o', str(tmp_path / 'ours.mcap'), '--quiet', '--duration', '0.1',
-                          '--params', file, *options]) == 0
+                          '--params', str(file), *options]) == 0
     with LogReader(tmp_path / 'ours.mcap') as log:
         ours = read_run_description(log).values_at_recording
     names = ('spin.l3', 'max_error', 'imu.rate', 'top.mass', 'time_scale', 'imu.lever_arm')
-    found = start_values('--params-file', file, *options)
+    found = start_values('--params-file', str(file), *options)
     assert [found[name] for name in names] == [2.25, 1e-7, 400.0, 1.0, 2.0, (0.0, 0.0, 1.0)]
     assert [found[name] for name in names] == [ours[name] for name in names]
-    found = start_values(*options, '--params-file', file)
+    found = start_values(*options, '--params-file', str(file))
     assert [found[name] for name in names] == [3.0, 1.0, 250.0, 1.0, 2.0, (1.0, 2.0, 3.0)]
     assert start_values('-p', 'spin.l3:=2', '-p', 'spin.l3:=1.5')['spin.l3'] == 1.5
 
@@ -167,13 +161,13 @@ def test_parameters_are_given_as_to_simulate():
 
 
 def test_of_several_files_the_last_that_is_for_the_node_wins(tmp_path):
-    one, two = (write_scene(tmp_path / f'{l3}.yaml', spin__l3=l3) for l3 in (2, 1.5))
+    one, two = (scene(tmp_path / f'{l3}.yaml', **{'spin.l3': l3}) for l3 in (2, 1.5))
     other = tmp_path / 'other.yaml'
     other.write_text('/last/other:\n  ros__parameters:\n    spin:\n      l3: 9\n'
                      '/*/spinning_top:\n  ros__parameters:\n    spin:\n      l3: 7\n')
     for given, expected in (((one, two), 1.5), ((two, one), 2.0), ((one, two, other), 7.0),
                             ((other, one, two), 1.5)):
-        arguments = [word for file in given for word in ('--params-file', file)]
+        arguments = [word for file in given for word in ('--params-file', str(file))]
         assert start_values(*map(str, arguments))['spin.l3'] == expected
 
 
@@ -192,8 +186,6 @@ def test_a_dump_of_the_parameters_gives_the_same_start(tmp_path):
     file.write_text(yaml.dump({'/**': {'ros__parameters': dumped}}))
     assert start_values('--params-file', str(file)) == expected
 
-
-# ---------------------------------------------------------------------- names and QoS
 
 def test_remapping_and_qos_overrides_work(tmp_path):
     arguments = ['-r', '__ns:=/ns', '-r', 'pose:=attitude', '-p',

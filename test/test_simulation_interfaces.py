@@ -8,7 +8,6 @@ installed ones where there are some.
 
 import json
 import re
-from pathlib import Path
 
 import pytest
 
@@ -21,7 +20,6 @@ from helpers.standard_node import KINDS, StandardNode, finished
 from spinning_top_sim.nodes.simulation_standard import FEATURES
 from spinning_top_sim.tools import inspect
 
-ROOT = Path(__file__).parents[1]
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 STOPPED, PLAYING, PAUSED, QUITTING, NO_WORLD = range(5)
 ALREADY, TRANSITION_ERROR, INCORRECT_TRANSITION = 101, 102, 103
@@ -49,8 +47,6 @@ def test_features_are_those_of_the_services(top):
                 'SIMULATION_RESET_TIME', 'WORLD_TAGS', 'ENTITY_INFO_SETTING'} & names
     assert not features.spawn_formats
 
-
-# ------------------------------------------------------------------------------------ states
 
 def test_a_node_that_starts_paused_is_stopped_until_something_moves(top):
     assert top.state == STOPPED
@@ -117,8 +113,6 @@ def test_a_failed_motion_is_paused_until_it_is_stopped(top):
     assert (top.state, top.loop.failure) == (STOPPED, None)
 
 
-# ------------------------------------------------------------------------------------- steps
-
 def test_steps_only_while_paused(top):
     code, text = top.refused('StepSimulation', steps=1)
     assert code == FAILED
@@ -177,8 +171,6 @@ def test_a_reset_another_state_or_a_failure_ends_the_steps(top, how, why):
     assert (goal.end, goal.feedback) == ('aborted', [(1, 10 ** 18 - 1)])
     assert 'interrupted after 1 of' in result.error_message
 
-
-# ------------------------------------------------------------------------------------ resets
 
 @pytest.mark.parametrize('scope', [0, 3])
 def test_a_reset_of_time_and_state_is_that_of_the_node(top, scope):

@@ -8,10 +8,11 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from helpers.node_logs import log_of, turned, xyz, xyzw
+from helpers.node_logs import log_of, xyz, xyzw
 from helpers.standard_node import KINDS, StandardNode
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 PAUSED, INVALID_POSE = 2, 101
@@ -63,9 +64,9 @@ def test_the_state_is_what_is_published_at_its_stamp(top, tmp_path):
         odom = published[stamp]
         assert xyzw(state.pose.orientation) == xyzw(odom.pose.pose.orientation)
         # The twist of an odometry is in the frame of the body.
-        turned_rates = turned(np.array(xyzw(odom.pose.pose.orientation)),
-                              np.array(xyz(odom.twist.twist.angular)))
-        assert np.allclose(numbers(state)[4:7], turned_rates, rtol=1e-14, atol=1e-14)
+        turned = Rotation.from_quat(xyzw(odom.pose.pose.orientation)).apply(
+            xyz(odom.twist.twist.angular))
+        assert np.allclose(numbers(state)[4:7], turned, rtol=1e-14, atol=1e-14)
 
 
 @pytest.mark.parametrize('which', ['pose', 'twist', 'both'])
@@ -131,6 +132,16 @@ def test_a_bad_state_changes_nothing(top, changes, code, text):
                                 set_pose=True, set_twist=True)
     assert (found, text in reason) == (code, True), (found, reason)
     assert top.simulation.segment is segment
+
+
+@pytest.mark.parametrize(('x', 'w', 'theta'), [(3e-9, 1.0, 0.0), (1.0, 3e-9, math.pi)])
+def test_next_to_a_pole_what_is_not_spin_is_nutation(top, x, w, theta):
+    state = upright(top, pose__orientation__x=x, pose__orientation__w=w, twist__angular__x=0.3,
+                    twist__angular__z=2.0)
+    top.done('SetEntityState', entity=NAME, state=state, set_pose=True, set_twist=True)
+    start = top.simulation.segment.start
+    assert start.theta == theta and abs(start.lz) == abs(start.l3)
+    assert start.theta_dot == pytest.approx(0.3)
 
 
 def test_a_state_can_be_set_where_the_pivot_is(top):

@@ -146,40 +146,6 @@ def test_a_template_is_what_ros_serializes(number):
     assert_same(messages.string(frame), String(data=frame))
 
 
-def test_many_messages_are_single_ones_one_after_the_other():
-    """Fields as arrays, as columns and as numbers for all; growing and shrinking counts."""
-    template = messages.imu('imu_link', messages.EXACT, messages.EXACT, messages.EXACT)
-    rng = np.random.default_rng(1)
-    for count in (1, 300, 7, 0, 1000):
-        stamps_ns = rng.integers(-2 ** 60, 2 ** 60, count)
-        orientation, rates = rng.normal(size=(count, 4)), rng.normal(size=(3, count))
-        force = (0.5, -0.25, 0.0)
-        rows = template.encode(stamps_ns, orientation, tuple(rates), force)
-        assert rows.shape == (count, len(template))
-        singles = [row.tobytes() for row in rows]
-        assert singles == [template.encode_one(stamp_ns, q, w, force)
-                           for stamp_ns, q, w in zip(stamps_ns, orientation, rates.T, strict=True)]
-        data = b''.join(singles)
-        assert np.array_equal(template.stamps_ns(data), stamps_ns)
-        for found, given in zip(template.decode(data), (orientation, rates.T, [force] * count),
-                                strict=True):
-            assert np.array_equal(found, np.reshape(given, found.shape))
-
-
-def test_a_byte_is_found_in_its_stamp_or_in_an_element_of_its_field():
-    template = messages.stamped('', 3)      # header, stamp, length and NUL of a string, padding
-    assert [template.field_at(at) for at in (3, 4, 11, 12, 19, 20, 31, 43)] == [
-        None, (-1, 0, 4), (-1, 0, 4), None, None, (0, 0, 20), (0, 1, 28), (0, 2, 36)]
-
-
-@pytest.mark.parametrize('fields', [(), ((np.zeros(1),),), ((np.zeros(1),) * 3,)])
-def test_a_field_that_lacks_a_column_or_has_one_too_many_is_refused(fields):
-    with pytest.raises(ValueError, match='zip'):
-        messages.float64_multi_array(('a', 'b')).encode(np.array([0]), *fields)
-
-
-# -------------------------------------------------------------------------------- the streams
-
 def test_every_stream_sends_a_message_of_its_type_with_the_frames_of_the_parameters():
     world, body, imu = 'map', 'top', 'a/much/longer/frame'
     simulation = simulate(world_frame=world, body_frame=body, imu__frame_id=imu)

@@ -81,21 +81,6 @@ def test_frames_that_no_tree_has_are_refused(values, named):
         described(values)
 
 
-@pytest.mark.parametrize('scene', ['cusp', 'heavy_top'])
-def test_the_inertia_is_that_of_the_top_about_its_centre_of_mass(scene):
-    top = parameters.top_of(parameters.checked(scene_parameters(scene)))
-    (inertial,) = element(scene_parameters(scene)).iter('inertial')
-    mass = float(inertial.find('mass').get('value'))
-    *xy, com = map(float, inertial.find('origin').get('xyz').split())
-    moments = {name: float(value) for name, value in inertial.find('inertia').attrib.items()}
-    assert (mass, xy, com) == (top.mass, [0.0, 0.0], top.com_distance)
-    assert moments['ixx'] == moments['iyy']
-    assert moments['ixx'] + mass * com * com == pytest.approx(top.lambda1, rel=1e-14)
-    assert moments['izz'] == top.lambda3
-    assert moments['ixy'] == moments['ixz'] == moments['iyz'] == 0.0
-    assert urdf.inertia_warning(parameters.checked(scene_parameters(scene))) == ''
-
-
 @pytest.mark.parametrize('name', ILLEGAL)
 def test_an_inertia_that_no_body_has_is_left_out_with_a_warning(name):
     values = ILLEGAL[name]

@@ -7,48 +7,27 @@ import re
 
 import numpy as np
 import pytest
-from helpers.inspected import as_json, log_of, rewritten, short_log, stepped_log, told
+from helpers.inspected import as_json, log_of, rewritten, told
+from helpers.logs import flipped
 from mcap.reader import make_reader
 
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import cdr, journal, parameters
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.tools import recorded_run
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp('inspect')
-
-
-@pytest.fixture(scope='module')
-def stepped(folder):
-    return stepped_log(folder / 'stepped.mcap')
-
-
-@pytest.fixture(scope='module')
-def short(folder):
-    return short_log(folder / 'short.mcap')
-
-
-@pytest.fixture(scope='module')
-def columns(folder):
+def columns(tmp_path_factory):
     """The exact solution in columns, with a command between two stretches; several chunks."""
-    return log_of(folder / 'columns.mcap', '--duration', 11, '--command', '3.1:1.7:1.4',
-                  '-p', 'solver.method:=exact', '-p', 'imu.accelerometer_random_walk:=0.01',
-                  '-p', 'markers.enabled:=true')
+    return log_of(tmp_path_factory.mktemp('log') / 'columns.mcap', '--duration', 11, '--command',
+                  '3.1:1.7:1.4', '-p', 'solver.method:=exact', '-p', 'markers.enabled:=true',
+                  '-p', 'imu.accelerometer_random_walk:=0.01')
 
 
 def chunks_of(path):
     with open(path, 'rb') as file:
         return make_reader(file).get_summary().chunk_indexes
-
-
-def with_flipped_bit(data, byte, bit=0):
-    changed = bytearray(data)
-    changed[byte] ^= 1 << bit
-    return bytes(changed)
 
 
 def verified(capsys, path):
@@ -75,7 +54,7 @@ def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
               for topic in counts}
     verdict = verified(capsys, rewritten(
         path, tmp_path / 'changed.mcap', lambda topic, number, data: (
-            with_flipped_bit(data, *places[topic])
+            flipped(data, *places[topic])
             if topic in places and number == min(1, counts[topic] - 1) else data)))
     first = verdict['first']
     assert verdict['different'] == len(counts)
@@ -86,7 +65,7 @@ def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
 
 def test_a_difference_names_field_stamp_and_both_values(short, tmp_path, capsys):
     path = rewritten(short, tmp_path / 'run.mcap', lambda topic, number, data: (
-        with_flipped_bit(data, len(data) - 8) if (topic, number) == ('/pose', 7) else data))
+        flipped(data, len(data) - 8) if (topic, number) == ('/pose', 7) else data))
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1
     said = re.search(r'first: /pose at 1\.070000000 s, byte \d+, pose\.orientation\[3\]: '
@@ -121,14 +100,6 @@ def test_each_change_that_takes_effect_at_once_is_replayed(short):
         events = [event for _, event in recorded_run.rerun(
             dataclasses.replace(run, events=[event]), run.epoch_ns + 2)]
         assert (event in events) is (parameter.effect is parameters.Effect.NOW), parameter.name
-
-
-def test_a_type_without_names_is_told():
-    values = parameters.checked({})
-    stream = Stream(values, 'pose', 'other', 'a_package/msg/New',
-                    cdr.Template(cdr.CdrWriter().header('').field(1)))
-    with pytest.raises(LookupError, match='no names for a_package/msg/New in recorded_run'):
-        recorded_run.field_names(stream)
 
 
 def test_another_machine_is_warned_of(short, capsys, monkeypatch):

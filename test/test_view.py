@@ -11,23 +11,23 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from helpers.recordings import write_rows
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim import State, solve
+from spinning_top_sim import solve
 from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.physics.regimes import SENTENCES
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import simulate, svg
 from spinning_top_sim.tools.scene_file import read_scene
-from spinning_top_sim.view import command, model, plots, text
-from spinning_top_sim.view.track import Samples, Track, state_of
+from spinning_top_sim.view import command, plots, shapes, text
+from spinning_top_sim.view.track import Series, Track
 
 pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')
 
@@ -67,7 +67,7 @@ def truth(shown, stamp_ns):
     """Return the exact state at a stamp before the command."""
     values = shown.values
     return solve(shown.top, parameters.start_state(values),
-                 [(stamp_ns - shown.origin_ns) * 1e-9])
+                 [(stamp_ns - shown.epoch_ns) * 1e-9])
 
 
 def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
@@ -85,14 +85,14 @@ def test_motions_of_a_log_begin_with_its_commands(shown):
     assert (first.description.name, second.description.name) == ('cusps', 'loops')
     assert (second.l3, second.lz) == (2.0, 1.5)
     assert shown.commands_ns == [second.begin_ns]
-    assert second.begin_ns - shown.origin_ns == COMMAND_S * 1e9
+    assert second.begin_ns - shown.epoch_ns == COMMAND_S * 1e9
     assert shown.motion_at(second.begin_ns - 1) is first
     assert first.description.theta_min == pytest.approx(math.radians(30.0))
 
 
-@pytest.mark.parametrize('name', model.ARROWS)
+@pytest.mark.parametrize('name', shapes.ARROWS)
 def test_arrows_are_the_vectors_in_the_world(shown, name):
-    stamp_ns = shown.origin_ns + 1_230_000_000
+    stamp_ns = shown.epoch_ns + 1_230_000_000
     exact, top = truth(shown, stamp_ns), shown.top
     omega, turn = exact.angular_velocity[0], Rotation.from_quat(exact.quaternion[0])
     up = turn.inv().apply([0.0, 0.0, 1.0])
@@ -101,43 +101,41 @@ def test_arrows_are_the_vectors_in_the_world(shown, name):
             'torque': np.cross([0.0, 0.0, top.com_distance], -top.mass * top.gravity * up),
             'specific force': np.ravel(exact.specific_force(shown.values['imu.lever_arm'])),
             }[name]
-    drawn = model.arrow(shown, name, stamp_ns)
+    drawn = shapes.arrow(shown, name, stamp_ns)
     expected = turn.apply(body)
     assert drawn / np.linalg.norm(drawn) == pytest.approx(expected / np.linalg.norm(expected),
                                                           abs=1e-8)
     if name == 'torque':                # P sin(theta), about the line of nodes
-        assert np.linalg.norm(drawn) / model.reach(shown) == pytest.approx(
+        assert np.linalg.norm(drawn) / shapes.reach(shown) == pytest.approx(
             math.sin(exact.theta[0]), abs=1e-8)
         assert drawn @ [math.sin(exact.phi[0]), -math.cos(exact.phi[0]), 0.0] == pytest.approx(
             -np.linalg.norm(drawn))
     if name == 'angular momentum':      # Lz is conserved, and L3 the usual length
-        assert drawn[2] / model.reach(shown) == pytest.approx(
+        assert drawn[2] / shapes.reach(shown) == pytest.approx(
             exact.lz[0] / exact.l3[0], abs=1e-8)
 
 
 def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
-    stamp_ns = shown.origin_ns + 2_000_000_000
-    lines = model.trace(shown, stamp_ns)
+    stamp_ns = shown.epoch_ns + 2_000_000_000
+    lines = shapes.trace(shown, stamp_ns)
     exact = truth(shown, stamp_ns)
     assert lines[-1, 1] == pytest.approx(
-        model.reach(shown) * np.ravel(exact.rows_axis), abs=1e-6)
+        shapes.reach(shown) * np.ravel(exact.rows_axis), abs=1e-6)
     assert len(lines) == 200            # 2 s at 100 Hz
     track = Track('', parameters.checked({}))
     half = math.sqrt(0.5)
-    track.add('pose', Samples(np.arange(4), np.array(
+    track.add('pose', Series(np.arange(4), np.array(
         [(0, 0, 0, 1, 0, 0, 0), (0, 0.01, 0, 1, 0, 0, 0), (0, half, 0, half, 0, 0, 0),
          (0, half, 0.01, half, 0, 0, 0)], float)))
-    assert len(model.trace(track, 3)) == 2
+    assert len(shapes.trace(track, 3)) == 2
 
 
 def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
     moved = solve(shown.top, parameters.start_state(shown.values), np.arange(20) * 0.04)
     track = Track('', shown.values)
-    track.add('joint_states', Samples(np.arange(20) * 40_000_000, np.column_stack(
+    track.add('joint_states', Series(np.arange(20) * 40_000_000, np.column_stack(
         (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
-    stamps_ns, axis, joined = model.path(track, 0, NANOSECONDS)
-    track.detect_motion()
-    assert track.motions[0].description.name == 'cusps'     # as at the start
+    stamps_ns, axis, joined = shapes.path(track, 0, NANOSECONDS)
     assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
     exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
     assert axis == pytest.approx(np.column_stack(exact.rows_axis), abs=1e-4)
@@ -145,13 +143,13 @@ def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
 
 def plotted(shown, stamp_ns):
     """Return the lines of the plots of 2.5 s, by plot and name."""
-    top = plots.Shown(shown, stamp_ns, shown.origin_ns, stamp_ns, shown.origin_ns)
+    top = plots.Shown(shown, stamp_ns, shown.epoch_ns, stamp_ns, shown.epoch_ns)
     return {(plot.title, line.name): (plot, line) for plot in (
         *plots.motion_plots([top]), *plots.accuracy_plots([top])) for line in plot.lines}
 
 
 def test_plots_are_the_published_numbers(shown):
-    stamp_ns = shown.origin_ns + 2_500_000_000
+    stamp_ns = shown.epoch_ns + 2_500_000_000
     found = plotted(shown, stamp_ns)
     for key, expected, tolerance in (
             (('Tilt', 'θ'), lambda exact: math.degrees(exact.theta[0]), 1e-8),
@@ -162,7 +160,7 @@ def test_plots_are_the_published_numbers(shown):
         plot, line = found[key]
         assert plot.now == 2.5 and len(line.x) > 200
         for at in (0, 100, -1):
-            exact = truth(shown, shown.origin_ns + round(line.x[at] * 1e9))
+            exact = truth(shown, shown.epoch_ns + round(line.x[at] * 1e9))
             assert line.y[at] == pytest.approx(expected(exact), abs=tolerance)
     total, parts = (sum(found['Energy', name][1].y for name in names)
                     for names in (('sum',), ('kinetic', 'potential')))
@@ -173,7 +171,7 @@ def test_plots_are_the_published_numbers(shown):
 
 
 def test_the_effective_potential_meets_the_energy_at_the_turning_points(shown):
-    stamp_ns = shown.origin_ns + 2_500_000_000
+    stamp_ns = shown.epoch_ns + 2_500_000_000
     exact, found = truth(shown, stamp_ns), plotted(shown, stamp_ns)
     plot, turning = found['Effective potential V(θ)', 'turning points']
     assert turning.dots and turning.x == pytest.approx([30.0, math.degrees(
@@ -207,50 +205,20 @@ def test_a_plot_is_svg_with_title_units_and_its_points():
 
 @pytest.mark.parametrize('scene', parameter_files('scene'))
 def test_every_scene_has_words_and_plots(scene):
+    """And is one motion, in however many parts its samples come."""
     values = parameters.checked(read_scene(parameter_files('scene')[scene]))
     track, start = Track('', values), parameters.start_state(values)
     moved = solve(track.top, start, np.arange(300) * 0.01)
-    track.add('joint_states', Samples(np.arange(300) * 10_000_000, np.column_stack(
-        (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
-    track.detect_motion()
+    rows = np.column_stack((moved.quaternion, moved.angular_velocity, moved.phi_dot))
+    for part in np.array_split(np.arange(300), 60):
+        track.add('joint_states', Series(part * 10_000_000, rows[part]))
+        track.detect_motion()
     (motion,) = track.motions
     words = text.words(track, motion, 0, 0)
     assert SENTENCES[motion.description.name] in words and 'nan' not in words
     for plot in plots.motion_plots([plots.Shown(track, 0, 0, NANOSECONDS, 0)]):
         ElementTree.fromstring(svg.draw(plot))
         assert 'nan' not in svg.draw(plot)
-
-
-@pytest.mark.parametrize(('start', 'words'), [
-    (State(theta=0.5, l3=1.6, lz=1.6 * math.cos(0.5)), 'cusps'),
-    (State(theta=0.0, l3=2.0, lz=2.0), 'sleeping'),
-    (State(theta=0.7, theta_dot=1.0, l3=1.6, lz=1.6), 'through the top'),
-    (State(theta=1.0, theta_dot=0.5, l3=0.0, lz=0.0), 'planar pendulum, swinging')])
-def test_a_live_track_names_the_motion_from_its_samples(start, words):
-    values = parameters.checked({})
-    track = Track('', values)
-    moved = solve(track.top, start, np.arange(200) * 0.01)
-    rows = np.column_stack((moved.quaternion, moved.angular_velocity, moved.phi_dot))
-    for k, row in enumerate(rows):
-        track.add('joint_states', Samples(np.array([k]), row[np.newaxis]))
-        track.detect_motion()
-    (motion,) = track.motions           # one: rounding begins no other
-    assert motion.description.name == words
-    (energy, l3, lz), _ = state_of(track.top, rows[50])
-    assert (energy, l3, lz) == pytest.approx((moved.energy[50], start.l3, start.lz), abs=1e-9)
-
-
-def test_each_of_two_logs_has_its_own_time(page, tmp_path):
-    paths = [tmp_path / f'{epoch}.mcap' for epoch in (1, 1000)]
-    for path in paths:
-        assert simulate.main(['--quiet', '--duration', '2', '-o', str(path), '--epoch',
-                              path.stem]) == 0
-    player = logs.Player(page, logs.read_logs(paths))
-    player.draw_next(0.5)
-    assert player.length == 2.0
-    assert page._words.content.count('t = 0.500 s, stamp ') == 2
-    assert page._plots.content.count('aria-label="Tilt"') == 1
-    assert page._plots.content.count('stroke-dasharray="5 3"') >= 4       # of the second log
 
 
 def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
@@ -260,15 +228,15 @@ def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
     player = logs.Player(page, [track])
     for t, x in ((1.0, 1.0), (2.2, 4.0 + 0.2 * 4.0)):       # 2 m/s^2, then 4 m/s
         player.draw(t)
-        reach = abs(model.reach(track))
+        reach = abs(shapes.reach(track))
         assert page._ground.position == pytest.approx((-(x % reach), 0.0, -0.8 * reach), abs=1e-9)
         assert 'The pivot moves' in page._words.content
-        stamp_ns = track.origin_ns + round(t * NANOSECONDS)
+        stamp_ns = track.epoch_ns + round(t * NANOSECONDS)
         assert track.places(np.array([stamp_ns])) == pytest.approx(np.array([[x, 0.0, 0.0]]))
         # The trace has stayed where the tip was: at the start at x = 0.
-        begin, end = (model.reach(track) * model.axis_of(track.attitudes.at(at_ns)[1])[0]
-                      for at_ns in (track.origin_ns, stamp_ns))
-        lines = model.trace(track, stamp_ns)
+        begin, end = (shapes.reach(track) * shapes.axis_of(track.attitudes.at(at_ns)[1])[0]
+                      for at_ns in (track.epoch_ns, stamp_ns))
+        lines = shapes.trace(track, stamp_ns)
         assert lines[0, 0] == pytest.approx(begin - (x, 0.0, 0.0), abs=1e-6)
         assert lines[-1, 1] == pytest.approx(end, abs=1e-6)
 
@@ -285,13 +253,10 @@ def foreign(log, path, topics):
     """Write a log as another program would: topics of `log`, and their new names."""
     with LogReader(log) as reader:
         types = {topic.name: topic.type_name for topic in reader.topics}
-        file = create_file(path, [RecordedTopic(name, types[topic])
-                                  for topic, name in topics.items()], {}, compression='none')
-        for message in reader.messages(topics=topics):
-            file.append(list(topics).index(message.topic), message.log_time, message.data)
-    file.write_chunk()
-    file.finish()
-    return path
+        return write_rows(
+            path, [RecordedTopic(name, types[topic]) for topic, name in topics.items()],
+            [(list(topics).index(message.topic), message.log_time, message.data)
+             for message in reader.messages(topics=topics)])
 
 
 @pytest.mark.parametrize('topic', ['/pose', '/ground_truth/imu', '/ground_truth/odom'])
@@ -299,7 +264,7 @@ def test_the_log_of_another_program_shows_its_attitudes(log, shown, page, tmp_pa
     # The first topic has no orientation.
     path = foreign(log, tmp_path / 'run.mcap', {'/imu/data_raw': '/raw', topic: '/robot/state'})
     track, = logs.read_logs([path])
-    assert not track.has_body and track.origin_ns == track.span[0]
+    assert not track.has_body and track.epoch_ns == track.span[0]
     if topic == '/pose':
         assert track.attitudes.rows == pytest.approx(shown.samples['pose'].rows, abs=1e-15)
     player = logs.Player(page, [track])
@@ -314,15 +279,6 @@ def test_a_log_without_attitudes_is_refused(log, tmp_path):
     path = foreign(log, tmp_path / 'raw.mcap', {'/imu/data_raw': '/raw'})
     with pytest.raises(LogError, match=r'raw.mcap: no attitude in it \(sensor_msgs/msg/Imu, '):
         logs.read_logs([path])
-
-
-def test_a_page_as_a_file_is_never_overwritten(log, tmp_path, capsys):
-    path = tmp_path / 'a.html'
-    path.write_text('mine')
-    assert command.main([str(log), '--html', str(path)]) == 1
-    assert capsys.readouterr().err == (
-        f'spinning-top view: cannot write {path}: it exists, and nothing is overwritten\n')
-    assert path.read_text() == 'mine'
 
 
 def test_a_player_follows_its_buttons_and_the_slider(shown, page):
@@ -371,25 +327,6 @@ def page():
     page = pages.Page('one', '127.0.0.1', None)
     yield page
     page.close()
-
-
-def test_a_part_that_is_switched_on_at_one_stamp_is_drawn_for_it(page, shown):
-    stamp_ns = shown.origin_ns + NANOSECONDS
-    page.set_tracks([shown])
-    page._trace.value = page._bounds.value = False
-    page.draw(stamp_ns, shown.origin_ns)
-    (top,) = page._tops
-    page.arrows[0].value = True
-    page.draw(stamp_ns, shown.origin_ns)
-    assert top._arrows[0].points[0, 1] == pytest.approx(
-        model.arrow(shown, model.ARROWS[0], stamp_ns), abs=1e-6)
-    page._bounds.value = True
-    assert 'trace' not in page.legend() and 'angular momentum' in page.legend()
-    assert top._stand.wxyz == pytest.approx([1, 0, 0, 0])
-    page.draw(stamp_ns, shown.origin_ns)
-    for bound, theta in zip(top._bounds, top._limits, strict=True):
-        assert bound.visible
-        assert (bound.points == model.circle(model.reach(shown), theta)).all()
 
 
 def test_a_page_of_another_site_is_refused(page):

@@ -87,10 +87,7 @@ def test_live(browser, peer, tmp_path):
             visit.press('Resume')
             visit.read('pause: running')
             # The plots have data, and a switched-on arrow is in the scene.
-            titles = visit.wait("(found => found.length === 6 && found)([...document"
-                                ".querySelectorAll('.plot .title')].map(e => e.textContent))")
-            assert {'Effective potential V(θ)', 'Energy', 'Tilt', 'Precession rate'} < set(titles)
-            assert visit.page.locator('.plot polyline').count() >= 7
+            visit.wait("document.querySelectorAll('.plot polyline').length >= 7")
             visit.tick('torque')
             visit.wait("[...document.querySelectorAll('.top-legend')].some("
                        "e => e.textContent.includes('torque'))")
@@ -107,14 +104,8 @@ def test_live(browser, peer, tmp_path):
             visit.choose('scene', 'wavy')
             visit.read('wavy, reset: at t = 0')
             visit.read('[Ww]aves')
-            visit.choose('scene', 'cusp')
-            visit.read('cusp, reset: at t = 0')
-            visit.tick('record')
-            visit.read('record: ')
-            wait_for('a log', lambda: list(tmp_path.glob('*.mcap')))
             visit.press('Reset')
-            visit.read('reset: at t = 0')
-            visit.read('[Cc]usps')
+            visit.read('(^|[^ ] ?)reset: at t = 0')
             assert visit.errors == []
             assert visit.hosts <= {'127.0.0.1', None}
 
@@ -131,26 +122,6 @@ def turned(attitude):
 def stamp_of(poses):
     seconds, nanoseconds = Time.from_msg(poses.last().header.stamp).seconds_nanoseconds()
     return str(seconds), f'{nanoseconds:09d}'
-
-
-def test_log(browser, tmp_path):
-    log = write_log(tmp_path / 'cusp.mcap', '120')      # longer than a slow browser takes to pause
-    poses = poses_of(log)
-    view = SimNode(tmp_path, program=(*VIEW, str(log)))
-    with view, Visit(browser, address_of(view)) as visit:
-        if visit.page.get_by_role('button', name='Pause').count():      # it is not at its end
-            visit.press('Pause')
-        visit.page.get_by_role('button', name='Play').wait_for()
-        visit.put('time [s]', 1.25)
-        visit.read(r't = 1\.250')
-        visit.read('[Cc]usps')
-        seconds, nanoseconds = map(int, visit.read(STAMP))
-        assert apart(visit.attitude(), poses[seconds * 10 ** 9 + nanoseconds]) < 1e-6
-        visit.press('Next command')
-        visit.read(r't = 2\.500')
-        visit.read('[Ll]oops')
-        assert visit.errors == []
-        assert visit.hosts <= {'127.0.0.1', None}
 
 
 def test_file_without_a_network(browser, tmp_path):

@@ -8,13 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
-from helpers.node_logs import stamp_of
 from helpers.simulations import record
-from nav_msgs.msg import Odometry
-from rclpy.parameter import Parameter
 
 from spinning_top_sim.nodes import throttle
 from spinning_top_sim.recording.reader import LogReader
@@ -42,21 +38,6 @@ def test_a_throttle_lets_few_messages_through_and_the_last_one(monkeypatch, peri
     one.flush(at_once=True)
     assert sent[-1] == number
     assert len(set(sent)) == len(sent)
-
-
-def test_the_throttled_topic_has_messages_of_its_stream(peer, tmp_path):
-    with SimNode(tmp_path) as node:
-        few = peer.listen(node.topic('ground_truth/odom_throttle'), Odometry)
-        few.wait(20)
-        every = peer.listen(node.topic('ground_truth/odom'), Odometry)
-        every.wait(1)
-        few.wait_more(20)
-        assert peer.switch(node, 'set_pause', True).success
-        wait_for('the last message on both topics', lambda: few.raw[-1] == every.raw[-1])
-        known = {stamp_of(data): data for data in every.raw}
-        shared = [data for data in few.raw if stamp_of(data) in known]
-        assert len(shared) >= 20
-        assert all(data == known[stamp_of(data)] for data in shared)
 
 
 @pytest.fixture
@@ -90,30 +71,9 @@ def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypa
         assert live._track.span[1] == epoch_ns + NANOSECONDS // 2
         assert live._page._tops[0].drawn[0] == epoch_ns + NANOSECONDS // 2
     # The trace begins with the last reset.
-    live._origin_ns = epoch_ns + NANOSECONDS // 4
+    live._epoch_ns = epoch_ns + NANOSECONDS // 4
     live._draw_once()
-    assert live._track.span[0] == live._origin_ns
-
-
-def test_the_page_shows_another_top_when_its_motion_begins(live, monkeypatch):
-    def ask(_, request):
-        values = parameters.checked({'top.mass': mass, 'spin.lz': 1.4})
-        return SimpleNamespace(values=[
-            Parameter(name, value=list(value) if isinstance(value, tuple) else value
-                      ).get_parameter_value()
-            for name in request.names for value in [values[name]]])
-
-    monkeypatch.setattr(live, '_ask', ask)
-    numbers = {'state': 'running', 'recorder': 'off', 'simulated time [s]': '1',
-               'energy drift': '0', 'real-time factor': '1', 'orientation error [rad]': '0'}
-    for seconds, mass in ((1, 2.0), (2, 4.0)):
-        numbers['stamp of t = 0 [ns]'] = str(seconds * NANOSECONDS)
-        live._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(
-            name='spinning_top', values=[KeyValue(key=key, value=value)
-                                         for key, value in numbers.items()])]))
-        assert live._stale
-        live._read_parameters()
-        assert live._track.top.mass == mass and not live._stale
+    assert live._track.span[0] == live._epoch_ns
 
 
 def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
@@ -126,16 +86,16 @@ def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
             wait_for('the page to listen', lambda: peer.node.count_subscribers(
                 node.topic('ground_truth/odom_throttle')))
             before = diagnostics.next(node)
-            # It hangs for two seconds of simulated time, which is the real time.
+            # It hangs for a second of simulated time, which is the real time.
             os.killpg(view.process.pid, signal.SIGSTOP)
-            poses.wait_more(400)
+            poses.wait_more(200)
             os.killpg(view.process.pid, signal.SIGCONT)
             # Killed while it makes a port of shared memory, as it may when it goes on, it would
             # block all who open that port (Fast DDS).
-            poses.wait_more(200)
+            poses.wait_more(100)
             assert view.alive
             view.kill()
-            poses.wait_more(100)
+            poses.wait_more(50)
         after = diagnostics.next(node)
         assert after['clock slip [s]'] == before['clock slip [s]'] == '0.000'
         assert after['recorder'] == 'recording'
@@ -144,5 +104,5 @@ def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
         stamps = {topic: np.array([message.log_time for message in reader.messages(
             topics=[f'{node.namespace}{topic}'])]) for topic in PERIODS}
     for topic, period in PERIODS.items():
-        assert len(stamps[topic]) > 4.0e9 / period
+        assert len(stamps[topic]) > 1.5e9 / period
         assert (np.diff(stamps[topic]) == period).all(), topic

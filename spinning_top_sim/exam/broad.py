@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.exam import measures
-from spinning_top_sim.exam.diagnosis import Fault
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import Run
@@ -29,6 +28,7 @@ from spinning_top_sim.exam.trial import (
     one_line,
 )
 from spinning_top_sim.installation import needed
+from spinning_top_sim.tools.verdict import Fault
 
 SUFFIXES = '.mat', '.hdf5', '.h5'
 # Arrays of a trial with their columns; the field is in microtesla, quaternions are w, x, y, z.
@@ -68,10 +68,11 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     ValueError
         If there is no folder, no trial in it, or a file is none.
     """
-    return judge(make_filter, map(read_trial, trials_in(folder)), 'data', subject, show=show)
+    return judge(make_filter, map(read_trial, trials_in(folder)), 'data', one_line(
+        subject or getattr(make_filter, '__name__', 'filter')), show=show)
 
 
-def judge(make_filter: MakeFilter, trials: Iterable[Trial], kind: str, subject: str | None,
+def judge(make_filter: MakeFilter, trials: Iterable[Trial], kind: str, subject: str,
           feed: Feed = feed_apart, show: Callable[[float], object] = lambda done: None) -> Report:
     """Return the report on a filter in trials; the names of its measures begin with `kind`."""
     found: dict[str, list[tuple[float, ...]]] = {}
@@ -99,8 +100,8 @@ def judge(make_filter: MakeFilter, trials: Iterable[Trial], kind: str, subject: 
                   if len(same) > 1 else math.nan,
                   f'{kind}_{name}_to_gyroscope': float(np.mean(ratio))}
     means = {name: value for name, value in means.items() if not math.isnan(value)}
-    return Report(one_line(subject or getattr(make_filter, '__name__', 'filter')),
-                  [Fault('invalid_output', '; '.join(failed))] if failed else [], means, outcomes)
+    faults = [Fault('invalid_output', '; '.join(failed))] if failed else []
+    return Report(subject, faults, means, outcomes)
 
 
 def trials_in(folder: str | Path) -> list[Path]:

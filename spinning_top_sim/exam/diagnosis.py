@@ -8,8 +8,8 @@ disappears, it was the cause.
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.exam import measures, scenarios
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.trial import ChangeRows, Hypothesis, Outcome, changed
+from spinning_top_sim.tools.verdict import Fault
 
 FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component_order',
           'frame_ned', 'gravity_sign', 'gyroscope_wiring', 'accelerometer_wiring',
@@ -33,23 +34,6 @@ FIRST_ORDER_LEFT = 0.5          # of that error, with rates for which first-orde
 LEVER_ARM = np.radians(1.0)     # between the attitudes with and without the lever arm
 AHEAD, DELAYED = -1.5, 0.75     # steps; a filter that corrects before its step is ahead by one
 BIAS_LEFT_S = 0.05              # error relative to the bias that causes it [rad/(rad/s)]
-CONSISTENT = 0.9999             # probability of the NEES band
-
-
-class Fault(NamedTuple):
-    """
-    A fault of a filter.
-
-    Parameters
-    ----------
-    name : str
-        One of FAULTS.
-    evidence : str
-        Why the exam reports it.
-    """
-
-    name: str
-    evidence: str
 
 
 def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
@@ -90,12 +74,12 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
         'convergence_s': max(measures.convergence_time(outcome.run.t, outcome.errors.tilt)
                              for outcome in outcomes),
         'heading_drift_deg_per_s': math.degrees(float(np.mean([
-            abs(np.polyfit(outcome.run.t - outcome.run.t[0], one.heading, 1)[0])
+            abs(np.polyfit(outcome.run.t - outcome.run.t[0], np.unwrap(one.heading), 1)[0])
             for outcome, one in zip(settled, errors, strict=True)])))}
 
 
-def quality(outcomes: Sequence[Outcome], unaided: Sequence[measures.Rmse],
-            imu: Mapping[str, Any], absolute: bool) -> dict[str, float]:
+def quality(outcomes: Sequence[Outcome], imu: Mapping[str, Any],
+            absolute: bool) -> dict[str, float]:
     """
     Return ratios of errors to the least that white noise allows, and to those without a filter.
 
@@ -105,6 +89,7 @@ def quality(outcomes: Sequence[Outcome], unaided: Sequence[measures.Rmse],
     rate, force, field = (imu.get(f'{name}noise_density', 0.0)
                           for name in ('imu.gyroscope_', 'imu.accelerometer_', 'mag.'))
     horizontal = math.hypot(*imu.get('mag.field', scenarios.FIELD)[:2])
+    unaided = [measures.unaided(one.run, slice(len(one.run.t) // 2, None)) for one in outcomes]
     found: dict[str, float] = {}
     for what, variance in (('tilt', 2.0 * rate * force / scenarios.GRAVITY), (
             'heading', rate * field / max(horizontal, 1e-12)))[:1 + absolute]:
@@ -159,13 +144,13 @@ def nees_marks(found: Mapping[str, measures.Nees]) -> dict[str, float]:
     """Return the result of `consistency` as measures."""
     names = {'tilt': 'nees', 'attitude': 'nees_attitude'}
     return {f'{names[what]}{end}': value for what, nees in found.items()
-            for end, value in zip(('', '_low', '_high'), (nees.ratio, *nees.band()), strict=True)}
+            for end, value in zip(('', '_low', '_high'), (nees.ratio, *nees.band), strict=True)}
 
 
 def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
     """Judge the result of `consistency`."""
     for what, nees in found.items():
-        low, high = nees.band(CONSISTENT)
+        low, high = nees.band
         if not low <= nees.ratio <= high:
             name = 'covariance_small' if nees.ratio > high else 'covariance_large'
             return Fault(name, f'the squared error of the {what} is {nees.ratio:.3g} times what '
@@ -176,8 +161,7 @@ def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
 
 def inaccuracy(outcome: Outcome, absolute: bool) -> Fault | None:
     """Judge the error in the last quarter, and whether it grows from quarter to quarter."""
-    error = outcome.errors.attitude(True) if absolute else outcome.errors.tilt
-    quarters = [rms(part) for part in np.array_split(error, 4)]
+    quarters = [rms(part) for part in np.array_split(outcome.errors.known(absolute), 4)]
     if quarters[-1] < DIVERGED:
         return None
     if all(later >= GROWS * one for one, later in itertools.pairwise(quarters[1:])):
@@ -185,12 +169,6 @@ def inaccuracy(outcome: Outcome, absolute: bool) -> Fault | None:
                      f'{", ".join(map(degrees, quarters))}')
     return Fault('inaccurate', f'{outcome.run.name}: the error in the last quarter is '
                  f'{degrees(quarters[-1])}, for no reason that is known')
-
-
-def one_of_each(faults: Sequence[Fault]) -> Iterator[Fault]:
-    """Yield the first fault of each name: a misreading, which hides the others, comes first."""
-    names = [fault.name for fault in faults]
-    yield from (fault for k, fault in enumerate(faults) if fault.name not in names[:k])
 
 
 def degrees(angle: float) -> str:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from spinning_top_sim.exam import scenarios
 from spinning_top_sim.exam.measures import increments, rms
@@ -53,30 +53,28 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
     """Return the run for the IMU's place and field, sampled at the rate of the slow motion."""
     rate = scenarios.SLOW.rate
     motion = scenarios.record(replace(scenarios.PIVOT, duration=MOTION_S), imu, 0)
-    at = Rotation.identity()
-    path = [np.tile(at.as_quat(), (round(FIRST_S * rate) + 1, 1))]
     goals = list(itertools.accumulate((Rotation.from_rotvec(
         math.radians(angle) * np.eye(3)[axis]) for axis, angle in TURNS), operator.mul))
-    rests, turns = [len(path[0]) - 2], []
-    for goal in (*goals, at, motion.start):
-        way = (at.inv() * goal).as_rotvec()
-        n = round(float(np.linalg.norm(way)) / TURN_RATE * rate) + 1
-        turns.append(rests[-1] + 1)
-        path += [(at * Rotation.from_rotvec(np.outer(np.arange(1, n + 1) / n, way))).as_quat(),
-                 np.tile(goal.as_quat(), (round(REST_S * rate), 1))]
-        rests.append(rests[-1] + n + round(REST_S * rate))
-        at = goal
-    lead = scenarios.along('', Rotation.from_quat(np.concatenate(path)), imu)
-    end, n = len(lead.t) + len(motion.t), round(ANSWER_S * rate)
-    last = np.tile(motion.truth[-1], (3 * n + 1, 1))
-    still = replace(scenarios.along('', Rotation.from_quat(last), imu).after(motion.after(lead)),
+    level = Rotation.identity()
+    stops = Rotation.concatenate((level, *goals, level, motion.start))
+    ways = (stops[:-1].inv() * stops[1:]).magnitude()
+    lengths, rest, answer = (np.rint(seconds * rate).astype(int) for seconds in (
+        ways / TURN_RATE, REST_S, ANSWER_S))
+    # Begin and end of each rest.
+    ends = np.cumsum([FIRST_S * rate, *(lengths + 1 + rest)]).astype(int)
+    begins = np.append(0, ends[1:] - rest)
+    path = Slerp(np.ravel((begins, ends), 'F'), stops[np.repeat(np.arange(len(stops)), 2)])
+    lead = scenarios.along(path(np.arange(ends[-1] + 1)), imu)
+    end = len(lead.t) + len(motion.t)
+    last = np.tile(motion.truth[-1], (3 * answer + 1, 1))
+    still = replace(scenarios.along(Rotation.from_quat(last), imu).after(motion.after(lead)),
                     name='excitation')
     still.gyroscope[:] += NEVER_ZERO
     run = replace(still, gyroscope=still.gyroscope.copy())
     kick = Rotation.from_quat(last[0]).inv().apply(KICK) / KICK_S
-    for number, first in enumerate(kicks := (end + n, end + 2 * n)):
+    for number, first in enumerate(kicks := (end + answer, end + 2 * answer)):
         run.gyroscope[first:first + round(KICK_S * rate)] += (-1.0) ** number * kick
-    return Excitation(run, still, np.array(rests), np.array(turns[:len(TURNS)]),
+    return Excitation(run, still, ends - 1, ends[:len(TURNS)],
                       slice(end - len(motion.t) // 2, end), kicks)
 
 
@@ -100,7 +98,7 @@ def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Real
     return fits[late][0], fit(EARLY, 0)[0], late
 
 
-def off(*matrices: Reals) -> float:
+def from_identity(*matrices: Reals) -> float:
     """Return how far the nearest of some matrices is from the identity."""
     return float(min(np.max(np.abs(matrix - np.eye(3))) for matrix in matrices))
 
@@ -132,12 +130,12 @@ def affine_of(readings: Reals, estimated: Rotation, level: Sequence[int],
 
 def words(matrix: Reals) -> str:
     """Return in words how a matrix (3, 3) of the gyroscope differs from the identity."""
-    off = 0.5 * np.max(np.abs(matrix - np.eye(3)))
+    large = 0.5 * np.max(np.abs(matrix - np.eye(3)))
     return '; '.join(
         f'a rate about {AXES[k]} turns it ' + (' and '.join(
             f'{column[j]:+.3g} times about {AXES[j]}' for j in range(3)
-            if abs(column[j] - (j == k)) >= off and column[j]) or 'not at all')
-        for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) >= off)
+            if abs(column[j] - (j == k)) >= large and column[j]) or 'not at all')
+        for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) >= large)
 
 
 def axes(matrix: Reals) -> str:

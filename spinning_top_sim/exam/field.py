@@ -16,7 +16,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.broad import Trial, judge
-from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import GRAVITY, Reals, Run
 from spinning_top_sim.exam.trial import Feed, MakeFilter
@@ -88,20 +87,20 @@ SCENES = (
         'mag.disturbance.body': (0.0, 1e3, -2e-6, 5e-7, 9e-6)}))
 
 
-def examine_field(make_filter: MakeFilter, seeds: Iterable[int], *, subject: str | None = None,
-                  imu: Mapping[str, Any] | None = None, feed: Feed = feed_apart) -> Report:
-    """
-    Examine a filter with the scenes.
-
-    The measures are those of `examine_data`.  A seed decides on motions, noise and device; `imu`
-    has the parameters imu.* and mag.* that differ from those of DEVICE.
-    """
-    return judge(make_filter, (record(scene, seed, imu or {}) for seed in seeds
-                               for scene in SCENES), 'field', subject, feed)
+def examine_field(make_filter: MakeFilter, subject: str, seeds: Iterable[int],
+                  imu: Mapping[str, Any], feed: Feed) -> Report:
+    """Examine a filter with the scenes; the arguments are those of `record` and `judge`."""
+    return judge(make_filter, (record(scene, seed, imu) for seed in seeds for scene in SCENES),
+                 'field', subject, feed)
 
 
 def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> Trial:
-    """Return a scene as an IMU reads it.  Raises ValueError for parameters not allowed."""
+    """
+    Return a scene as an IMU reads it.  Raises ValueError for parameters not allowed.
+
+    A seed decides on motions, noise and device; `imu` has the parameters imu.* and mag.* that
+    differ from those of DEVICE.
+    """
     random = np.random.default_rng((seed, *scene.name.encode()))
     begins = np.arange(0.0, scene.motions[-1][1], PASSING)[:, np.newaxis]
     events = np.hstack((begins, begins + PASSING, scene.magnet * random.standard_normal(

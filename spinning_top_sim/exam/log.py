@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from spinning_top_sim.exam import diagnosis
-from spinning_top_sim.exam.diagnosis import Fault, degrees
+from spinning_top_sim.exam.diagnosis import degrees
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import OF_PLACE, Reals, Run
-from spinning_top_sim.exam.trial import Outcome, is_indefinite, no_attitudes, one_line
+from spinning_top_sim.exam.trial import Outcome, invalid, one_line
 from spinning_top_sim.recording.reader import LogReader, LogTopic
-from spinning_top_sim.recording.writer import METADATA_NAME
+from spinning_top_sim.recording.recorder import METADATA_NAME
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.attitudes import LAYOUTS, decode
+from spinning_top_sim.tools.verdict import Fault
 
 # The first of these topics in the log is the truth.  An Imu is about the sensor, the others are
 # about the body.
@@ -77,8 +78,9 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
         true = _read(reader, true_topic)
         turns = _of_sensor(true_topic, true, _parameters(reader), north)
     subject = one_line(f'{topic} of {path.name}')
-    if invalid := _invalid_output(estimates):
-        return Report(subject, invalid, {})
+    for k, why in invalid(estimates.quaternions, estimates.covariances):
+        return Report(subject, [Fault('invalid_output', f'the message of '
+                                      f'{estimates.stamps_ns[k] * 1e-9:.9f} s: {why}')], {})
     outcome = _beside(one_line(topic), estimates, true.stamps_ns, turns)
     return _judge(subject, outcome, north is not None)
 
@@ -131,9 +133,8 @@ def _parameters(reader: LogReader) -> dict[str, Any]:
 def _of_sensor(topic: LogTopic, true: Attitudes, values: dict[str, Any],
                north: str | None) -> Rotation:
     """Return the true attitudes of the sensor, in a world with this north.  Raises ValueError."""
-    for k in no_attitudes(true.quaternions)[:1]:
-        raise ValueError(f'{topic.name} has the quaternion {true.quaternions[k].tolist()} at '
-                         f'{true.stamps_ns[k] * 1e-9:.9f} s: its norm must be 1')
+    for k, why in invalid(true.quaternions, np.empty((0, 3, 3))):
+        raise ValueError(f'{topic.name} at {true.stamps_ns[k] * 1e-9:.9f} s: {why}')
     turns = Rotation.from_quat(true.quaternions)
     if not (topic.type_name == 'sensor_msgs/msg/Imu' or topic.name.endswith(ODOMETRY_OF_SENSOR)):
         turns = turns * Rotation.from_euler('xyz', values.get('imu.rpy', (0.0, 0.0, 0.0)))
@@ -143,19 +144,6 @@ def _of_sensor(topic: LogTopic, true: Attitudes, values: dict[str, Any],
         east_part, north_part, _ = values['mag.field']
         turns = Rotation.from_euler('z', math.atan2(east_part, north_part)) * turns
     return turns
-
-
-def _invalid_output(estimates: Attitudes) -> list[Fault]:
-    covariances = estimates.covariances
-    finite = np.all(np.isfinite(covariances), axis=(1, 2))
-    impossible = ~finite & ~np.any(np.isnan(covariances), axis=(1, 2))      # NaN: unknown
-    impossible[finite] = is_indefinite(covariances[finite])
-    return [Fault('invalid_output', f'{len(wrong)} of {len(rows)} messages have an invalid '
-                  f'{what}; the first, at {estimates.stamps_ns[wrong[0]] * 1e-9:.9f} s, has '
-                  f'{rows[wrong[0]].tolist()}')
-            for what, rows, wrong in (
-                ('quaternion', estimates.quaternions, no_attitudes(estimates.quaternions)),
-                ('covariance', covariances, np.flatnonzero(impossible))) if len(wrong)][:1]
 
 
 def _beside(name: str, said: Attitudes, true_ns: NDArray[np.int64], turns: Rotation) -> Outcome:
@@ -203,4 +191,4 @@ def _judge(subject: str, outcome: Outcome, heading: bool) -> Report:
                   diagnosis.covariance_fault(consistency)) if fault][:1]
     measured = {**diagnosis.marks([corrected], heading), 'stamp_offset_s': offset.seconds,
                 **diagnosis.nees_marks(consistency)}
-    return Report(subject, list(diagnosis.one_of_each(faults)), measured, [corrected])
+    return Report(subject, faults, measured, [corrected])

@@ -8,17 +8,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import gammaincinv
+from scipy.special import gammainccinv, gammaincinv, ndtr, stdtrit
 
 from spinning_top_sim.exam.scenarios import Reals, Run
 
 CONVERGED_DEG = 1.0
-# Runs from which their spread is known, and how much of it has another reason than chance.
-FEWEST_RUNS, APART = 3, 5.0
+CONSISTENT = 0.9999             # probability of the NEES band
+WINDOW = 3.0                    # autocorrelation times over which correlations are summed
 
 
 class Errors(NamedTuple):
-    """Attitude errors [rad]: tilt (n,) >= 0, and heading (n,), continuous in time."""
+    """Attitude errors [rad]: tilt (n,) >= 0, and heading (n,) in [-pi, pi]."""
 
     tilt: Reals
     heading: Reals
@@ -27,11 +27,14 @@ class Errors(NamedTuple):
         """Return tilt and heading error combined (n,); see `turned`."""
         return np.hypot(self.tilt, self.turned(absolute))
 
+    def known(self, absolute: bool) -> Reals:
+        """Return tilt and heading error combined (n,), the tilt alone unless `absolute`."""
+        return np.hypot(self.tilt, absolute * self.heading)
+
     def turned(self, absolute: bool) -> Reals:
         """Return the heading error in [-pi, pi] (n,), relative to its mean unless `absolute`."""
         phase = np.exp(1j * self.heading)
-        turned: Reals = np.angle(phase if absolute else phase * np.conj(np.mean(phase)))
-        return turned
+        return self.heading if absolute else np.angle(phase * np.conj(np.mean(phase)))
 
 
 def errors_of(estimates: Reals, truth: Reals) -> Errors:
@@ -40,11 +43,9 @@ def errors_of(estimates: Reals, truth: Reals) -> Errors:
 
     estimates, truth : q(world <- sensor) as x, y, z, w (n, 4)
     """
-    x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat().T
-    heading = np.unwrap(2.0 * np.arctan2(z, w))
-    # Remove whole turns, so that the last heading is in [-pi, pi].
-    heading -= 2.0 * np.pi * np.rint(heading[-1] / (2.0 * np.pi))
-    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), heading)
+    x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat(
+        canonical=True).T
+    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), 2.0 * np.arctan2(z, w))
 
 
 class Rmse(NamedTuple):
@@ -59,7 +60,7 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
     """Return what BROAD's evaluation says of attitudes (n, 4); the heading is absolute."""
     total = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).magnitude()
     errors = errors_of(estimates, truth)
-    return Rmse(*(math.degrees(rms(one)) for one in (total, errors.turned(True), errors.tilt)))
+    return Rmse(*(math.degrees(rms(one)) for one in (total, errors.heading, errors.tilt)))
 
 
 def unaided(run: Run, rows: slice | NDArray[np.intp]) -> Rmse:
@@ -126,17 +127,22 @@ def time_offset(estimates: Reals, truth: Reals, rates: Reals, absolute: bool) ->
 
 
 class Nees(NamedTuple):
-    """Mean of the NEES divided by its expectation, and the degrees of freedom of the mean."""
+    """
+    Mean of the NEES divided by its expectation, and its degrees of freedom.
+
+    known : degrees of freedom of the variance from which the former are estimated
+    """
 
     ratio: float
     degrees: float
+    known: float
 
-    def band(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the limits between which a consistent ratio lies with this probability."""
-        tail = 0.5 * (1.0 - probability)
-        # Quantiles of the chi-squared distribution; scipy.stats would take long to import.
-        low, high = 2.0 * gammaincinv(0.5 * self.degrees, (tail, 1.0 - tail)) / self.degrees
-        return float(low), float(high)
+    @property
+    def band(self) -> tuple[float, float]:
+        """The limits between which a consistent ratio lies with the probability CONSISTENT."""
+        # Student's t for the estimate: as many standard deviations of a known chi-squared.
+        tail, half = ndtr(-stdtrit(self.known, 0.5 + 0.5 * CONSISTENT)), 0.5 * self.degrees
+        return float(gammaincinv(half, tail) / half), float(gammainccinv(half, tail) / half)
 
 
 def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees | None:
@@ -144,9 +150,10 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
     Return the NEES of the runs (Bar-Shalom et al. 2001, 5.4.2).
 
     The errors of a run are correlated: the number of independent tilts is smaller by the
-    integrated autocorrelation time.  The heading changes so slowly that the attitudes of a run
-    count as one.  The covariance may refer to the axes of the sensor or of the world: the
-    assumption with the greater likelihood counts.
+    integrated autocorrelation time, which is long for errors that are constant in a run, such as
+    that of a bias.  The heading changes so slowly that the attitudes of a run count as one.  The
+    covariance may refer to the axes of the sensor or of the world: the assumption with the greater
+    likelihood counts.
 
     runs : estimates (n, 4), truth (n, 4) and covariances (n, 3, 3) [rad^2] of each run
     absolute : False leaves out the heading
@@ -162,16 +169,12 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
         shortest = min(len(squares) for squares, _ in parts)
         values = np.stack([squares[:shortest] for squares, _ in parts])
         mean = max(float(np.mean(values)), 1e-300)
-        independent = len(runs) if absolute else values.size / autocorrelation_time(values)
-        if len(runs) >= FEWEST_RUNS:
-            # A constant error, such as that of a bias, is one draw a run: then the means of the
-            # runs differ by more than the errors in a run let expect.
-            spread = float(np.var(np.mean(values, axis=1), ddof=1)) / mean ** 2
-            draws = 2.0 * len(runs) / max(dimensions * spread, 1e-12)
-            independent = draws if draws < independent / APART else independent
+        time = autocorrelation_time(values)
+        independent, known = (len(runs), math.inf) if absolute else (
+            values.size / time, values.size / (2.0 * WINDOW * time + 1.0))    # Sokal, sect. 3
         # Negative log-likelihood for the best common factor of the covariances.
         unlikely = dimensions * math.log(mean) + float(np.mean([size for _, size in parts]))
-        found.append((unlikely, Nees(mean / dimensions, dimensions * independent)))
+        found.append((unlikely, Nees(mean / dimensions, dimensions * independent, known)))
     return min(found)[1] if found else None
 
 
@@ -197,7 +200,7 @@ def autocorrelation_time(values: Reals) -> float:
     """
     Return the integrated autocorrelation time of rows (runs, n) [samples], at least 1.
 
-    The sum ends at the first lag of at least 5 times its present value (Sokal 1997, sect. 3).
+    The sum ends at the first lag of at least WINDOW times its present value (Sokal 1997, sect. 3).
     """
     centred = values - np.mean(values)
     largest = float(np.max(np.abs(centred)))
@@ -208,5 +211,5 @@ def autocorrelation_time(values: Reals) -> float:
     power = np.mean(np.abs(np.fft.rfft(centred / largest, 2 * n)) ** 2, axis=0)     # no overflow
     correlations = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
     times = 2.0 * np.cumsum(correlations / correlations[0]) - 1.0
-    ends = np.flatnonzero(np.arange(n) >= 5.0 * times)
+    ends = np.flatnonzero(np.arange(n) >= WINDOW * times)
     return max(float(times[ends[0] if len(ends) else -1]), 1.0)

@@ -105,7 +105,9 @@ class ReferenceFilter:
         """Advance by the mean rates of a step and of the one before, which show the coning."""
         last, self._turn = self._turn, (gyroscope - self.bias) * dt
         self._turn_to(product(self._quaternion, exponential(
-            self._turn + _cross(last, self._turn) / 12.0)))
+            # The product of pure quaternions has the vector product.
+            self._turn + np.array(attitude.product(
+                (*last.tolist(), 0.0), (*self._turn.tolist(), 0.0))[:3]) / 12.0)))
         self._readings = np.concatenate((gyroscope[np.newaxis], self._readings[:-1]))
         change = DIFFERENCES @ self._readings
         density = max(self._rate_noise.add(float(change @ change) / 3.0 * dt, dt), LEAST[0] ** 2)
@@ -133,8 +135,9 @@ class ReferenceFilter:
             self._correct(h, residual, MOVING_FORCE ** 2 / dt, NO_FORCE_BIAS)
             return
         h[:, 6:] = self._to_world
-        # A white density N leaves N^2 / (4 BAND_S) in the band.
-        density = max(4.0 * BAND_S * self._force_noise.add(square, dt), LEAST[1] ** 2)
+        # Samples of a white density N leave 2 N^2 BAND_S^2 / (2 BAND_S + dt)^3 in the band.
+        density = max((2.0 * BAND_S + dt) ** 3 / (2.0 * BAND_S ** 2)
+                      * self._force_noise.add(square, dt), LEAST[1] ** 2)
         self._correct(h, residual, density / dt,
                       1.0 if gyroscope @ gyroscope > TURNING ** 2 else NO_FORCE_BIAS)
 
@@ -164,8 +167,8 @@ class ReferenceFilter:
         horizontal = self._field.real
         if self._disturbed_s > 0.0 or not horizontal:
             return
-        # East, unknown, deviates as the two other parts.  White noise leaves N^2 / (2 FIELD_S).
-        density = max(2.0 * FIELD_S * self._field_noise.add(
+        # East, unknown, deviates as the two other parts.  White noise leaves N^2/(2 FIELD_S + dt).
+        density = max((2.0 * FIELD_S + dt) * self._field_noise.add(
             0.5 * (abs(self._deviation) / horizontal) ** 2, dt), LEAST[2] ** 2)
         h = np.zeros((1, 9))
         h[0, 1:3] = -self._field.imag / horizontal, 1.0
@@ -211,12 +214,6 @@ def matrix_of(quaternion: Reals) -> Reals:
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
         (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))))
-
-
-def _cross(p: Reals, q: Reals) -> Reals:
-    a, b, c = p.tolist()
-    x, y, z = q.tolist()
-    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
 
 
 def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:

@@ -65,7 +65,7 @@ class Report(Verdict):
     def as_dict(self) -> dict[str, Any]:
         """Return subject, passed, faults, evidence and measures; None: NaN."""
         return {'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
-                'evidence': dict(self.found),
+                'evidence': {fault.name: fault.evidence for fault in self.found},
                 'measures': {name: number(value) for name, value in self.measures.items()}}
 
     def as_junit(self) -> str:
@@ -75,7 +75,7 @@ class Report(Verdict):
         suite = ElementTree.Element('testsuite', name=f'examine {self.subject}',
                                     tests=str(len(FAULTS)), failures=str(len(self.found)),
                                     errors='0', skipped='0')
-        evidence = dict(self.found)
+        evidence = {fault.name: fault.evidence for fault in self.found}
         for name in FAULTS:
             case = ElementTree.SubElement(suite, 'testcase', classname='examine', name=name)
             if name in evidence:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import diagnosis, excitation, measures, scenarios
-from spinning_top_sim.exam.diagnosis import HEADING, TILT, Fault, degrees
-from spinning_top_sim.exam.excitation import axes, gyroscope_of, moved, off, words
+from spinning_top_sim.exam.diagnosis import HEADING, TILT, degrees
+from spinning_top_sim.exam.excitation import axes, from_identity, gyroscope_of, moved, words
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.exam.trial import (
@@ -31,6 +31,7 @@ from spinning_top_sim.exam.trial import (
     changed,
     follow,
 )
+from spinning_top_sim.tools.verdict import Fault
 
 BIAS = np.array((0.01, -0.01, 0.02))    # of the gyroscope [rad/s]; its norm is 1.4 deg/s
 SIGNED = [sign * one for one in Rotation.create_group('O').as_matrix().round()
@@ -105,15 +106,17 @@ class Responses:
             before = self._whole(self._outcome)
             one, self._outcome = found
             self.faults += [Fault(name, f'{one.text}, the error falls from {degrees(before)} to '
-                                  f'{degrees(self._whole(self._outcome))}; all measures are those '
-                                  'after this correction') for name in one.faults]
+                                  f'{degrees(self._whole(self._outcome))}; all measures but those '
+                                  'of the field are those after this correction')
+                            for name in one.faults]
             (self.undone if {*one.faults} - {'stamp_offset'} else self._harmless).insert(0, one)
             self.unclear |= one.given is excitation.of_world
         clean = np.degrees(self._clean(self._outcome))
         self.measures |= {'tilt_clean_deg': float(max(clean[::2])),
                           'heading_clean_deg': float(max(clean[1::2]))}
         rest = self._rest()
-        if 'magnetometer_wiring' in dict(rest):     # a heading that nothing corrects is any
+        # A heading that nothing corrects is any.
+        if 'magnetometer_wiring' in [fault.name for fault in rest]:
             self.faults = [fault for fault in self.faults if fault.name != 'heading_offset']
         self.faults += rest
         self.unclear |= bool(rest)
@@ -124,7 +127,7 @@ class Responses:
     def _clean(self, outcome: Outcome, *places: Any) -> Reals:
         """Return errors of tilt and heading, by default at rest, then in motion, rms [rad]."""
         errors = outcome.errors
-        heading = self._absolute * errors.turned(True)
+        heading = self._absolute * errors.heading
         return np.array([rms(error[rows]) for rows in places or (self._rests, self._given.motion)
                          for error in (errors.tilt, heading)])
 
@@ -151,32 +154,38 @@ class Responses:
         return before > HEADING and after > LESS * before
 
     def _turns_wrong(self, outcome: Outcome) -> bool:
-        return off(*gyroscope_of(outcome, self._given.turns)[:2]) > GROSS_GAIN
+        return from_identity(*gyroscope_of(outcome, self._given.turns)[:2]) > GROSS_GAIN
 
     def _cause(self) -> Tried | None:
-        """Return a hypothesis that explains the error, and the outcome when it is undone."""
+        """
+        Return a hypothesis that explains the error, and the outcome when it is undone.
+
+        What would look like another cause is tried before that one.
+        """
         gross = self._turns_wrong(self._outcome)
         if not (gross or np.any(self._clean(self._outcome) > CLEAN)):
             return None
-        limit = diagnosis.EXPLAINED * self._whole(self._outcome)
         whole, early, late = gyroscope_of(self._outcome, self._given.turns)
-        for stage in (self._of_attitudes(), self._of_delays(late),
-                      gyroscope := self._of_gyroscope(whole, early),
-                      self._of_sensor('accelerometer', 2, (0, 1), diagnosis.GRAVITY_SIGN, *UNITS),
-                      self._of_sensor('magnetometer', 1, (0,), LEVEL) if self._absolute else (),
-                      self._of_smoothing()):
-            tried = []
-            for one, outcome in stage:
-                error = self._whole(outcome)
-                if error <= limit or (gross and stage is gyroscope
-                                      and not self._turns_wrong(outcome)):
-                    tried.append((error, one, outcome))
-                if error <= SURE * limit:
-                    break
-            if tried:
-                _, one, outcome = min(tried, key=lambda found: found[0])
-                return diagnosis.ambiguous(one, self._absolute), outcome
-        return None
+        return (self._best(self._of_attitudes()) or self._best(self._of_delays(late))
+                or self._best(self._of_gyroscope(whole, early), mends_turns=gross)
+                or self._best(self._of_sensor('accelerometer', 2, (0, 1), diagnosis.GRAVITY_SIGN,
+                                              *UNITS))
+                or self._best(self._of_sensor('magnetometer', 1, (0,), LEVEL))
+                or self._best(self._of_smoothing()))
+
+    def _best(self, tried: Iterator[Tried], mends_turns: bool = False) -> Tried | None:
+        """Return the one that leaves least, if it explains the error or mends wrong turns."""
+        limit, found = diagnosis.EXPLAINED * self._whole(self._outcome), []
+        for one, outcome in tried:
+            error = self._whole(outcome)
+            if error <= limit or (mends_turns and not self._turns_wrong(outcome)):
+                found.append((error, one, outcome))
+            if error <= SURE * limit:
+                break
+        if not found:
+            return None
+        _, one, outcome = min(found, key=lambda one: one[0])
+        return diagnosis.ambiguous(one, self._absolute), outcome
 
     def _of_attitudes(self) -> Iterator[Tried]:
         """Try misreadings of the attitudes, and what the attitudes at rest suggest."""
@@ -218,9 +227,9 @@ class Responses:
 
     def _of_gyroscope(self, whole: Reals, early: Reals) -> Iterator[Tried]:
         """Try the inverse of the matrix that the gyroscope has."""
-        if off(whole, early) < GAIN:
+        if from_identity(whole, early) < GAIN:
             return
-        if off(whole, early) > GROSS_GAIN:
+        if from_identity(whole, early) > GROSS_GAIN:
             yield from self._tried(         # judged by the turns
                 *permuted('gyroscope', lambda one: -np.sum((one - early) ** 2)),
                 *(wired('gyroscope', f'with the gyroscope multiplied by {text}', by * np.eye(3),
@@ -250,7 +259,8 @@ class Responses:
             and zero
         """
         tilt, heading, *_ = self._clean(self._outcome)
-        if max(tilt, heading) < HEADING if name == 'magnetometer' else tilt < TILT:
+        if (max(tilt, heading) < HEADING or not self._absolute if name == 'magnetometer' else
+                tilt < TILT):
             return
         readings = getattr(self._excited, name)
         found = self._at_rest(self._outcome)
@@ -332,18 +342,16 @@ class Responses:
         turns = Rotation.from_quat(self._outcome.estimates)
         if np.max((turns * turns[0].inv()).magnitude()) < STUCK:
             return [Fault('inaccurate', 'the attitude hardly changes')]
-        if off(whole, early) > GROSS_GAIN:
+        if from_identity(whole, early) > GROSS_GAIN:
             return [Fault('gyroscope_wiring', words(early))]
         if wrong and late > 1:
             return [Fault('lag', f'turns are followed {late} samples late; {left}')]
         found = self._not_corrected(self._excited.truth)
-        if found:       # compared with a run without kicks, as there may be another error
+        if found and wrong:     # a run without kicks has the same error
             without = self._respond((), self._given.still).estimates
-            first, _ = self._given.kicks
-            error = (Rotation.from_quat(without[first])
-                     * Rotation.from_quat(self._excited.truth[first]).inv()).magnitude()
+            error = measures.errors_of(without, self._excited.truth).attitude(True)
             # Far from the truth no filter is linear.
-            found = self._not_corrected(without) if error < NEAR else []
+            found = self._not_corrected(without) if error[self._given.kicks[0]] < NEAR else []
         if not found and wrong:
             return [Fault('inaccurate', f'{left}: no cause explains it')]
         return found
@@ -369,13 +377,8 @@ class Responses:
         motion, size = self._given.motion, float(np.linalg.norm(BIAS))
         run = self._excited.part(slice(motion.stop))
         outcome = self._respond((), replace(run, gyroscope=run.gyroscope + BIAS))
-        one, other = (Rotation.from_quat(rows[:motion.stop])
-                      for rows in (outcome.estimates, self._outcome.estimates))
-        if self._absolute:
-            apart = (one * other.inv()).magnitude()
-        else:
-            verticals = [turn.inv().apply((0.0, 0.0, 1.0)) for turn in (one, other)]
-            apart = np.linalg.norm(verticals[0] - verticals[1], axis=1)
+        apart = measures.errors_of(
+            outcome.estimates, self._outcome.estimates[:motion.stop]).known(self._absolute)
         estimates = outcome.biases - self._outcome.biases[:motion.stop]
         estimates = estimates[np.isfinite(estimates[:, 0])]
         if not len(estimates):

@@ -3,7 +3,7 @@
 
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -135,19 +135,19 @@ def feed(make_filter: MakeFilter, run: Run) -> Output:
                 gyroscope, accelerometer, fields, run.dt.tolist(), strict=True), start=1):
             attitudes[k - 1] = _numbers(
                 f'update {k} returns', filter_.update(rate, force, field, dt), (4,))
-            if k % READ_EVERY == 0:
-                covariances[k - 1] = _covariance_of(filter_)
-                if (bias := getattr(filter_, 'bias', None)) is not None:
-                    biases[k - 1] = _numbers('bias is', bias, (3,))
+            for name, rows in (('covariance', covariances), ('bias', biases)):
+                said = getattr(filter_, name, None) if k % READ_EVERY == 0 else None
+                if said is not None:
+                    rows[k - 1] = _numbers(f'{name} is', said, rows.shape[1:])
     except (InvalidOutputError, NodeError):
         raise
     except (Exception, SystemExit) as error:
         where = f'update {k} of {n}' if k else 'making the filter'
         raise InvalidOutputError(
             f'{where} raises {type(error).__name__}: {one_line(error)}') from error
-    if len(bad := no_attitudes(attitudes)):
-        raise InvalidOutputError(f'update {bad[0] + 1} returns {attitudes[bad[0]].tolist()}: its '
-                                 'norm must be 1')
+    covariances[~np.any(covariances, axis=(1, 2))] = np.nan     # in ROS, zeros mean unknown
+    for k, why in invalid(attitudes, covariances):
+        raise InvalidOutputError(f'update {k + 1}: {why}')
     attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
     return attitudes, covariances, biases
 
@@ -171,30 +171,19 @@ def follow(make_filter: MakeFilter, run: Run, undone: Sequence[Hypothesis] = (),
     return Outcome(run, estimates, covariances, biases)
 
 
-def no_attitudes(quaternions: Reals) -> NDArray[np.intp]:
-    """Return the indices of the rows (n, 4) whose norm is not 1."""
+def invalid(quaternions: Reals, covariances: Reals) -> Iterator[tuple[int, str]]:
+    """Yield the first row of each (n, 4), (n, 3, 3) that is invalid, and why; NaN: unknown."""
     with np.errstate(over='ignore'):
         norms = np.linalg.norm(quaternions, axis=1)
-    return np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
-
-
-def _covariance_of(filter_: Filter) -> Reals | float:
-    """Return the covariance of a filter, NaN if unknown.  Raises InvalidOutputError."""
-    value = getattr(filter_, 'covariance', None)
-    covariance = _numbers('covariance is', value, (3, 3)) if value is not None else np.zeros(1)
-    if not np.any(covariance):      # ROS messages mark an unknown covariance by zeros
-        return math.nan
-    if is_indefinite(covariance):
-        raise InvalidOutputError(f'covariance is {covariance.tolist()}: must have no '
-                                 'negative eigenvalue')
-    return covariance
-
-
-def is_indefinite(covariances: Reals) -> NDArray[np.bool_]:
-    """Return which of the finite matrices (..., 3, 3) have a negative eigenvalue (...)."""
-    eigenvalues = np.linalg.eigvalsh(0.5 * covariances + 0.5 * np.swapaxes(covariances, -1, -2))
-    indefinite: NDArray[np.bool_] = eigenvalues[..., 0] < -1e-9 * np.abs(eigenvalues).max(axis=-1)
-    return indefinite
+    for k in np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))[:1].tolist():
+        yield k, f'the quaternion is {quaternions[k].tolist()}: its norm must be 1'
+    finite = np.all(np.isfinite(covariances), axis=(1, 2))
+    wrong = ~finite & ~np.any(np.isnan(covariances), axis=(1, 2))
+    eigenvalues = np.linalg.eigvalsh(
+        0.5 * covariances[finite] + 0.5 * np.swapaxes(covariances[finite], 1, 2))
+    wrong[finite] = eigenvalues[:, 0] < -1e-9 * np.abs(eigenvalues).max(axis=1)
+    for k in np.flatnonzero(wrong)[:1].tolist():
+        yield k, f'the covariance is {covariances[k].tolist()}: must have no negative eigenvalue'
 
 
 def _numbers(what: str, value: object, shape: tuple[int, ...]) -> Reals:

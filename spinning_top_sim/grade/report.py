@@ -1,30 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of grading a simulator, as text and JSON."""
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-from spinning_top_sim.tools.verdict import Verdict, number
-
-
-class Fault(NamedTuple):
-    """
-    A fault of a simulator.
-
-    Parameters
-    ----------
-    name : str
-        As docs/grade.md defines it.
-    evidence : str
-        Why it is reported.
-    number : float
-        What was measured, such as a lag or a coefficient; NaN where there is none.
-    """
-
-    name: str
-    evidence: str
-    number: float = math.nan
+from spinning_top_sim.tools.verdict import Fault, Verdict, number
 
 
 class Report(Verdict):

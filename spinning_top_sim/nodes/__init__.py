@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ROS side, thin: parameters, timers, services, publishers.  What moves is elsewhere."""
+"""The nodes: parameters, timers, services and publishers around a simulation or a log."""

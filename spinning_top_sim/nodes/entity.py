@@ -32,10 +32,10 @@ def fill_state(message: Message, states: States, pivot: Kinematics, stamp_ns: in
     rotation = states.rows_quaternion
     for target, rows, names in (
             (message.pose.orientation, rotation, 'xyzw'),
-            (message.twist.angular, attitude.in_world(rotation, states.rows_angular_velocity),
+            (message.twist.angular, attitude.rotated(rotation, states.rows_angular_velocity),
              'xyz'),
             (message.acceleration.angular,
-             attitude.in_world(rotation, states.rows_angular_acceleration), 'xyz'),
+             attitude.rotated(rotation, states.rows_angular_acceleration), 'xyz'),
             (message.pose.position, pivot.position, 'xyz'),
             (message.twist.linear, pivot.velocity, 'xyz'),
             (message.acceleration.linear, pivot.acceleration, 'xyz')):
@@ -63,7 +63,7 @@ def requested_state(request: Message, top: Top, frame: str, now: States,
         raise RefusedError(
             UNSUPPORTED, f'header.frame_id = {requested_frame!r}: must be {frame!r} or empty')
     rotation = np.concatenate(now.rows_quaternion)
-    rates = np.concatenate(attitude.in_world(now.rows_quaternion, now.rows_angular_velocity))
+    rates = np.concatenate(attitude.rotated(now.rows_quaternion, now.rows_angular_velocity))
     if sets_pose:
         rotation = _numbers(wanted.pose.orientation, 'xyzw')
         position = _numbers(wanted.pose.position, 'xyz')

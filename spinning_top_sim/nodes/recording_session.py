@@ -17,7 +17,7 @@ from spinning_top_sim.streams.stream import Stream
 
 # Importing these takes long, so that is left to the opening of a log.
 if TYPE_CHECKING:
-    from spinning_top_sim.recording.writer import McapRecorder
+    from spinning_top_sim.recording.recorder import McapRecorder
 
 MOST_PENDING = 20_000       # stamps whose messages wait while a file is being opened
 
@@ -153,8 +153,8 @@ class RecordingSession:
 def _open_log(topics: Sequence[Topic], run: Mapping[str, Any]) -> McapRecorder:
     """Open the log that `record.uri` names; in a folder, under the first free name."""
     from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
+    from spinning_top_sim.recording.recorder import McapRecorder  # noqa: PLC0415
     from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
-    from spinning_top_sim.recording.writer import McapRecorder  # noqa: PLC0415
 
     values, metadata = run['values_at_recording'], provenance(**run)
     recorded = [RecordedTopic(*topic) for topic in topics]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
-from spinning_top_sim.nodes.pacing import FASTEST, RATES, SLOWEST
+from spinning_top_sim.nodes.playback import FASTEST, RATES, SLOWEST
 from spinning_top_sim.tools import cli
 
 DESCRIPTION = """\

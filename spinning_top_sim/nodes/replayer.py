@@ -27,7 +27,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
-from spinning_top_sim.nodes import pacing, reports
+from spinning_top_sim.nodes import playback, reports
 from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
@@ -51,16 +51,16 @@ class Replayer(Node):
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
         self._outputs = self._open_publishers()     # by channel
         self._senders = set(self._outputs.values())
-        self._playback = pacing.Playback(self._begin_ns, paused=options.start_paused)
+        self._playback = playback.Playback(self._begin_ns, paused=options.start_paused)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.declare_parameter('rate', 1.0, ParameterDescriptor(
             description='recorded over real time; a change takes effect at once',
-            additional_constraints=f'must be {pacing.RATES}', dynamic_typing=True))
+            additional_constraints=f'must be {playback.RATES}', dynamic_typing=True))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if options.clock:
             clock = self.create_publisher(ClockMessage, '/clock', 10)
             self._senders.add(clock)
-            self.create_timer(1.0 / max(options.clock, pacing.SLOWEST), lambda: clock.publish(
+            self.create_timer(1.0 / max(options.clock, playback.SLOWEST), lambda: clock.publish(
                 ClockMessage(clock=Time(nanoseconds=min(
                     self._playback.now(), LAST_STAMP_NS)).to_msg())), clock=steady)
         self.create_timer(1.0, self._show_status, clock=steady)
@@ -101,9 +101,9 @@ class Replayer(Node):
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         for rate in [parameter.value for parameter in parameters if parameter.name == 'rate']:
-            if type(rate) not in {int, float} or not pacing.SLOWEST <= rate <= pacing.FASTEST:
+            if type(rate) not in {int, float} or not playback.SLOWEST <= rate <= playback.FASTEST:
                 return SetParametersResult(
-                    successful=False, reason=f'rate = {rate!r}: must be {pacing.RATES}')
+                    successful=False, reason=f'rate = {rate!r}: must be {playback.RATES}')
             self._playback.set_rate(rate)
         return SetParametersResult(successful=True)
 
@@ -129,7 +129,7 @@ class Replayer(Node):
                     publisher.get_subscription_count() for publisher in self._senders
                     ) < self._options.wait_for_subscribers):
                 pass
-            with contextlib.closing(pacing.read_ahead(self._messages())) as messages:
+            with contextlib.closing(playback.read_ahead(self._messages())) as messages:
                 self._playback.run(messages)
             # Best-effort subscribers read shared memory, which ends with its sender.
             self._stopping.wait(0.3)
@@ -147,13 +147,13 @@ class Replayer(Node):
                 f'topics, {self._playback.late} of them late')
             self.finished.set_result(code)
 
-    def _messages(self) -> Iterator[pacing.Message]:
+    def _messages(self) -> Iterator[playback.Message]:
         """Yield the messages to play, in endless repetition with --loop."""
         names = {channel.name for channel in self._reader.topics
                  if channel.channel_id in self._outputs}
         start = self._begin_ns if self._options.start else None
         for number in itertools.count():
-            shift_ns, is_empty = number * (self._span_ns + pacing.ROUND_GAP_NS), True
+            shift_ns, is_empty = number * (self._span_ns + playback.ROUND_GAP_NS), True
             for message in self._reader.messages(names, start):
                 at_ns = message.log_time or self._begin_ns      # 0: before the first /clock
                 if message.channel_id in self._outputs:
@@ -180,7 +180,7 @@ class Replayer(Node):
 
     def _position(self) -> str:
         number, within = divmod(self._playback.now() - self._begin_ns,
-                                self._span_ns + pacing.ROUND_GAP_NS)
+                                self._span_ns + playback.ROUND_GAP_NS)
         at = self._options.start + min(within, self._span_ns) / NANOSECONDS
         which = f' of round {number + 1}' if self._options.loop else ''
         return f'{at:.2f} of {self._length_s:.2f} s{which}'

@@ -335,8 +335,9 @@ class Simulator(Node):
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
                 'clock slips; a recording stays complete, and /diagnostics counts', once=True)
         if self.values['max_error'] > 0.0:
-            # Without the lock, because it takes milliseconds and ticks would wait.
-            _ = self.simulation.segment.exact
+            with self.lock:
+                segment = self.simulation.segment
+            _ = segment.exact       # it takes milliseconds: with the lock, ticks would wait
         with self.lock:
             message = self._report.diagnostics(
                 self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tick does: which samples are sent now, in real time, without ROS and without waiting."""
+"""What a tick does: which samples are sent now, in real time, without ROS."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -119,6 +119,10 @@ class TickLoop:
         if self.state not in {state, LoopState.ENDED}:
             self.state = state
             self.interruptions += 1
+        self._anchor_clock()
+
+    def _anchor_clock(self) -> None:
+        """Let the simulated clock show now what is sent, and run in RUNNING only."""
         self._clock.set(self.now_ns, running=self.state is LoopState.RUNNING)
         self._pace_ticks()
 
@@ -167,7 +171,7 @@ class TickLoop:
             back_s = (simulation.now_ns - due_ns) / self._time_scale / NANOSECONDS
             self._tell(f'/clock stepped back by {back_s:g} s: the motion and its stamps go on '
                        'from where they are', False)
-            self._enter(LoopState.RUNNING)
+            self._anchor_clock()
             return simulation.now_ns
         self._stop_at_ns = self._steady() + TICK_BUDGET_NS
         try:
@@ -179,7 +183,7 @@ class TickLoop:
         lag_ns = target_ns - simulation.now_ns
         if not arrived and lag_ns > LONGEST_LAG_NS * self._time_scale:
             self.slipped_ns += lag_ns
-            self._enter(LoopState.RUNNING)
+            self._anchor_clock()
         return target_ns
 
     def _has_to_give_way(self) -> bool:

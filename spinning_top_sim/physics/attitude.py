@@ -63,8 +63,8 @@ def vertical_in_body(q: Quaternion) -> tuple[Column, Column, Column]:
     return (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), (w * w + z * z) - (x * x + y * y))
 
 
-def in_body(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
-    """Return the components in the body frame of a vector given in the world frame."""
+def rotated_back(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
+    """Return a vector given in frame a in the components of frame b, with q(a <- b)."""
     x, y, z, w = q
     vx, vy, vz = v
     return ((w * w + x * x - y * y - z * z) * vx + 2.0 * (x * y + w * z) * vy
@@ -75,10 +75,10 @@ def in_body(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
             + (w * w - x * x - y * y + z * z) * vz)
 
 
-def in_world(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
-    """Return the components in the world frame of a vector given in the body frame."""
+def rotated(q: Quaternion, v: Vector) -> tuple[Column, Column, Column]:
+    """Return a vector given in frame b in the components of frame a, with q(a <- b)."""
     x, y, z, w = q
-    return in_body((-x, -y, -z, w), v)
+    return rotated_back((-x, -y, -z, w), v)
 
 
 def rotation_vector(q: Quaternion) -> tuple[Column, Column, Column]:

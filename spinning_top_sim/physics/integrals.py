@@ -51,7 +51,7 @@ class Increments(NamedTuple):
         (x, y, z, w), (a, b, c, d), (v1, v2, v3) = self.rotation, later.rotation, later.velocity
         return Increments(
             np.stack(attitude.product((x, y, z, w), (a, b, c, d))),
-            self.velocity + np.stack(attitude.in_world((x, y, z, w), (v1, v2, v3))),
+            self.velocity + np.stack(attitude.rotated((x, y, z, w), (v1, v2, v3))),
             self.angles + later.angles, self.forces + later.forces)
 
 
@@ -106,7 +106,7 @@ def increments(states: Callable[[range], States], begins: range, length_ns: int,
         # The derivative of the rotation is half of its product with the angular velocity.
         derivatives = (
             *attitude.product(rotation, (0.5 * w1, 0.5 * w2, 0.5 * w3, 0.0 * w3)),
-            *attitude.in_body((-x, -y, -z, w), force), *rates, *force)
+            *attitude.rotated_back((-x, -y, -z, w), force), *rates, *force)
         for row, derivative in enumerate(derivatives):
             sums[row] += weight * derivative
     sums[3] += 1.0
@@ -125,11 +125,11 @@ def _differences(first: States, last: States, seconds: float, point: Point) -> R
     # The lengths of q and p, rounded like their components, would scale all the small angles.
     too_long, longer = _excess(now), _excess(last.rows_quaternion)
     scale = 1.0 - 0.5 * (too_long + longer)
-    v1, v2, v3 = attitude.in_world(now, first.velocity(point))
-    u1, u2, u3 = attitude.in_world(last.rows_quaternion, last.velocity(point))
+    v1, v2, v3 = attitude.rotated(now, first.velocity(point))
+    u1, u2, u3 = attitude.rotated(last.rows_quaternion, last.velocity(point))
     change = u1 - v1, u2 - v2, u3 - v3 + first.top.gravity * seconds
     return np.stack((*(scale * part for part in axis), 1.0 + (shrunk + 0.5 * (too_long - longer)),
-                     *attitude.in_body(now, change)))
+                     *attitude.rotated_back(now, change)))
 
 
 def _excess(q: Quaternion) -> Column:

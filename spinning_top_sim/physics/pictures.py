@@ -133,7 +133,7 @@ def animate(motion: Any, fps: float, speed: float) -> FuncAnimation:
         now = shown[number]
         for points, style in ((rim, {'facecolor': '#f2e3c9', 'edgecolor': INK, 'alpha': 0.9}),
                               (mark, {'color': COLOURS[1]})):
-            turned = attitude.in_world(tuple(motion.quaternion[now]), tuple(points.T))
+            turned = attitude.rotated(tuple(motion.quaternion[now]), tuple(points.T))
             axes.fill(*project(np.stack(turned, axis=1))[:2], **style)
         draw_tip(axes, path[:now + 1])
         axes.text(-1.05, 1.15, f't = {times[now]:.2f} s', color=INK, fontsize=9)

@@ -47,7 +47,7 @@ def state_of(top: Top, quaternion: Reals, angular_velocity: Reals) -> State:
         return State(theta=theta, theta_dot=math.hypot(wx, wy), phi=phi, psi=psi, l3=sign * lz,
                      lz=lz)
     columns = np.array([x]), np.array([y]), np.array([z]), np.array([w])
-    w1, w2, w3 = (float(part[0]) for part in attitude.in_body(columns, (wx, wy, wz)))
+    w1, w2, w3 = (float(part[0]) for part in attitude.rotated_back(columns, (wx, wy, wz)))
     z1, z2, z3 = (float(part[0]) for part in attitude.vertical_in_body(columns))
     phi, l3 = half_sum + half_difference, top.lambda3 * w3
     return State(theta=theta, theta_dot=wy * math.cos(phi) - wx * math.sin(phi), phi=phi,

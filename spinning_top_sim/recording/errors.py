@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 class RecordingError(RuntimeError):
-    """A recording cannot start; the text names the path or type and the reason."""
+    """A recording cannot start, or has stopped; the text names the path or type and the reason."""
 
 
 class LogError(RuntimeError):

@@ -39,6 +39,10 @@ class McapWriter:
     """
     A new MCAP file, which must not exist (FileExistsError), used by one thread at a time.
 
+    Messages come one by one into a chunk in memory (`append`, `append_all`, and `add_message` with
+    its numbers), or as arrays that make a chunk (`append_rows`).  `write_chunk` and `copy_chunk`
+    write a chunk, `write` any other record.
+
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 

@@ -25,10 +25,10 @@ from mcap.writer import MCAP0_MAGIC
 from spinning_top_sim.recording import records
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, known_topics, read_summary
+from spinning_top_sim.recording.recorder import OUR_LIBRARY
 from spinning_top_sim.recording.records import HEAD, DamagedError, LogMessage, Messages
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
 from spinning_top_sim.recording.scan import Damage, Part, Scan
-from spinning_top_sim.recording.writer import OUR_LIBRARY
 
 BLOCK = 16384               # messages that are read together
 _FIRST_DATE = 10 ** 17      # [ns], in 1973

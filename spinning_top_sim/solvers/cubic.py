@@ -5,7 +5,7 @@ import math
 from decimal import Decimal, getcontext
 from typing import NamedTuple
 
-from spinning_top_sim.solvers.decimal_math import ZERO
+from spinning_top_sim.solvers.decimal_math import ZERO, root
 
 MOST_NEWTON_STEPS = 50
 KEPT_DIGITS = 40        # what must be left of the digits after the discriminant has cancelled
@@ -53,7 +53,7 @@ def _quadratic_roots(total: Decimal, product: Decimal) -> tuple[Decimal, Decimal
     discriminant = total * total - 4 * product
     if discriminant < total * total * Decimal(10) ** (KEPT_DIGITS - getcontext().prec):
         raise RootsTooCloseError
-    gap = discriminant.sqrt()
+    gap = root(discriminant)
     large = (total + gap) / 2 if total > 0 else (total - gap) / 2
     small = product / large
     return min(large, small), max(large, small), gap
@@ -66,7 +66,7 @@ def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]
     It is 2 cos(arccos(|p|/(2 radius^3))/3) times `radius` from there, where p is the value of the
     cubic (Viete).  Newton's method from the nearest double converges quadratically.
     """
-    centre, radius = -a2 / 3, (a2 * a2 - 3 * a1).sqrt() / 3
+    centre, radius = -a2 / 3, root(a2 * a2 - 3 * a1) / 3
     value = ((centre + a2) * centre + a1) * centre + a0
     side = -1 if value > 0 else 1
     ratio = min(1.0, float(abs(value / (2 * radius ** 3))))

@@ -2,8 +2,8 @@
 """
 Elementary functions of `decimal.Decimal` numbers, to the precision of the current context.
 
-The standard library has sqrt, exp and ln only.  Results are accurate relative to themselves, also
-for small arguments; `sin_cos` loses the digits that cancel next to other multiples of pi/2.
+The standard library has exp and ln, and a slow sqrt.  Results are accurate relative to themselves,
+also for small arguments; `sin_cos` loses the digits that cancel next to other multiples of pi/2.
 """
 
 import math
@@ -12,6 +12,7 @@ from decimal import Context, Decimal, getcontext, localcontext
 from functools import lru_cache, reduce
 
 ZERO, ONE = Decimal(0), Decimal(1)
+Complex = tuple[Decimal, Decimal]
 DIGITS = 40             # that are left of long decimals once nothing cancels any more
 SMALL = Decimal('1e-9')
 # Parts of a quarter turn whose sines and cosines are tabulated.
@@ -28,6 +29,18 @@ def _context(digits: int) -> Context:
     return Context(prec=digits, Emin=-10 ** 12, Emax=10 ** 12)
 
 
+@lru_cache(64)
+def exact(x: float) -> Decimal:
+    """Return a double as it is; those of a top are asked for again and again."""
+    return Decimal(x)
+
+
+def root(x: Decimal) -> Decimal:
+    """Return the square root of x >= 0."""
+    shift = getcontext().prec - x.adjusted() // 2
+    return Decimal(math.isqrt(int(x.scaleb(2 * shift)))).scaleb(-shift)
+
+
 def pi() -> Decimal:
     """Return pi to the current precision."""
     return +_pi(getcontext().prec)
@@ -37,9 +50,9 @@ def pi() -> Decimal:
 def _pi(digits: int) -> Decimal:
     """Return pi from the arithmetic-geometric mean, by Gauss and Legendre [DLMF 19.8.6]."""
     with precision(digits + 10):
-        a, b, t, power = ONE, 1 / Decimal(2).sqrt(), ONE / 4, 1
+        a, b, t, power = ONE, 1 / root(Decimal(2)), ONE / 4, 1
         while abs(a - b) > Decimal(10) ** -digits:
-            a, b, t, power = (a + b) / 2, (a * b).sqrt(), t - power * ((a - b) / 2) ** 2, 2 * power
+            a, b, t, power = (a + b) / 2, root(a * b), t - power * ((a - b) / 2) ** 2, 2 * power
         return (a + b) ** 2 / (4 * t)
 
 
@@ -60,7 +73,7 @@ def _tables(digits: int) -> tuple[Decimal, list[tuple[Decimal, Decimal]], list[D
             n, size = 2 * len(sine), size * square
             sine.insert(0, -sine[0] / (n * (n + 1)))
         s = angle / 2 * reduce(lambda total, one: total * square + one, sine)
-        s, c = 2 * s * (1 - s * s).sqrt(), 1 - 2 * s * s
+        s, c = 2 * s * root(1 - s * s), 1 - 2 * s * s
         while (square ** len(arctan)).adjusted() > -digits - 5:
             arctan.insert(0, (-1) ** len(arctan) / Decimal(2 * len(arctan) + 1))
         values = [(ZERO, ONE)]
@@ -80,7 +93,7 @@ def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
     for coefficient in series:
         total = total * square + coefficient
     s = rest * total
-    c = (1 - s * s).sqrt()
+    c = root(1 - s * s)
     quarters, part = divmod(count, PARTS)
     if part:
         a, b = values[part]
@@ -109,7 +122,7 @@ def atan2(y: Decimal, x: Decimal) -> Decimal:
 
 def asinh(x: Decimal) -> Decimal:
     """Return the inverse of sinh for x >= 0, to 30 digits of 40."""
-    return x - x ** 3 / 6 if x < SMALL else (x + (x * x + 1).sqrt()).ln()
+    return x - x ** 3 / 6 if x < SMALL else (x + root(x * x + 1)).ln()
 
 
 def half_turns(radians: float) -> Decimal:

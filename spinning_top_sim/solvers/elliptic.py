@@ -2,8 +2,8 @@
 """
 Elliptic integrals by Gauss' arithmetic-geometric mean, in long decimals.
 
-One sequence of means of a_0 and g_0 gives the complete integrals of the first and of the third
-kind and the nome, and, with one more square root a step, an incomplete integral of the first kind.
+One sequence of means of a_0 and g_0 gives the complete integral of the first kind and the nome,
+and, with one more square root a step, an incomplete integral.
 No step subtracts numbers of one size, and all converge quadratically.
 
     a_(n+1) = (a_n + g_n)/2,  g_(n+1) = sqrt(a_n g_n),  c_n = sqrt(a_n^2 - g_n^2)    [DLMF 19.8(i)]
@@ -14,7 +14,7 @@ common scale: the functions depend on their ratios only, but for the mean itself
 
 from decimal import Decimal, getcontext
 
-from spinning_top_sim.solvers.decimal_math import ZERO
+from spinning_top_sim.solvers.decimal_math import ZERO, root
 
 # Coefficients of lambda, lambda^5, lambda^9 ... in the nome [DLMF 19.5.6; A002103 of oeis.org].
 # The first one that is left out contributes less than 1e-44 for k^2 <= 1/2.
@@ -36,7 +36,7 @@ class GaussMean:
         while len(self._c) < 2 or c > a * tolerance:
             product, a = a * g, (a + g) / 2
             c = c * c / (4 * a)                     # [DLMF 19.8.3]
-            g = product.sqrt() if c > a * tolerance else a
+            g = root(product) if c > a * tolerance else a
             self._means.append((a, g))
             self._c.append(c)
         self.mean = a
@@ -55,28 +55,6 @@ class GaussMean:
             total = total * power + coefficient
         return small * total
 
-    def mean_reciprocal(self, x1: Decimal, x2: Decimal) -> Decimal:
-        """
-        Return the mean of 1/x over a period, where x = x1 + (x2 - x1) sn^2, x1 and x2 > 0.
-
-        It is Pi(alpha^2, k)/(x1 K) with alpha^2 = 1 - x2/x1 [DLMF 19.8.7, 19.8.8].  To subtract
-        nothing, the sum of the Q_n there is replaced by 2 less that sum, which exchanging x1 and
-        x2 turns into the sum, and the last Q_n by the value for k = 0.
-        """
-        (a, g), *_ = self._means
-        square, product = a * a * x2 / x1, a * g    # p_n^2 and a_n g_n
-        if square < product:
-            x1, x2, square = x2, x1, product * product / square
-        total, weight = ZERO, Decimal(1)
-        for a, g in self._means[:-1]:
-            product = a * g
-            denominator = square + product
-            total += weight * 2 * product / denominator
-            weight *= (square - product) / (2 * denominator)
-            square = denominator * denominator / (4 * square)
-        total += weight * 2 * self.mean / (self.mean + square.sqrt())
-        return 1 / x2 + (1 / x1 - 1 / x2) * total / 2
-
     def amplitude(self, square: Decimal, sense: int) -> Decimal:
         """
         Return sin(pi u/(2K)) from sn^2(u), or sinh(pi u/(2K)) from -sn^2(iu).
@@ -89,12 +67,12 @@ class GaussMean:
         if not square:
             return ZERO
         a, _ = self._means[0]
-        h = a / square.sqrt()
+        h = a / root(square)
         small = Decimal(10) ** (-(getcontext().prec // 4) - 1)
         for c in self._c:
             square = sense * c * c
             # Two terms of the root are enough where c is small.
-            h = h + square / (4 * h) if c < h * small else (h + (h * h + square).sqrt()) / 2
+            h = h + square / (4 * h) if c < h * small else (h + root(h * h + square)) / 2
         amplitude = self.mean / h
         # The square may be 1 but for rounding: the sine is then 1.
         return min(amplitude, Decimal(1)) if sense < 0 else amplitude

@@ -18,7 +18,7 @@ from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.decimal_math import DIGITS, pi, precision
+from spinning_top_sim.solvers.decimal_math import DIGITS, exact, pi, precision
 from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import MOST, ThetaFunctions, ThetaValues, in_range
 from spinning_top_sim.solvers.times import LARGEST_NS, Times
@@ -83,11 +83,11 @@ class ExactSolution:
         self._check_start()
 
     def _take_constants(self, motion: ThetaMotion, l3: Decimal, lz: Decimal) -> None:
-        alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * Decimal(self.top.lambda1)
+        alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * exact(self.top.lambda1)
         bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
         in_range('the fastest rate', max(map(abs, (
             motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
-            l3 / Decimal(self.top.lambda3)))))
+            l3 / exact(self.top.lambda3)))))
         self._bottom_rate, self._top_rate = float(bottom_rate), float(top_rate)
         self._theta = ThetaFunctions(motion)
         fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),

@@ -26,10 +26,12 @@ class Propagator(Protocol):
     """A motion from its start at t = 0; `SteppedMotion` says what its members do."""
 
     top: Top
-    start: State
     ns_limit: int
     steps: int
     evaluations: int
+
+    @property
+    def start(self) -> State: ...
 
     @property
     def reached_ns(self) -> int: ...

@@ -12,12 +12,12 @@ out.
 import math
 from collections.abc import Sequence
 from decimal import Decimal
-from functools import cached_property
+from functools import reduce
 from itertools import count, zip_longest
-from operator import mul
+from operator import add, mul
 from typing import NamedTuple
 
-from spinning_top_sim.solvers.decimal_math import ONE, ZERO
+from spinning_top_sim.solvers.decimal_math import ONE, ZERO, root
 from spinning_top_sim.solvers.elliptic import GaussMean
 
 # What the terms of a series have in common: one of the four prefactors 1, cos y, sin y and
@@ -27,9 +27,9 @@ from spinning_top_sim.solvers.elliptic import GaussMean
 COS_EVEN, COS_ODD, SIN_ODD, SIN_EVEN = range(4)
 FIRST_POLYNOMIALS = ([1], [1, -2]), ([1], [1, -4]), ([1], [3, -4]), ([0], [2])
 MOST_TERMS = 6
-# That doubles need, and that states need which are handed over: motions between changes of the
-# vertical can be chaotic, and every error grows.
-DIGITS_OF_DOUBLES, DIGITS_HANDED_OVER = 19, 39
+# Of the polynomials in doubles, and of rates, and states that are handed over: motions between
+# changes of the vertical can be chaotic, and every error grows.
+DIGITS_OF_DOUBLES, DIGITS_OF_SERIES = 19, 39
 
 
 def _polynomials(first: Sequence[int], second: Sequence[int]) -> list[Sequence[int]]:
@@ -49,37 +49,42 @@ MULTIPLE_ANGLES = [
 
 class Series(NamedTuple):
     """
-    A prefactor times a polynomial in xi = sin^2 y.
+    The sum of weights[k] times cos(n y) or sin(n y): a prefactor times a polynomial in sin^2 y.
 
     In the imaginary form y stands for ix: cosh x for cos y, sinh x for sin y, xi = -sinh^2 x.
     """
 
     prefactor: int
-    polynomial: tuple[Decimal, ...]
+    weights: Sequence[Decimal]
 
-    @classmethod
-    def of(cls, prefactor: int, weights: Sequence[Decimal]) -> 'Series':
-        """Return the sum of weights[k] times cos(n y) or sin(n y)."""
-        shapes = MULTIPLE_ANGLES[prefactor]
-        return cls(prefactor, tuple([
-            sum(map(mul, weights[power:], shapes[power]), ZERO) for power in range(len(weights))]))
+    def polynomial(self, most: int) -> list[Decimal]:
+        """Return the coefficients of xi^0, xi^1 ... of so many terms."""
+        weights, shapes = self.weights[:most], MULTIPLE_ANGLES[self.prefactor]
+        # A sum of -0 is -0.
+        return [reduce(add, map(mul, weights[power:], shapes[power]))
+                for power in range(len(weights))]
 
     def scaled(self, scale: Decimal) -> 'Series':
-        return Series(self.prefactor, tuple([scale * x for x in self.polynomial]))
+        return Series(self.prefactor, [scale * x for x in self.weights])
 
     def at(self, sin: Decimal, cos: Decimal, xi: Decimal) -> Decimal:
-        value = ZERO
-        for coefficient in reversed(self.polynomial):
-            value = value * xi + coefficient
-        return value * (ONE, cos, sin, sin * cos)[self.prefactor]
+        """Return the sum by Clenshaw's recurrence."""
+        twice, value, before = 2 - 4 * xi, ZERO, ZERO
+        for weight in reversed(self.weights):
+            value, before = weight + twice * value - before, value
+        if self.prefactor == COS_EVEN:
+            return value - before * twice / 2
+        if self.prefactor == COS_ODD:
+            return (value - before) * cos
+        return (value + before) * sin if self.prefactor == SIN_ODD else 2 * before * sin * cos
 
     @property
     def leading(self) -> Decimal:
         """At y = 0, the value of a cosine series, or the derivative of a sine series."""
-        return self.polynomial[0]
+        return sum(map(mul, self.weights, MULTIPLE_ANGLES[self.prefactor][0]), ZERO)
 
 
-NOTHING = Series(COS_EVEN, (ZERO,))
+NOTHING = Series(COS_EVEN, [ZERO])
 # A real and an imaginary part
 Parts = tuple[Series, Series]
 
@@ -88,7 +93,6 @@ class ThetaForm:
     """
     The theta functions in the real or in the imaginary form.
 
-    digits : that the terms of the series reach
     mean : of which k is the modulus of the form: k^2 is m in the real and 1 - m in the imaginary
         form, and at most 1/2
     size : coefficients of a polynomial that doubles need
@@ -97,7 +101,7 @@ class ThetaForm:
         of theta2 and theta3 have not
     """
 
-    def __init__(self, mean: GaussMean, imaginary: bool, digits: int) -> None:
+    def __init__(self, mean: GaussMean, imaginary: bool) -> None:
         self.mean, self.imaginary = mean, imaginary
         q = mean.nome()
         exponent = q.adjusted()
@@ -105,19 +109,20 @@ class ThetaForm:
         # Terms k are of size q^(k^2 - k/2) or less beside the first one.
         self.size, terms = (
             next(k for k in count(2) if (2 * k * k - k) * depth > 2 * wanted)
-            for wanted in (DIGITS_OF_DOUBLES, digits))
-        self._even = [ONE, *(2 * q ** (k * k) for k in range(1, terms))]
-        self._odd = [q ** (k * (k + 1)) for k in range(terms)]
-        self.theta1 = Series.of(SIN_ODD, _alternating(self._odd))
-        self.theta3 = Series.of(COS_EVEN, self._even)
-        pair = (COS_ODD, self._odd), (COS_EVEN, _alternating(self._even))
-        self._weights2, weights4 = pair[::-1] if imaginary else pair
-        self.theta4 = Series.of(*weights4)
-        self.odd_over_even = 4 * q.sqrt() if imaginary else ONE
-
-    @cached_property
-    def theta2(self) -> Series:
-        return Series.of(*self._weights2)
+            for wanted in (DIGITS_OF_DOUBLES, DIGITS_OF_SERIES))
+        # 2 q^(k^2) and q^(k (k + 1))
+        self._even, self._odd, power = [ONE, 2 * q], [ONE], q
+        for _ in range(1, terms):
+            power *= q
+            self._odd.append(self._odd[-1] * power)
+            power *= q
+            self._even.append(self._even[-1] * power)
+        self._even.pop()
+        self.theta1 = Series(SIN_ODD, _alternating(self._odd))
+        self.theta3 = Series(COS_EVEN, self._even)
+        pair = Series(COS_ODD, self._odd), Series(COS_EVEN, _alternating(self._even))
+        self.theta2, self.theta4 = pair[::-1] if imaginary else pair
+        self.odd_over_even = 4 * root(q) if imaginary else ONE
 
     def slopes_of_sn2(self) -> tuple[Decimal, Decimal]:
         """Return c with d(sn^2 chi)/dchi = c theta1(2y)/D(y)^4, for theta4 and theta3 as D."""
@@ -134,17 +139,17 @@ class ThetaForm:
         sense : s
         """
         square = -amplitude * amplitude if self.imaginary else amplitude * amplitude
-        other, twice = (1 + square).sqrt(), 2 + 4 * square      # twice: 2 cosh 2A, or 2 cos 2A
+        other, twice = root(1 + square), 2 + 4 * square      # twice: 2 cosh 2A, or 2 cos 2A
         sines = _weighted(self._odd, -amplitude, amplitude, twice)
         cosines = _weighted(self._odd, other, other, twice)
-        theta1 = (Series.of(COS_ODD, _alternating(sines)),
-                  Series.of(SIN_ODD, _alternating(_signed(sense, cosines))))
+        theta1 = (Series(COS_ODD, _alternating(sines)),
+                  Series(SIN_ODD, _alternating(_signed(sense, cosines))))
         if self.imaginary:
             sines = _weighted(self._even, -2 * amplitude * other, ZERO, twice)
             cosines = _weighted(self._even, twice / 2, ONE, twice)
-            return theta1, (Series.of(COS_EVEN, _alternating(cosines)),
-                            Series.of(SIN_EVEN, _alternating(_signed(-sense, sines))))
-        return theta1, (Series.of(COS_ODD, cosines), Series.of(SIN_ODD, _signed(sense, sines)))
+            return theta1, (Series(COS_EVEN, _alternating(cosines)),
+                            Series(SIN_EVEN, _alternating(_signed(-sense, sines))))
+        return theta1, (Series(COS_ODD, cosines), Series(SIN_ODD, _signed(sense, sines)))
 
 
 def _alternating(weights: Sequence[Decimal]) -> list[Decimal]:

@@ -26,10 +26,11 @@ docs/theta_functions.md derives the first two steps.
    X is i s theta1(y - i s A) at even and theta2(y - i s A) at odd N for alpha; for beta, with b
    for a, it is the other way round [DLMF 20.2(i), 20.2(iii)].
 
-4. *Rates.*  r is half of the mean of Omega + (Lz + L3)/(lambda1 (1 + u)) for alpha and of
-   -Omega + (Lz - L3)/(lambda1 (1 - u)) for beta, Omega = L3/lambda3 - L3/lambda1.  X(y) turns by a
-   quarter turn from one N to the next, which r t contains already: kappa = -s takes it out again.
-   The imaginary form has kappa = s (a/K' - 1) [DLMF 20.7(viii)].
+4. *Rates.*  The argument of alpha has the rate Omega/2 + (Lz + L3)/(2 lambda1 (1 + u)), that of
+   beta -Omega/2 + (Lz - L3)/(2 lambda1 (1 - u)), Omega = L3/lambda3 - L3/lambda1.  r follows where
+   X is theta2 and y = 0, at u2 for alpha and at u1 for beta.  X(y) turns by a quarter turn from
+   one N to the next, which r t contains already: kappa = -s takes it out again.  The imaginary
+   form has kappa = s (a/K' - 1) [DLMF 20.7(viii)].
 
 5. *Poles.*  s = 0 means that the axis passes a pole exactly.  Then X is real and changes its sign
    there.  If Lz = L3 and u3 = 1, beta has no zero: it is proportional to dn(chi), with theta4 and
@@ -52,17 +53,19 @@ from spinning_top_sim.solvers.decimal_math import (
     DIGITS,
     ONE,
     ZERO,
+    Complex,
     asinh,
     atan2,
+    exact,
     half_turns,
     pi,
     precision,
+    root,
     sin_cos,
 )
 from spinning_top_sim.solvers.elliptic import GaussMean
 from spinning_top_sim.solvers.theta_series import (
     COS_EVEN,
-    DIGITS_OF_DOUBLES,
     MOST_TERMS,
     NOTHING,
     Parts,
@@ -85,7 +88,8 @@ class Factor:
     parts : R and s J at even and at odd N.  If it changes its sign at a pole, R is a sine series
         at one of them, and has the factor (-1)^floor(N/2).
     sense : s
-    start_argument : argument of (R + i s J) exp(i kappa y) at t = 0 [rad]
+    start_argument : argument of (R + i s J) exp(i kappa y) at t = 0, less that of `direction` of
+        `_Side` [rad]
     """
 
     rate: Decimal
@@ -128,26 +132,25 @@ class HalfAngles(NamedTuple):
     """
     A state in long decimals; theta is in [0, pi/2].
 
-    sin_half, theta_dot : of theta/2; [rad/s]
-    alpha_turns, beta_turns : (phi + psi)/2 and (phi - psi)/2 [turns]
+    sin_half, cos_half, theta_dot : of theta/2; [rad/s]
+    alpha, beta : complex numbers of any modulus with the arguments (phi + psi)/2, (phi - psi)/2
     l3, lz : [kg m^2/s]
     """
 
     sin_half: Decimal
+    cos_half: Decimal
     theta_dot: Decimal
-    alpha_turns: Decimal
-    beta_turns: Decimal
+    alpha: Complex
+    beta: Complex
     l3: Decimal
     lz: Decimal
 
 
-def set_up(top: Top, gravity: Decimal, start: State | HalfAngles,
-           digits: int = DIGITS_OF_DOUBLES) -> ThetaMotion:
+def set_up(top: Top, gravity: Decimal, start: State | HalfAngles) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the numbers as they are.
 
     gravity : instead of that of the top
-    digits : of the values of the series
 
     Raises ValueError if none of DIGITS_TO_TRY tell the roots of the cubic apart.  They are never
     equal: on the separatrix, or in steady precession with theta' != 0, cos(theta0) would be
@@ -156,7 +159,7 @@ def set_up(top: Top, gravity: Decimal, start: State | HalfAngles,
     for tried in DIGITS_TO_TRY:
         with precision(tried):
             try:
-                return _set_up(top, gravity, start, digits)
+                return _set_up(top, gravity, start)
             except RootsTooCloseError:
                 continue
             except (DecimalException, OverflowError) as error:
@@ -172,23 +175,24 @@ class _Side(NamedTuple):
 
     momentum, spin : its argument has the rate (spin + momentum/(lambda1 x))/2; x is 1 + u for
         alpha and 1 - u for beta
-    turns : its argument [turns]
+    turns, direction : its argument is so many turns and that of a complex number together
     modulus, slope : its modulus, and twice the derivative of that
     """
 
     momentum: Decimal
     spin: Decimal
     turns: Decimal
+    direction: Complex
     modulus: Decimal
     slope: Decimal
 
 
-def _set_up(top: Top, gravity: Decimal, start: State | HalfAngles, digits: int) -> ThetaMotion:
-    torque = Decimal(top.mass) * gravity * Decimal(top.com_distance)
-    lambda1, lambda3 = Decimal(top.lambda1), Decimal(top.lambda3)
+def _set_up(top: Top, gravity: Decimal, start: State | HalfAngles) -> ThetaMotion:
+    torque = exact(top.mass) * gravity * exact(top.com_distance)
+    lambda1, lambda3 = exact(top.lambda1), exact(top.lambda3)
+    alpha_turns, beta_turns, alpha, beta = ZERO, ZERO, (ONE, ZERO), (ONE, ZERO)
     if isinstance(start, HalfAngles):
-        sin_half, theta_dot, alpha_turns, beta_turns, l3, lz = start
-        cos_half = (1 - sin_half * sin_half).sqrt()
+        sin_half, cos_half, theta_dot, alpha, beta, l3, lz = start
     else:
         # Rounded now (+): a sum rounds its result, and -L3 must cancel Lz = L3 to the last digit.
         theta, theta_dot, l3, lz = (
@@ -197,8 +201,8 @@ def _set_up(top: Top, gravity: Decimal, start: State | HalfAngles, digits: int) 
         alpha_turns, beta_turns = phi + psi, phi - psi
         sin_half, cos_half = sin_cos(theta / 2)
     spin = l3 * (1 / lambda3 - 1 / lambda1)
-    sides = (_Side(lz + l3, spin, alpha_turns, cos_half, -sin_half * theta_dot),
-             _Side(lz - l3, -spin, beta_turns, sin_half, cos_half * theta_dot))
+    sides = (_Side(lz + l3, spin, alpha_turns, alpha, cos_half, -sin_half * theta_dot),
+             _Side(lz - l3, -spin, beta_turns, beta, sin_half, cos_half * theta_dot))
     f0, f1, f2, f3 = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     if not f0 and not f1:
         return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
@@ -206,7 +210,7 @@ def _set_up(top: Top, gravity: Decimal, start: State | HalfAngles, digits: int) 
     sense = -1 if torque < 0 else 1
     return _nutating(sides[::sense], lambda1, sense, l3, lz - l3 + 2 * l3 * sin_half ** 2, (
         f0, sense * f1, f2, sense * f3 or NO_GRAVITY * abs(f2)),
-        falling=sense * theta_dot > 0, digits=digits)
+        falling=sense * theta_dot > 0)
 
 
 def _resting(side: _Side, lambda1: Decimal) -> Factor:
@@ -215,12 +219,13 @@ def _resting(side: _Side, lambda1: Decimal) -> Factor:
     if side.momentum:
         rate += side.momentum / (4 * lambda1 * side.modulus ** 2)
     parts = Series(COS_EVEN, (side.modulus,)), NOTHING
-    return Factor(rate, side.turns, ZERO, (parts, parts), 0, ZERO)
+    argument = -atan2(side.direction[1], side.direction[0])
+    return Factor(rate, side.turns - argument / (2 * pi()), ZERO, (parts, parts), 0, argument)
 
 
 def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decimal,
               momentum: Decimal, cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool,
-              digits: int) -> ThetaMotion:
+              ) -> ThetaMotion:
     """
     Return a motion with P >= 0; with sense -1 that of which this is the mirror image.
 
@@ -230,31 +235,29 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decima
     imaginary = roots.gap21 > roots.gap32
     poles = _poles(sides, roots, lambda1 ** 2 * f3, imaginary)
     with precision(DIGITS):
-        a, g, c = roots.gap31.sqrt(), roots.gap32.sqrt(), roots.gap21.sqrt()
+        a, g, c = root(roots.gap31), root(roots.gap32), root(roots.gap21)
         mean = GaussMean(a, g, c)
-        form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary, digits)
+        form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary)
         quarter0, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
         stretch = form.mean.mean / mean.mean if imaginary else None
         sin = form.mean.amplitude(square, 1 if imaginary else -1)
         xi = -sin * sin if imaginary else sin * sin
-        cos = (1 - xi).sqrt()
+        cos = root(1 - xi)
         y0 = direction * (asinh(sin) / stretch if stretch else atan2(sin, cos))
-        factors = []
-        for side, pole in zip(sides, poles, strict=True):
-            rate = side.spin / 2
-            if side.momentum:
-                rate += side.momentum / lambda1 * mean.mean_reciprocal(pole.x1, pole.x2) / 2
-            factors.append(_factor(form, side, pole, rate, quarter0, y0,
-                                   (direction * sin, cos, xi)))
-        scale = sense * f3.sqrt() * a / 2 * roots.gap21         # w (u2 - u1)
+        scale = root(f3)
+        # w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
+        y_rate = scale * mean.mean / 2
+        factors = [_factor(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, quarter0,
+                           y0, (direction * sin, cos, xi))
+                   for side, pole in zip(sides, poles, strict=True)]
+        scale *= sense * a / 2 * roots.gap21         # w (u2 - u1)
         even, odd = form.slopes_of_sn2()
         turn = sense * l3 / lambda1
         swing = turn * roots.gap21 * (form.mean.quarter_period / form.theta1.leading) ** 2
         alpha, beta = factors[::sense]
         return ThetaMotion(
-            alpha, beta, stretch=stretch,
-            # w/K, where w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
-            quarter_rate=f3.sqrt() * mean.mean / pi(), quarter0=quarter0, offset0=y0 * 2 / pi(),
+            alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / pi(), quarter0=quarter0,
+            offset0=y0 * 2 / pi(),
             u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
             momentum=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
             swing=(-swing * form.theta4.leading ** 2,
@@ -321,11 +324,18 @@ def _nearest_quarter(roots: Roots, complement: Decimal, falling: bool,
         low * roots.gap32 if imaginary else roots.gap21 * roots.y3))
 
 
-def _factor(form: ThetaForm, side: _Side, pole: _Pole, rate: Decimal, quarters: int, y: Decimal,
+def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate: Decimal,
+            y_rate: Decimal, quarters: int, y: Decimal,
             point: tuple[Decimal, Decimal, Decimal]) -> Factor:
-    """Return alpha or beta; quarters, y, point: N, y and the arguments of `Series.at` at t = 0."""
-    sense, drift, argument = int(side.momentum.compare(ZERO)), ZERO, ZERO
-    scale = (max(pole.x1, pole.x2) / 2).sqrt()
+    """
+    Return alpha or beta.
+
+    x_rate, y_rate : rates of the argument of the series and of y [rad/s]
+    quarters, y, point : N, y and the arguments of `Series.at` at t = 0
+    """
+    sense, drift, rate = int(side.momentum.compare(ZERO)), ZERO, side.spin / 2
+    farthest, real, imag = max(pole.x1, pole.x2), ONE, ZERO
+    scale = root(farthest / 2)
     starts_in_first = quarters % 2 == pole.is_beta       # the theta1 of step 3
     if pole.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
@@ -343,13 +353,16 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, rate: Decimal, quarters: 
         first, second = form.shifted(amplitude, sense)
         drift = Decimal(-sense)
         if form.imaginary:
-            drift += sense * 2 / pi() * atan2(amplitude, (1 - amplitude * amplitude).sqrt())
+            drift += sense * 2 / pi() * atan2(amplitude, root(1 - amplitude * amplitude))
+        rate += (side.momentum / (2 * lambda1 * farthest) - drift * y_rate
+                 - second[1].leading / second[0].leading * x_rate)
         real, imag = (part.at(*point) for part in (first if starts_in_first else second))
-        argument = drift * y + atan2(imag, real)
     # alpha is largest at u2, where N is odd, and beta at u1: both at the centre of theta2.
     scale *= (form.theta4 if pole.is_beta else form.theta3).leading / second[0].leading
     first_scale = scale * form.odd_over_even if pole.is_beta else scale
     parts = (_scaled(first, first_scale), _scaled(second, scale))
+    c, s = side.direction
+    argument = drift * y + atan2(imag * c - real * s, real * c + imag * s)
     return Factor(rate, side.turns - argument / (2 * pi()), drift,
                   parts[::-1] if pole.is_beta else parts, sense, argument)
 

@@ -79,7 +79,7 @@ class ThetaFunctions:
                       if SIN_ODD in pair}
         for name, factor in zip(('alpha', 'beta'), factors, strict=True):
             for real, _ in factor.parts:
-                size = max(map(abs, real.polynomial))
+                size = max(map(abs, real.weights))
                 if 0 < size < LEAST_AMPLITUDE:
                     raise ValueError(
                         f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
@@ -312,7 +312,7 @@ def in_range(name: str, value: Decimal) -> float:
 
 def _coefficients(rows: Sequence[Sequence[Series]], most: int) -> NDArray[np.float64]:
     """Return the polynomials' coefficients in doubles, highest of at least 2 powers first."""
-    doubles = [[*map(float, x.polynomial[:most])] for row in rows for x in row]
+    doubles = [[*map(float, x.polynomial(most))] for row in rows for x in row]
     size = max(2, *map(len, doubles))
     return np.array([(size - len(x)) * [0.0] + x[::-1] for x in doubles]
                     ).T.reshape(size, len(rows), -1)

@@ -313,7 +313,7 @@ class _TransportStates(States):
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        first, second, _ = attitude.in_body(self.rows_quaternion, (*self._momentum, self._lz))
+        first, second, _ = attitude.rotated_back(self.rows_quaternion, (*self._momentum, self._lz))
         return first / self.top.lambda1, second / self.top.lambda1
 
     @cached_property

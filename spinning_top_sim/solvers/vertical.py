@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,13 +28,15 @@ from spinning_top_sim.solvers.decimal_math import (
     DIGITS,
     ONE,
     ZERO,
-    atan2,
+    Complex,
+    exact,
     pi,
     precision,
+    root,
     sin_cos,
 )
 from spinning_top_sim.solvers.exact import ExactSolution, _ExactStates
-from spinning_top_sim.solvers.theta_series import DIGITS_HANDED_OVER, SIN_ODD
+from spinning_top_sim.solvers.theta_series import SIN_ODD
 from spinning_top_sim.solvers.theta_setup import (
     DIGITS_TO_TRY,
     Factor,
@@ -52,7 +54,6 @@ POLE = Decimal('1e-30')
 # A motion that misses a pole by this share of what it could passes it exactly: the set-up squares
 # the share, and has 40 digits.
 THROUGH = Decimal('1e-19')
-Complex = tuple[Decimal, Decimal]
 
 
 class Posture(NamedTuple):
@@ -92,29 +93,25 @@ class Vertical(NamedTuple):
         """Return a posture as a state in this frame."""
         alpha, beta = _product(_inverse(self.alpha, self.beta), (posture.alpha, posture.beta))
         cosine2, sine2 = _square(alpha), _square(beta)
-        size2 = cosine2 + sine2
-        cosine2, sine2 = cosine2 / size2, sine2 / size2
-        sine, l3, turn = sine2.sqrt(), Decimal(posture.l3), 2 * pi()
-        half_sum = atan2(alpha[1], alpha[0])
-        o1, o2 = posture.across
+        size2, l3, (o1, o2) = cosine2 + sine2, Decimal(posture.l3), posture.across
+        cosine, sine = root(cosine2 / size2), root(sine2 / size2)
         if 2 * sine < POLE:         # all the motion of the axis is nutation: psi from omega
-            theta_dot = _square(posture.across).sqrt()
-            psi = atan2(o1, o2) if theta_dot else ZERO
-            return HalfAngles(ZERO, theta_dot, half_sum / turn, (half_sum - psi) / turn, +l3, +l3)
+            theta_dot = root(_square(posture.across))
+            beta = _times(alpha, (o2, -o1)) if theta_dot else alpha
+            return HalfAngles(ZERO, ONE, theta_dot, alpha, beta, +l3, +l3)
         # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
         # + i theta') exp(-i psi)
         minus_across, theta_dot = _times(posture.across, _times(alpha, (beta[0], -beta[1])))
-        half_tilt = (cosine2 * sine2).sqrt()
-        tilt, unit = 2 * half_tilt, half_tilt * size2
-        lambda1 = Decimal(top.lambda1)
-        lz = (1 - 2 * sine2) * l3 - lambda1 * minus_across / unit * tilt
-        fastest = (_square(posture.across) + abs(self.gravity * Decimal(top.mass) * Decimal(
-            top.com_distance)) / lambda1).sqrt()
+        half_tilt = cosine * sine
+        tilt, unit, lambda1 = 2 * half_tilt, half_tilt * size2, exact(top.lambda1)
+        lz = (1 - 2 * sine * sine) * l3 - lambda1 * minus_across / unit * tilt
+        most2 = THROUGH ** 2 * tilt * tilt * (l3 * l3 * tilt * tilt + lambda1 * (
+            lambda1 * _square(posture.across)
+            + abs(self.gravity * exact(top.mass) * exact(top.com_distance))))
         for pole in (l3, -l3):
-            if abs(lz - pole) <= THROUGH * tilt * (abs(l3) * tilt + lambda1 * fastest):
+            if (lz - pole) ** 2 <= most2:
                 lz = +pole
-        return HalfAngles(sine, theta_dot / unit, half_sum / turn,
-                          atan2(beta[1], beta[0]) / turn, +l3, lz)
+        return HalfAngles(sine, cosine, theta_dot / unit, alpha, beta, +l3, lz)
 
     def top(self, top: Top) -> Top:
         """Return the top in the effective gravity."""
@@ -139,13 +136,16 @@ class AcceleratedMotion(ExactSolution):
     """
 
     def __init__(self, top: Top, posture: Posture, acceleration: Exact) -> None:
-        self.vertical, start = about_vertical(top, posture, acceleration)
-        self.top, self.start = self.vertical.top(top), rounded(start)
-        self._posture, self._momenta = posture, (start.l3, start.lz)
+        self.vertical, self._halves = about_vertical(top, posture, acceleration)
+        self.top, self._posture = self.vertical.top(top), posture
         self._turns, self._sign, self._half_turn = 0, 1.0, 0.0
-        self._motion = set_up(top, self.vertical.gravity, start, DIGITS_HANDED_OVER)
+        self._motion = set_up(top, self.vertical.gravity, self._halves)
         with precision(DIGITS):
-            self._take_constants(self._motion, *self._momenta)
+            self._take_constants(self._motion, *self._halves[-2:])
+
+    @cached_property
+    def start(self) -> State:       # type: ignore[override]
+        return rounded(self._halves)
 
     def _across_of(self, states: _ExactStates) -> Column:
         if self._theta.real or not self._theta.u_dot.any():
@@ -182,9 +182,9 @@ class AcceleratedMotion(ExactSolution):
         with precision(DIGITS + 2):
             vertical = self.vertical
             alpha, beta, u_dot = _cayley_klein(self._motion, Decimal(ns).scaleb(-9))
-            across = _across(Decimal(self.top.lambda1), *self._momenta, alpha, beta, u_dot)
+            across = _across(exact(self.top.lambda1), *self._halves[-2:], alpha, beta, u_dot)
             alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
-            return Posture(alpha, beta, across, self.start.l3)
+            return Posture(alpha, beta, across, self._posture.l3)
 
 
 class _Chain(AcceleratedMotion):
@@ -202,7 +202,7 @@ def chained(motions: Sequence[AcceleratedMotion], counts: Sequence[int],
     """Return the states of motions of one kind, of each at so many of the times [ns]."""
     states = _ExactStates(_Chain(motions, counts), Times.from_ns(times_ns))
     states._lz, states._gravity, states._torque = np.repeat(np.array([
-        (motion.start.lz, motion.top.gravity, motion.top.gravity_torque)
+        (float(motion._halves.lz), motion.top.gravity, motion.top.gravity_torque)
         for motion in motions]).T, counts, axis=1)
     return states
 
@@ -213,7 +213,7 @@ def _verticals(gravity: float, acceleration: Exact,
     """Return the upward line of effective gravity, and the verticals along and against it."""
     x, y, z = (Decimal(a.numerator) / Decimal(a.denominator) for a in acceleration)
     z += Decimal(gravity)
-    size = (x * x + y * y + z * z).sqrt()
+    size = root(x * x + y * y + z * z)
     x, y, z = line = (x / size, y / size, z / size) if size else (ZERO, ZERO, ONE)
     return line, _upright(size, x, y, z), _upright(-size, -x, -y, -z)
 
@@ -243,12 +243,12 @@ def about_vertical(top: Top, posture: Posture, acceleration: Exact,
 
 def rounded(start: HalfAngles) -> State:
     """Return a state in doubles."""
-    sine, alpha, beta, l3 = (
-        float(x) for x in (start.sin_half, start.alpha_turns, start.beta_turns, start.l3))
+    alpha, beta = (math.atan2(float(y), float(x)) for x, y in (start.alpha, start.beta))
+    l3 = float(start.l3)
     return State(
-        theta=min(2.0 * math.asin(sine), 0.5 * math.pi), theta_dot=float(start.theta_dot),
-        phi=math.tau * (alpha + beta), psi=math.tau * (alpha - beta), l3=l3,
-        lz=float(start.lz) if sine else l3)
+        theta=min(2.0 * math.asin(float(start.sin_half)), 0.5 * math.pi),
+        theta_dot=float(start.theta_dot), phi=alpha + beta, psi=alpha - beta, l3=l3,
+        lz=float(start.lz) if start.sin_half else l3)
 
 
 def posture_of(top: Top, state: State) -> Posture:
@@ -258,7 +258,7 @@ def posture_of(top: Top, state: State) -> Posture:
         phi, psi = +Decimal(state.phi), +Decimal(state.psi)
         (s_sum, c_sum), (s_difference, c_difference), (s_psi, c_psi) = (
             sin_cos(_reduced(angle)) for angle in ((phi + psi) / 2, (phi - psi) / 2, psi))
-        l3, lz, two_lambda1 = Decimal(state.l3), Decimal(state.lz), 2 * Decimal(top.lambda1)
+        l3, lz, two_lambda1 = Decimal(state.l3), Decimal(state.lz), 2 * exact(top.lambda1)
         swing = ZERO                # phi' sin(theta)
         if lz + l3:
             swing += (lz + l3) / two_lambda1 * sine / cosine
@@ -294,13 +294,13 @@ def _cayley_klein(motion: ThetaMotion, t: Decimal) -> tuple[Complex, Complex, De
     else:
         sine, _ = sin_cos(y)
         xi = sine * sine
-    cosine = (1 - xi).sqrt()
+    cosine = root(1 - xi)
     point = sine, cosine, xi
     alpha, beta = (_factor(factor, whole, y, t, point) for factor in (motion.alpha, motion.beta))
     size2 = _square(alpha) + _square(beta)
     slope = motion.u_dot_series.at(2 * sine * cosine, 1 - 2 * xi, 4 * xi * (1 - xi))
     u_dot = motion.u_dot[whole % 2] * slope / (size2 * size2)
-    scale = 1 / size2.sqrt()
+    scale = 1 / root(size2)
     return _scaled(scale, alpha), _scaled(scale, beta), u_dot
 
 
@@ -344,14 +344,14 @@ def _sinh(x: Decimal) -> Decimal:
 
 def _least_rotation(x: Decimal, y: Decimal, z: Decimal) -> tuple[Complex, Complex]:
     """Return the Cayley-Klein parameters of the least rotation of (0, 0, 1) to a unit vector."""
-    across = (x * x + y * y).sqrt()
+    across = root(x * x + y * y)
     if not across:                  # perhaps a half turn, about the x axis
         return ((ONE, ZERO), (ZERO, ZERO)) if z > 0 else ((ZERO, ZERO), (ZERO, -ONE))
     if z > 0:
-        cosine = ((1 + z) / 2).sqrt()
+        cosine = root((1 + z) / 2)
         sine = across / (2 * cosine)
     else:
-        sine = ((1 - z) / 2).sqrt()
+        sine = root((1 - z) / 2)
         cosine = across / (2 * sine)
     return (cosine, ZERO), (sine * x / across, sine * y / across)
 

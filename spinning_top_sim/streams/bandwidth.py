@@ -43,7 +43,7 @@ class LowPass:
     def __init__(self, frequency: float, order: int) -> None:
         self._corner, self._order = math.tau * frequency, order
         self._decay = self._corner / (1.0 if order == 1 else math.sqrt(2.0))
-        self._gain = order * self._decay        # of the last part of the state
+        self._gain = order * self._decay        # of the last component of the state
         self.memory_ns = math.ceil(1e9 * TIME_CONSTANTS / self._decay)
         nodes, weights = np.polynomial.legendre.leggauss(NODES)
         self._nodes, self._weights = 0.5 * (1.0 + nodes), 0.5 * weights
@@ -60,12 +60,12 @@ class LowPass:
         mixed = len(range(times.start, segment.start_ns + self.memory_ns, times.step))
         together = max(1, MOST_TOGETHER // (NODES * len(self._edges(segment))))
         return np.concatenate([
-            self._state(segment, np.array(part[begin:begin + together]), signal, 1)[-1]
-            for part in (times[:mixed], times[mixed:])
-            for begin in range(0, len(part), together)], axis=1) * self._gain
+            self._state(segment, np.array(some[begin:begin + together]), signal, 1)[-1]
+            for some in (times[:mixed], times[mixed:])
+            for begin in range(0, len(some), together)], axis=1) * self._gain
 
     def carried(self, segment: Segment, until_ns: int, signal: Signal) -> NDArray[np.float64]:
-        """Return the state of the filter where another segment follows (parts, columns, 1)."""
+        """Return the state where another segment follows (components, columns, 1)."""
         return self._state(segment, np.array([until_ns]), signal, self._order)
 
     def _edges(self, segment: Segment) -> NDArray[np.float64]:
@@ -77,9 +77,9 @@ class LowPass:
         return np.linspace(0.0, self.memory_ns, panels + 1)[:, np.newaxis]
 
     def _state(self, segment: Segment, t_ns: NDArray[np.int64], signal: Signal,
-               parts: int) -> NDArray[np.float64]:
+               components: int) -> NDArray[np.float64]:
         """
-        Return the last parts of the filter's state at times, (parts, columns, n).
+        Return the last components of the filter's state at times, (components, columns, n).
 
         The state is the integral of the signal times exp(p t), t ago, with the pole p of the
         filter, as its real and, of second order, its imaginary part.
@@ -96,7 +96,7 @@ class LowPass:
         before = (edges[:-1, np.newaxis] + lengths * self._nodes[:, np.newaxis]).reshape(
             -1, len(back_ns))
         weights = 1e-9 * (lengths * self._weights[:, np.newaxis]).reshape(before.shape)
-        kernels = [weights * part for part in self._kernel(1e-9 * before)[-parts:]]
+        kernels = [weights * part for part in self._kernel(1e-9 * before)[-components:]]
         at_ns = t_ns - np.rint(np.vstack((before, back_ns))).astype(np.int64)
         unique, places = np.unique(at_ns, return_inverse=True)
         values = signal(segment.own_states(unique))[:, places.reshape(at_ns.shape)]
@@ -105,7 +105,8 @@ class LowPass:
                  if carried is None else carried)
         real, *imag = self._kernel(1e-9 * back_ns)      # what is left of that state
         totals = [real * first[0]] if not imag else [
-            real * first[0] - imag[0] * first[1], real * first[1] + imag[0] * first[0]][-parts:]
+            real * first[0] - imag[0] * first[1],
+            real * first[1] + imag[0] * first[0]][-components:]
         for node in range(len(before)):         # in one order, however many samples there are
             totals = [total + kernel[node] * values[:, node]
                       for total, kernel in zip(totals, kernels, strict=True)]

@@ -28,12 +28,12 @@ class Block(NamedTuple):
     """
     The messages of some streams after the block before and up to `until_ns`.
 
-    parts : of each stream that has any: the stream, the times (n,) [ns] of its messages, and the
-        messages as rows (n, size), valid until the next block
+    messages : of each stream that has any: the stream, the times (n,) [ns] of its messages, and
+        these as rows (n, size), valid until the next block
     """
 
     until_ns: int
-    parts: Sequence[tuple[Stream, NDArray[np.int64], Rows]]
+    messages: Sequence[tuple[Stream, NDArray[np.int64], Rows]]
 
 
 def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, until_ns: int, *,
@@ -55,15 +55,15 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
         if edges[-1] > after_ns:
             # Once for all streams of one rate.
             samples = cache(partial(_samples, path, epoch_ns))
-            parts = []
+            messages = []
             for stream in streams:
                 found = samples(*(stream.times(*ends) for ends in pairwise(edges)))
                 if found:
                     times_ns, rows = stream.encode(*found)
                     if len(times_ns):       # a sensor may lose all samples of a block
-                        parts.append((stream, times_ns, rows))
+                        messages.append((stream, times_ns, rows))
                     yield None
-            yield Block(edges[-1], parts)
+            yield Block(edges[-1], messages)
             after_ns = edges[-1]
         if failure is not None:
             raise failure

@@ -97,22 +97,22 @@ class Template:
 
     def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
         """Return messages (n, size) with stamps (n,) [ns]; they are valid until the next call."""
-        return self.encode_parts(stamps_ns, ((len(stamps_ns), values),))
+        return self.encode_runs(stamps_ns, ((len(stamps_ns), values),))
 
-    def encode_parts(self, stamps_ns: NDArray[np.int64],
-                     parts: Iterable[tuple[int, Sequence[Field]]]) -> NDArray[np.uint8]:
-        """Return the same, with the fields of so many messages after the other."""
+    def encode_runs(self, stamps_ns: NDArray[np.int64],
+                    runs: Iterable[tuple[int, Sequence[Field]]]) -> NDArray[np.uint8]:
+        """Return the same; `runs` has the fields of so many messages after the other."""
         count, begin = len(stamps_ns), 0
         if len(self._rows) < count:
             self._rows = np.frombuffer(count * self._buffer, self._row_type)
         rows = self._rows[:count]
         for at in self._stamps_at:
             rows[f'sec{at}'], rows[f'nanosec{at}'] = np.divmod(stamps_ns, NANOSECONDS)
-        for size, values in parts:
-            part = rows[begin:begin + size]
+        for size, values in runs:
+            run = rows[begin:begin + size]
             begin += size
             for i, value in zip(range(len(self._fields)), values, strict=True):
-                field = part[f'field{i}']
+                field = run[f'field{i}']
                 if isinstance(value, np.ndarray):
                     field[:] = value
                 else:

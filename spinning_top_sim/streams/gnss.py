@@ -52,16 +52,16 @@ class Gnss(Stream):
         valid = super().times(max(after_ns - self.late_ns, -1), until_ns - self.late_ns)
         return range(valid.start + self.late_ns, valid.stop + self.late_ns, valid.step)
 
-    def _measured(self, *parts: Samples) -> tuple[
+    def _measured(self, *samples: Samples) -> tuple[
             NDArray[np.int64], NDArray[np.int64], Vector, NDArray[np.bool_]]:
         """Return times and stamps of messages [ns], measurements, and which are in an outage."""
-        t_ns = np.concatenate([one.t_ns for one in parts])
+        t_ns = np.concatenate([one.t_ns for one in samples])
         valid_ns = t_ns - self.late_ns
-        x, y, z = value = parts[0].path.pivot(valid_ns)[self._index]
+        x, y, z = value = samples[0].path.pivot(valid_ns)[self._index]
         if self._deviation.any():
             x, y, z = value + self._deviation * noise.white(
                 self._seed, self._purpose, valid_ns // self.period_ns, 3)
-        return (t_ns, parts[0].epoch_ns + valid_ns, (x, y, z),
+        return (t_ns, samples[0].epoch_ns + valid_ns, (x, y, z),
                 np.searchsorted(self._edges_ns, valid_ns, 'right') % 2 == 1)
 
 
@@ -76,9 +76,9 @@ class Fix(Gnss):
         self._no_fix = messages.nav_sat_fix(values['body_frame'], None)
         return messages.nav_sat_fix(values['body_frame'], messages.diagonal(*variances))
 
-    def encode(self, *parts: Samples) -> Encoded:
+    def encode(self, *samples: Samples) -> Encoded:
         from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
-        t_ns, stamps_ns, position, is_out = self._measured(*parts)
+        t_ns, stamps_ns, position, is_out = self._measured(*samples)
         rows = self.template.encode(stamps_ns, enu2geodetic(*position, *self._origin))
         if is_out.any():
             rows = rows.copy()      # the template's own rows keep what is the same in all
@@ -100,7 +100,7 @@ class Velocity(Gnss):
         edges_ns = self._edges_ns.tolist()
         self.silences_ns = list(zip(edges_ns[::2], edges_ns[1::2], strict=True))
 
-    def encode(self, *parts: Samples) -> Encoded:
-        t_ns, stamps_ns, velocity, is_out = self._measured(*parts)
+    def encode(self, *samples: Samples) -> Encoded:
+        t_ns, stamps_ns, velocity, is_out = self._measured(*samples)
         rows = self.template.encode(stamps_ns, velocity)
         return t_ns[~is_out], rows[~is_out]

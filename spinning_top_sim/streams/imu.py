@@ -105,7 +105,7 @@ class Imu:
         """Return orientation and angular velocity of the body from those of the IMU."""
         x, y, z, w = self._mounting
         inverse = -x, -y, -z, w
-        return attitude.product(orientation, inverse), attitude.in_body(inverse, rates)
+        return attitude.product(orientation, inverse), attitude.rotated_back(inverse, rates)
 
     def true(self, states: States) -> tuple[Vector, Vector]:
         """Return angular velocity [rad/s] and specific force [m/s^2] in the frame of the IMU."""
@@ -137,7 +137,7 @@ class Imu:
         else:
             w1, w2, w3, f1, f2, f3 = np.concatenate([
                 self._low_pass.filtered(segment, times, self._signal)
-                for segment, times in samples.parts], axis=1)
+                for segment, times in samples.shares], axis=1)
             exact = (w1, w2, w3), (f1, f2, f3)
         if self._vibration.is_off:
             return exact
@@ -167,14 +167,14 @@ class Imu:
         x, y, z, w = increments.rotation
         v1, v2, v3 = increments.velocity
         if self._is_rotated:
-            x, y, z = attitude.in_body(self._mounting, (x, y, z))
+            x, y, z = attitude.rotated_back(self._mounting, (x, y, z))
         return (x, y, z, w), self.from_body((v1, v2, v3))
 
     def _body_increments(self, samples: Samples) -> Increments:
         """Return the increments over the intervals that end at these samples, n of each."""
         path, point = samples.path, self._lever_arm
         found: list[Increments] = []
-        for segment, times in samples.parts:
+        for segment, times in samples.shares:
             # Those that may be shorter, or contain a command, are computed one by one.
             since_ns = max(self._since_ns, segment.start_ns)
             single = len(range(times.start, since_ns + self.length_ns + 1, times.step))
@@ -190,18 +190,17 @@ class Imu:
     def motion(self, samples: Samples) -> tuple[Vector, Quaternion, Vector]:
         """Return position [m] and orientation in the world, velocity in the IMU's frame [m/s]."""
         states = samples.states
-        x, y, z = attitude.in_world(states.rows_quaternion, self._lever_arm)
+        x, y, z = attitude.rotated(states.rows_quaternion, self._lever_arm)
         v1, v2, v3 = states.velocity(self._lever_arm)
         if samples.pivot_moves:
             (a, b, c), (u, v, w), _ = samples.pivot
             x, y, z = x + a, y + b, z + c
-            u, v, w = attitude.in_body(states.rows_quaternion, (u, v, w))
+            u, v, w = attitude.rotated_back(states.rows_quaternion, (u, v, w))
             v1, v2, v3 = v1 + u, v2 + v, v3 + w
         return (x, y, z), self.orientation(states), self.from_body((v1, v2, v3))
 
     def from_body(self, vector: Vector) -> Vector:
-        # The mounting is q(body <- IMU), and `in_body` applies the inverse of its argument.
-        return attitude.in_body(self._mounting, vector) if self._is_rotated else vector
+        return attitude.rotated_back(self._mounting, vector) if self._is_rotated else vector
 
 
 class Sensor:
@@ -289,7 +288,7 @@ class Sensor:
             seconds * (reading - mean) for reading, mean in zip(
                 itertools.chain(*readings), itertools.chain(*means), strict=True))
         x, y, z = attitude.rotation_vector(rotation)
-        f1, f2, f3 = attitude.in_body(
+        f1, f2, f3 = attitude.rotated_back(
             attitude.quaternion_of_vector((-0.5 * x, -0.5 * y, -0.5 * z)),
             (force[0], force[1], force[2]))
         return (attitude.quaternion_of_vector((x + r1, y + r2, z + r3)),
@@ -306,9 +305,9 @@ def _six(values: Mapping[str, Any], error: str) -> tuple[float, ...]:
     return 3 * (rate,) + 3 * (force,)
 
 
-def _bias_paths(values: Mapping[str, Any]) -> list[noise.Path]:
+def _bias_paths(values: Mapping[str, Any]) -> list[noise.RandomPath]:
     """Return the parts of the bias that vary with time."""
-    path, paths = partial(noise.Path, values['seed']), []
+    path, paths = partial(noise.RandomPath, values['seed']), []
     if any(walk := _six(values, 'random_walk')):
         paths.append(path(noise.Purpose.WALK, (6 * (math.inf,),), (walk,)))
     if any(deviation := _six(values, 'bias_stddev')):

@@ -9,10 +9,9 @@ after `now_ns` empties the queue.
 
 import contextlib
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any
 
 from spinning_top_sim.physics.pivot import NEVER_NS
@@ -32,6 +31,22 @@ MOST_BYTES, MOST_STEPS, LONGEST_AHEAD_NS = 4 << 20, 256, 300_000_000
 Entry = tuple[int, int, bytes]
 # Takes messages of one stamp for a log, and their size together [bytes].
 Write = Callable[[Sequence[Entry], int], object]
+
+
+class Instant:
+    """
+    The messages of one time.
+
+    entries, size : for the log, and their size together [bytes]
+    publications : of outputs with subscribers
+    """
+
+    __slots__ = ('entries', 'publications', 'size')
+
+    def __init__(self) -> None:
+        self.entries: list[Entry] = []
+        self.publications: list[tuple[Output, bytes]] = []
+        self.size = 0
 
 
 @dataclass(eq=False)
@@ -71,7 +86,7 @@ class LiveSimulation(Simulation):
         self.outputs = [Output(stream) for stream in self.streams]
         self.computed_ns = -1
         self._write: Write = lambda entries, size: None
-        self._queue: deque[tuple[int, Output, bytes]] = deque()     # messages by time [ns]
+        self._queue: deque[tuple[int, Instant]] = deque()       # by time [ns]
         self._used: list[Output] = []               # those whose samples are in the queue
         # `version`, `epoch_ns`, and which outputs had no subscribers, when the queue was computed.
         self._holds_for: tuple[int, int, list[bool]] = -1, 0, []
@@ -120,7 +135,7 @@ class LiveSimulation(Simulation):
         try:
             while True:
                 while queue and queue[0][0] <= target_ns:
-                    self._send(queue[0][0], publish_from_ns)
+                    self._send(*queue.popleft(), publish_from_ns)
                 if self.computed_ns >= target_ns:
                     self.now_ns = max(self.now_ns, target_ns)
                     return True
@@ -167,22 +182,16 @@ class LiveSimulation(Simulation):
             self._queue.clear()
             self._work, self.computed_ns, self._block = None, self.now_ns, SMALLEST_BLOCK
 
-    def _send(self, t_ns: int, publish_from_ns: int) -> None:
-        """Send the first messages in the queue, those of one time, to the log before others."""
-        queue, stamp_ns = self._queue, self.epoch_ns + t_ns
-        instant = []
-        while queue and queue[0][0] == t_ns:
-            instant.append(queue.popleft())
-        entries = [(output.log_index, stamp_ns, message) for _, output, message in instant
-                   if output.log_index is not None]
-        if entries:
-            self._write(entries, sum(len(message) for *_, message in entries))
+    def _send(self, t_ns: int, instant: Instant, publish_from_ns: int) -> None:
+        """Send the messages of one time, to the log before others."""
+        if instant.entries:
+            self._write(instant.entries, instant.size)
         self.now_ns = t_ns
         if t_ns >= publish_from_ns:
-            for _, output, message in instant:
-                if output.publish is not None:
-                    output.publish(message)
-                    output.sent += 1
+            for output, message in instant.publications:
+                assert output.publish is not None       # `_refresh` sees when it is not
+                output.publish(message)
+                output.sent += 1
 
     def _compute(self, target_ns: int, publish_from_ns: int) -> None:
         """Finish the block under way, or compute one up to `target_ns` at most."""
@@ -224,11 +233,17 @@ class LiveSimulation(Simulation):
         return True
 
     def _append(self, block: Block) -> None:
-        messages: list[tuple[int, Output, bytes]] = []
-        for stream, times_ns, rows in block.parts:
+        """Put the messages of a block into the queue; what is done here is not done by a tick."""
+        instants: defaultdict[int, Instant] = defaultdict(Instant)
+        for stream, times_ns, rows in block.messages:
             output = next(one for one in self.outputs if one.stream is stream)
             data, size = rows.tobytes(), stream.size
-            messages += [(t_ns, output, data[begin:begin + size]) for t_ns, begin in zip(
-                times_ns.tolist(), range(0, len(data), size), strict=True)]
-        self._queue.extend(sorted(messages, key=itemgetter(0)))
+            for t_ns, begin in zip(times_ns.tolist(), range(0, len(data), size), strict=True):
+                instant, message = instants[t_ns], data[begin:begin + size]
+                if output.log_index is not None:
+                    instant.entries.append((output.log_index, self.epoch_ns + t_ns, message))
+                    instant.size += size
+                if output.publish is not None:
+                    instant.publications.append((output, message))
+        self._queue.extend(sorted(instants.items()))
         self.computed_ns = block.until_ns

@@ -35,7 +35,7 @@ class Magnetometer:
         self._noise = noise.SensorNoise(
             seed, noise.Purpose.MAG_WHITE, period_ns, np.full((3, 1), deviation),
             np.array(values['mag.hard_iron'])[:, np.newaxis],
-            [noise.Path(seed, noise.Purpose.MAG_WALK, (3 * (math.inf,),), (3 * (walk,),))]
+            [noise.RandomPath(seed, noise.Purpose.MAG_WALK, (3 * (math.inf,),), (3 * (walk,),))]
             if walk else ())
         self._events = [np.reshape(values[f'mag.disturbance.{frame}'], (-1, 5)).tolist()
                         for frame in ('world', 'body')]
@@ -43,7 +43,7 @@ class Magnetometer:
 
     def true(self, orientation: Quaternion) -> Vector:
         """Return the field [T] in frames with these orientations in the world."""
-        return attitude.in_body(orientation, self._field)
+        return attitude.rotated_back(orientation, self._field)
 
     def disturbed(self, exact: Vector, orientation: Quaternion,
                   from_body: Callable[[Vector], Vector], t_ns: NDArray[np.int64]) -> Vector:
@@ -57,7 +57,7 @@ class Magnetometer:
             return exact
         world, body = (_at(events, t_ns) for events in self._events)
         x, y, z = (one + outside + magnet for one, outside, magnet in zip(
-            exact, attitude.in_body(orientation, world), from_body(body), strict=True))
+            exact, attitude.rotated_back(orientation, world), from_body(body), strict=True))
         return x, y, z
 
     def read(self, exact: Vector, times: range) -> Vector:

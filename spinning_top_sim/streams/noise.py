@@ -37,7 +37,7 @@ def white(seed: int, purpose: Purpose, numbers: NDArray[np.int64], columns: int,
 
 
 @dataclass(frozen=True)
-class Path:
+class RandomPath:
     """
     Independent random functions of time, each a sum of Gauss-Markov processes.
 
@@ -76,7 +76,7 @@ class SensorNoise:
 
     def __init__(self, seed: int, purpose: Purpose, period_ns: int,
                  deviation: NDArray[np.float64], offset: NDArray[np.float64],
-                 paths: Sequence[Path] = ()) -> None:
+                 paths: Sequence[RandomPath] = ()) -> None:
         self._seed, self._purpose, self._period_ns = seed, purpose, period_ns
         # Adding 0.0 turns -0.0 into 0.0.
         self._deviation, self._offset, self._paths = deviation, offset + 0.0, paths
@@ -150,7 +150,7 @@ def _normal(seed: int, purpose: Purpose, number: int, columns: int,
 
 
 @lru_cache(8)
-def _path(path: Path, block: int) -> NDArray[np.float64]:
+def _path(path: RandomPath, block: int) -> NDArray[np.float64]:
     """Return the values of a path at the steps of a block, (DRAWN_TOGETHER, columns)."""
     parts, columns = np.shape(path.times)
     normal = _normal(path.seed, path.purpose, block, parts * columns).reshape(-1, parts, columns)
@@ -169,7 +169,7 @@ def _path(path: Path, block: int) -> NDArray[np.float64]:
 
 
 @lru_cache(256)
-def _begin(path: Path, block: int) -> NDArray[np.float64]:
+def _begin(path: RandomPath, block: int) -> NDArray[np.float64]:
     """
     Return the processes of a path where a block begins, (parts, columns).
 
@@ -190,7 +190,7 @@ def _begin(path: Path, block: int) -> NDArray[np.float64]:
                     _begin(path, block + apart), normal)
 
 
-def _between(path: Path, steps: int, before: NDArray[np.float64], after: NDArray[np.float64],
+def _between(path: RandomPath, steps: int, before: NDArray[np.float64], after: NDArray[np.float64],
              normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the processes half-way between two known values, `steps` away from each."""
     decay, gained = path.law(steps)

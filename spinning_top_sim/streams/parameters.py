@@ -342,7 +342,7 @@ def checked(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check_together(values: Mapping[str, Any]) -> None:
-    """Raise ValueError for values that only together, or with what is installed, are wrong."""
+    """Raise ValueError for values that are wrong only together."""
     def need(allowed: bool, name: str, text: str) -> None:
         value = values[name]
         if not allowed:

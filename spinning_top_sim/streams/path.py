@@ -59,13 +59,27 @@ class Segment:
     filtered : state of the low pass of the IMU at the start; None without one, or from t = 0 on
     """
 
-    def __init__(self, solver: Propagator, start: State, start_ns: int,
+    def __init__(self, solver: Propagator, start_ns: int, start: State | None = None,
                  ride: Ride | None = None) -> None:
-        self.solver, self.start, self.start_ns, self.ride = solver, start, start_ns, ride
+        self.solver, self.start_ns, self.ride, self._start = solver, start_ns, ride, start
         self.reached_ns = start_ns + solver.reached_ns
         self.filtered: NDArray[np.float64] | None = None
-        self._first = solver.states(range(1))
-        self.l3, self.lz = start.l3, start.lz
+
+    @property
+    def start(self) -> State:
+        return self._start or self.solver.start
+
+    @property
+    def l3(self) -> float:
+        return self.start.l3
+
+    @property
+    def lz(self) -> float:
+        return self.start.lz
+
+    @cached_property
+    def _first(self) -> States:
+        return self.solver.states(range(1))
 
     @cached_property
     def energy(self) -> float:

@@ -25,10 +25,10 @@ from spinning_top_sim.solvers.vertical import (
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.imu import LONGEST_NS
+from spinning_top_sim.streams.imu import LONGEST_NS, Imu
 from spinning_top_sim.streams.path import Path, Ride, Segment
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.streams.topics import ImuStream, all_streams
+from spinning_top_sim.streams.topics import all_streams
 
 # Steps that the first nanosecond of a motion may take, and those of a block offline, so that the
 # interpolants of these stay in the cache.
@@ -38,6 +38,33 @@ FIRST_STEPS, OFFLINE_STEPS = 500, 2000
 OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 4 << 20, 100 * NANOSECONDS, 20_000
 # Turns a second whose phases doubles hold up to the last stamp.
 MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
+
+
+class Command(NamedTuple):
+    """Momenta that were commanded [kg m^2/s], and when [ns]."""
+
+    t_ns: int
+    l3: float
+    lz: float
+
+
+class NewState(NamedTuple):
+    """A `State` that was set, and when [ns]."""
+
+    t_ns: int
+    theta: float
+    theta_dot: float
+    phi: float
+    psi: float
+    l3: float
+    lz: float
+
+
+class ImuRate(NamedTuple):
+    """Another `imu.rate` [Hz], and from when on [ns]."""
+
+    t_ns: int
+    rate: float
 
 
 class Drive(NamedTuple):
@@ -59,10 +86,8 @@ class Simulation:
     streams : every stream, whether it is switched on or not
     path : the motion
     now_ns : every sample up to here is done (-1: not even that of t = 0); may be set
-    history : what was applied since the start: commands as (t_ns, l3, lz), states that were set as
-        t_ns and the fields of `State`, changes of `imu.rate` as (t_ns, rate), velocities of the
-        pivot as `Drive`
-    pivot : the path of the pivot; None while it rests at the origin
+    history : what was applied since the start
+    pivot_path : of the pivot; None while it rests at the origin
     lz : as last commanded, about the vertical of the world [kg m^2/s]
     epoch_ns : stamp of t = 0 [ns]
     version : changes with all but `epoch_ns` that makes samples after `now_ns` other ones
@@ -70,7 +95,7 @@ class Simulation:
     Raises ValueError where there is no motion from the start state.
     """
 
-    _begun: Callable[..., PivotPath]    # the path of the newest `Drive`, from its `stop_ns`
+    _driven_path: Callable[..., PivotPath]      # of the newest `Drive`, from its `stop_ns`
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         self.version = 0
@@ -97,14 +122,14 @@ class Simulation:
         top, start = parameters.top_of(values), parameters.start_state(values)
         pivot = parameters.pivot_path(values)
         segment = _segment(top, start, 0, values, pivot)
-        streams = all_streams(values)
-        self.values, self.top, self.streams = dict(values), top, streams
-        self.imu = next(stream.imu for stream in streams if isinstance(stream, ImuStream))
-        self.history: list[tuple[Any, ...]] = []
+        self.imu = Imu(values)
+        self.values, self.top = dict(values), top
+        self.streams = all_streams(values, self.imu)
+        self.history: list[Command | NewState | ImuRate | Drive] = []
         self.now_ns = -1
         # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
-        self.pivot, self.lz = pivot, start.lz
+        self.pivot_path, self.lz = pivot, start.lz
         self.path = Path(segment, self._follow, self.imu.carry,
                          keep_ns=max(trace_ns, LONGEST_NS, self.imu.keep_ns),
                          keep_steps_ns=self.imu.keep_ns)
@@ -180,7 +205,7 @@ class Simulation:
         imu, rate = self.imu, changes.get('imu.rate')
         if rate is not None and imu.set_rate(rate, max(self.now_ns, 0)):
             self.path.keep_steps_ns = imu.keep_ns
-            self.history.append((max(self.now_ns, 0), rate))
+            self.history.append(ImuRate(max(self.now_ns, 0), rate))
         for stream in self.streams:
             stream.apply(changes)
         self.version += 1
@@ -205,7 +230,7 @@ class Simulation:
         self._continue(ContinuedState(
             theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
             psi=float(now.psi[0]), l3=l3, lz=lz))
-        self.history.append((self.now_ns, l3, lz))
+        self.history.append(Command(self.now_ns, l3, lz))
 
     def set_state(self, state: State) -> None:
         """
@@ -215,7 +240,7 @@ class Simulation:
         """
         self._settle()
         self._continue(state)
-        self.history.append((self.now_ns, *astuple(state)))
+        self.history.append(NewState(self.now_ns, *astuple(state)))
 
     def drive(self, velocity: Sequence[float], stop_ns: int | None = None) -> int | None:
         """
@@ -231,7 +256,7 @@ class Simulation:
         """
         target = checked_velocity(velocity)
         self._settle()
-        if self.pivot is None and not any(target):
+        if self.pivot_path is None and not any(target):
             return None
         if stop_ns is None:
             timeout_ns = round(self.values['pivot.cmd_timeout'] * NANOSECONDS)
@@ -239,19 +264,19 @@ class Simulation:
         last = self.history[-1] if self.history else None
         if isinstance(last, Drive) and last[1:4] == target and self.now_ns < last.stop_ns:
             # The motion up to now is the same.
-            self.pivot, segment = self._begun(stop_ns=stop_ns), self.segment
+            self.pivot_path, segment = self._driven_path(stop_ns=stop_ns), self.segment
             assert segment.ride is not None
-            segment.ride = segment.ride._replace(piece=self.pivot.lasting(segment.start_ns))
+            segment.ride = segment.ride._replace(piece=self.pivot_path.lasting(segment.start_ns))
             if self.path.end_after(self.now_ns):
                 self.version += 1
             self.history[-1] = last._replace(stop_ns=stop_ns)
             return stop_ns
         pivot = self.segment.pivot(np.array([self.now_ns]))
-        self._begun = partial(
+        self._driven_path = partial(
             PivotPath.to_velocity, target, position=pivot.position[:, 0].tolist(),
             velocity=pivot.velocity[:, 0].tolist(), start_ns=self.now_ns,
             most_acceleration=self.values['pivot.max_acceleration'])
-        self._continue(self.segment.posture(self.now_ns), self._begun(stop_ns=stop_ns))
+        self._continue(self.segment.posture(self.now_ns), self._driven_path(stop_ns=stop_ns))
         self.history.append(Drive(self.now_ns, *target, stop_ns))
         return stop_ns
 
@@ -263,9 +288,9 @@ class Simulation:
 
     def _continue(self, start: State | Posture, pivot: PivotPath | None = None) -> None:
         """Go on from another state, or from the present posture on another path of the pivot."""
-        pivot = pivot or self.pivot
+        pivot = pivot or self.pivot_path
         segment = _segment(self.top, start, self.now_ns, self.values, pivot)
-        self.pivot = pivot
+        self.pivot_path = pivot
         if isinstance(start, State):
             self.lz = start.lz
         self.path.go_on_with(segment)
@@ -275,7 +300,8 @@ class Simulation:
         """Return the segment behind the end of one: the pivot changes its acceleration."""
         while not last.reach(last.end_ns, OFFLINE_STEPS):
             pass
-        return _segment(self.top, last.posture(last.end_ns), last.end_ns, self.values, self.pivot)
+        return _segment(self.top, last.posture(last.end_ns), last.end_ns, self.values,
+                        self.pivot_path)
 
 
 def checked_velocity(velocity: Sequence[float]) -> tuple[float, float, float]:
@@ -292,8 +318,10 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
     """Return the motion from a start.  Raises ValueError if its first nanosecond shows none."""
     try:
         with np.errstate(over='ignore', invalid='ignore'):
-            segment = _begun(top, start, start_ns, values, pivot)
-            if isinstance(start, State) and not math.isfinite(segment.energy):
+            segment = _new_segment(top, start, start_ns, values, pivot)
+            # Steps are asked for their energy as long as the first one is kept.
+            if ((isinstance(start, State) or values['solver.method'] != 'exact')
+                    and not math.isfinite(segment.energy)):
                 raise ValueError(f'the energy would be {segment.energy!r} J')
         if not segment.reach(start_ns + 1, FIRST_STEPS):
             raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
@@ -314,23 +342,22 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
     return segment
 
 
-def _begun(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
+def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
            pivot: PivotPath | None) -> Segment:
     step = partial(propagate, method=values['solver.method'],
                    equations=values['solver.equations'], rtol=values['solver.rtol'],
                    atol=values['solver.atol'])
     if pivot is None:
         assert isinstance(start, State)
-        return Segment(step(top, start), start, start_ns)
+        return Segment(step(top, start), start_ns, start)
     posture, piece = start, pivot.lasting(start_ns)
     if isinstance(posture, State):
         posture = posture_of(top, posture)
     solver: Propagator
     if values['solver.method'] == 'exact':
         solver = AcceleratedMotion(top, posture, piece.acceleration)
-        vertical, state = solver.vertical, solver.start
+        vertical = solver.vertical
     else:
         vertical, halves = about_vertical(top, posture, piece.acceleration)
-        state = rounded(halves)
-        solver = step(vertical.top(top), state)
-    return Segment(solver, state, start_ns, Ride(top, vertical, piece))
+        solver = step(vertical.top(top), rounded(halves))
+    return Segment(solver, start_ns, ride=Ride(top, vertical, piece))

@@ -24,7 +24,7 @@ Result = TypeVar('Result')
 # Messages as rows (n, size): bytes or, of a table, numbers.
 Rows = NDArray[Any]
 # A segment and times in it [ns].
-Part = tuple[Segment, range]
+Share = tuple[Segment, range]
 # Times (n,) [ns] of messages, and the messages.
 Encoded = tuple[NDArray[np.int64], Rows]
 
@@ -34,17 +34,17 @@ class Samples:
     The motion at times of a block; the streams of one rate share it.
 
     path : the motion
-    parts : a segment and its times [ns], or several segments of one kind
+    shares : a segment and its times [ns], or several segments of one kind
     times : of the samples [ns]
     epoch_ns : stamp of t = 0 [ns]
     """
 
-    def __init__(self, path: Path, parts: Sequence[Part], epoch_ns: int) -> None:
-        self.path, self.parts, self.epoch_ns = path, parts, epoch_ns
-        self._segments = [segment for segment, _ in parts]
-        (_, first), (_, last) = parts[0], parts[-1]
+    def __init__(self, path: Path, shares: Sequence[Share], epoch_ns: int) -> None:
+        self.path, self.shares, self.epoch_ns = path, shares, epoch_ns
+        self._segments = [segment for segment, _ in shares]
+        (_, first), (_, last) = shares[0], shares[-1]
         self.times = range(first.start, last.stop, first.step)
-        self._counts = [len(times) for _, times in parts]
+        self._counts = [len(times) for _, times in shares]
         self._results: dict[Callable[..., Any], Any] = {}
 
     @cached_property
@@ -57,14 +57,14 @@ class Samples:
 
     @cached_property
     def states(self) -> States:
-        if len(self.parts) == 1:
+        if len(self.shares) == 1:
             return self._segments[0].states(self.times)
         return states_of(self._segments, self._counts, self.t_ns)
 
     @cached_property
     def pivot(self) -> Kinematics:
         """Position, velocity and acceleration of the pivot in the world, (3, n) each."""
-        if len(self.parts) == 1:
+        if len(self.shares) == 1:
             return self._segments[0].pivot(self.t_ns)
         return kinematics([segment.ride.piece for segment in self._segments if segment.ride],
                           self._counts, self.t_ns)
@@ -79,7 +79,11 @@ class Samples:
         return self._segments[0].orientation_error(self.states, self.times)
 
     def once(self, compute: Callable[['Samples'], Result]) -> Result:
-        """Return `compute(self)`, which is called for the first of the streams that ask for it."""
+        """
+        Return `compute(self)`, which is called for the first of the streams that ask for it.
+
+        Bound methods of one object are equal.
+        """
         if compute not in self._results:
             self._results[compute] = compute(self)
         result: Result = self._results[compute]
@@ -166,9 +170,9 @@ class Stream:
         return range((after_ns // self.period_ns + 1) * self.period_ns, until_ns + 1,
                      self.period_ns)
 
-    def encode(self, *parts: Samples) -> Encoded:
+    def encode(self, *samples: Samples) -> Encoded:
         """
-        Return the messages of samples, one part or more, in the order of time.
+        Return the messages of samples, whose times ascend.
 
         Returns
         -------
@@ -177,11 +181,14 @@ class Stream:
         rows : (n, size)
             The messages, valid until the next call.
         """
-        t_ns, epoch_ns = np.concatenate([one.t_ns for one in parts]), parts[0].epoch_ns
+        t_ns, epoch_ns = np.concatenate([one.t_ns for one in samples]), samples[0].epoch_ns
         stamps_ns = (epoch_ns + t_ns if self._timing is None
                      else self._timing.stamps_ns(epoch_ns, t_ns, self.period_ns))
-        rows = self.template.encode_parts(stamps_ns, [
-            (len(one.times), self.fields(one)) for one in parts])
+        try:
+            rows = self.template.encode_runs(stamps_ns, [
+                (len(one.times), self.fields(one)) for one in samples])
+        except ValueError as error:
+            raise ValueError(f'fields of {self.topic}: {error}') from error
         if self._timing is None:
             return t_ns, rows
         copies = self._timing.copies(t_ns, self.period_ns)

@@ -26,6 +26,7 @@ INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
               'quaternion_norm_error', 'orientation_error')
 TIMING = ('stamp_sec', 'stamp_nanosec', 'true_sec', 'true_nanosec', 'copies')
 ARRAY, ODOMETRY = 'std_msgs/msg/Float64MultiArray', 'nav_msgs/msg/Odometry'
+MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
 
 
 def _place(samples: Samples) -> Sequence[Any]:
@@ -45,7 +46,7 @@ def _velocity(samples: Samples) -> Vector:
     if not samples.pivot_moves:
         return messages.ORIGIN
     x, y, z = samples.pivot.velocity
-    return attitude.in_body(samples.states.rows_quaternion, (x, y, z))
+    return attitude.rotated_back(samples.states.rows_quaternion, (x, y, z))
 
 
 def _joints(samples: Samples) -> Sequence[Field]:
@@ -82,13 +83,6 @@ def _invariants(samples: Samples) -> Sequence[Field]:
     return ((*now, *drifts, states.norm_error, samples.orientation_error),)
 
 
-def _magnetic_field(imu: Imu, magnetometer: Callable[[int], Magnetometer], stream: Stream,
-                    samples: Samples) -> Sequence[Field]:
-    sensor, orientation = magnetometer(stream.period_ns), imu.orientation(samples.states)
-    field = sensor.disturbed(sensor.true(orientation), orientation, imu.from_body, samples.t_ns)
-    return sensor.read(field, samples.times), messages.diagonal(*3 * (sensor.variance,))
-
-
 class ImuStream(Stream):
     """Messages sensor_msgs/Imu, with the covariances for the present rate of the IMU."""
 
@@ -102,7 +96,7 @@ class ImuStream(Stream):
 
     def apply(self, changes: Mapping[str, Any]) -> None:
         super().apply(changes)
-        self.template = copy(self._template())
+        self.template = copy(self._template())      # `imu` has the new rate already
 
     def _template(self) -> Template:
         covariances = 3 * [messages.EXACT]
@@ -114,6 +108,22 @@ class ImuStream(Stream):
         if not self.has_orientation:
             covariances[0] = messages.UNKNOWN_ORIENTATION
         return messages.imu(self._frame_id, *covariances)
+
+
+class MagneticField(Stream):
+    """Readings of the magnetometer, a sample of which is taken for each message."""
+
+    def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
+        super().__init__(values, 'mag', 'imu/mag', MAGNETIC_FIELD,
+                         messages.stamped(values['imu.frame_id'], 3, 9), self._field)
+        self._imu, self._sensor_of = imu, lru_cache(4)(partial(Magnetometer, values))
+
+    def _field(self, samples: Samples) -> Sequence[Field]:
+        sensor = self._sensor_of(self.period_ns)
+        orientation = self._imu.orientation(samples.states)
+        field = sensor.disturbed(sensor.true(orientation), orientation, self._imu.from_body,
+                                 samples.t_ns)
+        return sensor.read(field, samples.times), messages.diagonal(*3 * (sensor.variance,))
 
 
 class Markers(Stream):
@@ -169,16 +179,16 @@ class Markers(Stream):
         return x, y, z
 
 
-def all_streams(values: Mapping[str, Any]) -> list[Stream]:
-    """Return every stream, in the order in which the samples of one time are sent."""
-    imu, world, body = Imu(values), values['world_frame'], values['body_frame']
+def all_streams(values: Mapping[str, Any], imu: Imu | None = None) -> list[Stream]:
+    """
+    Return every stream, in the order in which the samples of one time are sent.
+
+    imu : of which they are; None: one of these parameters
+    """
+    imu, world, body = imu or Imu(values), values['world_frame'], values['body_frame']
     frame, faults = values['imu.frame_id'], faults_of(values)
     stream, of_imu = partial(Stream, values), partial(ImuStream, values, imu)
     increment = partial(stream, 'increments', timing=faults, rate_parameter='imu.rate')
-    magnetic = partial(stream, 'mag', type_name='sensor_msgs/msg/MagneticField',
-                       template=messages.stamped(frame, 3, 9))
-    mag = magnetic('imu/mag')
-    mag.fields = partial(_magnetic_field, imu, lru_cache(4)(partial(Magnetometer, values)), mag)
     return [
         stream('clock', '/clock', 'rosgraph_msgs/msg/Clock', messages.clock()),
         stream('pose', 'pose', 'geometry_msgs/msg/PoseStamped', messages.stamped(world, 3, 4),
@@ -196,10 +206,11 @@ def all_streams(values: Mapping[str, Any]) -> list[Stream]:
         stream('imu_timing', 'ground_truth/imu_timing', ARRAY,
                messages.float64_multi_array(TIMING), partial(_timing, Timing(values), imu),
                rate_parameter='imu.rate'),
-        mag,
-        magnetic('ground_truth/mag', fields=lambda samples: (
-            attitude.in_body(imu.orientation(samples.states), values['mag.field']),
-            messages.EXACT)),
+        MagneticField(values, imu),
+        stream('mag', 'ground_truth/mag', MAGNETIC_FIELD, messages.stamped(frame, 3, 9),
+               lambda samples: (
+                   attitude.rotated_back(imu.orientation(samples.states), values['mag.field']),
+                   messages.EXACT)),
         Fix(values, 'gnss/fix'),
         Fix(values, 'ground_truth/gnss/fix', is_exact=True),
         Velocity(values, 'gnss/velocity'),

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line without ROS: simulate, and what is done with a log."""
+"""The commands that need no ROS, and what they share."""

@@ -77,7 +77,7 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
              for stream, labels in names.items()}
     recorded = journal.recorded_streams(list(names), values)
     for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
-        for stream, times_ns, encoded in block.parts:
+        for stream, times_ns, encoded in block.messages:
             once = np.diff(times_ns, prepend=-1) > 0        # a faulty sensor sends some twice
             numbers = np.vstack([field.T for field in stream.template.decode(encoded)])
             parts[stream].append((times_ns[once], numbers[:, once]))

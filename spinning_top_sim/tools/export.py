@@ -1,143 +1,157 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Writes files for other tools from a log.
+Write the top of a scene as a model for physics engines (MJCF, URDF, SDF), or
+reference trajectories and models of all scenes.
 
-TUM: "timestamp tx ty tz qx qy qz qw", in s and m (vision.in.tum.de, RGB-D dataset, file formats).
-EuRoC: state_groundtruth_estimate0/data.csv and imu0/data.csv (M. Burri et al., "The EuRoC micro
-aerial vehicle datasets", IJRR 35, 2016).  kalibr: imu.yaml (github.com/ethz-asl/kalibr, wiki "Yaml
-formats").
+exit codes:
+  0    done
+  1    a file cannot be written, or a library is missing
+  2    wrong arguments or parameters, or a top that no model has
 """
 
 import argparse
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+import json
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import yaml
-from numpy.typing import NDArray
+from spinning_top_sim.installation import parameter_files, version
+from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.stream import Samples, period_ns
+from spinning_top_sim.tools import cli, models, scene_file
+from spinning_top_sim.tools.table import UNITS, Table, write_csv, write_parquet
 
-from spinning_top_sim.physics import attitude
-from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools import cli
-from spinning_top_sim.tools.recorded_run import RunDescription
+COLUMNS = {**UNITS, **{f'{name}_{axis}': unit for name, unit in (
+    ('gyroscope', 'rad/s'), ('accelerometer', 'm/s^2'), ('pivot_acceleration', 'm/s^2'))
+    for axis in 'xyz'}}
+# The IMU where a scene has one at the pivot: off the axis and turned, so that its readings show
+# every term of a simulator's formulas.
+PLACE = {'imu.lever_arm': (0.03, -0.02, 0.05), 'imu.rpy': (0.3, -0.2, 1.1)}
+SUFFIXES = {'mjcf': 'mjcf.xml', 'urdf': 'urdf', 'sdf': 'sdf'}
 
-RAW, BIAS, ODOMETRY = 'imu/data_raw', 'ground_truth/imu_bias', 'ground_truth/imu_odom'
-KALIBR_NEEDS = tuple(f'imu.{kind}_{name}' for kind in ('accelerometer', 'gyroscope')
-                     for name in ('noise_density', 'random_walk'))
-EUROC_HEAD = ('#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],'
-              'q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1],'
-              'b_w_RS_S_x [rad s^-1],b_w_RS_S_y [rad s^-1],b_w_RS_S_z [rad s^-1],'
-              'b_a_RS_S_x [m s^-2],b_a_RS_S_y [m s^-2],b_a_RS_S_z [m s^-2]\n')
-EUROC_IMU_HEAD = ('#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
-                  'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n')
-FIX, VELOCITY = 'gnss/fix', 'gnss/velocity'
-FIX_HEAD = '#timestamp [ns],latitude [deg],longitude [deg],altitude [m]\n'
-VELOCITY_HEAD = '#timestamp [ns],v_east [m s^-1],v_north [m s^-1],v_up [m s^-1]\n'
+SCHEMA = """# Reference trajectories of the heavy symmetric top
 
+Written by spinning_top_sim {version}.
+Licence: CC0 1.0, https://creativecommons.org/publicdomain/zero/1.0/
 
-def add_argument(parser: argparse.ArgumentParser) -> None:
-    """Add the argument --export."""
-    parser.add_argument(
-        '--export', type=_parse, metavar='KIND:FILE', action='append', default=[],
-        help='write a file for other tools: tum or euroc, the true trajectory of the IMU; '
-        'euroc_imu, its readings (CSV); kalibr, its parameters (imu.yaml); gnss_fix and '
-        'gnss_velocity, what a receiver measures (CSV; nan: no fix); may be repeated; an existing '
-        'file is never overwritten')
+Each scene has `NAME.csv` and `NAME.parquet` with the same numbers, and models `NAME.mjcf.xml`,
+`NAME.urdf` and `NAME.sdf`. `scenes.json` has the top, the start and the IMU of each, in SI units:
+`lambda1` (moment of inertia across the axis, about the pivot), `lambda3` (along the axis), `mass`,
+`com_distance` (from the pivot along +z of the body), `gravity` (downwards), and the IMU's
+`lever_arm` in the body and its `rpy`, roll, pitch and yaw about fixed axes.
 
+A row is one time; there are {rate:g} a second, for {duration:g} s. The numbers are doubles. In CSV
+each has the shortest decimals, 17 at most, that are read back as the same double. The motion is
+the exact solution, evaluated in doubles.
 
-def _parse(text: str) -> tuple[str, Path]:
-    kind, colon, name = text.partition(':')
-    if kind not in KINDS or not name:
-        raise argparse.ArgumentTypeError(
-            f'{text}: must be KIND:FILE with one of {", ".join(KINDS)}, such as tum:truth.tum')
-    return kind, Path(name)
+The world has z up and its origin at the pivot. The body has its origin there too, and z along the
+symmetry axis. R(world <- body) = Rz(phi) Ry(theta) Rz(psi).
 
-
-def check(exports: Sequence[tuple[str, Path]], topics: Collection[str],
-          values: Mapping[str, Any]) -> None:
-    """Raise ValueError or OSError if files cannot be made of a run with these parameters."""
-    for kind, path in exports:
-        for topic in KINDS[kind][0]:
-            if topic not in topics:
-                raise ValueError(f'--export {kind}: the log has no {topic}')
-        for name in KALIBR_NEEDS if kind == 'kalibr' else ():
-            if not values[name] > 0.0:
-                raise ValueError(f'--export kalibr: {name} = {values[name]!r}: kalibr reads only '
-                                  'what is > 0')
-        cli.check_output(path)
-
-
-def write(reader: LogReader, run: RunDescription,
-          exports: Sequence[tuple[str, Path]]) -> Iterator[str]:
-    """Write the files; yield a line about each.  Raises ValueError or OSError."""
-    check(exports, run.topics, run.values_in_effect)
-    for kind, path in exports:
-        lines = KINDS[kind][1](reader, run)
-        first = next(lines, '')         # a run that is refused leaves no file
-        with open(path, 'x', encoding='utf-8') as file:
-            file.write(first)
-            file.writelines(lines)
-        yield f'{path}: {kind}'
+| column | unit | meaning |
+|---|---|---|
+{columns}
+Where the pivot moves (`pivot_moves` in scenes.json), theta is in [0, pi], and phi and psi are
+within two turns; energy and lz are those in the frame of the pivot about the effective vertical
+there, constant as long as the acceleration of the pivot is.
+"""
+MEANINGS = {
+    't': 'time since the start',
+    'theta phi psi': 'tilt from the upward vertical, precession and spin angle, unwrapped and '
+                     'continued through the poles',
+    'theta_dot phi_dot psi_dot': 'their rates',
+    'qx qy qz qw': 'attitude q(world <- body), its sign continuous',
+    'omega_1 omega_2 omega_3': 'angular velocity in the body',
+    'energy': 'kinetic energy + M g R cos(theta)',
+    'l3 lz': 'angular momentum along the axis and along the upward vertical',
+    'gyroscope_x gyroscope_y gyroscope_z': 'angular velocity in the frame of the IMU',
+    'accelerometer_x accelerometer_y accelerometer_z':
+        'acceleration minus gravity at the IMU, in its frame: +g upwards at rest',
+    'pivot_acceleration_x pivot_acceleration_y pivot_acceleration_z':
+        'acceleration of the pivot in the world, of the piece that ends where two meet'}
 
 
-def _tum(reader: LogReader, run: RunDescription) -> Iterator[str]:
-    for stamps_ns, (position, orientation, *_) in _blocks(reader, run, ODOMETRY):
-        stamps = (f'{stamp_ns // 10 ** 9}.{stamp_ns % 10 ** 9:09d}' for stamp_ns in stamps_ns)
-        yield from _rows(' ', stamps, position, orientation)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with these arguments, by default the program's; return its exit code."""
+    return cli.run('export', __doc__, argv, add_arguments, _run)
 
 
-def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
-    biases = [block for block in _blocks(reader, run, BIAS) if len(block[0])]
-    if not biases:
-        raise ValueError(f'--export euroc: the log has no sample of {BIAS}')
-    bias_ns = np.concatenate([stamps_ns for stamps_ns, _ in biases])
-    bias = np.concatenate([np.hstack(fields[1:]) for _, fields in biases])
-    yield EUROC_HEAD
-    for stamps_ns, (position, orientation, velocity, _) in _blocks(reader, run, ODOMETRY):
-        world = attitude.in_world(tuple(orientation.T), tuple(velocity.T))
-        # The bias of the last reading before the sample.
-        newest = np.maximum(np.searchsorted(bias_ns, stamps_ns, 'right') - 1, 0)
-        yield from _rows(',', stamps_ns, position, np.roll(orientation, 1, axis=1),
-                        np.column_stack(world), bias[newest])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    kind = parser.add_mutually_exclusive_group(required=True)
+    kind.add_argument('--model', choices=models.FORMATS, help='write one model to -o FILE')
+    kind.add_argument('--reference', metavar='FOLDER', type=Path,
+                      help='write trajectories (CSV, Parquet), models and a description of all '
+                      'scenes, or of the one that is given, into a new folder')
+    scene_file.add_parameters(parser)
+    parser.add_argument('-o', '--output', metavar='FILE', type=Path,
+                        help='file of the model; an existing one is never overwritten')
+    parser.add_argument('--duration', type=float, default=10.0, metavar='S',
+                        help='of the trajectories, default %(default)g s')
+    parser.add_argument('--rate', type=float, default=100.0, metavar='HZ',
+                        help='of the trajectories, default %(default)g Hz')
 
 
-def _csv(topic: str, head: str, first: int, reader: LogReader,
-         run: RunDescription) -> Iterator[str]:
-    """Yield the lines of a table of a topic, from that field of its messages on."""
-    yield head
-    for stamps_ns, fields in _blocks(reader, run, topic):
-        yield from _rows(',', stamps_ns, *fields[first:])
+def _run(arguments: argparse.Namespace) -> int:
+    given = scene_file.given(arguments)
+    files = [*scene_file.chosen_files(arguments), *map(Path, arguments.params)]
+    name = files[0].stem if files else 'spinning_top'
+    if arguments.model:
+        if arguments.output is None:
+            raise ValueError('--model: -o FILE must be given')
+        text = models.model(parameters.checked(given), arguments.model, name)
+        cli.check_output(arguments.output)
+        arguments.output.write_text(text, encoding='utf-8')
+        return cli.OK
+    if arguments.output is not None:
+        raise ValueError(f'-o {arguments.output}: must not be given with --reference')
+    for option, most in (('duration', parameters.LONGEST), ('rate', parameters.HIGHEST_RATE)):
+        if not 0.0 < getattr(arguments, option) <= most:
+            raise ValueError(f'--{option} {getattr(arguments, option)!r}: must be > 0 and '
+                             f'<= {most:g}')
+    scenes = {name: given} if files else {
+        stem: {**scene_file.read_scene(path), **given}
+        for stem, path in parameter_files('scene').items()}
+    cli.check_output(arguments.reference)
+    _write_reference(arguments.reference, {
+        name: parameters.checked({**PLACE, **values, 'solver.method': 'exact'})
+        for name, values in scenes.items()}, arguments.duration, arguments.rate)
+    return cli.OK
 
 
-def _rows(separator: str, stamps: Iterable[object],
-          *columns: NDArray[np.float64]) -> Iterator[str]:
-    for stamp, row in zip(stamps, np.hstack(columns).tolist(), strict=True):
-        yield f'{stamp}{separator}{separator.join(map(repr, row))}\n'
+def _write_reference(folder: Path, scenes: Mapping[str, Mapping[str, Any]], duration: float,
+                     rate: float) -> None:
+    """Write trajectories, models, scenes.json and README.md into a new folder."""
+    folder.mkdir(parents=True)
+    facts = {}
+    for name, values in scenes.items():
+        table = Table(period_ns(rate), COLUMNS, partial(_imu_and_pivot, Imu(values)))
+        rows = [rows for block in Simulation(values).play([table], round(duration * NANOSECONDS))
+                for _, _, rows in block.messages]
+        write_parquet(folder / f'{name}.parquet', rows, COLUMNS)
+        write_csv(folder / f'{name}.csv', rows, COLUMNS)
+        for file_format, suffix in SUFFIXES.items():
+            (folder / f'{name}.{suffix}').write_text(
+                models.model(values, file_format, name), encoding='utf-8')
+        start = models.start_of(values)
+        facts[name] = {'top': vars(parameters.top_of(values)), 'start': {
+            **vars(parameters.start_state(values)),
+            'quaternion_xyzw': start.quaternion[0].tolist(),
+            'angular_velocity_body': start.angular_velocity[0].tolist()},
+            'imu': {'lever_arm': values['imu.lever_arm'], 'rpy': values['imu.rpy']},
+            'pivot_moves': parameters.pivot_path(values) is not None}
+    (folder / 'scenes.json').write_text(json.dumps(facts, indent=2) + '\n', encoding='utf-8')
+    lines = (f'| {", ".join(f"`{name}`" for name in names.split())} | '
+             f'{COLUMNS[names.split()[0]]} | {text} |\n' for names, text in MEANINGS.items())
+    (folder / 'README.md').write_text(SCHEMA.format(
+        version=version(), rate=rate, duration=duration, columns=''.join(lines)), encoding='utf-8')
 
 
-def _kalibr(_: LogReader, run: RunDescription) -> Iterator[str]:
-    values = run.values_in_effect
-    content = {'rostopic': run.topics[RAW], 'update_rate': values['imu.rate'],
-               **{name.removeprefix('imu.'): values[name] for name in KALIBR_NEEDS}}
-    yield yaml.safe_dump(content, sort_keys=True, default_flow_style=None)
-
-
-def _blocks(reader: LogReader, run: RunDescription, topic: str,
-            ) -> Iterator[tuple[NDArray[np.int64], tuple[NDArray[np.float64], ...]]]:
-    """Yield stamps (n,) [ns] and fields of the messages of a stream, block by block."""
-    template = next(stream.template for stream in all_streams(run.values_in_effect)
-                    if stream.topic == topic)
-    for _, group in reader.groups([run.topics[topic]]):
-        data = b''.join(message.data for message in group if len(message.data) == len(template))
-        yield template.stamps_ns(data), template.decode(data)
-
-
-# Of each kind: the topics that it needs, and the generator of its text.
-KINDS: dict[str, tuple[Sequence[str], Callable[..., Iterator[str]]]] = {
-    'tum': ((ODOMETRY,), _tum), 'euroc': ((ODOMETRY, BIAS), _euroc),
-    'euroc_imu': ((RAW,), partial(_csv, RAW, EUROC_IMU_HEAD, 1)), 'kalibr': ((RAW,), _kalibr),
-    'gnss_fix': ((FIX,), partial(_csv, FIX, FIX_HEAD, 0)),
-    'gnss_velocity': ((VELOCITY,), partial(_csv, VELOCITY, VELOCITY_HEAD, 0))}
+def _imu_and_pivot(imu: Imu, samples: Samples) -> tuple[Column, ...]:
+    """Return the readings of a perfect IMU, and the acceleration of the pivot."""
+    rates, force = imu.true(samples.states)
+    return (*rates, *force, *samples.pivot.acceleration)

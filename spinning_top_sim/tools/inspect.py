@@ -26,10 +26,10 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.scan import count, seconds
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools import cli, export
+from spinning_top_sim.tools import cli, log_exports
 from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import MotionReport, Survey, survey
-from spinning_top_sim.tools.verify import Verdict, compare
+from spinning_top_sim.tools.verify import Comparison, compare
 
 DEGREES = math.degrees(1.0)
 # Rows of the table of a motion: text, field of Description and Measured, factor.
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='draw the turning top; likewise')
     add('--verify', action='store_true',
         help='compute the run again and compare every message byte for byte')
-    export.add_argument(parser)
+    log_exports.add_argument(parser)
     add('--json', action='store_true', help='print everything as JSON')
 
 
@@ -76,7 +76,7 @@ def _run(arguments: argparse.Namespace) -> int:
                                   quiet=arguments.json) as show:
                     verdict = compare(found.run, reader, end_ns, lambda stamp_ns: show(
                         (stamp_ns - begin_ns) / NANOSECONDS))
-            exported += export.write(reader, found.run, arguments.export)
+            exported += log_exports.write(reader, found.run, arguments.export)
     if arguments.json:
         print(json.dumps(_as_json(found, verdict), indent=2, allow_nan=False))
     else:
@@ -109,7 +109,7 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
                 raise
 
 
-def _as_json(found: Survey, verdict: Verdict | None) -> object:
+def _as_json(found: Survey, verdict: Comparison | None) -> object:
     """Return the findings for JSON; docs/log_format.md has the keys."""
     damage, run = found.damage, found.run
     content: dict[str, object] = {
@@ -145,7 +145,7 @@ def _fields_of(source: object, *names: str) -> dict[str, object]:
     return {name: getattr(source, name) for name in names}
 
 
-def _as_text(found: Survey, verdict: Verdict | None) -> Iterator[str]:
+def _as_text(found: Survey, verdict: Comparison | None) -> Iterator[str]:
     """Yield the findings as lines of text."""
     damage, run = found.damage, found.run
     state = ('whole' if found.whole and not damage.defects else
@@ -220,7 +220,7 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
                'with; --verify compares each message')
 
 
-def _verdict(verdict: Verdict) -> Iterator[str]:
+def _verdict(verdict: Comparison) -> Iterator[str]:
     for warning in verdict.warnings:
         yield f'verify: {warning}: the last bits may differ for that'
     compared = sum(verdict.compared.values())

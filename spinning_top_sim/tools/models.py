@@ -135,7 +135,7 @@ FORMATS: dict[str, Callable[[Mapping[str, Any], str], str]] = {
 def _facts(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield what each file says about its start and its pivot."""
     start = start_of(values)
-    world = attitude.in_world(start.rows_quaternion, tuple(start.angular_velocity[0]))
+    world = attitude.rotated(start.rows_quaternion, tuple(start.angular_velocity[0]))
     yield f'Attitude at the start, q(world <- body) as x y z w: {_text(*start.quaternion[0])}'
     yield f'Angular velocity at the start in the body: {_text(*start.angular_velocity[0])} rad/s,'
     yield f'in the world: {_text(*np.concatenate(world))} rad/s'

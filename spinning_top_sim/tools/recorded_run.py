@@ -5,17 +5,17 @@ import contextlib
 import json
 import operator
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.recording.reader import LogReader, LogTopic
-from spinning_top_sim.recording.writer import METADATA_NAME
+from spinning_top_sim.recording.recorder import METADATA_NAME
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import ENCAPSULATION
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.simulation import Command, Drive, ImuRate, NewState, Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
@@ -26,10 +26,12 @@ MOST_TEXT = 300             # of a reason
 # What is computed for a log at most: for a small one, and more for each of its bytes.
 LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
 LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
-# Numbers of the events that begin another motion at the present time, in the order of
-# `Simulation.history`.
-FIELDS_OF = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fields(State)),
-             'drive': ('x', 'y', 'z', 'stop_ns')}
+# What entries of `Simulation.history` have after their time, by the events that record them; they
+# differ in the count of numbers.
+APPLIED = {'command': Command._fields[1:], 'state': NewState._fields[1:],
+           'parameters': ImuRate._fields[1:], 'drive': Drive._fields[1:]}
+# Numbers of the events that begin another motion at the present time.
+FIELDS_OF = {name: APPLIED[name] for name in ('command', 'state', 'drive')}
 # Names in the message definition of the arrays of numbers in a template, in their order, by topic
 # or by type.
 FIELDS = {
@@ -149,12 +151,11 @@ def _journal(reader: LogReader, topic: str | None, epoch_ns: int,
 
 def _applied_before(epoch_ns: int, t_ns: int, *numbers: float) -> Event:
     """Return an entry of `Simulation.history` as an event.  Raises ValueError for other counts."""
-    if len(numbers) == 1:
-        rate = parameters.BY_NAME['imu.rate'].check(numbers[0])
-        return Event('parameters', epoch_ns + t_ns, t_ns, t_ns, {'imu.rate': rate})
-    name = next(name for name, keys in FIELDS_OF.items() if len(numbers) == len(keys))
-    return Event(name, epoch_ns + t_ns, t_ns, t_ns,
-                 dict(zip(FIELDS_OF[name], numbers, strict=True)))
+    name = next(name for name, keys in APPLIED.items() if len(numbers) == len(keys))
+    details = dict(zip(APPLIED[name], numbers, strict=True))
+    if name == 'parameters':
+        details = {'imu.rate': parameters.BY_NAME['imu.rate'].check(details['rate'])}
+    return Event(name, epoch_ns + t_ns, t_ns, t_ns, details)
 
 
 def reason_of(error: Exception) -> str:

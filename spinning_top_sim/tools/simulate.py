@@ -18,15 +18,15 @@ from typing import Any
 
 from spinning_top_sim.recording.provenance import provenance
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream, period_ns
-from spinning_top_sim.tools import cli, export, scene_file
+from spinning_top_sim.tools import cli, log_exports, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
 from spinning_top_sim.tools.table import RIDE_UNITS, Table, write_csv, write_parquet
 
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--namespace', default='/', help='of the topics in the log')
     add('--format', choices=FORMATS,
         help='format of the output; default: by the extension of its name')
-    export.add_argument(parser)
+    log_exports.add_argument(parser)
     add('--quiet', action='store_true', help='no progress, no summary')
 
 
@@ -77,7 +77,7 @@ def _run(arguments: argparse.Namespace) -> int:
     simulation = Simulation(values, round(epoch_ns))
     if simulation.top.objection:
         cli.print_line(f'spinning-top simulate: warning: {simulation.top.objection}', sys.stderr)
-    export.check(arguments.export, [stream.topic for stream in journal.recorded_streams(
+    log_exports.check(arguments.export, [stream.topic for stream in journal.recorded_streams(
         simulation.streams, values)], values)
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
@@ -88,7 +88,7 @@ def _run(arguments: argparse.Namespace) -> int:
     lines = [f'{output}: {summary}']
     if arguments.export:
         with LogReader(output) as reader:
-            lines += export.write(reader, read_run_description(reader), arguments.export)
+            lines += log_exports.write(reader, read_run_description(reader), arguments.export)
     if not arguments.quiet:
         for line in lines:
             cli.print_line(line)
@@ -101,13 +101,13 @@ def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Se
                  show: Callable[[float], object]) -> Mapping[str, str]:
     """Write a table; return the units of its columns."""
     table = Table(period_ns(simulation.values['pose.rate']))
-    if simulation.pivot:
+    if simulation.pivot_path:
         table = Table(table.period_ns, RIDE_UNITS, lambda samples: (
             *samples.pivot.position, *samples.pivot.velocity))
     write = write_csv if file_format == 'csv' else write_parquet
     # A command changes the rows after its time.
     write(path, (rows for done in _play(simulation, [table], stops, show)
-                 if isinstance(done, Block) for _, _, rows in done.parts), table.units)
+                 if isinstance(done, Block) for _, _, rows in done.messages), table.units)
     return table.units
 
 
@@ -180,7 +180,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
         for done in _play(simulation, streams, stops, show):
             if isinstance(done, Block):
                 file.append_rows([(streams.index(stream), epoch_ns + t_ns, rows)
-                                  for stream, t_ns, rows in done.parts])
+                                  for stream, t_ns, rows in done.messages])
             else:
                 t_ns, (l3, lz) = simulation.now_ns, done
                 file.append(events_topic, epoch_ns + t_ns, journal.event(

@@ -5,7 +5,26 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+
+class Fault(NamedTuple):
+    """
+    A fault that was found.
+
+    Parameters
+    ----------
+    name : str
+        One of FAULTS.
+    evidence : str
+        Why it is reported.
+    number : float
+        What was measured, such as a lag or a coefficient; NaN where there is none.
+    """
+
+    name: str
+    evidence: str
+    number: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -17,14 +36,14 @@ class Verdict:
     ----------
     subject : str
         Name of what was judged.
-    found : sequence
-        The faults, with `name` and `evidence`.
+    found : sequence of Fault
+        The faults with their evidence.
     measures : mapping
         Measures by name; NaN: could not be measured.
     """
 
     subject: str
-    found: Sequence[Any]
+    found: Sequence[Fault]
     measures: Mapping[str, float]
     # Of each measure that needs a word: what it is, and from where on it is a fault.
     meanings: ClassVar[Mapping[str, str]] = {}

@@ -38,7 +38,7 @@ class Difference(NamedTuple):
 
 
 @dataclass
-class Verdict:
+class Comparison:
     """The result of a comparison."""
 
     compared: dict[str, int]              # messages that both have, by topic
@@ -59,7 +59,7 @@ class Verdict:
 
 
 def compare(run: RunDescription, reader: LogReader, end_ns: int,
-            show: Callable[[int], None]) -> Verdict:
+            show: Callable[[int], None]) -> Comparison:
     """
     Compute the run of a log while the log is read in the order of time; return the result.
 
@@ -67,7 +67,7 @@ def compare(run: RunDescription, reader: LogReader, end_ns: int,
     show : takes the log time that is reached [ns]
     """
     topics = (*run.topics.values(), run.commands_topic)
-    verdict = Verdict(dict.fromkeys(filter(None, topics), 0), warnings=_warnings(run))
+    verdict = Comparison(dict.fromkeys(filter(None, topics), 0), warnings=_warnings(run))
     for stamp_ns, reason in run.broken:
         verdict.different += 1
         verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
@@ -96,13 +96,13 @@ def compare(run: RunDescription, reader: LogReader, end_ns: int,
     return verdict
 
 
-def _compute(run: RunDescription, end_ns: int, computed: _Computed, verdict: Verdict,
+def _compute(run: RunDescription, end_ns: int, computed: _Computed, verdict: Comparison,
              show: Callable[[int], None]) -> Iterator[float]:
     """Compute the run; yield the log times before which all is computed, at last infinity."""
     try:
         for simulation, event in rerun(run, end_ns, samples=True):
             if isinstance(event, Block):
-                for stream, times_ns, rows in event.parts:
+                for stream, times_ns, rows in event.messages:
                     topic = run.topics[stream.topic]
                     for t_ns, row in zip(times_ns.tolist(), rows, strict=True):
                         computed[simulation.epoch_ns + t_ns, topic].append((stream, row.tobytes()))
@@ -118,7 +118,7 @@ def _compute(run: RunDescription, end_ns: int, computed: _Computed, verdict: Ver
     yield math.inf
 
 
-def _miss(computed: _Computed, verdict: Verdict, before_ns: float) -> None:
+def _miss(computed: _Computed, verdict: Comparison, before_ns: float) -> None:
     """Count the computed messages before a time that the log does not have."""
     for key in [key for key in computed if key[0] < before_ns]:
         verdict.missing += len(computed.pop(key))

@@ -31,14 +31,14 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.journal import NODE_NAME
 from spinning_top_sim.tools.scene_file import read_scene
-from spinning_top_sim.view import model
+from spinning_top_sim.view import shapes
 from spinning_top_sim.view.controls import Controls
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
 from spinning_top_sim.view.track import (
     ENERGY_DRIFT,
     ORIENTATION_ERROR,
     WIDTHS,
-    Samples,
+    Series,
     Track,
     empty,
 )
@@ -49,7 +49,7 @@ INBOX = 2000                    # messages that wait for the next picture
 ANSWER_S = 5.0                  # timeout of a service call
 SILENT_S = 5.0                  # timeout of /diagnostics, which come every second
 RESTART_NS = NANOSECONDS        # a step back of the stamps by more is another run
-KEPT_NS = 2 * max(WINDOW_NS, model.TRACE_NS)
+KEPT_NS = 2 * max(WINDOW_NS, shapes.TRACE_NS)
 KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom': Odometry,
            'ground_truth/imu': Imu}
 
@@ -84,7 +84,7 @@ class LiveView(Node):
                 ('record', SetBool), ('step', Trigger), ('reset', Trigger))}
         self._track: Track | None = None
         self._stale = True              # the parameters have to be read, as after a reset
-        self._origin_ns: int | None = None      # stamp of t = 0; unknown before /diagnostics
+        self._epoch_ns: int | None = None      # stamp of t = 0; unknown before /diagnostics
         self._errors: tuple[float, float] | None = None         # from /diagnostics, not drawn yet
         self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
         self._gone = False              # whether the page says that the node has ended
@@ -114,7 +114,7 @@ class LiveView(Node):
         needed = {'pose', 'joint_states'}
         if self.count_publishers(throttle.TOPICS['ground_truth/odom']):     # both in one
             needed = {'ground_truth/odom'}
-        if self._page.arrows[model.ARROWS.index('specific force')].value:
+        if self._page.arrows[shapes.ARROWS.index('specific force')].value:
             needed |= {'ground_truth/imu'}
         for topic in needed - self._listeners.keys():
             self._listen(topic)
@@ -127,10 +127,10 @@ class LiveView(Node):
                 self._heard_at = time.monotonic()
                 numbers = {pair.key: pair.value for pair in status.values}
                 self._controls.tell_status(status.message, numbers)
-                origin_ns = int(numbers['stamp of t = 0 [ns]'])
-                if self._origin_ns not in (None, origin_ns):
+                epoch_ns = int(numbers['stamp of t = 0 [ns]'])
+                if self._epoch_ns not in (None, epoch_ns):
                     self._stale = True      # not `|=`: that could undo what `choose` writes
-                self._origin_ns = origin_ns
+                self._epoch_ns = epoch_ns
                 self._errors = float(numbers['energy drift']), float(
                     numbers['orientation error [rad]'])
 
@@ -167,13 +167,13 @@ class LiveView(Node):
         if self._errors is not None:
             row = np.full((1, WIDTHS['~/invariants']), math.nan)
             row[0, [ENERGY_DRIFT, ORIENTATION_ERROR]] = self._errors
-            track.add('~/invariants', Samples(np.array([newest_ns]), row))
+            track.add('~/invariants', Series(np.array([newest_ns]), row))
             self._errors = None
-        track.drop_before(max(newest_ns - KEPT_NS, min(self._origin_ns or 0, newest_ns)))
+        track.drop_before(max(newest_ns - KEPT_NS, min(self._epoch_ns or 0, newest_ns)))
         track.detect_motion()
         if track.motions:
             self._controls.show_spin(track.motions[-1].l3, track.motions[-1].lz)
-        self._page.draw(newest_ns, self._origin_ns or newest_ns)
+        self._page.draw(newest_ns, self._epoch_ns or newest_ns)
 
     def _take_messages(self) -> None:
         """Add the messages of the inbox to the track."""

@@ -20,7 +20,7 @@ from spinning_top_sim.tools import recorded_run, svg
 from spinning_top_sim.tools.attitudes import LAYOUTS, decode
 from spinning_top_sim.view import plots, text
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
-from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Samples, Track, joined
+from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Series, Track, joined
 
 SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
 LONGEST_HTML_S = 60.0
@@ -41,7 +41,7 @@ def _read_log(path: Path, name: str) -> Track:
             notes.append(str(error))
         else:
             track = Track(name, run.values_in_effect)
-            track.origin_ns = run.epoch_ns
+            track.epoch_ns = run.epoch_ns
             _read_samples(reader, track, run.topics)
             try:
                 _follow_run(track, run, reader.span[1])
@@ -77,10 +77,10 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
                 if 0.5 < norm < 2.0:
                     found[stamp_ns] = quaternion / norm
         if found:
-            rows = Samples(np.array(list(found), np.int64), np.pad(
+            rows = Series(np.array(list(found), np.int64), np.pad(
                 np.array(list(found.values())), ((0, 0), (0, 3))))
             track.add('pose', rows)
-            track.origin_ns = track.span[0]
+            track.epoch_ns = track.span[0]
             break
     return track
 
@@ -106,8 +106,8 @@ class Player:
 
     def __init__(self, page: Page, tracks: Sequence[Track]) -> None:
         self._page = page
-        self._origin_ns = tracks[0].origin_ns       # t = 0 of all logs coincides
-        shifts_ns = [track.origin_ns - self._origin_ns for track in tracks]
+        self._epoch_ns = tracks[0].epoch_ns       # t = 0 of all logs coincides
+        shifts_ns = [track.epoch_ns - self._epoch_ns for track in tracks]
         shifted = list(zip(tracks, shifts_ns, strict=True))
         self._begin_ns = min(track.span[0] - shift_ns for track, shift_ns in shifted)
         self.length = self._seconds(max(track.span[1] - shift_ns for track, shift_ns in shifted))
@@ -165,19 +165,19 @@ class Player:
         self.draw(self._now)
 
     def draw(self, now: float) -> None:
-        self._page.draw(self._begin_ns + round(now * NANOSECONDS), self._origin_ns)
+        self._page.draw(self._begin_ns + round(now * NANOSECONDS), self._epoch_ns)
 
     def write_html(self, path: Path) -> str:
         """Write a file that plays the first minute by itself; return its length and size."""
         page, begin_ns = self._page, self._begin_ns
         clock = page.server.scene.add_frame('/clock', show_axes=False)
-        start = (begin_ns - self._origin_ns) / NANOSECONDS
+        start = (begin_ns - self._epoch_ns) / NANOSECONDS
         clock.position = (start, 0.0, 0.0)          # read by the script of the file
         self.draw(0.0)
         seconds = min(self.length, LONGEST_HTML_S)
-        words = ''.join(page.words(begin_ns + round(second * NANOSECONDS), self._origin_ns)
+        words = ''.join(page.words(begin_ns + round(second * NANOSECONDS), self._epoch_ns)
                         for second in [0.0, *self._commands] if second <= seconds)
-        tops = page.shown(begin_ns, self._origin_ns, begin_ns,
+        tops = page.shown(begin_ns, self._epoch_ns, begin_ns,
                           begin_ns + round(seconds * NANOSECONDS))
         serializer = page.server.get_scene_serializer()
         for picture in range(1, int(seconds * RATE) + 1):

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: scene, words and plots, made with viser; the same for logs and for a running node."""
+"""
+The page: scene, words and plots, made with viser; the same for logs and for a running node.
+
+On the page are tops whose motions began at different dates.  `page_ns` is a stamp of the first
+one; a stamp of another is `page_ns + shift_ns`, so that the t = 0 of all coincide.
+"""
 
 import math
 import time
@@ -11,7 +16,7 @@ import viser
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import svg
-from spinning_top_sim.view import body, model, plots, text
+from spinning_top_sim.view import body, plots, shapes, text
 from spinning_top_sim.view.server import Server
 from spinning_top_sim.view.track import DescribedMotion, Track
 
@@ -52,7 +57,7 @@ class DrawnTop:
 
     def __init__(self, scene: viser.SceneApi, number: int, track: Track, shift_ns: int) -> None:
         self.track, self.shift_ns = track, shift_ns
-        name, far = f'/top{number}', model.reach(track)
+        name, far = f'/top{number}', shapes.reach(track)
         radius = abs(far)
         self.root = scene.add_frame(name, show_axes=False)
         self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
@@ -76,10 +81,10 @@ class DrawnTop:
         self._arrows = [scene.add_arrows(
             f'{name}/{arrow.replace(" ", "_")}', NO_LINES, colour,
             shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
-            visible=False) for arrow, colour in zip(model.ARROWS, ARROW_COLOURS, strict=True)]
+            visible=False) for arrow, colour in zip(shapes.ARROWS, ARROW_COLOURS, strict=True)]
         self._colour = np.array(TRACES[number])
         self._limits: tuple[float, float] | None = None         # that are drawn [rad]
-        self.drawn: tuple[int, model.Vectors] | None = None
+        self.drawn: tuple[int, shapes.Vectors] | None = None
         self._shown: object = None                      # stamp and switches of the picture
 
     def motion(self, page_ns: int) -> DescribedMotion | None:
@@ -101,15 +106,15 @@ class DrawnTop:
         self._body.wxyz = (w, x, y, z)
         self._trace.visible = self._sphere.visible = trace
         if trace:
-            self._draw_trace(model.trace(self.track, stamp_ns))
-        for name, arrow, on in zip(model.ARROWS, self._arrows, arrows, strict=True):
+            self._draw_trace(shapes.trace(self.track, stamp_ns))
+        for name, arrow, on in zip(shapes.ARROWS, self._arrows, arrows, strict=True):
             arrow.visible = on
-            vector = model.arrow(self.track, name, stamp_ns) if on else None
-            arrow.points = NO_LINES if vector is None else model.segments(
+            vector = shapes.arrow(self.track, name, stamp_ns) if on else None
+            arrow.points = NO_LINES if vector is None else shapes.segments(
                 np.vstack((np.zeros(3), vector)))
         self._draw_bounds(self.motion(page_ns), bounds)
 
-    def _draw_trace(self, lines: model.Lines) -> None:
+    def _draw_trace(self, lines: shapes.Lines) -> None:
         """Draw a trace that fades with its age; the colours of a line's points are linear."""
         lines = lines if len(lines) else NO_LINES
         if len(lines) != len(self._trace.points):
@@ -126,7 +131,7 @@ class DrawnTop:
             return
         self._limits = moves.theta_min, moves.theta_max
         for bound, theta in zip(self._bounds, self._limits, strict=True):
-            bound.points = model.circle(model.reach(self.track), theta)
+            bound.points = shapes.circle(shapes.reach(self.track), theta)
         # A top that comes low hangs from above.
         self._stand.wxyz = (1, 0, 0, 0) if moves.theta_max < STANDS_TO else (0, 1, 0, 0)
 
@@ -138,7 +143,7 @@ class Page:
     title : such as the name of the log
     controls : the folder for the controls of the source of the samples
     message : what was done, or the reason why not
-    arrows : the switches of model.ARROWS
+    arrows : the switches of shapes.ARROWS
     """
 
     def __init__(self, title: str, host: str, port: int | None) -> None:
@@ -158,7 +163,7 @@ class Page:
         with gui.add_folder('Show'):
             self._trace = gui.add_checkbox('trace of the axis', True)
             self._bounds = gui.add_checkbox('bounds of θ', True)
-            self.arrows = [gui.add_checkbox(name, False) for name in model.ARROWS]
+            self.arrows = [gui.add_checkbox(name, False) for name in shapes.ARROWS]
             self._over = gui.add_checkbox('one over the other', False, visible=False)
         self._accuracy_folder = gui.add_folder('Accuracy', expand_by_default=False)
         with self._accuracy_folder:
@@ -185,7 +190,7 @@ class Page:
         scene = self.server.scene
         self._tops = [DrawnTop(scene, number, track, shift_ns) for number, (track, shift_ns)
                       in enumerate(zip(tracks, shifts_ns, strict=True))]
-        size = self._reach = max(abs(model.reach(track)) for track in tracks)
+        size = self._reach = max(abs(shapes.reach(track)) for track in tracks)
         self._over.visible = len(tracks) > 1
         self._bounds.visible = self._accuracy_folder.visible = any(
             track.has_body for track in tracks)
@@ -202,11 +207,11 @@ class Page:
         camera.look_at = (0.0, 0.0, 0.1 * size)
         camera.near, camera.far = 0.01 * size, 100.0 * size
 
-    def draw(self, page_ns: int, origin_ns: int) -> None:
+    def draw(self, page_ns: int, epoch_ns: int) -> None:
         """
         Draw all tops at a stamp of the page [ns].
 
-        origin_ns : stamp of t = 0
+        epoch_ns : stamp of t = 0
         """
         arrows = [switch.value for switch in self.arrows]
         side = 0.0 if self._over.value else 1.3 * self._reach
@@ -222,24 +227,24 @@ class Page:
                 top.draw(page_ns, trace=self._trace.value, bounds=self._bounds.value,
                          arrows=arrows)
         if self._number % PLOT_EVERY == 0:
-            tops = self.shown(page_ns, origin_ns, page_ns - WINDOW_NS, page_ns)
+            tops = self.shown(page_ns, epoch_ns, page_ns - WINDOW_NS, page_ns)
             set_content(self._plots, ''.join(map(svg.draw, plots.motion_plots(tops))))
             set_content(self._accuracy, ''.join(map(svg.draw, plots.accuracy_plots(tops))))
-            set_content(self._words, self.words(page_ns, origin_ns))
+            set_content(self._words, self.words(page_ns, epoch_ns))
             set_content(self._legend, self.legend())
         self._number += 1
 
-    def shown(self, page_ns: int, origin_ns: int, begin_ns: int,
+    def shown(self, page_ns: int, epoch_ns: int, begin_ns: int,
               end_ns: int) -> list[plots.Shown]:
         """Return what is plotted of the tops at a stamp, for a span of stamps of the page."""
         return [plots.Shown(top.track, *(stamp_ns + top.shift_ns for stamp_ns in (
-            page_ns, begin_ns, end_ns, origin_ns))) for top in self._tops]
+            page_ns, begin_ns, end_ns, epoch_ns))) for top in self._tops]
 
-    def words(self, page_ns: int, origin_ns: int) -> str:
+    def words(self, page_ns: int, epoch_ns: int) -> str:
         """Return HTML about the motions and the samples that are drawn."""
         drawn = [(top, top.track.attitudes.at(page_ns + top.shift_ns)) for top in self._tops]
         return ''.join(text.words(top.track, top.motion(page_ns), sample[0],
-                                  sample[0] - top.shift_ns - origin_ns) if sample else
+                                  sample[0] - top.shift_ns - epoch_ns) if sample else
                        f'<p>{top.track.name} {NO_SAMPLES}</p>' for top, sample in drawn)
 
     def legend(self) -> str:
@@ -251,5 +256,5 @@ class Page:
         if self._bounds.value and any(top.track.motions for top in self._tops):
             entries.append((BOUNDS, 'bounds of θ'))
         entries += [(colour, name) for name, colour, switch in zip(
-            model.ARROWS, ARROW_COLOURS, self.arrows, strict=True) if switch.value]
+            shapes.ARROWS, ARROW_COLOURS, self.arrows, strict=True) if switch.value]
         return text.legend(entries)

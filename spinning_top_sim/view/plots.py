@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.regimes import effective_potential
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.svg import Line, Plot
-from spinning_top_sim.view import model
+from spinning_top_sim.view import shapes
 from spinning_top_sim.view.track import (
     ENERGY_DRIFT,
     ORIENTATION_ERROR,
     PRECESSION,
-    Samples,
+    Series,
     Track,
 )
 
@@ -33,12 +33,12 @@ class Shown(NamedTuple):
     stamp_ns: int
     begin_ns: int
     end_ns: int
-    origin_ns: int
+    epoch_ns: int
 
     def seconds(self, stamps_ns: NDArray[np.int64]) -> Reals:
-        return (stamps_ns - self.origin_ns) / NANOSECONDS
+        return (stamps_ns - self.epoch_ns) / NANOSECONDS
 
-    def part(self, samples: Samples) -> tuple[Reals, Reals]:
+    def part(self, samples: Series) -> tuple[Reals, Reals]:
         stamps_ns, rows = samples.part(self.begin_ns, self.end_ns).thinned(POINTS)
         return self.seconds(stamps_ns), rows
 
@@ -48,19 +48,19 @@ def motion_plots(tops: Sequence[Shown]) -> list[Plot]:
     potential, energy, tilt, rate = (list[Line]() for _ in range(4))
     for top, dash in zip(tops, ('', '5 3'), strict=False):
         potential += _potential(top, dash)
-        stamps_ns, axis, _ = model.path(top.track, top.begin_ns, top.end_ns)
-        stamps_ns, axis = Samples(stamps_ns, axis).thinned(POINTS)
-        tilt.append(Line('θ', RED, top.seconds(stamps_ns), model.tilt(axis), dash))
+        stamps_ns, axis, _ = shapes.path(top.track, top.begin_ns, top.end_ns)
+        stamps_ns, axis = Series(stamps_ns, axis).thinned(POINTS)
+        tilt.append(Line('θ', RED, top.seconds(stamps_ns), shapes.tilt(axis), dash))
         times, rows = top.part(top.track.rates)
         if len(rows):
             rate.append(Line('φ′', BLUE, times, rows[:, PRECESSION], dash))
-            kinetic, height = model.energies(top.track.top, rows)
+            kinetic, height = shapes.energies(top.track.top, rows)
             energy += [Line('kinetic', RED, times, kinetic, dash),
                        Line('potential', BLUE, times, height, dash),
                        Line('sum', GREEN, times, kinetic + height, dash)]
     now = float(tops[0].seconds(np.array(tops[0].stamp_ns)))
     present = tops[0].track.attitudes.at(tops[0].stamp_ns)
-    theta = float(model.tilt(model.axis_of(present[1]))[0]) if present else math.nan
+    theta = float(shapes.tilt(shapes.axis_of(present[1]))[0]) if present else math.nan
     return [plot for plot in (
         Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', potential, theta,
              float(potential[1].y[0]) if potential else None),

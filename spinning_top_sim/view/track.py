@@ -33,40 +33,40 @@ SAME = 1e-6                 # relative difference between the constants of one m
 MOST_MOTIONS = 99           # that are kept
 
 
-class Samples(NamedTuple):
+class Series(NamedTuple):
     """Ascending stamps (n,) [ns] and one row of numbers for each (n, width)."""
 
     stamps_ns: NDArray[np.int64]
     rows: NDArray[np.float64]
 
-    def part(self, begin_ns: int, end_ns: int) -> 'Samples':
+    def part(self, begin_ns: int, end_ns: int) -> 'Series':
         """Return the samples from one stamp to another, both included."""
         begin = int(np.searchsorted(self.stamps_ns, begin_ns))
         end = int(np.searchsorted(self.stamps_ns, end_ns, 'right'))
-        return Samples(self.stamps_ns[begin:end], self.rows[begin:end])
+        return Series(self.stamps_ns[begin:end], self.rows[begin:end])
 
     def at(self, stamp_ns: int) -> tuple[int, NDArray[np.float64]] | None:
         """Return stamp and row of the newest sample up to a stamp, None if there is none."""
         index = int(np.searchsorted(self.stamps_ns, stamp_ns, 'right')) - 1
         return None if index < 0 else (int(self.stamps_ns[index]), self.rows[index])
 
-    def thinned(self, most: int) -> 'Samples':
+    def thinned(self, most: int) -> 'Series':
         """Return at most so many evenly chosen samples, with the last one."""
         stride = max(1, -(-len(self.rows) // most))
         first = (len(self.rows) - 1) % stride
-        return Samples(self.stamps_ns[first::stride], self.rows[first::stride])
+        return Series(self.stamps_ns[first::stride], self.rows[first::stride])
 
 
-def joined(parts: Sequence[Samples]) -> Samples:
+def joined(parts: Sequence[Series]) -> Series:
     """Return all samples in the order of their stamps, the first of each stamp."""
     stamps_ns, order = np.unique(np.concatenate([part.stamps_ns for part in parts]),
                                  return_index=True)
-    return Samples(stamps_ns, np.concatenate([part.rows for part in parts])[order])
+    return Series(stamps_ns, np.concatenate([part.rows for part in parts])[order])
 
 
-def empty(topic: str) -> Samples:
+def empty(topic: str) -> Series:
     """Return no samples of a topic."""
-    return Samples(np.empty(0, np.int64), np.empty((0, WIDTHS[topic])))
+    return Series(np.empty(0, np.int64), np.empty((0, WIDTHS[topic])))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Track:
     has_body : whether they are those of the body; in the logs of other programs they are not
     samples : by topic
     motions : in the order of their begin
-    origin_ns, commands_ns : of a log, stamps of t = 0 and of its commands [ns]
+    epoch_ns, commands_ns : of a log, stamps of t = 0 and of its commands [ns]
     note : what is missing in a log, '' if nothing is
     """
 
@@ -114,19 +114,19 @@ class Track:
         self.shape = Shape(self.top)
         self.samples = {topic: empty(topic) for topic in WIDTHS}
         self.motions: list[DescribedMotion] = []
-        self.origin_ns, self.commands_ns = 0, list[int]()
+        self.epoch_ns, self.commands_ns = 0, list[int]()
         self.note = ''
         self._constants: tuple[float, float, float] | None = None   # of the newest motion
         self._imu = Imu(values)
         self._templates = {stream.topic: stream.template for stream in all_streams(values)
                            if stream.topic in WIDTHS}
 
-    def decode(self, topic: str, stamps_ns: Sequence[int], messages: Sequence[bytes]) -> Samples:
+    def decode(self, topic: str, stamps_ns: Sequence[int], messages: Sequence[bytes]) -> Series:
         """Return serialized messages of a topic as samples."""
         stamps = np.array(stamps_ns, np.int64)
         fields = self._templates[topic].decode(b''.join(messages))
         if topic == '~/invariants':
-            return Samples(stamps, fields[0])
+            return Series(stamps, fields[0])
         found = attitudes_of(topic, self._imu, stamps, fields)
         assert found is not None
         rows = found.rows.T
@@ -142,9 +142,9 @@ class Track:
             norm = np.linalg.norm(fields[1], axis=1)
             place = np.nan_to_num(fields[0][np.isfinite(norm) & (norm > 0.0)])
             rows = np.column_stack((rows[:, :4] if topic == 'pose' else rows, place))
-        return Samples(found.stamps_ns, rows)
+        return Series(found.stamps_ns, rows)
 
-    def add(self, topic: str, samples: Samples) -> None:
+    def add(self, topic: str, samples: Series) -> None:
         """Add samples of a topic."""
         self.samples[topic] = joined([self.samples[topic], samples])
 
@@ -154,12 +154,12 @@ class Track:
                         for topic, samples in self.samples.items()}
 
     @property
-    def attitudes(self) -> Samples:
+    def attitudes(self) -> Series:
         """The samples that show the attitude, in their first four columns."""
         return self._best(ATTITUDES)
 
     @property
-    def rates(self) -> Samples:
+    def rates(self) -> Series:
         """The samples that show attitude, angular velocity and phi'."""
         return self._best(RATES)
 
@@ -176,7 +176,7 @@ class Track:
         """Whether the pivot has moved between the last two samples."""
         return bool(np.diff(self._best(PLACES).rows[-2:, -3:], axis=0).any())
 
-    def _best(self, topics: Sequence[str]) -> Samples:
+    def _best(self, topics: Sequence[str]) -> Series:
         return next((self.samples[topic] for topic in topics
                      if len(self.samples[topic].stamps_ns)), self.samples[topics[0]])
 
@@ -196,7 +196,7 @@ class Track:
         stamps_ns, rows = self.rates
         if not len(rows):
             return
-        constants, state = state_of(self.top, rows[-1])
+        constants, state = constants_and_state(self.top, rows[-1])
         if pivot_moves := self.moves:     # L3 alone is constant
             constants = 0.0, constants[1], 0.0
         if self._constants is not None and _same(self.top, constants, self._constants):
@@ -210,7 +210,8 @@ class Track:
             int(stamps_ns[-1]), self.top, state, description, pivot_moves=pivot_moves)]
 
 
-def state_of(top: Top, row: NDArray[np.float64]) -> tuple[tuple[float, float, float], State]:
+def constants_and_state(top: Top, row: NDArray[np.float64],
+                        ) -> tuple[tuple[float, float, float], State]:
     """
     Return energy, L3 and Lz of a row of RATES, and its state.
 
@@ -218,7 +219,7 @@ def state_of(top: Top, row: NDArray[np.float64]) -> tuple[tuple[float, float, fl
     """
     quaternion, omega = row[:4], row[4:7]
     state = placement.state_of(top, quaternion, np.array(
-        attitude.in_world(tuple(quaternion), tuple(omega))))
+        attitude.rotated(tuple(quaternion), tuple(omega))))
     up = float(attitude.vertical_in_body(tuple(quaternion))[2])
     moments = np.array((top.lambda1, top.lambda1, top.lambda3))
     energy = 0.5 * float(moments @ omega ** 2) + top.gravity_torque * up

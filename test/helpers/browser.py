@@ -15,11 +15,11 @@ PATIENCE_MS = 60_000
 OPTIONS = ('--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader',
            '--enable-unsafe-swiftshader')
 # Shaders are made and the scene is moved, but no pixel is computed: the processor would need ten
-# seconds for the first picture.  Ten pictures a second are enough to be looked at by a program.
+# seconds for the first picture.  Five pictures a second are enough to be looked at by a program.
 NOT_DRAWN = """for (const name of ['drawArrays', 'drawElements', 'drawElementsInstanced'])
     WebGL2RenderingContext.prototype[name] = () => {};
 const draw = window.requestAnimationFrame.bind(window);
-window.requestAnimationFrame = act => setTimeout(() => draw(act), 100);"""
+window.requestAnimationFrame = act => setTimeout(() => draw(act), 200);"""
 
 
 def launch():

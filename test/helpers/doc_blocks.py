@@ -6,9 +6,10 @@ The blocks of a page run in order, in one empty folder and one Python namespace.
 
 - `python` blocks are executed, unless their first line is a comment with the name of a file, such
   as `# my_filter.py`: then they are written to that file.  So are `yaml` blocks.
-- `bash` blocks are run by bash.  `<!-- background -->` in the line before keeps one running until
-  the page ends; `<!-- exit code 1 -->` expects another than 0; `<!-- not run: REASON -->` leaves
-  one out, and fails where REASON is not known.
+- `bash` blocks are run by bash, but for plain commands of `spinning-top`, which are called here.
+  `<!-- background -->` in the line before keeps one running until the page ends; `<!-- exit code 1
+  -->` expects another than 0; `<!-- not run: REASON -->` leaves one out, and fails where REASON is
+  not known.
 - A `text` block right behind a block that ran is its output.  Integers are equal, other numbers
   agree within 2 %, and a line `...` stands for any lines.
 """
@@ -18,6 +19,7 @@ import io
 import math
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -26,6 +28,7 @@ from typing import NamedTuple
 
 import spinning_top_sim
 from helpers.reference import ROOT
+from spinning_top_sim.__main__ import main
 
 FENCE = re.compile(r'^(?:<!-- (?P<mark>[^\n]*?) -->\n)?'
                    r'^```(?P<language>[^\n]*)\n(?P<text>.*?)^```$', re.MULTILINE | re.DOTALL)
@@ -89,7 +92,7 @@ class Runner:
             Path(folder).symlink_to(ROOT / folder)
         # Executables, and the package where it is not installed.
         paths = (str(Path(sys.executable).parent), str(ROOT / 'scripts'), os.environ['PATH'])
-        self._environment = {**os.environ, 'PATH': os.pathsep.join(paths), 'COLUMNS': '118',
+        self._environment = {**os.environ, 'PATH': os.pathsep.join(paths),
                              'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1',
                              'PYTHONPATH': os.pathsep.join(filter(None, (
                                  os.environ.get('PYTHONPATH'), SOURCE)))}
@@ -113,6 +116,13 @@ class Runner:
         return None
 
     def _shell(self, block):
+        commands = [shlex.split(line) for line in block.text.replace('\\\n', '').splitlines()]
+        if not block.mark and all(words[:1] == ['spinning-top'] and not {'|', '||', '>'} & {*words}
+                                  for words in commands):
+            # The command itself, without a start of Python.
+            with contextlib.redirect_stdout(io.StringIO()) as out:
+                assert [main(words[1:]) for words in commands] == [0] * len(commands), block
+            return out.getvalue()
         process = subprocess.Popen(
             ['bash', '-euo', 'pipefail', '-c', block.text], stdin=subprocess.DEVNULL, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,

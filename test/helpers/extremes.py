@@ -24,23 +24,20 @@ INTEGERS = (0, 1, -1, 2, 14, 1000, 2 ** 31 - 1, 2 ** 31, 2 ** 53 + 1, 2 ** 63 - 
 STRINGS = ('', 'x', 'world', '/', '~', 'a/b', 'a b', '\u00e9', '\x1b[31m', 'all', 'x' * 300, '..')
 
 
-def parameter_set(random_: random.Random, allowed: bool = False) -> dict[str, object]:
+def parameter_set(random_: random.Random) -> dict[str, object]:
     """
     Return some parameters at extreme values, by name.
 
     Most are in the range of their parameter, at its ends as often as not.  Nothing is set that
     writes files.
-
-    allowed : only values that the table allows, and now and then all parameters
     """
     settable = [row for row in parameters.TABLE if not row.name.startswith('record.')]
-    counts = (1, 2, 3, 5, 10, len(settable)) if allowed else (1, 1, 1, 2, 3, 5, 8)
-    chosen = random_.sample(settable, random_.choice(counts))
-    value = _allowed_value if allowed else _value
-    return {row.name: value(random_, row) for row in chosen}
+    wild = random_.choice((0.0, 0.4))
+    return {row.name: (_any_value if random_.random() < wild else _allowed_value)(random_, row)
+            for row in random_.sample(settable, random_.choice((1, 1, 1, 2, 3, 5, 8)))}
 
 
-def number(random_: random.Random, row: Parameter) -> float | int:
+def _number(random_: random.Random, row: Parameter) -> float | int:
     """Return an allowed number: an end of the range, the default, or of any magnitude."""
     low = row.minimum if row.minimum is not None else (
         -LARGEST if row.above is None else math.nextafter(row.above, 1.0))
@@ -85,34 +82,21 @@ def _allowed_value(random_: random.Random, row: Parameter) -> object:
     if isinstance(default, bool):
         return random_.random() < 0.5
     if isinstance(default, tuple) and isinstance(default[0], float):
-        return [number(random_, row) for _ in default]
-    return default if isinstance(default, str | tuple) else number(random_, row)
+        return [_number(random_, row) for _ in default]
+    return default if isinstance(default, str | tuple) else _number(random_, row)
 
 
-def _value(random_: random.Random, row: Parameter) -> object:
-    """Return a value of the right type as a rule."""
+def _any_value(random_: random.Random, row: Parameter) -> object:
+    """Return a value of the right type as a rule, and of any size."""
     default = row.default
-    if random_.random() < 0.05:
+    if random_.random() < 0.1:
         return random_.choice((True, 'text', 1, 1.5, [1.0], ['a'], [], random_.choice(NOT_FINITE)))
     if isinstance(default, tuple):
-        if isinstance(default[0], str):
-            return [random_.choice(STRINGS) for _ in range(random_.randint(0, 3))]
-        return [_double(random_) for _ in default]
-    if isinstance(default, bool):
-        return random_.random() < 0.5
+        return ([random_.choice(STRINGS) for _ in range(random_.randint(0, 3))]
+                if isinstance(default[0], str) else [_double(random_) for _ in default])
     if isinstance(default, str):
-        return random_.choice(row.choices or STRINGS)
-    return _numeric(random_, row)
-
-
-def _numeric(random_: random.Random, row: Parameter) -> float | int:
-    bounds = [bound for bound in (row.minimum, row.maximum, row.above) if bound is not None]
-    if isinstance(row.default, int):
-        return random_.choice([*INTEGERS, *map(int, bounds)])
-    if bounds and random_.random() < 0.3:
-        return random_.choice([float(bound) for bound in bounds])
-    value = _double(random_)
-    return abs(value) if bounds and random_.random() < 0.9 else value
+        return random_.choice(STRINGS)
+    return random_.choice(INTEGERS) if isinstance(default, int) else _double(random_)
 
 
 def _double(random_: random.Random) -> float:

@@ -22,8 +22,8 @@ from helpers.definitions import add_definitions
 from helpers.recordings import METADATA
 from spinning_top_sim.recording import chunks
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.recover import main
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
@@ -67,6 +67,12 @@ def write_anew(path, content):
     """Write a file, not over the one before: that would wait for the disk."""
     path.unlink(missing_ok=True)
     path.write_bytes(content)
+
+
+def flipped(content: bytes, position: int, bit: int = 0) -> bytes:
+    changed = bytearray(content)
+    changed[position] ^= 1 << bit
+    return bytes(changed)
 
 
 def records_of(content: bytes) -> list[tuple[int, int, int]]:
@@ -141,8 +147,6 @@ STRANGERS = {
     'unchunked': {'use_chunking': False},
     'lz4': {'compression': CompressionType.LZ4},
     'no index': {'index_types': IndexType.NONE},
-    'no index of metadata': {'index_types': IndexType.CHUNK | IndexType.MESSAGE},
-    'no statistics': {'use_statistics': False},
     'nothing repeated': {'repeat_channels': False, 'repeat_schemas': False},
     'nothing but messages': {
         'use_chunking': False, 'use_statistics': False, 'use_summary_offsets': False,

@@ -153,7 +153,8 @@ class SimNode:
 
 def as_yaml(value):
     """Return a parameter's value as the command line takes it."""
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if isinstance(value, str) else (
+        json.dumps(value).replace('Infinity', '.inf').replace('NaN', '.nan'))
 
 
 class Topic:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading what a node has published and recorded, and what tests of it share."""
 
+import contextlib
+import io
 import json
 import time
 from pathlib import Path
@@ -13,10 +15,7 @@ from nav_msgs.msg import Odometry
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 
-from helpers.node_harness import LIFETIME_S
-from helpers.simulations import record
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.tools import inspect
 
 SECOND = 1_000_000_000
 KINDS = {'pose': PoseStamped, 'joint_states': JointState, 'imu/data_raw': Imu,
@@ -45,23 +44,6 @@ def xyz(v):
     return v.x, v.y, v.z
 
 
-def product(p, q):
-    """Return the Hamilton product of arrays of x, y, z, w."""
-    (a, b, c, d), (x, y, z, w) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
-    return np.stack([d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
-                     d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z], axis=-1)
-
-
-def conjugate(q):
-    return q * np.array([-1.0, -1.0, -1.0, 1.0])
-
-
-def turned(q, v):
-    """Return R(q) v for arrays of x, y, z, w and of vectors."""
-    pure = np.concatenate([v, np.zeros((*v.shape[:-1], 1))], axis=-1)
-    return product(product(q, pure), conjugate(q))[..., :3]
-
-
 def log_of(path):
     """Return {topic: [(log time, bytes)]} and the metadata of a log, by the mcap package."""
     with Path(path).open('rb') as file:
@@ -78,25 +60,11 @@ def the_log(folder):
     return path
 
 
-def simulated(log, metadata, until_ns):
-    """Compute the run of a log in this process; return {topic: [(stamp, bytes)]}."""
-    run = metadata['spinning_top_sim']
-    assert 0 <= until_ns < LIFETIME_S * SECOND, 'the stamp of t = 0 in the log is wrong'
-    epoch_ns = int(run['epoch_ns'])
-    simulation = LiveSimulation(parameters.checked(json.loads(run['parameters'])), epoch_ns)
-    taken = record(simulation)
-    for event in events_in(log):
-        if event['event'] in ('command', 'parameters'):
-            simulation.advance(event['t_ns'])
-        if event['event'] == 'command':
-            simulation.command(event['l3'], event['lz'])
-        if event['event'] == 'parameters':
-            simulation.apply(event)
-    simulation.advance(until_ns)
-    rows = {stream.topic: [] for stream in simulation.streams}
-    for topic, t_ns, data in taken:
-        rows[topic].append((epoch_ns + t_ns, data))
-    return rows
+def verified(path):
+    """Return what `inspect --verify` says of a log: it computes the run from its journal."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        inspect.main([str(path), '--verify', '--json'])
+    return json.loads(out.getvalue())['verify']
 
 
 def events_in(log):

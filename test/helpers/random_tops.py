@@ -93,26 +93,17 @@ def wild(d):
     d.l3, d.lz = d.sign() * d.log(-6, 4), d.sign() * d.log(-6, 4)
 
 
-def top_pole(d):
-    d.theta, d.lz = 0.0, d.l3
-
-
-def bottom_pole(d):
-    d.theta, d.lz = math.pi, -d.l3
+def at_a_pole(d):
+    d.theta, d.lz = (0.0, d.l3) if d.chance(0.5) else (math.pi, -d.l3)
 
 
 def rest_at_a_pole(d):
-    (top_pole if d.chance(0.5) else bottom_pole)(d)
+    at_a_pole(d)
     d.theta_dot = 0.0
 
 
-def next_to_the_top(d):
-    d.theta = d.log(-16, -1)
-    d.lz = d.consistent_lz(d.sign() * d.l0 * d.log(-3, 1))
-
-
-def next_to_the_bottom(d):
-    d.theta = math.pi - d.log(-15.5, -1)
+def next_to_a_pole(d):
+    d.theta = d.log(-16, -1) if d.chance(0.5) else math.pi - d.log(-15.5, -1)
     d.lz = d.consistent_lz(d.sign() * d.l0 * d.log(-3, 1))
 
 
@@ -123,12 +114,8 @@ def near_pass(d):
     d.theta_dot = d.sign() * d.w0 * d.log(-1, 1)
 
 
-def crosses_the_top(d):
-    d.lz = d.l3
-
-
-def crosses_the_bottom(d):
-    d.lz = -d.l3
+def crosses_a_pole(d):
+    d.lz = d.sign() * d.l3
 
 
 def no_spin(d):
@@ -219,10 +206,9 @@ def near_sleeping(d):
         d.consistent_lz(0.0), 0.0)
 
 
-KINDS = (generic, wild, top_pole, bottom_pole, rest_at_a_pole, next_to_the_top, next_to_the_bottom,
-         near_pass, crosses_the_top, crosses_the_bottom, no_spin, planar, no_torque, tiny_gravity,
-         upside_down, fast, near_separatrix, waking_sleeper, cusp, steady, near_hanging,
-         near_sleeping)
+KINDS = (generic, wild, at_a_pole, rest_at_a_pole, next_to_a_pole, near_pass, crosses_a_pole,
+         no_spin, planar, no_torque, tiny_gravity, upside_down, fast, near_separatrix,
+         waking_sleeper, cusp, steady, near_hanging, near_sleeping)
 
 
 def random_case(seed):

@@ -9,6 +9,7 @@ from mcap.reader import NonSeekingReader
 from mcap.records import Channel as ChannelRecord
 from rosbags.typesys import Stores, get_typestore
 
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, qos_profiles
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
@@ -36,6 +37,18 @@ def pose_cdr(number: int) -> bytes:
 def array_cdr(number: int) -> bytes:
     """The CDR of a Float64MultiArray without labels, packed by hand."""
     return struct.pack('<4sIII4xd', b'\x00\x01\x00\x00', 0, 0, 1, float(number))
+
+
+def write_rows(path, topics, rows, per_chunk=None):
+    """Write a log of rows (number of a topic, stamp [ns], data), so many in a chunk."""
+    file = create_file(path, topics, {}, compression='none')
+    for number, row in enumerate(rows, start=1):
+        file.append(*row)
+        if per_chunk and number % per_chunk == 0:
+            file.write_chunk()
+    file.write_chunk()
+    file.finish()
+    return path
 
 
 def some_messages(count: int) -> list[tuple[int, int, bytes]]:

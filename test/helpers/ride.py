@@ -17,14 +17,13 @@ class Sample(NamedTuple):
 
     quaternion : (n, 4) x, y, z, w of q(world <- body)
     omega, alpha : (n, 3) angular velocity and acceleration in the body
-    position, force : (n, 3) of a point of the body: place in the world, specific force in the body
+    position : (n, 3) of a point of the body in the world
     """
 
     quaternion: np.ndarray
     omega: np.ndarray
     alpha: np.ndarray
     position: np.ndarray
-    force: np.ndarray
 
 
 def kinematics(path, times_ns):
@@ -66,7 +65,7 @@ class Ride:
         motion = self.motions[k]
         states = motion.states(range(t - self.pieces[k].start_ns, t - self.pieces[k].start_ns + 1))
         q = attitude.product(motion.vertical.rows, states.rows_quaternion)
-        arm = np.stack(attitude.in_world(q, point), axis=-1)
+        arm = np.stack(attitude.rotated(q, point), axis=-1)
         pivot = kinematics(self.path, [t])
         return (np.stack(q, axis=-1), states.angular_velocity, states.angular_acceleration,
-                pivot.position + arm, np.stack(states.specific_force(point), axis=-1))
+                pivot.position + arm)

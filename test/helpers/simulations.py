@@ -41,7 +41,7 @@ def play(simulation, until_ns, *topics):
     """Return what the same run sends offline, in the order of blocks: [(topic, t_ns, bytes)]."""
     streams = [one for one in simulation.streams if not topics or one.topic in topics]
     return [(one.topic, t_ns, row.tobytes()) for block in simulation.play(streams, until_ns)
-            for one, times_ns, rows in block.parts
+            for one, times_ns, rows in block.messages
             for t_ns, row in zip(times_ns.tolist(), rows, strict=True)]
 
 

@@ -28,7 +28,7 @@ from pathlib import Path
 
 STARTING_S = 120.0          # patience for imports
 MOST_FAILURES = 20          # then enough is known
-PARTS = ('logs', 'nodes', 'sensor', 'exam', 'wrong', 'grade')
+PARTS = ('logs', 'nodes', 'sensor', 'fit')
 
 
 @dataclass
@@ -96,18 +96,14 @@ def serve(module, pipe):
         pipe.send(answer)
 
 
-def run(part, first=0, count=None, seconds=None, processes=1, tell=None, module=None):
-    """
-    Check seeds from `first` on, so many, or as long as there is time; return the Result.
-
-    module : that has the part, where it is none of this folder
-    """
+def run(part, first, count, seconds, processes, tell):
+    """Check seeds from `first` on, so many, or as long as there is time; return the Result."""
     result, lock = Result(), threading.Lock()
     seeds = itertools.count(first) if count is None else iter(range(first, first + count))
     end = None if seconds is None else time.monotonic() + seconds
 
     def work():
-        worker = Worker(module or f'stress.{part}')
+        worker = Worker(f'stress.{part}')
         try:
             while end is None or time.monotonic() < end:
                 with lock:
@@ -122,8 +118,7 @@ def run(part, first=0, count=None, seconds=None, processes=1, tell=None, module=
                         result.failures.append(
                             f'{part}: seed {seed}: {failure}\nTo repeat it:  '
                             f'python test/stress {part} --first {seed} --count 1')
-                    if tell is not None:
-                        tell(result, failure)
+                    tell(result, failure)
         finally:
             worker.close()
 

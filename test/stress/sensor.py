@@ -39,8 +39,6 @@ def check(seed, folder):
     return 'as commanded'
 
 
-# ------------------------------------------------------------------------------- from whole runs
-
 # Two commands, so that the spin is not one constant that a bias could be mistaken for.
 EXCITED = {**scene_parameters('wavy'), 'solver.method': 'exact', 'imu.rpy': (0.4, -0.9, 1.3),
            'imu.lever_arm': (0.3, -0.2, 0.4)}
@@ -91,8 +89,6 @@ def least_squares(regressors, readings):
     return found, np.sqrt(np.outer(unit, variances))
 
 
-# ------------------------------------------------------------------------- from a sensor at rest
-
 def at_rest(seed, count, band=(1.0, 1000.0), **errors):
     """Return `count` readings at rest, a millisecond apart, with errors of both kinds of axes."""
     values = {f'imu.{kind}_{name}': value for kind in KINDS for name, value in errors.items()}
@@ -124,8 +120,6 @@ def allan_deviation(rows, m):
     return math.sqrt(0.5 * np.mean((averages[m:] - averages[:-m]) ** 2))
 
 
-# ------------------------------------------------------------------- against published covariances
-
 NOISY = {**scene_parameters('looping'), 'solver.method': 'exact', 'imu.rpy': (0.4, -0.9, 1.3),
          'imu.orientation_stddev': (0.01, 0.05, 0.002), 'imu.gyroscope_noise_density': 1e-3,
          'imu.accelerometer_noise_density': 2e-2, 'imu.gyroscope_resolution': 1e-2}
@@ -156,8 +150,6 @@ def covariances(simulation, topic):
     return np.concatenate([numbers[begin:begin + 9:4] for begin in (4, 16, 28)])
 
 
-# ----------------------------------------------------------------------------------- independence
-
 def correlations(seeds, count):
     """
     Return {between what: (correlations, how many products each is the mean of)}.
@@ -171,9 +163,9 @@ def correlations(seeds, count):
             (purpose.WHITE, 6), (purpose.ORIENTATION, 3), (purpose.MAG_WHITE, 3),
             (purpose.TIMING, 3))]
         # Correlation times far below a step: every step is new.
-        columns += [noise.Path(seed, one, (3 * (1e-5,),), (3 * (1.0,),)).at(numbers * MILLISECOND)
-                    for one in (purpose.GAUSS_MARKOV, purpose.FLICKER, purpose.WALK,
-                                purpose.MAG_WALK)]
+        columns += [noise.RandomPath(seed, one, (3 * (1e-5,),), (3 * (1.0,),)).at(
+            numbers * MILLISECOND) for one in (
+                purpose.GAUSS_MARKOV, purpose.FLICKER, purpose.WALK, purpose.MAG_WALK)]
         drawn.append(np.concatenate(columns))
     drawn = np.array(drawn)                     # (seeds, columns, numbers)
 

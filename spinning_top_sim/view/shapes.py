@@ -94,7 +94,7 @@ def energies(top: Top, rows: Vectors) -> tuple[Vectors, Vectors]:
 
 def in_world(quaternion: Vectors, vector: Vectors) -> Vectors:
     """Return the components in the world of a vector in the body."""
-    return np.array(attitude.in_world(tuple(quaternion), tuple(vector)))
+    return np.array(attitude.rotated(tuple(quaternion), tuple(vector)))
 
 
 def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
