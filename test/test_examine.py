@@ -77,17 +77,6 @@ def test_the_autocorrelation_time_is_the_direct_sum():
     centred, expected = values - np.mean(values), 1.0
     for lag in range(1, 1000):
         expected += 2.0 * np.mean(centred[:, lag:] * centred[:, :-lag]) / np.mean(centred ** 2)
-        if lag >= 3.0 * expected:
-            break
-    assert measures.autocorrelation_time(values) == pytest.approx(expected, rel=1e-9)
-    assert measures.autocorrelation_time(np.ones((3, 7))) == 1.0
-
-
-def test_the_autocorrelation_time_is_the_direct_sum():
-    values = np.cumsum(np.random.default_rng(1).standard_normal((3, 1000)), axis=1)
-    centred, expected = values - np.mean(values), 1.0
-    for lag in range(1, 1000):
-        expected += 2.0 * np.mean(centred[:, lag:] * centred[:, :-lag]) / np.mean(centred ** 2)
         if lag >= 5.0 * expected:
             break
     assert measures.autocorrelation_time(values) == pytest.approx(expected, rel=1e-9)
