@@ -147,6 +147,18 @@ def test_odometry_has_the_twist_in_the_frame_of_the_body():
         pivot.velocity[:, 0], abs=1e-15)
 
 
+@pytest.mark.parametrize('method', METHODS)
+def test_rates_of_the_angles_are_their_derivatives_in_the_world(method):
+    simulation = simulation_of(**{'solver.method': method, **SHUTTLE})
+    simulation.segment.reach(S // 2, 10 ** 6)
+    states = simulation.segment.states(range(S // 2 - 20_000_000, S // 2 + 1, 20_000))
+    for angle, rate in ((states.phi, states.phi_dot), (states.theta, states.theta_dot),
+                        (states.psi, states.psi_dot)):
+        found = (np.unwrap(angle)[2:] - np.unwrap(angle)[:-2]) / 4e-5
+        assert found == pytest.approx(rate[1:-1], rel=1e-6, abs=1e-6)
+        assert np.ptp(rate) > 1e-3
+
+
 def test_a_table_has_the_pivot(tmp_path):
     path = tmp_path / 'truth.csv'
     assert simulate.main(['--scene', 'shuttle', '--duration', '3', '--quiet', '-o',

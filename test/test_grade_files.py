@@ -66,6 +66,12 @@ TABLES = {
                   'frame': ['world'] * len(T), **wxyz(
                       'pose.orientation.w', 'pose.orientation.x', 'pose.orientation.y',
                       'pose.orientation.z')}, ';', ''),
+    'comments and decimal commas': (
+        {'time_us': [f'{1e6 * t:.1f}'.replace('.', ',') for t in T], **{
+            name: [f'{value:.12f}'.replace('.', ',') for value in values] for name, values in
+            wxyz('qpos_0', 'qpos_1', 'qpos_2', 'qpos_3').items()}}, ';', '# simulator\n# SI\n'),
+    'names in a comment before the last': (
+        {'# t': T, **wxyz('qw', 'qx', 'qy', 'qz')}, ',', '# 200 Hz\n'),
     'camel case': ({**wxyz('quatW', 'quatX', 'quatY', 'quatZ'), 'Time_ms': 1e3 * T}, '\t', ''),
     'dates and numbers': ({'time': [f'{np.datetime64(ns, "ns")}' for ns in NS.tolist()],
                            **wxyz('q0', 'q1', 'q2', 'q3')}, ',', ''),

@@ -27,6 +27,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from spinning_top_sim.exam.adapters import FILTERS
+from spinning_top_sim.exam.broad import examine_data, trials_in
 from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.trial import INTERRUPTED, Filter
@@ -126,8 +127,6 @@ def _report(arguments: argparse.Namespace) -> Report:
     if arguments.data is None:
         # Published filters neither crash nor hang: without processes, the exam is faster.
         return examine(make_filter, subject=shown, isolated=shown is None, **options)
-    from spinning_top_sim.exam.broad import examine_data, trials_in  # noqa: PLC0415 - as above
-
     with cli.progress('examined', len(trials_in(arguments.data)), 'trials') as show:
         return examine_data(make_filter, arguments.data, subject=shown, show=show)
 

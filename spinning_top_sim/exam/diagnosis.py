@@ -8,7 +8,7 @@ disappears, it was the cause.
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -74,7 +74,7 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
         'convergence_s': max(measures.convergence_time(outcome.run.t, outcome.errors.tilt)
                              for outcome in outcomes),
         'heading_drift_deg_per_s': math.degrees(float(np.mean([
-            abs(np.polyfit(outcome.run.t - outcome.run.t[0], one.heading, 1)[0])
+            abs(np.polyfit(outcome.run.t - outcome.run.t[0], np.unwrap(one.heading), 1)[0])
             for outcome, one in zip(settled, errors, strict=True)])))}
 
 
@@ -169,12 +169,6 @@ def inaccuracy(outcome: Outcome, absolute: bool) -> Fault | None:
                      f'{", ".join(map(degrees, quarters))}')
     return Fault('inaccurate', f'{outcome.run.name}: the error in the last quarter is '
                  f'{degrees(quarters[-1])}, for no reason that is known')
-
-
-def one_of_each(faults: Sequence[Fault]) -> Iterator[Fault]:
-    """Yield the first fault of each name: a misreading, which hides the others, comes first."""
-    names = [fault.name for fault in faults]
-    yield from (fault for k, fault in enumerate(faults) if fault.name not in names[:k])
 
 
 def degrees(angle: float) -> str:

@@ -123,8 +123,10 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     exam.sit()
     if level == 'full' and restart and exam.outcomes:
         exam.measures |= in_field(numbers[:1]).measures
-    return Report(subject, tuple(diagnosis.one_of_each(exam.faults)), exam.measures,
-                  exam.outcomes)
+    first: dict[str, Fault] = {}        # of each name: a misreading, which hides others, is first
+    for fault in exam.faults:
+        first.setdefault(fault.name, fault)
+    return Report(subject, [*first.values()], exam.measures, exam.outcomes)
 
 
 def _imu_parameters(imu: Mapping[str, Any] | str | Path | None) -> Mapping[str, Any]:
@@ -307,11 +309,14 @@ class _OneFilterExam(_Exam):
         """Turn the field to and fro: if the attitude follows, the heading can be judged."""
         level = Rotation.identity()
         n = round(TURN_S * scenarios.SLOW.rate / 3.0)
-        run = scenarios.turning(self._imu, level, level, TURN_S, np.repeat(
-            (0.5 * DECLINATION, -0.5 * DECLINATION, 0.5 * DECLINATION), n))
+        run = scenarios.turning(self._imu, level, level, TURN_S)
+        turns = Rotation.from_quat(run.truth)
+        west = Rotation.from_rotvec(0.5 * DECLINATION * np.repeat(
+            ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)), n, axis=0))
+        run = replace(run, name='field to and fro', magnetometer=(
+            turns.inv() * west * turns).apply(run.magnetometer))
         # The sensor is level after each third, so the attitudes are equal for any misreading.
-        one, two, three = Rotation.from_quat(self._follow(
-            replace(run, name='field to and fro')).estimates[n - 1::n])
+        one, two, three = Rotation.from_quat(self._follow(run).estimates[n - 1::n])
         # This sum is zero for a constant drift.
         moved = ((one.inv() * two).magnitude() + (two.inv() * three).magnitude()
                  - (one.inv() * three).magnitude())
@@ -328,7 +333,6 @@ class _OneFilterExam(_Exam):
 
 def for_first_order(run: Run) -> Run:
     """Return the rates for which the normalised first-order step q + q w dt/2 is exact."""
-    half = 0.5 * run.dt * np.linalg.norm(run.gyroscope, axis=1)
+    half = 0.5 * run.dt[:, np.newaxis] * np.linalg.norm(run.gyroscope, axis=1, keepdims=True)
     longer = np.tan(np.minimum(half, 1.5)) / np.where(half > 0.0, half, 1.0)
-    return replace(run, gyroscope=run.gyroscope * np.where(
-        half > 0.0, longer, 1.0)[:, np.newaxis])
+    return replace(run, gyroscope=longer * run.gyroscope)

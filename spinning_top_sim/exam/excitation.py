@@ -33,6 +33,8 @@ class Excitation(NamedTuple):
     """
     Rests between turns, the slow motion, and two kicks of the gyroscope alone at rest.
 
+    run : with the kicks
+    still : without them
     rests : index of the last sample of each rest (n,); the first and the last but one are equal
     turns : index of the first sample of each turn (n,)
     motion : where the slow motion is judged
@@ -40,6 +42,7 @@ class Excitation(NamedTuple):
     """
 
     run: Run
+    still: Run
     rests: NDArray[np.intp]
     turns: NDArray[np.intp]
     motion: slice
@@ -61,17 +64,18 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
     ends = np.cumsum([FIRST_S * rate, *(lengths + 1 + rest)]).astype(int)
     begins = np.append(0, ends[1:] - rest)
     path = Slerp(np.ravel((begins, ends), 'F'), stops[np.repeat(np.arange(len(stops)), 2)])
-    lead = scenarios.along('', path(np.arange(ends[-1] + 1)), imu)
+    lead = scenarios.along(path(np.arange(ends[-1] + 1)), imu)
     end = len(lead.t) + len(motion.t)
     last = np.tile(motion.truth[-1], (3 * answer + 1, 1))
-    run = replace(scenarios.along('', Rotation.from_quat(last), imu).after(motion.after(lead)),
-                  name='excitation')
-    run.gyroscope[:] += NEVER_ZERO
+    still = replace(scenarios.along(Rotation.from_quat(last), imu).after(motion.after(lead)),
+                    name='excitation')
+    still.gyroscope[:] += NEVER_ZERO
+    run = replace(still, gyroscope=still.gyroscope.copy())
     kick = Rotation.from_quat(last[0]).inv().apply(KICK) / KICK_S
     for number, first in enumerate(kicks := (end + answer, end + 2 * answer)):
         run.gyroscope[first:first + round(KICK_S * rate)] += (-1.0) ** number * kick
-    return Excitation(run, ends - 1, ends[:len(TURNS)], slice(end - len(motion.t) // 2, end),
-                      kicks)
+    return Excitation(run, still, ends - 1, ends[:len(TURNS)],
+                      slice(end - len(motion.t) // 2, end), kicks)
 
 
 def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Reals, int]:
@@ -126,12 +130,12 @@ def affine_of(readings: Reals, estimated: Rotation, level: Sequence[int],
 
 def words(matrix: Reals) -> str:
     """Return in words how a matrix (3, 3) of the gyroscope differs from the identity."""
-    off = 0.5 * np.max(np.abs(matrix - np.eye(3)))
+    large = 0.5 * np.max(np.abs(matrix - np.eye(3)))
     return '; '.join(
         f'a rate about {AXES[k]} turns it ' + (' and '.join(
             f'{column[j]:+.3g} times about {AXES[j]}' for j in range(3)
-            if abs(column[j] - (j == k)) >= off and column[j]) or 'not at all')
-        for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) >= off)
+            if abs(column[j] - (j == k)) >= large and column[j]) or 'not at all')
+        for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) >= large)
 
 
 def axes(matrix: Reals) -> str:

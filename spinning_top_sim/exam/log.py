@@ -191,4 +191,4 @@ def _judge(subject: str, outcome: Outcome, heading: bool) -> Report:
                   diagnosis.covariance_fault(consistency)) if fault][:1]
     measured = {**diagnosis.marks([corrected], heading), 'stamp_offset_s': offset.seconds,
                 **diagnosis.nees_marks(consistency)}
-    return Report(subject, list(diagnosis.one_of_each(faults)), measured, [corrected])
+    return Report(subject, faults, measured, [corrected])

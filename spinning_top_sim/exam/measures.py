@@ -14,13 +14,11 @@ from spinning_top_sim.exam.scenarios import Reals, Run
 
 CONVERGED_DEG = 1.0
 CONSISTENT = 0.9999             # probability of the NEES band
-# Runs from which their spread is known, and how much of it has another reason than chance.
-FEWEST_RUNS, APART = 3, 5.0
 WINDOW = 3.0                    # autocorrelation times over which correlations are summed
 
 
 class Errors(NamedTuple):
-    """Attitude errors [rad]: tilt (n,) >= 0, and heading (n,), continuous in time."""
+    """Attitude errors [rad]: tilt (n,) >= 0, and heading (n,) in [-pi, pi]."""
 
     tilt: Reals
     heading: Reals
@@ -31,13 +29,12 @@ class Errors(NamedTuple):
 
     def known(self, absolute: bool) -> Reals:
         """Return tilt and heading error combined (n,), the tilt alone unless `absolute`."""
-        return np.hypot(self.tilt, absolute * self.turned(True))
+        return np.hypot(self.tilt, absolute * self.heading)
 
     def turned(self, absolute: bool) -> Reals:
         """Return the heading error in [-pi, pi] (n,), relative to its mean unless `absolute`."""
         phase = np.exp(1j * self.heading)
-        turned: Reals = np.angle(phase if absolute else phase * np.conj(np.mean(phase)))
-        return turned
+        return self.heading if absolute else np.angle(phase * np.conj(np.mean(phase)))
 
 
 def errors_of(estimates: Reals, truth: Reals) -> Errors:
@@ -46,11 +43,9 @@ def errors_of(estimates: Reals, truth: Reals) -> Errors:
 
     estimates, truth : q(world <- sensor) as x, y, z, w (n, 4)
     """
-    x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat().T
-    heading = np.unwrap(2.0 * np.arctan2(z, w))
-    # Remove whole turns, so that the last heading is in [-pi, pi].
-    heading -= 2.0 * np.pi * np.rint(heading[-1] / (2.0 * np.pi))
-    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), heading)
+    x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat(
+        canonical=True).T
+    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), 2.0 * np.arctan2(z, w))
 
 
 class Rmse(NamedTuple):
@@ -65,7 +60,7 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
     """Return what BROAD's evaluation says of attitudes (n, 4); the heading is absolute."""
     total = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).magnitude()
     errors = errors_of(estimates, truth)
-    return Rmse(*(math.degrees(rms(one)) for one in (total, errors.turned(True), errors.tilt)))
+    return Rmse(*(math.degrees(rms(one)) for one in (total, errors.heading, errors.tilt)))
 
 
 def unaided(run: Run, rows: slice | NDArray[np.intp]) -> Rmse:
@@ -155,9 +150,10 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
     Return the NEES of the runs (Bar-Shalom et al. 2001, 5.4.2).
 
     The errors of a run are correlated: the number of independent tilts is smaller by the
-    integrated autocorrelation time.  The heading changes so slowly that the attitudes of a run
-    count as one.  The covariance may refer to the axes of the sensor or of the world: the
-    assumption with the greater likelihood counts.
+    integrated autocorrelation time, which is long for errors that are constant in a run, such as
+    that of a bias.  The heading changes so slowly that the attitudes of a run count as one.  The
+    covariance may refer to the axes of the sensor or of the world: the assumption with the greater
+    likelihood counts.
 
     runs : estimates (n, 4), truth (n, 4) and covariances (n, 3, 3) [rad^2] of each run
     absolute : False leaves out the heading
@@ -174,19 +170,11 @@ def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees 
         values = np.stack([squares[:shortest] for squares, _ in parts])
         mean = max(float(np.mean(values)), 1e-300)
         time = autocorrelation_time(values)
-        independent, known = (len(runs), 1e9) if absolute else (
+        independent, known = (len(runs), math.inf) if absolute else (
             values.size / time, values.size / (2.0 * WINDOW * time + 1.0))    # Sokal, sect. 3
-        if len(runs) >= FEWEST_RUNS:
-            # A constant error, such as that of a bias, is one draw a run: then the means of the
-            # runs differ by more than the errors in a run let expect.
-            spread = float(np.var(np.mean(values, axis=1), ddof=1)) / mean ** 2
-            draws = 2.0 * len(runs) / max(dimensions * spread, 1e-12)
-            if draws < independent / APART:
-                independent, known = draws, len(runs) - 1
         # Negative log-likelihood for the best common factor of the covariances.
         unlikely = dimensions * math.log(mean) + float(np.mean([size for _, size in parts]))
-        found.append((unlikely, Nees(
-                mean / dimensions, dimensions * independent, known)))
+        found.append((unlikely, Nees(mean / dimensions, dimensions * independent, known)))
     return min(found)[1] if found else None
 
 

@@ -38,7 +38,7 @@ def draw_page(report: Report, path: Path) -> None:
             errors = outcome.errors
             tilt.semilogy(outcome.run.t, np.maximum(np.degrees(errors.tilt), LEAST_DEG),
                           linewidth=0.8, label=outcome.run.name)
-            heading.plot(outcome.run.t, np.degrees(errors.turned(True)), linewidth=0.8)
+            heading.plot(outcome.run.t, np.degrees(errors.heading), linewidth=0.8)
         tilt.set(ylabel='tilt error [deg]', xlabel='t [s]')
         tilt.yaxis.set_major_formatter('{x:g}')         # the default is TeX
         tilt.tick_params(which='minor', labelleft=False)

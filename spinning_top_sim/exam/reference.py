@@ -105,7 +105,9 @@ class ReferenceFilter:
         """Advance by the mean rates of a step and of the one before, which show the coning."""
         last, self._turn = self._turn, (gyroscope - self.bias) * dt
         self._turn_to(product(self._quaternion, exponential(
-            self._turn + _cross(last, self._turn) / 12.0)))
+            # The product of pure quaternions has the vector product.
+            self._turn + np.array(attitude.product(
+                (*last.tolist(), 0.0), (*self._turn.tolist(), 0.0))[:3]) / 12.0)))
         self._readings = np.concatenate((gyroscope[np.newaxis], self._readings[:-1]))
         change = DIFFERENCES @ self._readings
         density = max(self._rate_noise.add(float(change @ change) / 3.0 * dt, dt), LEAST[0] ** 2)
@@ -212,12 +214,6 @@ def matrix_of(quaternion: Reals) -> Reals:
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
         (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))))
-
-
-def _cross(p: Reals, q: Reals) -> Reals:
-    a, b, c = p.tolist()
-    x, y, z = q.tolist()
-    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
 
 
 def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:

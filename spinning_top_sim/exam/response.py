@@ -51,7 +51,7 @@ STAYS = 0.98                    # of a kick
 FITS, STEPS, LESS = 0.1, 4, 0.7
 # Of the effect of a bias is left in the same attitude, without and with a growing estimate.
 LEARNED, LEARNING, BIAS_FOUND = 0.5, 0.9, 0.05
-NEAR = np.radians(3.0)          # error in which a kick is judged
+NEAR = 0.5                      # error in which a kick is judged [rad]
 BIAS_OFF = 0.5                  # by which the reported bias differs, relative
 STUCK = np.radians(1.0)         # by which attitudes differ at least
 
@@ -106,8 +106,9 @@ class Responses:
             before = self._whole(self._outcome)
             one, self._outcome = found
             self.faults += [Fault(name, f'{one.text}, the error falls from {degrees(before)} to '
-                                  f'{degrees(self._whole(self._outcome))}; all measures are those '
-                                  'after this correction') for name in one.faults]
+                                  f'{degrees(self._whole(self._outcome))}; all measures but those '
+                                  'of the field are those after this correction')
+                            for name in one.faults]
             (self.undone if {*one.faults} - {'stamp_offset'} else self._harmless).insert(0, one)
             self.unclear |= one.given is excitation.of_world
         clean = np.degrees(self._clean(self._outcome))
@@ -126,7 +127,7 @@ class Responses:
     def _clean(self, outcome: Outcome, *places: Any) -> Reals:
         """Return errors of tilt and heading, by default at rest, then in motion, rms [rad]."""
         errors = outcome.errors
-        heading = self._absolute * errors.turned(True)
+        heading = self._absolute * errors.heading
         return np.array([rms(error[rows]) for rows in places or (self._rests, self._given.motion)
                          for error in (errors.tilt, heading)])
 
@@ -345,18 +346,21 @@ class Responses:
             return [Fault('gyroscope_wiring', words(early))]
         if wrong and late > 1:
             return [Fault('lag', f'turns are followed {late} samples late; {left}')]
-        found = self._not_corrected()
+        found = self._not_corrected(self._excited.truth)
+        if found and wrong:     # a run without kicks has the same error
+            without = self._respond((), self._given.still).estimates
+            error = measures.errors_of(without, self._excited.truth).attitude(True)
+            # Far from the truth no filter is linear.
+            found = self._not_corrected(without) if error[self._given.kicks[0]] < NEAR else []
         if not found and wrong:
             return [Fault('inaccurate', f'{left}: no cause explains it')]
         return found
 
-    def _not_corrected(self) -> list[Fault]:
-        """Name the sensors that leave a kick."""
+    def _not_corrected(self, without: Reals) -> list[Fault]:
+        """Name the sensors that leave a kick, compared with attitudes without it."""
         n = round(excitation.ANSWER_S * scenarios.SLOW.rate)
         error = (Rotation.from_quat(self._outcome.estimates)
-                 * Rotation.from_quat(self._excited.truth).inv()).as_rotvec()
-        if np.linalg.norm(error[self._given.kicks[0] - 1]) > NEAR:     # no filter is linear there
-            return []
+                 * Rotation.from_quat(without).inv()).as_rotvec()
         up, down = (error[[first + excitation.LATEST, first + n - 1]] - error[first - 1]
                     for first in self._given.kicks)
         begin, end = 0.5 * (up - down)

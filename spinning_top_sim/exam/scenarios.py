@@ -107,8 +107,7 @@ class Run:
                                 for one in fields(self)[1:]))
 
 
-def turning(imu: Mapping[str, Any], first: Rotation, last: Rotation, seconds: float,
-            declination: float | Reals = 0.0) -> Run:
+def turning(imu: Mapping[str, Any], first: Rotation, last: Rotation, seconds: float) -> Run:
     """
     Return a slow tumbling from one attitude to another as `along`.
 
@@ -119,27 +118,22 @@ def turning(imu: Mapping[str, Any], first: Rotation, last: Rotation, seconds: fl
     turns = (Slerp((0.0, 1.0), Rotation.concatenate((first, last)))(part)
              * Rotation.from_euler('zx', np.stack((
                  12.0 * np.pi * part, 0.7 * np.sin(6.0 * np.pi * part)), axis=1)))
-    return along('', turns, imu, declination)
+    return along(turns, imu)
 
 
-def along(name: str, turns: Rotation, imu: Mapping[str, Any],
-          declination: float | Reals = 0.0) -> Run:
+def along(turns: Rotation, imu: Mapping[str, Any]) -> Run:
     """
     Return the readings along attitudes q(world <- sensor), without noise and acceleration; t <= 0.
 
-    They have the rate of the slow motion.
-
-    turns : n + 1 attitudes, between which the rate is constant
-    declination : by which the field is turned to the west [rad], one or for each of n samples
+    They have the rate of the slow motion; it is constant between two of the n + 1 attitudes.
     """
     n, rate = len(turns) - 1, SLOW.rate
     t: Reals = np.arange(1 - n, 1) / rate
     rates = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate
     to_sensor = turns[1:].inv()
-    field = Rotation.from_euler('z', np.broadcast_to(declination, n)[:, np.newaxis]).apply(
-        magnetic(imu.get('mag.field', FIELD)))
-    return Run(name, t, np.full(n, 1.0 / rate), turns[1:].as_quat(), rates, rates.copy(),
-               to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(field))
+    return Run('', t, np.full(n, 1.0 / rate), turns[1:].as_quat(), rates, rates.copy(),
+               to_sensor.apply((0.0, 0.0, GRAVITY)),
+               to_sensor.apply(magnetic(imu.get('mag.field', FIELD))))
 
 
 def magnetic(field: tuple[float, float, float]) -> tuple[float, float, float]:

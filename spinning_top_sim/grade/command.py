@@ -134,14 +134,11 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
         notes.append(f'the attitudes are exact but for noise of {level:.3g} rad: graded without '
                      'it')
     else:
-        found = found * (error if np.array_equal(even, times) else
-                         RotationSpline(times, error)(even))
+        found = found * RotationSpline(times, error)(even)
     angle = float(abs(motion.start.l3 / motion.top.lambda3)) * (even[1] - even[0])
     readings = {'attitudes': np.roll(found.as_quat(), 1, axis=1)}
     for name, (at, values) in parts.items():
-        if len(at) == len(even) and np.max(np.abs(at - even)) < SAME_S:
-            readings[name] = values
-        elif angle < COARSE:
+        if angle < COARSE or (len(at) == len(even) and np.max(np.abs(at - even)) < SAME_S):
             readings[name] = make_interp_spline(at, values, DEGREE)(even)
         else:
             notes.append(f'{name}: not at the times of the attitudes, and the spin is '
@@ -151,11 +148,10 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
 
 def _longest(name: str, at: Reals, values: Reals, notes: list[str]) -> tuple[Reals, Reals]:
     """Return the longest part without a gap."""
-    steps = np.diff(at)
-    ends = np.array([0, *(np.flatnonzero(steps > GAP * np.median(steps)) + 1), len(at)])
-    if len(ends) > 2:
+    gaps = np.flatnonzero(np.diff(at) > GAP * np.median(np.diff(at))) + 1
+    if len(gaps):
         notes.append(f'{name}: the longest part without a gap is used')
-    chosen = slice(*ends[np.argmax(np.diff(ends)):][:2].tolist())
+    chosen = max(np.split(np.arange(len(at)), gaps), key=len)
     return at[chosen], values[chosen]
 
 

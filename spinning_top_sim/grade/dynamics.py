@@ -27,15 +27,10 @@ WRONG_ENERGY = 0.1  # of the change of the potential energy
 
 def faults_of(motions: Sequence[Motion], dt: float) -> list[Fault]:
     """Return the causes of the error of motions."""
-    parts, body = [_terms(motion, dt) for motion in motions], motions[0].body
-    largest = max(rms(target) for target, _ in parts)
-    if largest < UNIMPORTANT:
+    body = motions[0].body
+    target, effects = pooled(_terms(motion, dt) for motion in motions)
+    if rms(target) < UNIMPORTANT:
         return []
-    # Motions count the same, unless what is not explained is small there.
-    weights = [1.0 / max(rms(target), 0.1 * largest) for target, _ in parts]
-    target, effects = pooled((weight * target, {
-        name: weight * effect for name, effect in effects.items()})
-        for weight, (target, effects) in zip(weights, parts, strict=True))
     faults, residual = explain(target, effects, [
         Cause(['gyroscopic'], _gyroscopic), Cause(['gyroscopic step', 'gravity step'], _step),
         Cause(['gyroscopic', 'in world'], instead(

@@ -44,7 +44,7 @@ STEP = 1e-6                 # of an unknown's natural size: for derivatives of t
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
 BEGIN = 64                  # attitudes that tell the start of a known top, whatever follows
-OFF = 0.1                   # rad, or share of the rates: another start
+OFF = 0.05                  # rad, and of the angle turned since: another start
 
 
 @dataclass(frozen=True)
@@ -169,19 +169,14 @@ def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> 
 
 
 def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) -> str:
-    """Return how far the attitudes are from a start at t = 0, '' if they are near it."""
+    """Return how far the first attitudes are from a motion, '' if they are near it."""
     times, attitudes = (part[:FIRST] for part in parts['attitudes'])
     right = ExactSolution(top, start).states_at_seconds(times)
-    error = (Rotation.from_quat(np.roll(attitudes, -1, axis=1))
-             * Rotation.from_quat(right.quaternion).inv())
-    apart, turns = error[0].magnitude(), (error[1:] * error[:-1].inv()).as_rotvec()
-    off, noise = (np.linalg.norm(one) for one in (
-        np.sum(turns, axis=0), 3.0 * np.std(turns, axis=0)))
-    span, rate = float(times[-1] - times[0]), np.linalg.norm(right.angular_velocity[0])
-    if apart <= OFF and off <= OFF * rate * span + noise:
-        return ''
-    return (f'at its begin the attitude is {math.degrees(apart):.3g} deg off, the rates '
-            f'{off / span:.3g} rad/s')
+    apart = (Rotation.from_quat(right.quaternion).inv()
+             * Rotation.from_quat(np.roll(attitudes, -1, axis=1))).magnitude()
+    turned = np.linalg.norm(right.angular_velocity[0]) * (times - times[0])
+    return '' if np.all(apart < OFF * (1.0 + turned)) else (
+        f'at its begin the attitude is up to {math.degrees(np.max(apart)):.3g} deg off')
 
 
 def _begun(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, Reals, bool]:
@@ -189,6 +184,8 @@ def _begun(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, Reals, b
     times, attitudes = parts['attitudes']
     if len(times) < FEWEST:
         raise ValueError(f'{len(times)} attitudes: must be {FEWEST} at least for a fit')
+    if not np.any(np.ptp(attitudes, axis=0)):
+        raise ValueError('the attitude never changes: there is no motion to fit')
     turns, x = Rotation.from_quat(np.roll(attitudes, -1, axis=1)), np.zeros(unknowns.UNKNOWNS)
     one = Readings('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
     told = parts.get('rates', parts.get('gyroscope'))

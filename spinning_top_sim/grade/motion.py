@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
+from scipy.ndimage import correlate1d
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.scenes import Body, Reals, Start
@@ -87,13 +88,10 @@ class Trajectory:
         for at in np.flatnonzero(~(np.abs(norms - 1.0) < 1e-2)):
             raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
                                          'must be 1')
-        attitudes /= norms
-        flips = np.cumprod(np.where(np.sum(attitudes[1:] * attitudes[:-1], axis=1) < 0.0, -1, 1))
-        attitudes[1:] *= flips[:, np.newaxis]
         told = said.get('covariance')
         if not isinstance(told, Mapping):
             told = {} if told is None else {'gyroscope': told, 'accelerations': told}
-        return cls(t, attitudes, **parts, covariance={
+        return cls(t, attitudes / norms, **parts, covariance={
             name: _numbers(f'covariance of {name}', matrix, (3, 3))
             for name, matrix in told.items()})
 
@@ -164,10 +162,9 @@ class Motion:
     @property
     def accelerations(self) -> Reals:
         """Angular accelerations (n - 12, 3)."""
-        inner, n = slice(MARGIN, -MARGIN), len(self.trajectory.t) - 4 * MARGIN
-        off = self.rates - self.truth.angular_velocity[inner]
-        total = sum(weight * off[at:at + n] for at, weight in enumerate(_WEIGHTS) if weight)
-        return total / self.trajectory.step + self.truth.angular_acceleration[inner][inner]
+        inner = slice(MARGIN, -MARGIN)
+        total = correlate1d(self.rates - self.truth.angular_velocity[inner], _WEIGHTS, axis=0)
+        return (total / self.trajectory.step + self.truth.angular_acceleration[inner])[inner]
 
     @property
     def data(self) -> Attitudes:

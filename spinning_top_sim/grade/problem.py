@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,7 +35,7 @@ FAR = 1e9
 CHANGE = 1e-5               # of the readings by a step of finite differences [rad], [rad/s], ..
 
 
-@dataclass
+@dataclass(eq=False)
 class Readings:
     """
     Readings at times.
@@ -43,14 +44,12 @@ class Readings:
     times : (n,), ascending [s]
     values : (4, n) or (3, n), [rad/s] or [m/s^2]
     sigma : standard deviation of a component
-    motions : attitudes (4, n) and rates (3, n) of the last unknowns
     """
 
     kind: str
     times: Reals
     values: Reals
     sigma: float = 1.0
-    motions: dict[bytes, tuple[Reals, Reals]] = field(default_factory=dict, init=False)
 
 
 class Problem:
@@ -64,6 +63,7 @@ class Problem:
         self.readings, self.reference, self.gravity = readings, reference, gravity
         self.mounting: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
         self._steps = np.full(UNKNOWNS, 1e-6)
+        self._motion = lru_cache(maxsize=4)(self._motion_of)
 
     def start(self, x: Reals) -> tuple[Top, State]:
         """Return top and state with lambda1 = lambda3 = 1: its spin is L3, not omega_3."""
@@ -107,22 +107,19 @@ class Problem:
 
     def motion(self, x: Reals, one: Readings) -> tuple[Reals, Reals]:
         """Return attitudes (4, n), and for an IMU rates in the body (3, n), at its times."""
-        late = 0.0 if one.kind == 'attitude' else float(x[LATE])
-        key = x[:8].tobytes() + np.float64(late).tobytes()
-        if key not in one.motions:
-            if len(one.motions) > 1:
-                one.motions.pop(next(iter(one.motions)))        # the older one
-            t = one.times - late
-            states = ExactSolution(*self.start(x)).states_at_seconds(t)
-            angle, zero = (x[SPIN] - x[L3]) * t, np.zeros(1)
-            q = np.stack(attitude.product(states.rows_quaternion, (
-                zero, zero, np.sin(0.5 * angle), np.cos(0.5 * angle))))
-            w = np.full((3, len(t)), x[SPIN])
-            if one.kind != 'attitude':
-                (w1, w2), sine, cosine = states.transverse_velocity, np.sin(angle), np.cos(angle)
-                w[:2] = cosine * w1 + sine * w2, cosine * w2 - sine * w1
-            one.motions[key] = q, w
-        return one.motions[key]
+        return self._motion(one, *x[:8].tolist(), late=float(x[LATE]))
+
+    def _motion_of(self, one: Readings, *unknowns: float, late: float) -> tuple[Reals, Reals]:
+        x, t = np.array(unknowns), one.times - (0.0 if one.kind == 'attitude' else late)
+        states = ExactSolution(*self.start(x)).states_at_seconds(t)
+        angle, zero = (x[SPIN] - x[L3]) * t, np.zeros(1)
+        q = np.stack(attitude.product(states.rows_quaternion, (
+            zero, zero, np.sin(0.5 * angle), np.cos(0.5 * angle))))
+        w = np.full((3, len(t)), x[SPIN])
+        if one.kind != 'attitude':
+            (w1, w2), sine, cosine = states.transverse_velocity, np.sin(angle), np.cos(angle)
+            w[:2] = cosine * w1 + sine * w2, cosine * w2 - sine * w1
+        return q, w
 
     def _force(self, x: Reals, q: Reals, w: Reals) -> Reals:
         """Return the specific force at the IMU, as `States.specific_force` for its own spin."""

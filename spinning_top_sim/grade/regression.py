@@ -55,7 +55,10 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
         tried = [fitted(target, [effects[name] for cause in (*chosen, one)
                                         for name in cause.effects]) for one in others]
-        after = [beyond(left, floor) for _, left in tried]
+        # A cause with a judge that names no fault explains nothing.
+        after = [beyond(left, floor) if one.judge is None or one.judge(
+            part[-len(one.effects):]) else np.inf
+            for one, (part, left) in zip(others, tried, strict=True)]
         good = max(AS_GOOD * min(after), min(0.02 * before, floor or np.inf))
         _, left, best = min((len(one.effects), left, k) for k, (one, left) in enumerate(
             zip(others, after, strict=True)) if left <= good)

@@ -34,6 +34,8 @@ NOISY = 1e-4                # of the reading: smaller noise is rounding
 NOISE_BAND = 0.05           # of the noise, to either side of what is declared, beside its doubt
 FOUR_SIGMA = 4.0            # that doubt
 LEAST_KURTOSIS = 2.4        # normal 3, uniform 1.8
+DENSITIES = {'gyroscope': 'gyroscope_noise_density',
+             'accelerations': 'accelerometer_noise_density'}
 KINDS = ('gyroscope', 'accelerations', 'magnetometer', 'rotations', 'velocities')
 _DEGREES, _G = (180.0 / math.pi, math.pi / 180.0), (1.0 / 9.80665,)
 UNITS = {'gyroscope': _DEGREES, 'rates': _DEGREES, 'rotations': _DEGREES, 'accelerations': _G,
@@ -130,40 +132,26 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     runs = [one for motion in motions if (one := _readings_of(kind, motion))]
     if not runs:
         return [], {}
-    said, means = motions[0].trajectory, kind == 'velocities'       # means over a step
-    lag, late = (0, 0.0) if means else _lag(runs)
-    parts, sizes = [run.late(lag) for run in runs], np.array([run.size for run in runs])
-    (target, effects), wrong = pooled(parts), [one for one, _ in parts]
+    # Velocities are means over a step.
+    lag, late = (0, 0.0) if kind == 'velocities' else _lag(runs)
+    wrong, effects = zip(*(run.late(lag) for run in runs), strict=True)
+    target, sizes = np.concatenate(wrong), np.array([run.size for run in runs])
     noise, floor = np.array([*map(_white, wrong)]), _white(*wrong)
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
     most = floor * math.sqrt(1.05 + 2.0 * doubt)
-    before = beyond(target, most)
     marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(sizes * noise)),
-             f'{kind}_discrepancy': before}
-    faults, residual = [], target
+             f'{kind}_discrepancy': beyond(target, most)}
+    faults = []
     if abs(late) > LATE:
-        faults.append(Fault('imu_one_step_late', f'readings belong to the motion of {late:.3g} '
-                            f'steps ({1e3 * late * said.step:.3g} ms) before', late))
-    strange = STRANGE.get(kind, 2e-3)
-    if motions[0].derived and kind != 'rates':
-        # Rates of the attitudes may be half a step apart from those of the simulator.
-        turns = (one.trajectory.rotation[:2] for one in motions)
-        strange += 0.25 * max(float((a.inv() * b).magnitude()) ** 2 for a, b in turns)
-    rest = 0.0
-    if before > strange:
-        found, residual = regression.explain(target, effects, _causes(kind, motions[0].body),
-                                             math.hypot(floor, 0.5 * strange))
-        turned, left = _turned(target, effects['total'])
-        if beyond(left, most) < min(TURNED * before, 0.1 * beyond(residual, most)):
-            found, residual = turned, left
-        faults += found
-        rest = beyond(residual, most)
-    scaled = {'units', 'reading_scale'} & {fault.name for fault in faults}
-    if rest > max(UNEXPLAINED * before, strange):
-        name = 'rates_scale' if kind == 'rates' else 'inconsistent_reading'
-        faults.append(Fault(name, f'{100.0 * rest:.3g} % of the reading is not that of the '
-                            'motion', rest))
-    elif kind in ('gyroscope', 'accelerations') and not scaled:
+        ms = 1e3 * abs(late) * motions[0].trajectory.step
+        faults.append(Fault('imu_one_step_late', 'readings belong to the motion of '
+                            f'{abs(late):.3g} steps ({ms:.3g} ms) '
+                            f'{"before" if late > 0.0 else "after"}', late))
+    found, residual, explained = _explained(
+        kind, motions, *pooled(zip(wrong, effects, strict=True)), floor, most)
+    faults += found
+    if explained and kind in DENSITIES and not any(
+            fault.name in ('units', 'reading_scale') for fault in faults):
         noises = [size * one for size, one in zip(
             sizes, np.split(residual, np.cumsum([*map(len, wrong)])[:-1]), strict=True)]
         # A cause that is found has taken fast motion away, or has left some.
@@ -171,6 +159,29 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
         faults += _noise_faults(kind, motions[0], level, level > NOISY * sizes[0],
                                 np.concatenate(noises), NOISE_BAND + doubt)
     return [fault._replace(evidence=f'{kind}: {fault.evidence}') for fault in faults], marks
+
+
+def _explained(kind: str, motions: Sequence[Motion], target: Reals, effects: Mapping[str, Reals],
+               floor: float, most: float) -> tuple[list[Fault], Reals, bool]:
+    """Return the causes of a discrepancy, what they leave of it, and whether that is noise."""
+    before, strange = beyond(target, most), STRANGE.get(kind, 2e-3)
+    if motions[0].derived and kind != 'rates':
+        # Rates of the attitudes may be half a step apart from those of the simulator.
+        turns = (one.trajectory.rotation[:2] for one in motions)
+        strange += 0.25 * max(float((a.inv() * b).magnitude()) ** 2 for a, b in turns)
+    if before <= strange:
+        return [], target, True
+    faults, residual = regression.explain(target, effects, _causes(kind, motions[0].body),
+                                          math.hypot(floor, 0.5 * strange))
+    turned, left = _turned(target, effects['total'])
+    if beyond(left, most) < min(TURNED * before, 0.1 * beyond(residual, most)):
+        faults, residual = turned, left
+    rest = beyond(residual, most)
+    if explained := rest <= max(UNEXPLAINED * before, strange):
+        return faults, residual, explained
+    name = 'rates_scale' if kind == 'rates' else 'inconsistent_reading'
+    text = f'{100.0 * rest:.3g} % of the reading is not that of the motion'
+    return [*faults, Fault(name, text, rest)], residual, explained
 
 
 def _turned(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
@@ -186,8 +197,7 @@ def _turned(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
 def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residual: Reals,
                   band: float) -> Iterator[Fault]:
     """Compare noise with what is declared and with normal noise; `band`: of the ratio to 1."""
-    density = (motion.body.gyroscope_noise_density if kind == 'gyroscope' else
-               motion.body.accelerometer_noise_density)
+    density = getattr(motion.body, DENSITIES[kind])
     covariance = motion.trajectory.covariance.get(kind)
     root = math.sqrt(motion.trajectory.step)
     text = f'the noise has a standard deviation of {noise:.4g}'
@@ -195,17 +205,18 @@ def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residua
     if told == 0.0 and exists:
         yield Fault('covariance_zero', f'{text}, its covariance is told as 0', noise)
     declared = (told or math.nan) if density is None else density / root
-    if declared == 0.0 and exists:
-        yield Fault('noise_scale', f'{text}, it is declared as 0', math.inf)
-    elif declared and abs((ratio := noise / declared) - 1.0) > band:
+    ratio = noise / declared if declared else math.inf if exists else 1.0
+    if abs(ratio - 1.0) > band:
         factors = {'sqrt(2)': math.sqrt(2.0), '1/sqrt(2)': math.sqrt(0.5), 'sqrt(dt)': root,
                    '1/sqrt(dt)': 1.0 / root}
         as_if = min(factors, key=lambda name: abs(ratio / factors[name] - 1.0))
         named = f' ({as_if})' if abs(ratio / factors[as_if] - 1.0) < band else ''
-        yield Fault('noise_scale', f'{text}, {ratio:.4g}{named} times what is declared', ratio)
+        yield Fault('noise_scale', f'{text}, {ratio:.4g}{named} times what is declared, '
+                    f'{declared:.4g}', ratio)
     if exists and noise > rms(residual) / (1.0 + band):
         kurtosis = float(np.mean(residual ** 4)) / rms(residual) ** 4
-        if kurtosis < LEAST_KURTOSIS:
+        doubt = FOUR_SIGMA * math.sqrt(24.0 / residual.size)
+        if kurtosis < min(LEAST_KURTOSIS, 3.0 - doubt):
             yield Fault('uniform_noise', f'the noise has a kurtosis of {kurtosis:.3g}; normal '
                         'noise has 3, uniform noise 1.8', kurtosis)
 

@@ -34,7 +34,8 @@ ATTITUDES, GYROSCOPE, RATES = 'attitudes', 'gyroscope', 'rates'
 ACCELERATIONS, MAGNETOMETER, ANGLES = 'accelerations', 'magnetometer', 'angles'
 # Words in the name of a column, before its component.
 WORDS = {
-    ATTITUDES: {'q', 'quat', 'quaternion', 'orientation', 'attitude', 'attitudes', 'rotation'},
+    ATTITUDES: {'q', 'qpos', 'quat', 'quaternion', 'orientation', 'attitude', 'attitudes',
+                'rotation'},
     GYROSCOPE: {'g', 'gyro', 'gyr', 'gyroscope'},
     ACCELERATIONS: {'a', 'acc', 'accel', 'acceleration', 'accelerations', 'accelerometer'},
     RATES: {'w', 'omega', 'rate', 'rates', 'angular'},
@@ -49,9 +50,9 @@ UNITS = {'deg': math.pi / 180.0, 'dps': math.pi / 180.0}
 # In the order of preference.
 MESSAGES = [f'{package}/msg/{name}' for package, name in (
     ('geometry_msgs', 'PoseStamped'), ('geometry_msgs', 'PoseWithCovarianceStamped'),
-    ('nav_msgs', 'Odometry'), ('geometry_msgs', 'QuaternionStamped'),
-    ('sensor_msgs', 'JointState'), ('tf2_msgs', 'TFMessage'), ('sensor_msgs', 'Imu'),
-    ('sensor_msgs', 'MagneticField'))]
+    ('nav_msgs', 'Odometry'), ('geometry_msgs', 'QuaternionStamped'), ('geometry_msgs', 'Pose'),
+    ('geometry_msgs', 'TransformStamped'), ('sensor_msgs', 'JointState'),
+    ('tf2_msgs', 'TFMessage'), ('sensor_msgs', 'Imu'), ('sensor_msgs', 'MagneticField'))]
 COVARIANCES = {GYROSCOPE: 'angular_velocity_covariance',
                ACCELERATIONS: 'linear_acceleration_covariance'}
 NOT_OF_BODY = ('imu_odom', 'imu_bias')      # topics of this package
@@ -135,12 +136,14 @@ def _csv(path: Path) -> Table:
     lines = [line for line in path.read_text('utf-8-sig', errors='replace').splitlines()
              if line.strip()]
     comments = [line.lstrip('# ') for line in lines if line.startswith('#')]
-    lines = [line for line in lines if not line.startswith('#')]
-    if not comments and re.match('[-+.0-9]', lines[0]):
-        comments = [TUM]
-    head = comments[-1] if comments else lines.pop(0)
-    mark = next((mark for mark in ',;\t' if mark in head), ' ')
-    names, *rows = csv.reader((head, *lines), delimiter=mark, skipinitialspace=True)
+    lines = [line for line in lines if not line.startswith('#')] or ['']
+    mark = next((mark for mark in ';\t,' if mark in lines[0]), ' ')
+    if mark == ';':                                 # with decimal commas
+        lines = [line.replace(',', '.') for line in lines]
+    names, *rows = split = [*csv.reader(lines, delimiter=mark, skipinitialspace=True)]
+    if re.match('[-+.0-9]', lines[0]):              # no names: those of a comment, or of TUM
+        heads = csv.reader(reversed([TUM, *comments]), delimiter=mark, skipinitialspace=True)
+        names, rows = next((head for head in heads if len(head) == len(names)), names), split
     whole = [row for row in rows if len(row) == len(names)]
     if len(whole) < max(len(rows) - 1, 1):      # the last may be cut off
         raise ValueError('must have a line with the names of columns, then lines with as many '
@@ -273,8 +276,10 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
         if not reader.whole:
             recorded.notes.append('the log is truncated: read as far as it goes')
         tables, first = _log_tables(reader, types, end_ns)
+    rests = {key: all(len({*cells}) == 1 for name, cells in table.items() if name != 'stamp_ns')
+             for key, table in tables.items()}          # such as a fixed frame among transforms
     chosen = sorted(tables, key=lambda one: (
-        one[0] != wanted, MESSAGES.index(types[one[0]]), one))
+        one[0] != wanted, rests[one], MESSAGES.index(types[one[0]]), one))
     recorded.add({' '.join(filter(None, one)): tables[one] for one in chosen}, origin)
     for topic, message in first.items():
         recorded.covariance.update((kind, matrix) for kind, matrix in _covariances(message)
@@ -298,8 +303,10 @@ def _log_tables(reader: LogReader, types: Mapping[str, str], end_ns: int,
     for topic, log_time, content in _contents(reader, types, end_ns):
         frame = content.child_frame_id if hasattr(content, 'transform') else ''
         first.setdefault(topic, content)
-        stamp, table = content.header.stamp, tables[topic, frame]
-        table['stamp_ns'].append(stamp.sec * 10 ** 9 + stamp.nanosec or log_time)
+        table, stamp_ns = tables[topic, frame], 0
+        if hasattr(content, 'header'):
+            stamp_ns = content.header.stamp.sec * 10 ** 9 + content.header.stamp.nanosec
+        table['stamp_ns'].append(stamp_ns or log_time)
         for name, value in _fields(content):
             table[name].append(value)
     return tables, first
@@ -307,7 +314,7 @@ def _log_tables(reader: LogReader, types: Mapping[str, str], end_ns: int,
 
 def _contents(reader: LogReader, types: Mapping[str, str],
               end_ns: int) -> Iterator[tuple[str, int, Any]]:
-    """Yield topics, log times and messages; of transforms the first one.  Raises LogError."""
+    """Yield topics, log times and messages, or transforms in them.  Raises LogError."""
     with needed('a log', 'rosbags'):
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
 
@@ -315,11 +322,11 @@ def _contents(reader: LogReader, types: Mapping[str, str],
     for message in reader.messages(types, end=end_ns):
         try:
             content: Any = store.deserialize_cdr(message.data, types[message.topic])
-            content = getattr(content, 'transforms', [content])[0]
         except Exception as error:      # whatever rosbags raises
             raise LogError(f'cannot read {reader.path}: a message of {message.topic} is no '
                            f'{types[message.topic]}: {error}') from error
-        yield message.topic, message.log_time, content
+        for one in getattr(content, 'transforms', [content]):
+            yield message.topic, message.log_time, one
 
 
 def _fields(message: Any, prefix: str = '') -> Iterator[tuple[str, float]]:
