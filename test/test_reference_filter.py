@@ -50,6 +50,19 @@ def test_an_uncalibrated_device_is_calibrated_and_the_covariance_says_how_well()
         assert low < nees[what].ratio < high, what
 
 
+def test_the_covariance_of_the_tilt_is_not_below_the_bound_of_white_noise():
+    """At 50 Hz, where low passes of the residual are far from continuous ones."""
+    imu = scenarios.CALIBRATED
+    bound = 2.0 * (imu['imu.gyroscope_noise_density'] * imu['imu.accelerometer_noise_density']
+                   / scenarios.GRAVITY)
+    ratios = []
+    for seed in range(2):
+        outcome = follow(ReferenceFilter, scenarios.record(replace(SLOW, rate=50.0), imu, seed))
+        turn = Rotation.from_quat(outcome.estimates[-1]).as_matrix()
+        ratios.append(np.trace((turn @ outcome.covariances[-1] @ turn.T)[:2, :2]) / bound)
+    assert 1.0 < np.mean(ratios) < 1.3
+
+
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_at_rest_the_gyroscope_shows_its_bias_without_a_field(sign):
     filter_, bias, noise = ReferenceFilter(), sign * np.array((0.01, -0.02, 0.03)), (
