@@ -122,9 +122,11 @@ def test_a_fault_of_the_method_is_named(report, name):
         assert report(name, 'component_order').faults == ['component_order', name]
 
 
-@pytest.mark.parametrize('name', ['gyroscope_wiring', 'hard_iron', 'lag'])
-def test_another_filter_is_blamed_for_its_fault_only(report, name):
-    assert report('reference', name).faults == [name]
+@pytest.mark.parametrize('name', ['gyroscope_wiring', 'conjugated'])
+def test_another_filter_has_its_own_faults_and_this_one(report, name):
+    pytest.importorskip('imufusion')
+    own = report('imufusion').faults
+    assert own and report('imufusion', name).faults == [name, *own]
 
 
 def test_a_filter_without_faults_passes(report):

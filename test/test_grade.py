@@ -161,6 +161,9 @@ def test_a_motion_that_exists_is_graded():
     right, start = trajectory_of(Imu(defect='increments', parts=('increments', 'gyroscope')))
     assert grade_trajectory(right, WHEEL, start).passed
     late, _ = trajectory_of(Imu(defect='late'))
+    early = {name: part[1:] if name == 'gyroscope' else part[:-1] for name, part in right.items()}
+    (fault,) = grade_trajectory(early, WHEEL, start).faults
+    assert 'the motion of 1 steps after' in fault.evidence and fault.number == pytest.approx(-1.0, abs=1e-3)
     top = Top(**{name: getattr(WHEEL, name) for name in Top.__dataclass_fields__})
     imu = {'lever_arm': WHEEL.lever_arm, 'mounting': WHEEL.mounting}
     report = grade_trajectory(late, top, start.state, **imu)

@@ -184,6 +184,50 @@ def foreign_log(path, late):
                       rows)
 
 
+def test_transforms_that_move_and_poses_without_a_header_are_read(tmp_path):
+    from mcap.writer import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    make = {name.rpartition('/')[2]: one for name, one in store.types.items()}
+
+    def turn(q):
+        return make['Transform'](make['Vector3'](0.0, 0.0, 0.0), make['Quaternion'](*q))
+
+    def transforms(k):
+        header = make['Header'](make['Time'](*divmod(int(NS[k]), 10 ** 9)), 'world')
+        return make['TFMessage']([
+            make['TransformStamped'](header, 'camera', turn((0.0, 0.0, 0.0, 1.0))),
+            make['TransformStamped'](header, 'top', turn(Q[k].tolist()))])
+
+    def pose(k):
+        return make['Pose'](make['Point'](0.0, 0.0, 0.0), make['Quaternion'](*Q[k].tolist()))
+
+    for name, content in (('tf2_msgs/msg/TFMessage', transforms),
+                          ('geometry_msgs/msg/Pose', pose)):
+        path = tmp_path / f'{content.__name__}.mcap'
+        with open(path, 'wb') as file:
+            writer = Writer(file)
+            writer.start('ros2')
+            channel = writer.register_channel('/a', 'cdr', writer.register_schema(
+                name, 'ros2msg', b''))
+            for k, stamp in enumerate(NS[:100].tolist()):
+                writer.add_message(channel, stamp, bytes(store.serialize_cdr(content(k), name)),
+                                   stamp)
+            writer.finish()
+        recorded = motion_files.read(path)
+        times, attitudes = recorded.parts['attitudes']
+        assert times == pytest.approx(T[:100], abs=1e-6)
+        assert attitudes == pytest.approx(np.roll(Q[:100], 1, axis=1))
+
+
+def test_a_top_at_rest_cannot_be_fitted(tmp_path, capsys):
+    path = table(tmp_path / 'a.csv', {'t': T, **wxyz('qw', 'qx', 'qy', 'qz'), 'qx': 0.0 * T,
+                                      'qy': 0.0 * T, 'qz': 0.0 * T, 'qw': 1.0 + 0.0 * T})
+    assert main([str(path), '--fit']) == 2
+    assert 'the attitude never changes' in capsys.readouterr().err
+
+
 def test_a_log_of_another_program_is_graded(tmp_path, capsys):
     right, wrong = (foreign_log(tmp_path / f'{late}.mcap', late) for late in (0, 1))
     assert main([str(right), *LOOPING]) == 0

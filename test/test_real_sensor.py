@@ -16,7 +16,7 @@ FREE = {'top.com_distance': 0.0, 'top.lambda1': 0.1, 'top.lambda3': 0.2, 'initia
 STANDING = {'initial.theta': 0.0, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method': 'exact'}
 
 
-@pytest.mark.parametrize(('order', 'corner'), [(1, 20.0), (2, 7.0), (2, 150.0)])
+@pytest.mark.parametrize(('order', 'corner'), [(1, 20.0), (2, 150.0)])
 def test_gain_and_delay_are_those_of_the_analog_filter(order, corner):
     """In the transverse rate: a sine at |1 - lambda3/lambda1| omega3, the frequency TURNS."""
     from scipy import signal  # takes long

@@ -153,13 +153,6 @@ def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(tmp_path):
     assert start_values('-p', 'spin.l3:=2', '-p', 'spin.l3:=1.5')['spin.l3'] == 1.5
 
 
-def test_parameters_are_given_as_to_simulate():
-    argv = ['--scene', 'wavy', '-p', 'spin.l3:=1.5', '-p', 'imu.enabled:=true']
-    sim_node._prepare(argv)
-    assert argv[:2] == ['--ros-args', '--params-file'] and argv[2].endswith('/wavy.yaml')
-    assert argv[3:] == ['-p', 'spin.l3:=1.5', '-p', 'imu.enabled:=true', '--']
-
-
 def test_of_several_files_the_last_that_is_for_the_node_wins(tmp_path):
     one, two = (scene(tmp_path / f'{l3}.yaml', **{'spin.l3': l3}) for l3 in (2, 1.5))
     other = tmp_path / 'other.yaml'

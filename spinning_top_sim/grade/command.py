@@ -65,7 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     recorded = motion_files.read(arguments.file, arguments.topic)
     body, state, found = _motion(arguments, recorded)
-    trajectory = trajectory_of(recorded, ExactSolution(body, state), found.begin if found else 0.0)
+    trajectory = trajectory_of(recorded, ExactSolution(body, state),
+                               recorded.parts['attitudes'][0][0] if found else 0.0)
     report = grade_trajectory(trajectory, body, state, subject=arguments.file.name)
     if arguments.json:
         print(json.dumps({**report.as_dict(), 'notes': recorded.notes,
@@ -125,8 +126,15 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
         if min(at[-1], times[-1]) - max(at[0], times[0]) < 0.5 * np.ptp(times):
             notes.append(f'{name}: not at the times of the attitudes, left out')
             del parts[name]
-    first = [parts[name][0] for name in ('gyroscope', 'accelerations') if name in parts]
-    even = _even([*first, times, *(at for at, _ in parts.values())], notes)
+    every = [*(parts[name][0] for name in ('gyroscope', 'accelerations') if name in parts), times,
+             *(at for at, _ in parts.values())]
+    begin, end = max(at[0] for at in every) - SAME_S, min(at[-1] for at in every) + SAME_S
+    grid = every[0][(every[0] >= begin) & (every[0] <= end)]
+    even: Reals = np.linspace(grid[0], grid[-1], len(grid))
+    if np.max(np.abs(even - grid)) < EVEN * (even[1] - even[0]):
+        even = grid
+    else:
+        notes.append('stamps are not evenly spaced: interpolated')
     error = turns(times).inv() * Rotation.from_quat(np.roll(attitudes, -1, axis=1))
     level, white = fitting.whiteness(error.as_rotvec().T)
     found = turns(even)
@@ -153,14 +161,3 @@ def _longest(name: str, at: Reals, values: Reals, notes: list[str]) -> tuple[Rea
         notes.append(f'{name}: the longest part without a gap is used')
     chosen = max(np.split(np.arange(len(at)), gaps), key=len)
     return at[chosen], values[chosen]
-
-
-def _even(times: Sequence[Reals], notes: list[str]) -> Reals:
-    """Return the first of these times within all of them, made evenly spaced."""
-    begin, end = max(at[0] for at in times) - SAME_S, min(at[-1] for at in times) + SAME_S
-    grid = times[0][(times[0] >= begin) & (times[0] <= end)]
-    even: Reals = np.linspace(grid[0], grid[-1], len(grid))
-    if np.max(np.abs(even - grid)) < EVEN * (even[1] - even[0]):
-        return grid
-    notes.append('stamps are not evenly spaced: interpolated')
-    return even

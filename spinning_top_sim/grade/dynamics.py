@@ -44,12 +44,11 @@ def faults_of(motions: Sequence[Motion], dt: float) -> list[Fault]:
 
 def energy_fault(motion: Motion) -> Iterator[Fault]:
     """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
-    if motion.trajectory.energy is None:
+    told, data = motion.trajectory.energy, motion.data
+    if told is None or (constants := data.constants(motion.body)) is None:
         return
-    data, torque = motion.data, motion.body.gravity_torque
-    energy, _, _ = data.constants(motion.body) or (0.0, 0.0, 0.0)
-    share = float(np.ptp(motion.trajectory.energy[MARGIN:-MARGIN] - energy)) / (
-        float(np.ptp(torque * data.height)) or 1.0)
+    potential = motion.body.gravity_torque * data.height
+    share = float(np.ptp(told[MARGIN:-MARGIN] - constants[0]) / (np.ptp(potential) or 1.0))
     if share > WRONG_ENERGY:
         yield Fault('energy', f'{motion.name}: the energy told differs from that of attitude and '
                     f'rates by up to {100.0 * share:.3g} % of the change of the potential energy',

@@ -43,7 +43,6 @@ SEEN = 6.0                  # standard deviations of its amplitude: a smaller nu
 STEP = 1e-6                 # of an unknown's natural size: for derivatives of the values
 VAGUE = 0.2                 # of its natural size: an unknown is not told by the readings
 INTERVAL = 1.96             # standard deviations: 95 %
-BEGIN = 64                  # attitudes that tell the start of a known top, whatever follows
 OFF = 0.05                  # rad, and of the angle turned since: another start
 
 
@@ -58,8 +57,6 @@ class Fit:
         At the first attitude.  lambda1 is as given: attitudes tell ratios only.
     mounting, lever_arm : tuple of float
         Of the IMU, as `Body` has them.
-    begin : float
-        Time of the first attitude [s].
     values, deviations : dict
         Estimates and standard deviations by the names of NAMES; inf where the readings do not
         tell the value.
@@ -78,7 +75,6 @@ class Fit:
     start: State
     mounting: tuple[float, float, float, float]
     lever_arm: tuple[float, float, float]
-    begin: float
     values: Mapping[str, float]
     deviations: Mapping[str, float]
     covariance: Reals
@@ -96,9 +92,8 @@ class Fit:
     def lines(self) -> Iterator[str]:
         """Yield lines for a reader."""
         yield (f'fit: residual {self.residual:.3g} rad, noise {self.noise:.3g} rad' + (
-            '' if self.reached else ': no motion of a top comes near the attitudes' if
-            self.residual > LARGEST else ': the residual is not noise, or the fit has not '
-            'converged; what follows is of the nearest motion, and the intervals mean nothing'))
+            '' if self.reached else ': the residual is not noise, or the fit has not converged; '
+            'what follows is of the nearest motion, and the intervals mean nothing'))
         for name, value in self.values.items():
             spread = INTERVAL * self.deviations[name]
             yield f'  {name:<16}{value:>16.9g} ' + (
@@ -137,9 +132,22 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     ValueError
         If there are too few attitudes, or no readings.
     """
-    (one, first, sure), trials = _begun(parts), []
+    times, attitudes = parts['attitudes']
+    if len(times) < FEWEST:
+        raise ValueError(f'{len(times)} attitudes: must be {FEWEST} at least for a fit')
+    if not np.any(np.ptp(attitudes, axis=0)):
+        raise ValueError('the attitude never changes: there is no motion to fit')
+    turns = Rotation.from_quat(np.roll(attitudes, -1, axis=1))
+    one = Readings('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
+    told = parts.get('rates', parts.get('gyroscope'))
+    spin, sure = unknowns.spin_rate(one.times, one.values,
+                                    told and float(np.median(told[1][:, 2])))
+    across = np.cross(*turns[:2].apply((0.0, 0.0, 1.0))) / one.times[1]
+    first = np.zeros(unknowns.UNKNOWNS)
+    first[unknowns.RATES] = (*turns[0].inv().apply(across)[:2], spin)
     small = [(0, *pair) for pair in unknowns.small_nutation(one.times, one.values)]
-    for size, l3, p in ((FIRST, first[SPIN], 0.0), *small[:4], (4 * FIRST, first[SPIN], 0.0)):
+    trials: list[_Trial] = []
+    for size, l3, p in ((FIRST, spin, 0.0), *small[:4], (4 * FIRST, spin, 0.0)):
         first[[L3, P]] = l3, p
         trials.append(_fit_from(one, first, size, gravity))
         best = min(trials, key=lambda trial: trial.residual)
@@ -147,24 +155,23 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
         if best.explained or min(others, default=math.inf) < SAME * best.residual:
             break                               # another guess finds the same
     if not sure:
-        _add_turns(best.x, one.times)
+        best.x[SPIN] += unknowns.turns_added(best.x, one.times)
     best.problem.readings = [replace(one, sigma=max(best.residual, 1e-15))]
     if best.reached:
         at, frozen = _without_unseen_nutation(best.problem, best.x, best.residual)
         free = [k for k in MOTION if k not in frozen]
         best = best._replace(frozen=frozen, x=_descend(best.problem, at, free)[0]
                              if frozen else best.x)
-    begin = float(parts['attitudes'][0][0])
     if imu:
-        best = _with_imu(best, parts, begin)
-    return _conclude(best, begin, lambda1, gravity)
+        best = _with_imu(best, parts)
+    return _conclude(best, lambda1, gravity)
 
 
 def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> State:
     """Return the start of a known top: the fitted one, or if none was found that of the begin."""
     if not found.reached:
         times, attitudes = parts['attitudes']
-        found = fit({**parts, 'attitudes': (times[:BEGIN], attitudes[:BEGIN])})
+        found = fit({**parts, 'attitudes': (times[:4 * FIRST], attitudes[:4 * FIRST])})
     return replace(Start.of(found.top, found.start), state=None).state_of(top)
 
 
@@ -177,23 +184,6 @@ def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) 
     turned = np.linalg.norm(right.angular_velocity[0]) * (times - times[0])
     return '' if np.all(apart < OFF * (1.0 + turned)) else (
         f'at its begin the attitude is up to {math.degrees(np.max(apart)):.3g} deg off')
-
-
-def _begun(parts: Mapping[str, tuple[Reals, Reals]]) -> tuple[Readings, Reals, bool]:
-    """Return attitudes from t = 0 on, unknowns with the first rates, and if turns are known."""
-    times, attitudes = parts['attitudes']
-    if len(times) < FEWEST:
-        raise ValueError(f'{len(times)} attitudes: must be {FEWEST} at least for a fit')
-    if not np.any(np.ptp(attitudes, axis=0)):
-        raise ValueError('the attitude never changes: there is no motion to fit')
-    turns, x = Rotation.from_quat(np.roll(attitudes, -1, axis=1)), np.zeros(unknowns.UNKNOWNS)
-    one = Readings('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
-    told = parts.get('rates', parts.get('gyroscope'))
-    hint = told and float(np.median(told[1][:, 2]))
-    spin, sure = unknowns.spin_rate(one.times, one.values, hint)
-    across = np.cross(*turns[:2].apply((0.0, 0.0, 1.0))) / one.times[1]
-    x[unknowns.RATES] = (*turns[0].inv().apply(across)[:2], spin)
-    return one, x, sure
 
 
 def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
@@ -257,22 +247,13 @@ def whiteness(rest: Reals) -> tuple[float, bool]:
     return math.sqrt(level), strongest < math.log(ONCE_IN * power.size)
 
 
-def _add_turns(x: Reals, times: Reals) -> None:
-    """Make the spin the slowest with 0 < lambda3 <= 2 lambda1, by whole turns per attitude."""
-    step = float(times[-1]) / (len(times) - 1)
-    sign, turn = math.copysign(1.0, x[L3]), math.tau / step
-    less = 0.5 * abs(x[L3]) - sign * x[SPIN]
-    if np.max(np.abs(np.diff(times) - step)) < 1e-5 * step and less > 0.01 * sign * x[SPIN]:
-        x[SPIN] += sign * turn * math.ceil(less / turn)
-
-
-def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: float) -> _Trial:
+def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]]) -> _Trial:
     """Fit the readings of an IMU, first with the motion as it is, then together."""
     problem, x, streams = trial.problem, trial.x, []
     for name, kind in (('gyroscope', 'rates'), ('accelerations', 'force')):
         if name not in parts:
             raise ValueError(f'the file has no {name}: the place of the IMU cannot be fitted')
-        streams.append(Readings(kind, parts[name][0] - begin,
+        streams.append(Readings(kind, parts[name][0] - parts['attitudes'][0][0],
                                 np.ascontiguousarray(parts[name][1].T)))
         streams[-1].sigma = float(np.std(streams[-1].values)) or 1.0
     (one,), problem.readings = problem.readings, streams
@@ -288,7 +269,7 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]], begin: fl
     return _judged(problem, x, trial.reached and converged, trial.frozen)
 
 
-def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fit:
+def _conclude(trial: _Trial, lambda1: float, gravity: float) -> Fit:
     """Return the fit in public parameters, with what the readings do not tell."""
     problem, x = trial.problem, trial.x
     free = [*MOTION, *SENSOR] if len(problem.readings) > 1 else [*MOTION]
@@ -312,10 +293,16 @@ def _conclude(trial: _Trial, begin: float, lambda1: float, gravity: float) -> Fi
     hidden = np.abs(slopes @ directions[~told].T) > 0.01 * allowed[:, np.newaxis]
     deviations[np.any(hidden, axis=1) | ~(deviations < allowed)] = math.inf
     names = [list(NAMES)[k] for k in free]
-    top, start = _scaled(values[:8].tolist(), lambda1, gravity)
+    theta, theta_dot, phi, psi, l3, lz, ratio, p = values[:8].tolist()
+    # Of mass and com_distance only the product counts.
+    distance = math.copysign(min(0.1, gravity / (4.0 * max(abs(p), 1e-9))), p) or 0.1
+    top = Top(lambda1=lambda1, lambda3=(ratio if ratio > 0.0 else 1.0) * lambda1, gravity=gravity,
+              com_distance=distance, mass=abs(p * lambda1 / (gravity or math.inf) / distance))
+    start = State(theta=theta, theta_dot=theta_dot, phi=phi, psi=psi, l3=l3 * lambda1,
+                  lz=lz * lambda1)
     mx, my, mz, mw = turned(problem.mounting, x[unknowns.MOUNTING]).as_quat().tolist()
     arm_x, arm_y, arm_z = x[unknowns.PLACE].tolist()
-    return Fit(top, start, (mw, mx, my, mz), (arm_x, arm_y, arm_z), begin,
+    return Fit(top, start, (mw, mx, my, mz), (arm_x, arm_y, arm_z),
                dict(zip(names, values.tolist(), strict=True)),
                dict(zip(names, deviations.tolist(), strict=True)), half @ half.T,
                tuple(_not_told(names, values, deviations, hidden)), trial.residual, trial.noise,
@@ -369,15 +356,3 @@ def _public(problem: Problem, x: Reals) -> Reals:
     return np.array([state.theta, state.theta_dot, state.phi, state.psi, state.l3, state.lz,
                      state.l3 / (float(x[SPIN]) or 1e-300), x[P], *mounting.as_rotvec(),
                      *x[unknowns.PLACE], x[unknowns.LATE]])
-
-
-def _scaled(values: Sequence[float], lambda1: float, gravity: float) -> tuple[Top, State]:
-    """Return top and start with this lambda1."""
-    theta, theta_dot, phi, psi, l3, lz, ratio, p = values
-    p = p if gravity else 0.0
-    distance = math.copysign(min(0.1, gravity / (4.0 * max(abs(p), 1e-9))), p) or 0.1
-    mass = abs(p) * lambda1 / abs(gravity * distance) if gravity else 1.0
-    top = Top(lambda1=lambda1, lambda3=(ratio if ratio > 0.0 else 1.0) * lambda1, gravity=gravity,
-              com_distance=distance, mass=mass)
-    return top, State(theta=theta, theta_dot=theta_dot, phi=phi, psi=psi, l3=l3 * lambda1,
-                      lz=lz * lambda1)

@@ -83,14 +83,14 @@ class Problem:
 
     def jacobian(self, x: Reals, free: Sequence[int], central: bool = False) -> Reals:
         """Return the derivatives of the residuals (m, len(free)), by finite differences."""
-        base = None if central else self.residuals(x)
         columns, sigma = [], min(one.sigma for one in self.readings)
+        behind = self.residuals(x)
         for k in free:
             step = np.zeros(UNKNOWNS)
             step[k] = self._steps[k]
-            ahead = self.residuals(x + step)
-            change = 0.5 * (ahead - self.residuals(x - step)) if base is None else ahead - base
-            columns.append(change / step[k])
+            behind = self.residuals(x - step) if central else behind
+            change = self.residuals(x + step) - behind
+            columns.append(change / ((1.0 + central) * step[k]))
             largest = float(np.max(np.abs(columns[-1]))) * sigma
             self._steps[k] = min(max(CHANGE / max(largest, 1e-300), 1e-12), 1e-4)
         return np.stack(columns, axis=1)
@@ -99,7 +99,7 @@ class Problem:
         """Return readings - model (3, n)."""
         q, w = self.motion(x, one)
         if one.kind == 'attitude':
-            a, b, c, d = q
+            a, b, c, d = q          # SciPy's rotations take ten times as long
             turn = np.stack(attitude.product((-a, -b, -c, d), tuple(one.values)))
             return np.stack(attitude.rotation_vector(tuple(np.where(turn[3] < 0.0, -turn, turn))))
         model = w if one.kind == 'rates' else self._force(x, q, w)
@@ -154,6 +154,15 @@ def spin_rate(times: Reals, q: Reals, hint: float | None) -> tuple[float, bool]:
     rate += math.tau / step * round(turns) if sure else 0.0
     rest = np.remainder(turn - rate * dt + math.pi, math.tau) - math.pi
     return rate + float(np.sum(rest) / np.sum(dt)), sure
+
+
+def turns_added(x: Reals, times: Reals) -> float:
+    """Return what makes the spin the slowest with 0 < lambda3 <= 2 lambda1, by whole turns."""
+    step = float(times[-1]) / (len(times) - 1)
+    sign, turn = math.copysign(1.0, x[L3]), math.tau / step
+    less = 0.5 * abs(x[L3]) - sign * x[SPIN]
+    even = np.max(np.abs(np.diff(times) - step)) < 1e-5 * step
+    return sign * turn * math.ceil(less / turn) if even and less > 0.01 * sign * x[SPIN] else 0.0
 
 
 def small_nutation(times: Reals, q: Reals) -> Iterator[tuple[float, float]]:

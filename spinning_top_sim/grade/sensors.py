@@ -143,10 +143,8 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
              f'{kind}_discrepancy': beyond(target, most)}
     faults = []
     if abs(late) > LATE:
-        ms = 1e3 * abs(late) * motions[0].trajectory.step
         faults.append(Fault('imu_one_step_late', 'readings belong to the motion of '
-                            f'{abs(late):.3g} steps ({ms:.3g} ms) '
-                            f'{"before" if late > 0.0 else "after"}', late))
+                            f'{abs(late):.3g} steps {"before" if late > 0.0 else "after"}', late))
     found, residual, explained = _explained(
         kind, motions, *pooled(zip(wrong, effects, strict=True)), floor, most)
     faults += found

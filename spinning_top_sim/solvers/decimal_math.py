@@ -17,6 +17,8 @@ DIGITS = 40             # that are left of long decimals once nothing cancels an
 SMALL = Decimal('1e-9')
 # Parts of a quarter turn whose sines and cosines are tabulated.
 PARTS = 64
+# Of doubles that are asked for again and again, as those of a top are.
+exact = lru_cache(64)(Decimal)
 
 
 def precision(digits: int) -> AbstractContextManager[Context]:
@@ -27,12 +29,6 @@ def precision(digits: int) -> AbstractContextManager[Context]:
 @lru_cache
 def _context(digits: int) -> Context:
     return Context(prec=digits, Emin=-10 ** 12, Emax=10 ** 12)
-
-
-@lru_cache(64)
-def exact(x: float) -> Decimal:
-    """Return a double as it is; those of a top are asked for again and again."""
-    return Decimal(x)
 
 
 def root(x: Decimal) -> Decimal:
@@ -87,37 +83,41 @@ def _tables(digits: int) -> tuple[Decimal, list[tuple[Decimal, Decimal]], list[D
 def sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
     """Return sin x and cos x."""
     angle, values, series, _ = _tables(getcontext().prec)
-    count = int((x / angle).to_integral_value())
+    count = round(x / angle)
     rest = x - count * angle
     square, total = rest * rest, ZERO
     for coefficient in series:
         total = total * square + coefficient
     s = rest * total
-    c = root(1 - s * s)
+    c = (1 - s * s).sqrt()      # fast next to 1
     quarters, part = divmod(count, PARTS)
     if part:
         a, b = values[part]
         s, c = a * c + b * s, b * c - a * s
-    return [(s, c), (c, -s), (-s, -c), (-c, s)][quarters % 4]
+    if quarters & 2:
+        s, c = -s, -c
+    return (c, -s) if quarters & 1 else (s, c)
 
 
 def atan2(y: Decimal, x: Decimal) -> Decimal:
     """Return the argument of x + iy; 0 at the origin."""
-    size = max(abs(x), abs(y))
-    if not size:
+    if abs(y) <= abs(x):
+        quarters, y, x = (0, y, x) if x >= 0 else (2 if y >= 0 else -2, -y, -x)
+    else:
+        quarters, y, x = (1, -x, y) if y > 0 else (-1, x, -y)
+    if not x:
         return ZERO
     angle, values, _, series = _tables(getcontext().prec)
-    count = round(math.atan2(y / size, x / size) / float(angle))
-    quarters, part = divmod(count, PARTS)
-    y, x = [(y, x), (-x, y), (-y, -x), (x, -y)][quarters % 4]
+    tangent = y / x
+    part = round(math.atan(tangent) / float(angle))
     if part:
-        s, c = values[part]
-        y, x = y * c - x * s, x * c + y * s
-    tangent = y / x             # of the angle that is left
+        s, c = values[abs(part)]
+        s = s if part > 0 else -s
+        tangent = (tangent * c - s) / (tangent * s + c)     # of the angle that is left
     square, total = tangent * tangent, ZERO
     for coefficient in series:
         total = total * square + coefficient
-    return count * angle + tangent * total
+    return (PARTS * quarters + part) * angle + tangent * total
 
 
 def asinh(x: Decimal) -> Decimal:
@@ -127,9 +127,9 @@ def asinh(x: Decimal) -> Decimal:
 
 def half_turns(radians: float) -> Decimal:
     """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
-    exact = Decimal(radians)
-    with localcontext(prec=getcontext().prec + max(0, exact.adjusted())):
-        rest = (exact / (4 * pi())).remainder_near(ONE)
+    angle = Decimal(radians)
+    with localcontext(prec=getcontext().prec + max(0, angle.adjusted())):
+        rest = (angle / (4 * pi())).remainder_near(ONE)
     return +rest
 
 

@@ -31,24 +31,26 @@ class GaussMean:
     """
 
     def __init__(self, a: Decimal, g: Decimal, c: Decimal) -> None:
-        self._means, self._c = [(a, g)], [c]
-        tolerance = _tolerance()
-        while len(self._c) < 2 or c > a * tolerance:
+        # The size of c/a whose square is negligible.
+        self._tolerance = tolerance = Decimal(10) ** (-(getcontext().prec // 2) - 1)
+        self._start, self._squares = a, [c * c]
+        self._means: list[tuple[Decimal, Decimal]] = []     # g_n and c_n
+        while not self._means or c > a * tolerance:
             product, a = a * g, (a + g) / 2
-            c = c * c / (4 * a)                     # [DLMF 19.8.3]
+            c = self._squares[-1] / (4 * a)         # [DLMF 19.8.3]
             g = root(product) if c > a * tolerance else a
-            self._means.append((a, g))
-            self._c.append(c)
+            self._means.append((g, c))
+            self._squares.append(c * c)
         self.mean = a
 
     @property
     def quarter_period(self) -> Decimal:
         """2 K(k)/pi."""
-        return self._means[0][0] / self.mean
+        return self._start / self.mean
 
     def nome(self) -> Decimal:
         """Return q = exp(-pi K'/K) to 40 digits, for k^2 <= 1/2."""
-        (a, _), (_, g), c = self._means[0], self._means[1], self._c[1]
+        a, (g, c) = self._start, self._means[0]
         small = a * c / (a + g) ** 2                # (1 - sqrt(k'))/(1 + sqrt(k'))/2
         power, total = small ** 4, ZERO
         for coefficient in reversed(NOME_COEFFICIENTS):
@@ -66,18 +68,12 @@ class GaussMean:
         """
         if not square:
             return ZERO
-        a, _ = self._means[0]
-        h = a / root(square)
-        small = Decimal(10) ** (-(getcontext().prec // 4) - 1)
-        for c in self._c:
-            square = sense * c * c
+        h = self._start / root(square)
+        for c2 in self._squares:
             # Two terms of the root are enough where c is small.
-            h = h + square / (4 * h) if c < h * small else (h + root(h * h + square)) / 2
+            h2 = h * h
+            h = (h + sense * c2 / (4 * h) if c2 < h2 * self._tolerance
+                 else (h + root(h2 + sense * c2)) / 2)
         amplitude = self.mean / h
         # The square may be 1 but for rounding: the sine is then 1.
         return min(amplitude, Decimal(1)) if sense < 0 else amplitude
-
-
-def _tolerance() -> Decimal:
-    """Return the size of c/a whose square is negligible."""
-    return Decimal(10) ** (-(getcontext().prec // 2) - 1)

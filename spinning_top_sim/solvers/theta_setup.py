@@ -42,7 +42,6 @@ there are 57 digits, and more if two roots are close.  Then 40 are enough.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from decimal import Decimal, DecimalException
 from typing import NamedTuple
 
@@ -77,8 +76,7 @@ DIGITS_TO_TRY = 57, 114, 228, 456
 NO_GRAVITY = Decimal('1e-1000')     # so small that u3 is infinite to all digits
 
 
-@dataclass(frozen=True)
-class Factor:
+class Factor(NamedTuple):
     """
     Alpha or beta: (R + i s J)/D exp i(r t + c + kappa y); the symbols are explained above.
 
@@ -88,8 +86,7 @@ class Factor:
     parts : R and s J at even and at odd N.  If it changes its sign at a pole, R is a sine series
         at one of them, and has the factor (-1)^floor(N/2).
     sense : s
-    start_argument : argument of (R + i s J) exp(i kappa y) at t = 0, less that of `direction` of
-        `_Side` [rad]
+    start_argument : of (R + i s J) exp(i kappa y), less that of the start's `direction` [rad]
     """
 
     rate: Decimal
@@ -100,8 +97,7 @@ class Factor:
     start_argument: Decimal
 
 
-@dataclass(frozen=True)
-class ThetaMotion:
+class ThetaMotion(NamedTuple):
     """
     A motion in theta functions; the symbols are explained above.
 
@@ -328,9 +324,8 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate:
             y_rate: Decimal, quarters: int, y: Decimal,
             point: tuple[Decimal, Decimal, Decimal]) -> Factor:
     """
-    Return alpha or beta.
+    Return alpha or beta; x_rate, y_rate: of x and y [rad/s] of the imaginary and the real form.
 
-    x_rate, y_rate : rates of the argument of the series and of y [rad/s]
     quarters, y, point : N, y and the arguments of `Series.at` at t = 0
     """
     sense, drift, rate = int(side.momentum.compare(ZERO)), ZERO, side.spin / 2

@@ -49,12 +49,15 @@ class ThetaFunctions:
     rates, offset, offset_rest, start_whole : of the three phases, (3, 1).  At t = 0 a phase is
         start_whole + offset + offset_rest.
     drifts : kappa/2 of alpha and beta, (2, 1)
-    prefactors : at even and at odd N, of the rows R of alpha, R of beta, s J of alpha, s J of beta
+    prefactors : at even and at odd N, of the rows R of alpha and beta, s J of alpha and beta;
+        where they differ in a chain, of all its motions one after the other
+    stretch : K/K' times a quarter turn, 0 in the real form; None if there is no other
     coefficients : of the polynomials, highest power first, by row, at even and at odd N, (k, 4, 2)
     real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
     zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
     u_dot, u_dot_coefficients : of u'
     momentum, swing : of (Lz - L3 u)/lambda1
+    chains : whether the motion can be part of a chain: it nutates, and passes no pole
     first : of a chain, the place of each time's constants at even N in the last axis, (n,)
     """
 
@@ -72,8 +75,11 @@ class ThetaFunctions:
         self.stretch: Column | float | None = (
             QUARTER * float(motion.stretch) if motion.stretch else None)
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
-        self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
-        self.coefficients = _coefficients(rows, motion.size)
+        self.prefactors: list[tuple[int, ...]] = [
+            (even.prefactor, odd.prefactor) for even, odd in rows]
+        series = [motion.u_dot_series, motion.u_dot_series]
+        coefficients = _coefficients([*rows, series], motion.size)
+        self.coefficients, self.u_dot_coefficients = coefficients[:, :4], coefficients[:, 4, :1]
         self.real = [k for k, factor in enumerate(factors) if not factor.sense]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
                       if SIN_ODD in pair}
@@ -85,29 +91,25 @@ class ThetaFunctions:
                         f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
                         f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
         self.u_dot = np.array([in_range("cos(theta)'", x) for x in motion.u_dot])
-        self.u_dot_coefficients = _coefficients([[motion.u_dot_series]], motion.size)[:, 0]
         self.momentum, self.swing = (
             np.array([*map(float, pair)]) for pair in (motion.momentum, motion.swing))
+        self.chains = any(motion.u_dot) and not self.real
         self._quarter0 = motion.quarter0
-
-    @cached_property
-    def kind(self) -> tuple[object, ...] | None:
-        """What motions of one chain have in common; None of one that cannot be part of any."""
-        if self.real or not self.u_dot.any():
-            return None
-        return self.stretch is None, *self.prefactors
 
     @classmethod
     def chained(cls, parts: Sequence[ThetaFunctions], counts: Sequence[int]) -> ThetaFunctions:
-        """Return the constants of motions of one kind, of each for so many times."""
+        """Return the constants of motions, of each for so many times."""
         chain = copy(parts[0])
         chain.rates = Rates.chained([part.rates for part in parts], counts)
         chain.offset, chain.offset_rest, chain.start_whole, chain.drifts = (
             np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(*(
                 (part.offset, part.offset_rest, part.start_whole, part.drifts)
                 for part in parts), strict=True))
-        if chain.stretch is not None:
-            chain.stretch = np.repeat([part.stretch for part in parts], counts)
+        if any(part.stretch for part in parts):
+            chain.stretch = np.repeat([part.stretch or 0.0 for part in parts], counts)
+        if any(part.prefactors != chain.prefactors for part in parts):
+            chain.prefactors = [sum(rows, ()) for rows in zip(*(
+                part.prefactors for part in parts), strict=True)]
         chain.coefficients = _side_by_side([part.coefficients for part in parts])
         chain.u_dot_coefficients = np.repeat(_side_by_side([
             part.u_dot_coefficients for part in parts]), counts, axis=1)
@@ -179,12 +181,12 @@ class ThetaValues:
     def _evaluate(self) -> None:
         """Compute R and s J of alpha and beta, (2, n) each."""
         constants, quarters = self._constants, self._whole[0]
-        if constants.stretch is None:
-            sin = self._sin[0]
-            xi = sin * sin
-        else:
-            sin = np.sinh(constants.stretch * self._offset)
-            xi = -sin * sin
+        sin = self._sin[0]
+        xi = sin * sin
+        if constants.stretch is not None:
+            is_real = np.equal(constants.stretch, 0.0)
+            sin = np.where(is_real, sin, np.sinh(constants.stretch * self._offset))
+            xi = np.where(is_real, xi, -sin * sin)
         cos = np.sqrt(1.0 - xi)
         self._parity, self._xi = quarters & 1, xi
         odd = self._parity.astype(bool)
@@ -194,8 +196,11 @@ class ThetaValues:
             rows[k] *= 1 - (quarters & 2)
         self._without_zero = {k: rows[k].copy() for k in constants.zeros}
         bases = 1.0, cos, sin, sin * cos
-        for k, (one, other) in enumerate(constants.prefactors):
-            rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
+        for k, (one, other, *more) in enumerate(constants.prefactors):
+            if more:
+                rows[k] *= np.choose(np.take(constants.prefactors[k], self._place), bases)
+            else:
+                rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
         self._real, self._imag = rows[:2], rows[2:]
         self._sin_cos, self._cos_y, self._sin_y = bases[3], cos, sin
 

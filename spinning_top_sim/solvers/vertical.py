@@ -91,7 +91,8 @@ class Vertical(NamedTuple):
 
     def start(self, top: Top, posture: Posture) -> HalfAngles:
         """Return a posture as a state in this frame."""
-        alpha, beta = _product(_inverse(self.alpha, self.beta), (posture.alpha, posture.beta))
+        (a, b), (c, d) = self.alpha, self.beta
+        alpha, beta = _product(((a, -b), (-c, -d)), (posture.alpha, posture.beta))
         cosine2, sine2 = _square(alpha), _square(beta)
         size2, l3, (o1, o2) = cosine2 + sine2, Decimal(posture.l3), posture.across
         cosine, sine = root(cosine2 / size2), root(sine2 / size2)
@@ -113,10 +114,6 @@ class Vertical(NamedTuple):
                 lz = +pole
         return HalfAngles(sine, cosine, theta_dot / unit, alpha, beta, +l3, lz)
 
-    def top(self, top: Top) -> Top:
-        """Return the top in the effective gravity."""
-        return _in_gravity(top, float(self.gravity))
-
 
 class AcceleratedMotion(ExactSolution):
     """
@@ -137,11 +134,12 @@ class AcceleratedMotion(ExactSolution):
 
     def __init__(self, top: Top, posture: Posture, acceleration: Exact) -> None:
         self.vertical, self._halves = about_vertical(top, posture, acceleration)
-        self.top, self._posture = self.vertical.top(top), posture
+        self.top, self._posture = in_gravity(top, float(self.vertical.gravity)), posture
         self._turns, self._sign, self._half_turn = 0, 1.0, 0.0
         self._motion = set_up(top, self.vertical.gravity, self._halves)
         with precision(DIGITS):
             self._take_constants(self._motion, *self._halves[-2:])
+        self.chains = self._theta.chains        # whether it can be `chained`
 
     @cached_property
     def start(self) -> State:       # type: ignore[override]
@@ -158,11 +156,6 @@ class AcceleratedMotion(ExactSolution):
         cancels = np.abs(bottom) + np.abs(top) > np.abs(one) + np.abs(two)
         across: Column = np.where(cancels, one + two, bottom + top)
         return across
-
-    @property
-    def kind(self) -> tuple[object, ...] | None:
-        """What motions have in common that can be `chained`; None of one that cannot."""
-        return self._theta.kind
 
     @property
     def energy(self) -> float:
@@ -188,7 +181,7 @@ class AcceleratedMotion(ExactSolution):
 
 
 class _Chain(AcceleratedMotion):
-    """Motions of one kind, each at `counts` of the times, for states only: it has no posture."""
+    """Motions one after the other, each at `counts` of the times, for states only."""
 
     def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int]) -> None:
         self.top, self.start, self._turns = motions[0].top, motions[0].start, 0
@@ -199,7 +192,7 @@ class _Chain(AcceleratedMotion):
 
 def chained(motions: Sequence[AcceleratedMotion], counts: Sequence[int],
             times_ns: NDArray[np.int64]) -> States:
-    """Return the states of motions of one kind, of each at so many of the times [ns]."""
+    """Return the states of motions, of each at so many of the times [ns]."""
     states = _ExactStates(_Chain(motions, counts), Times.from_ns(times_ns))
     states._lz, states._gravity, states._torque = np.repeat(np.array([
         (float(motion._halves.lz), motion.top.gravity, motion.top.gravity_torque)
@@ -225,7 +218,8 @@ def _upright(gravity: Decimal, x: Decimal, y: Decimal, z: Decimal) -> Vertical:
 
 
 @lru_cache(16)
-def _in_gravity(top: Top, gravity: float) -> Top:
+def in_gravity(top: Top, gravity: float) -> Top:
+    """Return the top in another gravity [m/s^2]."""
     return replace(top, gravity=gravity)
 
 
@@ -309,11 +303,10 @@ def _factor(factor: Factor, whole: int, y: Decimal, t: Decimal,
     """Return alpha D or beta D; `whole`, y, `point`: N, y and the arguments of `Series.at`."""
     parts = factor.parts[whole % 2]
     real, imag = (part.at(*point) for part in parts)
-    passes = any(one[0].prefactor == SIN_ODD for one in factor.parts)
-    if passes and whole % 4 >= 2:
-        real = -real
+    if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
+        real = -real                # it passes a pole
     turn = factor.rate * t + 2 * pi() * factor.phase_turns + factor.drift * y
-    sine, cosine = sin_cos(turn.remainder_near(2 * pi()))
+    sine, cosine = sin_cos(turn)
     return _times((real, imag), (cosine, sine))
 
 
@@ -363,10 +356,6 @@ def _product(p: Sequence[Complex], q: Sequence[Complex]) -> tuple[Complex, Compl
     (r1, i1), (r2, i2) = _times(a, c), _times(b, conj_d)
     (r3, i3), (r4, i4) = _times(a, d), _times(b, conj_c)
     return (r1 - r2, i1 - i2), (r3 + r4, i3 + i4)
-
-
-def _inverse(alpha: Complex, beta: Complex) -> tuple[Complex, Complex]:
-    return (alpha[0], -alpha[1]), (-beta[0], -beta[1])
 
 
 def _times(a: Complex, b: Complex) -> Complex:

@@ -73,17 +73,17 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
 
 
 def _samples(path: Path, epoch_ns: int, *ranges: range) -> list[Samples]:
-    """Return the samples at times [ns] in consecutive segments, short ones of a kind together."""
+    """Return the samples at times [ns] in consecutive segments, short ones that chain together."""
     groups: list[list[tuple[Segment, range]]] = []
-    kind, count = None, 0
+    chains, count = False, 0
     for times in filter(len, ranges):
         segment = path.after(times.start - 1)
         count += len(times)
-        if kind and kind == segment.kind and count <= BLOCK:
+        if chains and segment.chains and count <= BLOCK:
             groups[-1].append((segment, times))
         else:
             groups.append([(segment, times)])
-            kind, count = segment.kind, len(times)
+            chains, count = segment.chains, len(times)
     return [Samples(path, group, epoch_ns) for group in groups]
 
 

@@ -55,19 +55,18 @@ class Segment:
 
     ride : what the pivot does; None while it rests at the origin
     reached_ns : time up to which the solver needs no further steps
-    energy, l3, lz : constants of the motion, at its start
+    start, energy, l3, lz : at its start
     filtered : state of the low pass of the IMU at the start; None without one, or from t = 0 on
     """
 
-    def __init__(self, solver: Propagator, start_ns: int, start: State | None = None,
-                 ride: Ride | None = None) -> None:
-        self.solver, self.start_ns, self.ride, self._start = solver, start_ns, ride, start
+    def __init__(self, solver: Propagator, start_ns: int, ride: Ride | None = None) -> None:
+        self.solver, self.start_ns, self.ride = solver, start_ns, ride
         self.reached_ns = start_ns + solver.reached_ns
         self.filtered: NDArray[np.float64] | None = None
 
     @property
     def start(self) -> State:
-        return self._start or self.solver.start
+        return self.solver.start
 
     @property
     def l3(self) -> float:
@@ -88,9 +87,9 @@ class Segment:
         return float(self._first.energy[0])
 
     @property
-    def kind(self) -> tuple[object, ...] | None:
-        """What segments have in common that are evaluated together; None of one that is not."""
-        return self.solver.kind if isinstance(self.solver, AcceleratedMotion) else None
+    def chains(self) -> bool:
+        """Whether it can be evaluated together with others."""
+        return isinstance(self.solver, AcceleratedMotion) and self.solver.chains
 
     @cached_property
     def exact(self) -> ExactSolution | None:
@@ -172,7 +171,7 @@ class Segment:
 
 def states_of(segments: Sequence[Segment], counts: Sequence[int],
               times_ns: NDArray[np.int64]) -> States:
-    """Return the states in the world in segments of one kind, in each at so many times [ns]."""
+    """Return the states in the world in segments that chain, in each at so many times [ns]."""
     motions, rides = [], []
     for segment in segments:
         assert isinstance(segment.solver, AcceleratedMotion) and segment.ride

@@ -19,6 +19,7 @@ from spinning_top_sim.solvers.vertical import (
     AcceleratedMotion,
     Posture,
     about_vertical,
+    in_gravity,
     posture_of,
     rounded,
 )
@@ -349,7 +350,7 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
                    atol=values['solver.atol'])
     if pivot is None:
         assert isinstance(start, State)
-        return Segment(step(top, start), start_ns, start)
+        return Segment(step(top, start), start_ns)
     posture, piece = start, pivot.lasting(start_ns)
     if isinstance(posture, State):
         posture = posture_of(top, posture)
@@ -359,5 +360,5 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
         vertical = solver.vertical
     else:
         vertical, halves = about_vertical(top, posture, piece.acceleration)
-        solver = step(vertical.top(top), rounded(halves))
-    return Segment(solver, start_ns, ride=Ride(top, vertical, piece))
+        solver = step(in_gravity(top, float(vertical.gravity)), rounded(halves))
+    return Segment(solver, start_ns, Ride(top, vertical, piece))

@@ -34,7 +34,7 @@ class Samples:
     The motion at times of a block; the streams of one rate share it.
 
     path : the motion
-    shares : a segment and its times [ns], or several segments of one kind
+    shares : a segment and its times [ns], or several segments that chain
     times : of the samples [ns]
     epoch_ns : stamp of t = 0 [ns]
     """
