@@ -175,24 +175,22 @@ class Responses:
 
     def _best(self, tried: Iterator[Tried], mends_turns: bool = False) -> Tried | None:
         """Return the one that leaves least, if it explains the error or mends wrong turns."""
-        limit, found = diagnosis.EXPLAINED * self._whole(self._outcome), []
+        limit, least, best = diagnosis.EXPLAINED * self._whole(self._outcome), math.inf, None
         for one, outcome in tried:
             error = self._whole(outcome)
-            if error <= limit or (mends_turns and not self._turns_wrong(outcome)):
-                found.append((error, one, outcome))
+            if error < least and (error <= limit or (
+                    mends_turns and not self._turns_wrong(outcome))):
+                least, best = error, (diagnosis.ambiguous(one, self._absolute), outcome)
             if error <= SURE * limit:
                 break
-        if not found:
-            return None
-        _, one, outcome = min(found, key=lambda one: one[0])
-        return diagnosis.ambiguous(one, self._absolute), outcome
+        return best
 
     def _of_attitudes(self) -> Iterator[Tried]:
         """Try misreadings of the attitudes, and what the attitudes at rest suggest."""
         estimated, true = (Rotation.from_quat(rows[self._rests])
                            for rows in (self._outcome.estimates, self._excited.truth))
         in_sensor, in_world = (true.inv() * estimated).mean(), (estimated * true.inv()).mean()
-        heading = math.remainder(2.0 * math.atan2(*in_world.as_quat()[2:]), math.tau)
+        heading = 2.0 * math.atan2(*in_world.as_quat(canonical=True)[2:])
         back = Rotation.from_rotvec((0.0, 0.0, -heading))
         group = Rotation.create_group('O')
         square = group[int(np.argmin((group.inv() * in_sensor).magnitude()))]
@@ -288,11 +286,10 @@ class Responses:
 
     def _apart(self, others: Reals) -> Reals:
         """Return the turns to other attitudes, at rest and in motion."""
-        judged = np.append(self._rests, np.arange(*self._given.motion.indices(len(others)))[::10])
+        judged = [*self._rests, *range(*self._given.motion.indices(len(others)))[::10]]
         one, other = (Rotation.from_quat(rows[judged])
                       for rows in (self._outcome.estimates, others))
-        turns: Reals = (other * one.inv()).as_rotvec().ravel()
-        return turns
+        return (other * one.inv()).as_rotvec().ravel()
 
     def _at_rest(self, outcome: Outcome, more: Sequence[Hypothesis] = (),
                  ) -> list[tuple[Rotation, NDArray[np.intp]]]:
@@ -333,10 +330,10 @@ class Responses:
 
     def _rest(self) -> list[Fault]:
         """Name what no hypothesis explains by where it shows."""
-        tilt, heading, tilt_moving, heading_moving = map(degrees, self._clean(self._outcome))
-        left = (f'without noise the error at rest is {tilt} of tilt and {heading} of heading, in '
-                f'motion {tilt_moving} and {heading_moving}')
-        wrong = bool(np.any(self._clean(self._outcome) > CLEAN))
+        clean = self._clean(self._outcome)
+        left = ('without noise the error at rest is {} of tilt and {} of heading, '
+                'in motion {} and {}').format(*map(degrees, clean))
+        wrong = bool(np.any(clean > CLEAN))
         whole, early, late = gyroscope_of(self._outcome, self._given.turns)
         self._early = early
         turns = Rotation.from_quat(self._outcome.estimates)
