@@ -27,7 +27,6 @@ from spinning_top_sim.tools.verdict import number
 
 FEWEST = 32                 # attitudes that can be fitted
 GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
-SAME = 1.01                 # of the least residual: another fit that finds the same motion
 LOST = 0.05                 # residual of a part that is too long to begin with [rad]
 FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
 NAMES = {'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'psi': 'rad', 'L3/lambda1': 'rad/s',
@@ -150,10 +149,9 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     for size, l3, p in ((FIRST, spin, 0.0), *small[:4], (4 * FIRST, spin, 0.0)):
         first[[L3, P]] = l3, p
         trials.append(_fit_from(one, first, size, gravity))
-        best = min(trials, key=lambda trial: trial.residual)
-        others = [trial.residual for trial in trials if trial is not best]
-        if best.explained or min(others, default=math.inf) < SAME * best.residual:
+        if trials[-1].explained:
             break                               # another guess finds the same
+    best = min(trials, key=lambda trial: trial.residual)
     if not sure:
         best.x[SPIN] += unknowns.turns_added(best.x, one.times)
     best.problem.readings = [replace(one, sigma=max(best.residual, 1e-15))]
