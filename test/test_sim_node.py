@@ -45,9 +45,12 @@ def both_runs(peer, diagnostics, tmp_path_factory):
     """Two nodes side by side in namespaces of their own, recorded, watched, told, and ended."""
     folder = tmp_path_factory.mktemp('runs')
     runs = {}
-    with (SimNode(folder, {**RUNS['plain'], 'record.enabled': True}, namespace='/plain') as one,
-          SimNode(folder, {**RUNS['mounted'], 'record.enabled': True},
-                  namespace='/mounted') as two):
+    # With the default depth of 10, a subscriber that stands still for 50 ms misses samples.
+    one, two = ({**values, 'record.enabled': True, **{
+        f'qos_overrides./{name}/{topic}.publisher.depth': 1000 for topic in (*KINDS, 'markers')}}
+        for name, values in RUNS.items())
+    with (SimNode(folder, one, namespace='/plain') as one,
+          SimNode(folder, two, namespace='/mounted') as two):
         for node in (one, two):
             topics = {name: peer.listen(node.topic(name), kind) for name, kind in KINDS.items()}
             runs[node.namespace[1:]] = SimpleNamespace(node=node, topics=topics)

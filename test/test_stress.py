@@ -63,7 +63,8 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
         for name in ('theta', 'theta_dot', 'phi', 'psi'):
             assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-9)
         truth = ExactSolution(simulation.top, ContinuedState(l3=l3, lz=lz, **{
-            name: float(getattr(after, name)[0]) for name in ('theta', 'theta_dot', 'phi', 'psi')}))
+            name: float(getattr(after, name)[0])
+            for name in ('theta', 'theta_dot', 'phi', 'psi')}))
         for later in (1_000_000, 50_000_000, 200_000_000):
             simulation.advance(now + later)
             exact = truth.states(range(later, later + 1))
