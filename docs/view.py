@@ -11,8 +11,8 @@ from playwright.sync_api import sync_playwright
 
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.view.log import Player, read_logs
-from spinning_top_sim.view.model import ARROWS
 from spinning_top_sim.view.page import Page
+from spinning_top_sim.view.shapes import ARROWS
 
 HERE = Path(__file__).parent
 SHOWN_S = 12.3
