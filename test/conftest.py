@@ -7,20 +7,20 @@ import helpers.own_domain  # noqa: F401, before any node starts
 import pytest
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config, items):
-    """
-    Begin with the files of the longest tests, so that at the end no worker waits for one.
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    if config.getvalue('dist') != 'load':
+        return None
+    from helpers.scheduling import BySharedFixture
 
-    With `--dist loadgroup` the tests of a file that use its fixtures share a worker: such fixtures
-    start nodes or simulate logs.
-    """
+    return BySharedFixture(config, log)
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the files of the longest tests, so that at the end no worker waits for one."""
     long = {f'test_{name}.py' for name in (
         'attitude_filter', 'docs', 'tour', 'view_node', 'sim_node_life', 'grade_files', 'recover')}
     items.sort(key=lambda item: item.path.name not in long)
-    for item in items if config.pluginmanager.hasplugin('xdist') else ():
-        if not vars(item.module).keys().isdisjoint(item.fixturenames):
-            item.add_marker(pytest.mark.xdist_group(item.path.name))
 
 
 @pytest.fixture(autouse=True)
