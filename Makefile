@@ -151,12 +151,13 @@ $(VENV)/.deps-%: pyproject.toml $(VENV)/.made
 	@touch '$@'
 
 # The package alone: takes seconds and needs no network.  Folders too: their modification time
-# changes when a file is removed.
+# changes when a file is removed.  The dependencies may have brought an older wheel from a cache.
 SOURCES := $(shell find pyproject.toml setup.py setup.cfg package.xml config foxglove launch \
     resource rviz scripts spinning_top_sim urdf -name __pycache__ -prune -o \
     \( -type f -o -type d \) ! -name '.*' ! -name '*~' -print)
 $(VENV)/.package: $(VENV)/.deps-ros$(if $(filter kilted,$(ROS)),-kilted) $(SOURCES)
 	@echo 'Installing spinning_top_sim into $(VENV)'
-	@rm -rf '$(VENV)/build' && mkdir '$(VENV)/build'
+	@rm -rf '$(VENV)/build' '$(VENV)'/lib/python*/site-packages/spinning_top_sim
+	@mkdir '$(VENV)/build'
 	@$(PIP) --no-deps --no-build-isolation --force-reinstall .
 	@touch '$@'
