@@ -179,8 +179,8 @@ def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) 
     right = ExactSolution(top, start).states_at_seconds(times)
     apart = (Rotation.from_quat(right.quaternion).inv()
              * Rotation.from_quat(np.roll(attitudes, -1, axis=1))).magnitude()
-    turned = np.linalg.norm(right.angular_velocity[0]) * (times - times[0])
-    return '' if np.all(apart < OFF * (1.0 + turned)) else (
+    angle = np.linalg.norm(right.angular_velocity[0]) * (times - times[0])
+    return '' if np.all(apart < OFF * (1.0 + angle)) else (
         f'at its begin the attitude is up to {math.degrees(np.max(apart)):.3g} deg off')
 
 

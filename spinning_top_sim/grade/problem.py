@@ -107,10 +107,11 @@ class Problem:
 
     def motion(self, x: Reals, one: Readings) -> tuple[Reals, Reals]:
         """Return attitudes (4, n), and for an IMU rates in the body (3, n), at its times."""
-        return self._motion(one, *x[:8].tolist(), late=float(x[LATE]))
+        late = 0.0 if one.kind == 'attitude' else float(x[LATE])
+        return self._motion(one, *x[:8].tolist(), late=late)
 
     def _motion_of(self, one: Readings, *unknowns: float, late: float) -> tuple[Reals, Reals]:
-        x, t = np.array(unknowns), one.times - (0.0 if one.kind == 'attitude' else late)
+        x, t = np.array(unknowns), one.times - late
         states = ExactSolution(*self.start(x)).states_at_seconds(t)
         angle, zero = (x[SPIN] - x[L3]) * t, np.zeros(1)
         q = np.stack(attitude.product(states.rows_quaternion, (

@@ -182,11 +182,13 @@ class ThetaValues:
         """Compute R and s J of alpha and beta, (2, n) each."""
         constants, quarters = self._constants, self._whole[0]
         sin = self._sin[0]
-        xi = sin * sin
-        if constants.stretch is not None:
-            is_real = np.equal(constants.stretch, 0.0)
-            sin = np.where(is_real, sin, np.sinh(constants.stretch * self._offset))
-            xi = np.where(is_real, xi, -sin * sin)
+        if constants.stretch is None:
+            xi = sin * sin
+        else:
+            is_real = np.equal(constants.stretch, 0.0)      # of some motions of a chain
+            sinh = np.sinh(constants.stretch * self._offset)
+            sin = np.where(is_real, sin, sinh) if np.any(is_real) else sinh
+            xi = np.where(is_real, 1.0, -1.0) * sin * sin
         cos = np.sqrt(1.0 - xi)
         self._parity, self._xi = quarters & 1, xi
         odd = self._parity.astype(bool)
