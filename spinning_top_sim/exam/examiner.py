@@ -116,8 +116,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
                  LastingSubject(make_filter, values, numbers[0]), numbers)
     exam.sit()
     if level == 'full' and restart and exam.outcomes:
-        exam.found.measures |= in_field(numbers[:1]).measures
-    return exam.found.report(subject, exam.outcomes)
+        exam.findings.measures |= in_field(numbers[:1]).measures
+    return exam.findings.report(subject, exam.outcomes)
 
 
 def _imu_parameters(imu: Mapping[str, Any] | str | Path | None) -> Mapping[str, Any]:
@@ -146,13 +146,13 @@ class _Exam:
     """
     The runs of one exam.
 
-    found : faults and measures
+    findings : faults and measures
     outcomes : of the noisy runs
     """
 
     def __init__(self, subject: Subject, seeds: Sequence[int]) -> None:
         self._subject, self._seeds = subject, seeds
-        self.found = Findings()
+        self.findings = Findings()
         self.outcomes: list[Outcome] = []
 
     def sit(self) -> None:
@@ -164,28 +164,28 @@ class _Exam:
             self._do(partial(self._do_noisy_run, seed))
         if not self.outcomes:
             return
-        self.found.measures = (diagnosis.marks(self.outcomes, self._absolute)
-                               | self.found.measures)
+        self.findings.measures = (diagnosis.marks(self.outcomes, self._absolute)
+                               | self.findings.measures)
         self._do(self._judge_integration)
         if not self._response.unclear:
             self._do(self._judge_lever_arm)
             if identified:
                 self._do(self._response.judge_bias)
         self._judge_noisy_runs()
-        self._do(lambda: self.found.measures.update(self._subject.convergence()))
+        self._do(lambda: self.findings.measures.update(self._subject.convergence()))
 
     def _do(self, part: Callable[[], object]) -> bool:
         """Do a part of the exam; return False where the filter fails, which is reported."""
         try:
             part()
         except InvalidOutputError as error:
-            self.found.faults.append(Fault('invalid_output', str(error)))
+            self.findings.faults.append(Fault('invalid_output', str(error)))
             return False
         return True
 
     def _begin(self) -> None:
         self._absolute = self._subject.uses_field()
-        self._response = Response(self._subject, self._absolute, self.found)
+        self._response = Response(self._subject, self._absolute, self.findings)
 
     def _run(self, run: Run, *changes: ChangeReadings) -> Outcome:
         """Return the outcome of a run; causes that have been found are undone."""
@@ -197,25 +197,25 @@ class _Exam:
 
     def _judge_noisy_runs(self) -> None:
         first = self.outcomes[0]
-        imu, found, early = self._subject.imu, self.found, self._response.early
-        found.measures |= diagnosis.quality(self.outcomes, imu, self._absolute)
-        found.measures['stamp_offset_s'] = diagnosis.stamp_fault(
+        imu, findings, early = self._subject.imu, self.findings, self._response.early
+        findings.measures |= diagnosis.quality(self.outcomes, imu, self._absolute)
+        findings.measures['stamp_offset_s'] = diagnosis.stamp_fault(
             first.last(), self._absolute)[0].seconds
         large = diagnosis.inaccuracy(first, self._absolute)
-        if large and not found.faults and from_identity(early) > SLIGHT:
+        if large and not findings.faults and from_identity(early) > SLIGHT:
             large = Fault('gyroscope_wiring', f'{words(early)}; {large.evidence}')
-        if large and (large.name == 'diverges' or not found.faults):
-            found.faults.append(large)
-        if any(fault.name not in SHOW_ELSEWHERE for fault in found.faults):
-            found.drop('inaccurate')
+        if large and (large.name == 'diverges' or not findings.faults):
+            findings.faults.append(large)
+        if any(fault.name not in SHOW_ELSEWHERE for fault in findings.faults):
+            findings.drop('inaccurate')
         consistency = diagnosis.consistency(self.outcomes, self._absolute)
-        found.measures |= diagnosis.nees_marks(consistency)
+        findings.measures |= diagnosis.nees_marks(consistency)
         # Faults are another reason for errors; without noise there is nothing random to judge by.
         # After minutes of learning the bias, a filter that goes on is too sure of it.
-        if self._subject.restarts and not found.faults and any(
+        if self._subject.restarts and not findings.faults and any(
                 imu.get(f'imu.{sensor}_noise_density')
                 for sensor in ('gyroscope', 'accelerometer')):
-            found.faults += filter(None, [diagnosis.covariance_fault(consistency)])
+            findings.faults += filter(None, [diagnosis.covariance_fault(consistency)])
 
     def _judge_integration(self) -> None:
         """Compare sampling rates on the fast motion, if possible without the magnetometer."""
@@ -233,17 +233,17 @@ class _Exam:
         for outcome in outcomes:
             one, true = map(Rotation.from_quat, (outcome.estimates, outcome.run.truth))
             moved.append(rms(((true[0] * one[0].inv()) * one * true.inv()).magnitude()))
-        self.found.measures['order'] = measures.convergence_order(finer, moved)
-        self.found.measures['integration_error_deg'] = math.degrees(moved[0])
+        self.findings.measures['order'] = measures.convergence_order(finer, moved)
+        self.findings.measures['integration_error_deg'] = math.degrees(moved[0])
         self._judge_steps(outcomes, finer)
         absolute = self._absolute and not changes
         before = diagnosis.error_of(outcomes[0], absolute)
         # An error of the scale does not fall with the rate.
-        if before > diagnosis.FIRST_ORDER and not self.found.measures['order'] < 1.0:
+        if before > diagnosis.FIRST_ORDER and not self.findings.measures['order'] < 1.0:
             after = diagnosis.error_of(self._run(runs[0], for_first_order, *changes).last(),
                                        absolute)
             if after < diagnosis.FIRST_ORDER_LEFT * before:
-                self.found.faults.append(Fault(
+                self.findings.faults.append(Fault(
                     'first_order_integration', 'integration is first order: correcting it reduces '
                     f'the error on the fast motion from {degrees(before)} to {degrees(after)}'))
 
@@ -256,9 +256,9 @@ class _Exam:
         apart = abs(gains[-1] - gains[0]) / max(abs(gains[0]), STEP)
         if apart > STEP and abs(gains[-1] / finer[-1] - gains[0]) < 0.25 * abs(gains[0]):
             # A wrong step turns up as a wrong scale at one rate.
-            if 'time_step' in [fault.name for fault in self.found.faults]:
-                self.found.drop('gyroscope_wiring')
-            self.found.faults.append(Fault(
+            if 'time_step' in [fault.name for fault in self.findings.faults]:
+                self.findings.drop('gyroscope_wiring')
+            self.findings.faults.append(Fault(
                 'time_step', f'at {" and ".join(one.run.name for one in outcomes)} turns move it '
                 f'{" and ".join(f"{gain:.3g}" for gain in gains)} times as far as the sensor: the '
                 'step is not used'))
@@ -272,9 +272,9 @@ class _Exam:
             (still.accelerometer[:begin], moving.accelerometer[begin:])))
         arm, pivot = (self._run(run).estimates[first:end] for run in (with_arm, still))
         effect = rms(measures.errors_of(arm, pivot).tilt)
-        self.found.measures['lever_arm_deg'] = math.degrees(effect)
+        self.findings.measures['lever_arm_deg'] = math.degrees(effect)
         if effect > diagnosis.LEVER_ARM:
-            self.found.faults.append(Fault(
+            self.findings.faults.append(Fault(
                 'lever_arm', f'10 cm off the axis adds {degrees(effect)}: motion is mistaken for '
                 'gravity'))
 

@@ -67,7 +67,7 @@ LEVEL = Hypothesis(('magnetometer_wiring',), 'with the field of a level sensor',
 
 class Response:
     """
-    The response of a filter to the excitation; `found` takes its faults and measures.
+    The response of a filter to the excitation; `findings` takes its faults and measures.
 
     absolute : whether the heading is judged
     undone : inverses of the causes that were found, for other runs
@@ -75,8 +75,8 @@ class Response:
     unclear : whether an error is left that would be taken for that by a lever arm or a bias
     """
 
-    def __init__(self, subject: Subject, absolute: bool, found: Findings) -> None:
-        self._subject, self._absolute, self._found = subject, absolute, found
+    def __init__(self, subject: Subject, absolute: bool, findings: Findings) -> None:
+        self._subject, self._absolute, self._findings = subject, absolute, findings
         self.undone: list[Hypothesis] = []
         self._harmless: list[Hypothesis] = []
         self.early, self.unclear = np.eye(3), False
@@ -96,20 +96,20 @@ class Response:
                 break
             before = self._whole(self._outcome)
             one, self._outcome = best
-            self._found.faults += [
+            self._findings.faults += [
                 Fault(name, f'{one.text}, the error falls from {degrees(before)} to '
                       f'{degrees(self._whole(self._outcome))}; all measures but those of the '
                       'field are those after this correction') for name in one.faults]
             (self.undone if {*one.faults} - {'stamp_offset'} else self._harmless).insert(0, one)
             self.unclear |= one.given is excitation.of_world
         clean = np.degrees(self._clean(self._outcome))
-        self._found.measures |= {'tilt_clean_deg': float(max(clean[::2])),
+        self._findings.measures |= {'tilt_clean_deg': float(max(clean[::2])),
                                  'heading_clean_deg': float(max(clean[1::2]))}
         rest = self._rest()
         # A heading that nothing corrects is any.
         if 'magnetometer_wiring' in [fault.name for fault in rest]:
-            self._found.drop('heading_offset')
-        faults = self._found.faults
+            self._findings.drop('heading_offset')
+        faults = self._findings.faults
         faults += rest
         self.unclear |= bool(rest)
         if self.unclear:
@@ -376,18 +376,18 @@ class Response:
         found, late = estimates[-1], rms(apart[motion]) / size
         share, before = (estimates[[-1, len(estimates) // 4]] @ BIAS / size ** 2).tolist()
         first, again = apart[self._rests[[0, -2]]].tolist()
-        self._found.measures |= {'bias_error_s': late, 'bias_found': share}
+        self._findings.measures |= {'bias_error_s': late, 'bias_found': share}
         left = late > diagnosis.BIAS_LEFT_S
         right = (-BIAS_FOUND < share < 1.0 / BIAS_OFF if left else
                  np.linalg.norm(found - BIAS) < BIAS_OFF * size)
         if left and not (again < LEARNED * first or (
                 again < LEARNING * first and share > max(BIAS_FOUND, 1.2 * before))):
-            self._found.faults.append(Fault(
+            self._findings.faults.append(Fault(
                 'no_bias_estimate', 'with a gyroscope bias of 1 deg/s the '
                 f'{"attitude" if self._absolute else "tilt"} is {late:.3g} deg off in the end: '
                 'the bias is not learned'))
         elif not right and not math.isnan(share):
-            self._found.faults.append(Fault(
+            self._findings.faults.append(Fault(
                 'bias_report', f'a gyroscope bias of {np.degrees(BIAS).round(2).tolist()} deg/s '
                 f'is learned, but the estimate is {np.degrees(found).round(2).tolist()} deg/s'))
 
