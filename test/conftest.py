@@ -60,3 +60,17 @@ def short(tmp_path_factory):
     from helpers.inspected import short_log
 
     return short_log(tmp_path_factory.mktemp('log') / 'short.mcap')
+
+
+@pytest.fixture(scope='session')
+def log(tmp_path_factory):
+    from helpers.logs import small_log
+
+    return small_log(tmp_path_factory.mktemp('log') / 'run.mcap')
+
+
+@pytest.fixture
+def no_sync(monkeypatch):
+    from helpers.logs import without_sync
+
+    without_sync(monkeypatch)

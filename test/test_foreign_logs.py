@@ -14,7 +14,6 @@ from helpers.logs import (
     run,
     seen_by_mcap,
     seen_by_us,
-    without_sync,
     write_anew,
     write_stranger,
 )
@@ -23,11 +22,6 @@ from mcap.reader import make_reader
 from mcap.records import Header
 
 from spinning_top_sim.recording.reader import LogReader
-
-
-@pytest.fixture
-def no_sync(monkeypatch):
-    without_sync(monkeypatch)
 
 
 @pytest.mark.parametrize('kind', STRANGERS)

@@ -63,8 +63,6 @@ def test_the_body_has_the_mass_and_the_moments_of_the_top(scene):
     ({'lambda1': 1e300, 'lambda3': 1e300}, {'radius': LARGEST}),
     ({'lambda1': 5e-324, 'lambda3': 5e-324}, {'radius': SMALLEST}),
 ])
-
-
 def test_every_top_can_be_drawn(changed, expected):
     shape = Shape(Top(**{**CUSP, **changed}))
     assert math.copysign(1.0, shape.tip) == expected.pop('tip', math.copysign(1.0, shape.tip))

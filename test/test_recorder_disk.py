@@ -20,7 +20,6 @@ from helpers.recordings import (
     METADATA,
     TOPICS,
     complete_messages,
-    parsed_qos,
     pose_cdr,
     rows_of,
     some_messages,
@@ -35,7 +34,6 @@ from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import McapRecorder, create_file
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 
 PATIENCE_S = 20.0  # for what happens at once on an idle machine
 
@@ -56,14 +54,6 @@ def eventually(condition):
     while not condition():
         assert time.monotonic() < deadline, 'did not happen in time'
         time.sleep(0.005)
-
-
-@pytest.mark.parametrize('value', [
-    '1.5', '[1]', '{}', 'true', '"7"', '~', '.nan', 'keep_some', str(1 << 63), '-' + '9' * 20])
-def test_a_policy_that_is_not_understood_is_the_default(value):
-    keys = ('history', 'depth', 'reliability', 'deadline')
-    text = '- ' + '\n  '.join(f'{key}: {value}' for key in keys)
-    assert parsed_qos(text) == (DEFAULT_QOS,)
 
 
 def test_too_little_space_at_the_start_leaves_no_file(tmp_path):

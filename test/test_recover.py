@@ -26,9 +26,7 @@ from helpers.logs import (
     seen_by_mcap,
     seen_by_rosbags,
     seen_by_us,
-    small_log,
     torn,
-    without_sync,
     write_anew,
     write_log,
 )
@@ -38,16 +36,6 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from spinning_top_sim.recording.reader import LogReader
-
-
-@pytest.fixture(scope='module')
-def log(tmp_path_factory):
-    return small_log(tmp_path_factory.mktemp('log') / 'run.mcap')
-
-
-@pytest.fixture
-def no_sync(monkeypatch):
-    without_sync(monkeypatch)
 
 
 def check_with_all_readers(path, messages) -> None:
@@ -237,6 +225,7 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
         path.write_bytes(path.read_bytes()[:-100])
     with LogReader(path) as reader:
         assert reader.whole == (not torn)
+        assert reader.span == (min(stamps), max(stamps))
         read = [(message.log_time, struct.unpack('<I', message.data)[0])
                 for message in reader.messages()]
     assert read == sorted((stamp, number) for number, stamp in enumerate(stamps))

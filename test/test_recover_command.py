@@ -9,7 +9,7 @@ import sys
 import tracemalloc
 
 import pytest
-from helpers.logs import ALL_KEPT, FAILED, SOME_LOST, TOPICS, run, small_log
+from helpers.logs import ALL_KEPT, FAILED, SOME_LOST, TOPICS, run
 from helpers.recordings import write_rows
 from helpers.reference import ROOT
 from mcap.writer import MCAP0_MAGIC
@@ -19,11 +19,6 @@ from spinning_top_sim.recording.log_file import LogFile
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recovery import recover
-
-
-@pytest.fixture(scope='module')
-def log(tmp_path_factory):
-    return small_log(tmp_path_factory.mktemp('log') / 'run.mcap')
 
 
 def run_process(*argv, **options) -> subprocess.CompletedProcess:

@@ -20,10 +20,8 @@ from helpers.node_logs import (
     SECOND,
     assert_clean_end,
     assert_received_from,
-    assert_steps,
     log_of,
     stamp_of,
-    stamps_of,
     the_log,
     verified,
 )
@@ -81,13 +79,6 @@ def both_runs(peer, diagnostics, tmp_path_factory):
 @pytest.fixture(params=RUNS)
 def run(request, both_runs):
     return both_runs[request.param]
-
-
-def test_consecutive_stamps_differ_by_exactly_the_period(run):
-    for name in KINDS:
-        stamps = stamps_of(run.topics[name])
-        assert set(stamps % PERIODS_NS[name]) == {0}
-        assert_steps(stamps, PERIODS_NS[name], run.said['skipped samples'])
 
 
 def test_the_log_is_what_the_subscribers_got(run):

@@ -162,10 +162,3 @@ def test_the_shell_completes_commands_and_options(empty):
     pytest.importorskip('argcomplete')
     assert completed('spinning-top in') == ['inspect']
     assert '--verify' in completed('spinning-top inspect --ve')
-
-
-def test_extremes_of_names_are_told(tmp_path, capsys):
-    assert main(['simulate', '--scene', 'cups', '-o', str(tmp_path / 'a.mcap')]) == 2
-    assert ('spinning-top simulate: --scene cups: must be the path of a file, or one of braking, '
-            'cusp') in capsys.readouterr().err
-    assert not os.listdir(tmp_path)
