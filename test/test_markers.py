@@ -139,13 +139,6 @@ def test_the_trace_goes_on_through_commands():
         assert decoded(run, t_ns)[3][:-1] == pytest.approx(tip * np.array(expected), abs=1e-8)
 
 
-def test_a_reset_begins_the_trace_anew():
-    run = markers_of(commands=((SECOND, 2.0, 1.5),), duration_ns=2 * SECOND)
-    run.simulation.restart(run.simulation.values)
-    assert {t: data for _, t, data in play(run.simulation, SECOND, 'markers')} == {
-        t: data for t, data in run.sent.items() if t <= SECOND}
-
-
 @pytest.mark.parametrize('frame', ['', 'x' * 7, 'θ'])
 def test_bodies_and_lines_are_drawn_to_the_scale_of_the_top(frame):
     """The axis is 2 % of the distance to the tip wide, the trace half of that."""

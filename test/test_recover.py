@@ -20,7 +20,6 @@ from helpers.logs import (
     SOME_LOST,
     TOPICS,
     flipped,
-    metadata_of,
     places,
     run,
     seen_by_mcap,
@@ -45,8 +44,8 @@ def check_with_all_readers(path, messages) -> None:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         values = [message.x if schema.name == POINT else message.data
                   for schema, _, _, message in reader.iter_decoded_messages()]
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     assert values == [float(number) for number in range(len(messages))]
-    metadata = metadata_of(path)
     assert metadata['spinning_top_sim'] == METADATA
     assert f'message_count: {len(messages)}\n' in metadata['rosbag2']['serialized_metadata']
     with LogReader(path) as reader:
