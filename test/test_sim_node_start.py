@@ -23,7 +23,6 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.recorded_run import read_run_description
 
-
 # Of simulation_interfaces.
 STOPPED, QUITTING, INCORRECT_STATE, FAILED, TRANSITION_ERROR = 0, 3, 3, 4, 102
 
