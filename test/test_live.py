@@ -11,6 +11,7 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.reference import ROOT
 from helpers.simulations import (
     EPOCH_NS,
     MILLISECOND,
@@ -249,6 +250,18 @@ def test_a_change_of_rates_reaches_every_stream():
         assert times(taken, one.topic) == list(range(SECOND + 20 * MILLISECOND, 2 * SECOND + 1,
                                                      20 * MILLISECOND)), one.topic
     assert simulation.history == [(0, 100.0), (SECOND, 50.0)], 'the rates of the IMU'
+
+
+def test_what_takes_effect_at_once_acts_on_the_samples_or_is_named_in_the_node():
+    """The switches of streams have no name there: they come with the streams."""
+    node = ''.join(path.read_text() for path in (ROOT / 'spinning_top_sim/nodes').glob('*.py'))
+    before = play(simulate(), SECOND // 2)
+    for parameter in parameters.TABLE:
+        if (parameter.effect is parameters.Effect.NOW and f"'{parameter.name}'" not in node
+                and not parameter.name.endswith('.enabled')):
+            simulation = simulate()
+            simulation.apply({parameter.name: parameter.check(0.5 * parameter.default)})
+            assert play(simulation, SECOND // 2) != before, parameter.name
 
 
 def test_segments_are_forgotten_when_nothing_reaches_back_to_them():

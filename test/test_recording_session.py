@@ -44,7 +44,8 @@ class Recorded:
                 for name, type_name in names]
 
     def start(self):
-        return self.session.start(self.values)()
+        self.session.start(self.values)
+        return self.session.open()
 
     def is_held(self):
         return self.lock._lock.locked()

@@ -129,7 +129,7 @@ def start_values(*arguments):
     argv = ['--ros-args', '-r', '__ns:=/last', *arguments]
     with as_a_process():
         rclpy.init(args=argv)
-        node = sim_node._prepare(argv)()
+        node = sim_node._prepare(argv)[1]()
         values = node.start_values
         node.stop()
         node.destroy_node()

@@ -19,7 +19,7 @@ from spinning_top_sim.tools import simulate
 from spinning_top_sim.view import command
 
 pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')
-VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
+VIEW = ('-m', 'spinning_top_sim', 'view', '--no-browser', '--port', '0')
 STAMP = r'stamp (\d+)\.(\d{9})'
 
 

@@ -19,7 +19,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.view.track import Track
 
-VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
+VIEW = ('-m', 'spinning_top_sim', 'view', '--no-browser', '--port', '0')
 PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
 
 
