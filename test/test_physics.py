@@ -60,21 +60,17 @@ def random_states(count=50):
             for start in starts]
 
 
-def rotation_of(state):
-    return Rotation.from_quat(state.quaternion[0])
-
-
 def test_quaternion_is_rz_ry_rz():
     for start, state in random_states():
         expected = Rotation.from_euler('ZYZ', (start.phi, start.theta, start.psi))
-        assert (rotation_of(state) * expected.inv()).magnitude() < 1e-14
+        assert (Rotation.from_quat(state.quaternion[0]) * expected.inv()).magnitude() < 1e-14
 
 
 def test_angular_velocity_is_that_of_the_euler_angles():
     """Eq. (1): phi' z + theta' e2' + psi' e3, turned into the body by an independent library."""
     for start, state in random_states():
         e2 = Rotation.from_euler('Z', start.phi).apply((0.0, 1.0, 0.0))
-        rotation = rotation_of(state)
+        rotation = Rotation.from_quat(state.quaternion[0])
         world = (state.phi_dot * np.array((0.0, 0.0, 1.0)) + start.theta_dot * e2
                  + state.psi_dot * rotation.apply((0.0, 0.0, 1.0)))
         rounding = 1e-14 * (1.0 + abs(state.phi_dot[0]) + abs(state.psi_dot[0]))

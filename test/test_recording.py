@@ -26,6 +26,7 @@ from helpers.recordings import (
     pose_cdr,
     rows_of,
     some_messages,
+    write,
 )
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -51,7 +52,7 @@ def record(path, messages, **options):
     with closing(McapRecorder(
             path, TOPICS, METADATA, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
-            recorder.write(*message)
+            write(recorder, *message)
         return recorder.close()
 
 
@@ -210,7 +211,7 @@ def test_messages_of_any_length_are_all_kept(tmp_path):
             size = (1000, rng.choice([12, 12, 12, 700]), time_ns % 7)[topic]
             data = rng.randbytes(size)
             wanted[topic].append((time_ns, data))
-            recorder.write(topic, time_ns, data)
+            write(recorder, topic, time_ns, data)
     found = [[], [], []]
     names = [topic.name for topic in TOPICS]
     with (tmp_path / 'run.mcap').open('rb') as file:

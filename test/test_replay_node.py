@@ -19,6 +19,7 @@ import rclpy
 from helpers.definitions import add_definitions
 from helpers.node_harness import SimNode, wait_for
 from helpers.own_node import InThisProcess, run_main
+from helpers.recordings import write
 from mcap.writer import Writer as McapWriter
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
@@ -63,7 +64,7 @@ def write_log(path, count, step_ns=2_000_000, padding=0, topics=OURS, **options)
                    RecordedTopic(twist, TWIST, {'depth': 7, 'reliability': 2})],
             {}, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
-            recorder.write(*message)
+            write(recorder, *message)
     return [[data for index, _, data in messages if index == topic] for topic in (0, 1)]
 
 

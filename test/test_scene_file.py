@@ -79,13 +79,6 @@ def test_a_file_may_have_parameters_of_ros_only(tmp_path, section):
                  '-p', 'use_sim_time:=true', '-p', 'qos_overrides./a.b:=1', '--quiet']) == 0
 
 
-@pytest.mark.parametrize('name', ['1', '[a]', '<<'])
-def test_a_name_that_is_no_text_is_refused(tmp_path, name):
-    path = scene(tmp_path / 'p.yaml', **{name: '1.5'})
-    with pytest.raises(ValueError, match=r'p\.yaml'):
-        read_scene(path)
-
-
 def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):
     path = scene(tmp_path / 'p.yaml', **{'spin.l33': 1.0})
     output = tmp_path / 'run.mcap'

@@ -55,7 +55,7 @@ def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, numbers):
         os.killpg(node.process.pid, numbers[0])
         time.sleep(0.05)
         code = node.end(numbers[1])
-        peer.stop_listening(pose)
+        pose.muted = True
     assert_clean_end(node, code)
     path = the_log(node.folder)
     log, _ = log_of(path)

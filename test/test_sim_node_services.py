@@ -32,7 +32,7 @@ def served(peer, tmp_path_factory):
         clock = peer.listen('/clock', Clock).wait(3)
         pose = peer.listen(node.topic('pose'), PoseStamped).wait(3)
         assert clock.last().clock.sec > 1_000_000_000
-        peer.stop_listening(clock)
+        clock.muted = True
         yield SimpleNamespace(node=node, pose=pose)
         assert_clean_end(node, node.end())
 
@@ -92,5 +92,5 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
         waits()                             # it has stopped
         assert_clean_end(node, node.end())
     assert TRACEBACK not in node.err
-    peer.stop_listening(pose)
+    pose.muted = True
     clock.stop()

@@ -121,6 +121,8 @@ REMEDIES = [
     (['view', 'a.mcap'], "pip install 'viser"),
     (['inspect', 'a.mcap', '--plot', 'a.png'], "pip install 'matplotlib"),
     (['simulate', '--duration', '1', '-o', 'b.parquet'], "pip install 'pyarrow"),
+    (['simulate', '--duration', '1', '-o', 'b.mcap', '-p', 'gnss.enabled:=true'],
+     "pip install 'pymap3d"),
     (['examine', '--filter', 'vqf'], "pip install 'vqf"),
     (['examine', '--node', 'a', '--topic', 'b'], "pip install 'ros-jazzy-rclpy"),
     (['ensemble', 'e.yaml', '-o', 'runs'], "pip install 'distributed"),

@@ -126,9 +126,6 @@ class McapRecorder:
             queued=missing if running else 0, lost=0 if running else missing,
             error=self.error)
 
-    def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
-        self.write_all([(topic_index, log_time_ns, data)], len(data))
-
     def write_all(self, entries: Sequence[Entry], size: int) -> None:
         """
         Hand over messages, from one thread at a time; they keep their order.

@@ -25,7 +25,7 @@ from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.installation import parameter_files
-from spinning_top_sim.nodes import throttle
+from spinning_top_sim.nodes.publishers import THROTTLED
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -107,12 +107,12 @@ class LiveView(Node):
             self._inbox.append((topic, data))
             self._arrived.set()
         self._listeners[topic] = self.create_subscription(
-            KIND_OF[topic], throttle.TOPICS.get(topic, topic), _receive, QOS, raw=True)
+            KIND_OF[topic], THROTTLED.get(topic, topic), _receive, QOS, raw=True)
 
     def _listen_as_needed(self) -> None:
         """Subscribe to the topics that are shown only: each message costs the node some time."""
         needed = {'pose', 'joint_states'}
-        if self.count_publishers(throttle.TOPICS['ground_truth/odom']):     # both in one
+        if self.count_publishers(THROTTLED['ground_truth/odom']):     # both in one
             needed = {'ground_truth/odom'}
         if self._page.arrows[shapes.ARROWS.index('specific force')].value:
             needed |= {'ground_truth/imu'}

@@ -153,7 +153,11 @@ def options(parameters):
 
 
 class Topic:
-    """The messages that have arrived on one topic, serialized, in order."""
+    """
+    The messages that have arrived on one topic, serialized, in order.
+
+    muted: further ones are ignored; rclpy cannot destroy a subscription that is waited for
+    """
 
     def __init__(self, kind):
         self.kind = kind
@@ -174,9 +178,8 @@ class Topic:
         """Wait until `count` more messages have arrived."""
         return self.wait(len(self.raw) + count, timeout)
 
-    def messages(self, start=0):
-        """Return the messages from `start` on, deserialized."""
-        return [deserialize_message(data, self.kind) for data in self.raw[start:]]
+    def messages(self):
+        return [deserialize_message(data, self.kind) for data in self.raw]
 
     def last(self):
         return deserialize_message(self.raw[-1], self.kind)
@@ -236,10 +239,6 @@ class Peer:
             kind, name, topic.receive, QoSProfile(depth=20_000, reliability=reliability),
             raw=True)
         return topic
-
-    def stop_listening(self, topic):
-        """Ignore further messages; rclpy cannot destroy a subscription that is waited for."""
-        topic.muted = True
 
     def call(self, kind, name, request, timeout=PATIENCE_S, again=False):
         """
