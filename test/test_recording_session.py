@@ -158,4 +158,5 @@ def test_a_recording_that_has_failed_gives_way_to_the_next(tmp_path):
     node._check_recording = lambda: Simulator._check_recording(node)
     assert Simulator._record(node, SetBool.Request(data=True)).startswith('recording to ')
     assert told == ['recording stopped: the disk is gone; the simulation goes on']
-    recorded.stop()
+    assert ' messages, ' in Simulator._record(node, SetBool.Request())
+    assert Simulator._record(node, SetBool.Request()) == 'not recording'

@@ -224,7 +224,6 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
         path.write_bytes(path.read_bytes()[:-100])
     with LogReader(path) as reader:
         assert reader.whole == (not torn)
-        assert reader.span == (min(stamps), max(stamps))
         read = [(message.log_time, struct.unpack('<I', message.data)[0])
                 for message in reader.messages()]
     assert read == sorted((stamp, number) for number, stamp in enumerate(stamps))

@@ -63,13 +63,6 @@ def test_a_table_of_the_truth(tmp_path):
     assert table == pytest.approx(np.loadtxt(exact, delimiter=',', skiprows=1), abs=1e-9)
 
 
-def test_parquet(tmp_path):
-    parquet = pytest.importorskip('pyarrow.parquet')
-    path = simulate(tmp_path / 'truth.parquet', '--duration', 1)
-    table = parquet.read_table(path)
-    assert table.num_rows == 101 and table.column_names[:2] == ['t', 'theta']
-
-
 def test_commands_at_one_time_are_applied_in_the_order_given(tmp_path):
     """The last one given holds, whether its momenta are larger or smaller."""
     for number, (first, last) in enumerate((('2.0:1.5', '1.7:1.4'), ('1.7:1.4', '2.0:1.5'))):
