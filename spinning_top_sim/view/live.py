@@ -2,7 +2,6 @@
 """The page of a running sim_node: a node that subscribes to it, and calls its services."""
 
 import math
-import struct
 import threading
 import time
 import traceback
@@ -184,11 +183,11 @@ class LiveView(Node):
             topic, data = self._inbox.popleft()
             arrived[topic].append(data)
         for topic, messages in arrived.items():
-            stamps_ns = [_stamp_ns(data) for data in messages]
+            samples = self._track.decode(topic, messages)
             known_ns = self._track.samples[topic].stamps_ns
-            if len(known_ns) and stamps_ns[-1] < known_ns[-1] - RESTART_NS:
+            if len(known_ns) and (samples.stamps_ns[-1:] < known_ns[-1] - RESTART_NS).any():
                 self._track.drop_before(known_ns[-1] + 1)        # the sim_node was started again
-            self._track.add(topic, self._track.decode(topic, stamps_ns, messages))
+            self._track.add(topic, samples)
         for topic in KIND_OF.keys() - self._listeners.keys():   # these get old
             self._track.samples[topic] = empty(topic)
 
@@ -265,9 +264,3 @@ class LiveView(Node):
                         for name, value in values.items()])).result
         if not result.successful:
             raise RequestError(result.reason)
-
-
-def _stamp_ns(data: bytes) -> int:
-    """Return the stamp of a serialized message that begins with a std_msgs/Header [ns]."""
-    seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
-    return int(seconds) * NANOSECONDS + int(nanoseconds)

@@ -121,10 +121,12 @@ class Track:
         self._templates = {stream.topic: stream.template for stream in all_streams(values)
                            if stream.topic in WIDTHS}
 
-    def decode(self, topic: str, stamps_ns: Sequence[int], messages: Sequence[bytes]) -> Series:
-        """Return serialized messages of a topic as samples."""
-        stamps = np.array(stamps_ns, np.int64)
-        fields = self._templates[topic].decode(b''.join(messages))
+    def decode(self, topic: str, messages: Sequence[bytes],
+               stamps_ns: Sequence[int] | None = None) -> Series:
+        """Return serialized messages of a topic as samples; by default their stamps are in them."""
+        template, data = self._templates[topic], b''.join(messages)
+        stamps = template.stamps_ns(data) if stamps_ns is None else np.array(stamps_ns, np.int64)
+        fields = template.decode(data)
         if topic == '~/invariants':
             return Series(stamps, fields[0])
         found = attitudes_of(topic, self._imu, stamps, fields)
