@@ -123,7 +123,7 @@ class Track:
 
     def decode(self, topic: str, messages: Sequence[bytes],
                stamps_ns: Sequence[int] | None = None) -> Series:
-        """Return serialized messages of a topic as samples; by default their stamps are in them."""
+        """Return serialized messages of a topic as samples; by default with the stamps in them."""
         template, data = self._templates[topic], b''.join(messages)
         stamps = template.stamps_ns(data) if stamps_ns is None else np.array(stamps_ns, np.int64)
         fields = template.decode(data)
