@@ -282,8 +282,6 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
     ({'runs': 1.5}, 'runs = 1.5: must be an integer >= 1'),
     ({'duration': 0.0}, 'duration = 0.0: must be a number >= 1e-09'),
     ({'run': 3}, "'run'")])
-
-
 def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, changes, said):
     path = written(tmp_path, **changes)
     code = main([str(path), '-o', str(tmp_path / 'out')])

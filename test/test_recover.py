@@ -20,15 +20,12 @@ from helpers.logs import (
     SOME_LOST,
     TOPICS,
     flipped,
-    metadata_of,
     places,
     run,
     seen_by_mcap,
     seen_by_rosbags,
     seen_by_us,
-    small_log,
     torn,
-    without_sync,
     write_anew,
     write_log,
 )
@@ -40,16 +37,6 @@ from mcap_ros2.decoder import DecoderFactory
 from spinning_top_sim.recording.reader import LogReader
 
 
-@pytest.fixture(scope='module')
-def log(tmp_path_factory):
-    return small_log(tmp_path_factory.mktemp('log') / 'run.mcap')
-
-
-@pytest.fixture
-def no_sync(monkeypatch):
-    without_sync(monkeypatch)
-
-
 def check_with_all_readers(path, messages) -> None:
     """A recovered log of ours: the messages, for everyone, and what it says of the run."""
     assert seen_by_us(path) == seen_by_mcap(path) == seen_by_rosbags(path) == messages
@@ -57,8 +44,8 @@ def check_with_all_readers(path, messages) -> None:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         values = [message.x if schema.name == POINT else message.data
                   for schema, _, _, message in reader.iter_decoded_messages()]
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     assert values == [float(number) for number in range(len(messages))]
-    metadata = metadata_of(path)
     assert metadata['spinning_top_sim'] == METADATA
     assert f'message_count: {len(messages)}\n' in metadata['rosbag2']['serialized_metadata']
     with LogReader(path) as reader:

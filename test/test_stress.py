@@ -6,6 +6,7 @@ STRESS_TOPS=100000 in the environment takes as many random tops; `python test/st
 same on all processors.
 """
 
+import importlib
 import math
 import os
 
@@ -70,3 +71,13 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
             exact = truth.states(range(later, later + 1))
             assert math.dist(simulation.state().quaternion[0], exact.quaternion[0]) < 1e-7
         now += 200_000_000
+
+
+@pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0)])
+def test_a_seed_of_a_part_of_make_stress(tmp_path, monkeypatch, request, part, seed):
+    pytest.importorskip('rclpy')
+    module = importlib.import_module(f'stress.{part}')
+    if part == 'nodes':
+        peer = request.getfixturevalue('peer')
+        monkeypatch.setattr(module, 'shared_peer', lambda: peer)
+    assert module.check(seed, tmp_path)

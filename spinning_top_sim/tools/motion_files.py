@@ -30,6 +30,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 from spinning_top_sim.tools import recorded_run
+from spinning_top_sim.tools.attitudes import deserialized
 
 ATTITUDES, GYROSCOPE, RATES = 'attitudes', 'gyroscope', 'rates'
 ACCELERATIONS, MAGNETOMETER, ANGLES = 'accelerations', 'magnetometer', 'angles'
@@ -322,16 +323,12 @@ def _log_tables(reader: LogReader, types: Mapping[str, str], end_ns: int,
 def _contents(reader: LogReader, types: Mapping[str, str],
               end_ns: int) -> Iterator[tuple[str, int, Any]]:
     """Yield topics, log times and messages, or transforms in them.  Raises LogError."""
-    with needed('a log', 'rosbags'):
-        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
-
-    store = get_typestore(Stores.ROS2_JAZZY)
     for message in reader.messages(types, end=end_ns):
         try:
-            content: Any = store.deserialize_cdr(message.data, types[message.topic])
-        except Exception as error:      # whatever rosbags raises
-            raise LogError(f'cannot read {reader.path}: a message of {message.topic} is no '
-                           f'{types[message.topic]}: {error}') from error
+            content = deserialized(message.data, types[message.topic])
+        except ValueError as error:
+            raise LogError(f'cannot read {reader.path}: a message of {message.topic} is '
+                           f'{error}') from error
         for one in getattr(content, 'transforms', [content]):
             yield message.topic, message.log_time, one
 
