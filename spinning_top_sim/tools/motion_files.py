@@ -284,15 +284,18 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
         if not reader.whole:
             recorded.notes.append('the log is truncated: read as far as it goes')
         tables, first = _log_tables(reader, types, end_ns)
-    rests = {key: all(len({*cells}) == 1 for name, cells in table.items() if name != 'stamp_ns')
-             for key, table in tables.items()}          # such as a fixed frame among transforms
     chosen = sorted(tables, key=lambda one: (
-        one[0] != wanted, rests[one], MESSAGES.index(types[one[0]]), one))
+        one[0] != wanted, _rests(tables[one]), MESSAGES.index(types[one[0]]), one))
     recorded.add({' '.join(filter(None, one)): tables[one] for one in chosen}, origin)
     for topic, message in first.items():
         recorded.covariance.update((kind, matrix) for kind, matrix in _covariances(message)
                                    if f'{kind} of {topic}: ' in ''.join(recorded.notes))
     return recorded
+
+
+def _rests(table: Table) -> bool:
+    """Return whether nothing in it changes, such as a fixed frame among transforms."""
+    return all(len({*cells}) == 1 for name, cells in table.items() if name != 'stamp_ns')
 
 
 def _covariances(message: Any) -> Iterator[tuple[str, Reals]]:
