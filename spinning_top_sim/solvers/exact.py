@@ -20,7 +20,13 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import DIGITS, exact, pi, precision
 from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
-from spinning_top_sim.solvers.theta_values import MOST, ThetaFunctions, ThetaValues, in_range
+from spinning_top_sim.solvers.theta_values import (
+    MOST,
+    Constants,
+    ThetaFunctions,
+    ThetaValues,
+    in_range,
+)
 from spinning_top_sim.solvers.times import LARGEST_NS, Times
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
@@ -89,7 +95,7 @@ class ExactSolution:
             motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
             l3 / exact(self.top.lambda3)))))
         self._bottom_rate, self._top_rate = float(bottom_rate), float(top_rate)
-        self._theta = ThetaFunctions(motion)
+        self._constants = Constants(motion)
         fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
                       abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
         limit = min(Decimal(MOST_TURNS) / fastest, MOST)
@@ -124,6 +130,10 @@ class ExactSolution:
                 raise ValueError(f'{name} = {getattr(start, name)!r} cannot be held in doubles: '
                                  f'the constants of {self.top} and {start} are too far apart in '
                                  'size')
+
+    @cached_property
+    def _theta(self) -> ThetaFunctions:
+        return ThetaFunctions([self._constants])
 
     @cached_property
     def _at_start(self) -> ThetaValues:

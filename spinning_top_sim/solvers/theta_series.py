@@ -42,7 +42,7 @@ def _polynomials(first: Sequence[int], second: Sequence[int]) -> list[Sequence[i
 
 # By prefactor and power of xi, the coefficients of the multiples that have such a power.
 MULTIPLE_ANGLES = [
-    [[row[power] if power < len(row) else 0 for row in rows[power:]]
+    [[Decimal(row[power]) if power < len(row) else ZERO for row in rows[power:]]
      for power in range(MOST_TERMS)]
     for rows in (_polynomials(*pair) for pair in FIRST_POLYNOMIALS)]
 

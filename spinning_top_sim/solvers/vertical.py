@@ -139,7 +139,7 @@ class AcceleratedMotion(ExactSolution):
         self._motion = set_up(top, self.vertical.gravity, self._halves)
         with precision(DIGITS):
             self._take_constants(self._motion, *self._halves[-2:])
-        self.chains = self._theta.chains        # whether it can be `chained`
+        self.chains = self._constants.chains    # whether it can be `chained`
 
     @cached_property
     def start(self) -> State:       # type: ignore[override]
@@ -185,7 +185,8 @@ class _Chain(AcceleratedMotion):
 
     def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int]) -> None:
         self.top, self.start, self._turns = motions[0].top, motions[0].start, 0
-        self._theta = ThetaFunctions.chained([motion._theta for motion in motions], counts)
+        self._constants = motions[0]._constants
+        self._theta = ThetaFunctions([motion._constants for motion in motions], counts)
         rates: Any = np.array([(motion._bottom_rate, motion._top_rate) for motion in motions])
         self._bottom_rate, self._top_rate = np.repeat(rates.T, counts, axis=1)
 
