@@ -13,7 +13,9 @@ from functools import lru_cache, reduce
 
 ZERO, ONE = Decimal(0), Decimal(1)
 Complex = tuple[Decimal, Decimal]
-DIGITS = 40             # that are left of long decimals once nothing cancels any more
+# That are left of long decimals once nothing cancels any more; the product of two numbers of at
+# most 38 digits takes half the time of one of longer ones.
+DIGITS = 38
 SMALL = Decimal('1e-9')
 # Parts of a quarter turn whose sines and cosines are tabulated.
 PARTS = 64
@@ -109,7 +111,7 @@ def atan2(y: Decimal, x: Decimal) -> Decimal:
         return ZERO
     angle, values, _, series = _tables(getcontext().prec)
     tangent = y / x
-    part = round(math.atan(tangent) / float(angle))
+    part = round(math.atan(tangent) * 2 * PARTS / math.pi)
     if part:
         s, c = values[abs(part)]
         s = s if part > 0 else -s
@@ -121,7 +123,7 @@ def atan2(y: Decimal, x: Decimal) -> Decimal:
 
 
 def asinh(x: Decimal) -> Decimal:
-    """Return the inverse of sinh for x >= 0, to 30 digits of 40."""
+    """Return the inverse of sinh for x >= 0, to 30 digits of 38."""
     return x - x ** 3 / 6 if x < SMALL else (x + root(x * x + 1)).ln()
 
 

@@ -37,7 +37,7 @@ docs/theta_functions.md derives the first two steps.
    theta3 for X.
 
 Everything that cancels, cancels here: next to a pole, to the separatrix, to steady precession.  So
-there are 57 digits, and more if two roots are close.  Then 40 are enough.
+there are 57 digits, and more if two roots are close.  Then 38 are enough.
 """
 
 from __future__ import annotations
