@@ -83,8 +83,9 @@ class Factor(NamedTuple):
     rate : r [rad/s]
     phase_turns : c [turns]
     drift : kappa
-    parts : R and s J at even and at odd N.  If it changes its sign at a pole, R is a sine series
-        at one of them, and has the factor (-1)^floor(N/2).
+    parts : R and s J at even and at odd N, less their common factors.  If it changes its sign at
+        a pole, R is a sine series at one of them, and has the factor (-1)^floor(N/2).
+    scales : these factors
     sense : s
     start_argument : of (R + i s J) exp(i kappa y), less that of the start's `direction` [rad]
     """
@@ -93,6 +94,7 @@ class Factor(NamedTuple):
     phase_turns: Decimal
     drift: Decimal
     parts: tuple[Parts, Parts]
+    scales: tuple[Decimal, Decimal]
     sense: int
     start_argument: Decimal
 
@@ -214,9 +216,10 @@ def _resting(side: _Side, lambda1: Decimal) -> Factor:
     rate = side.spin / 2
     if side.momentum:
         rate += side.momentum / (4 * lambda1 * side.modulus ** 2)
-    parts = Series(COS_EVEN, (side.modulus,)), NOTHING
+    parts = Series(COS_EVEN, (ONE,)), NOTHING
     argument = -atan2(side.direction[1], side.direction[0])
-    return Factor(rate, side.turns - argument / (2 * pi()), ZERO, (parts, parts), 0, argument)
+    return Factor(rate, side.turns - argument / (2 * pi()), ZERO, (parts, parts),
+                  (side.modulus, side.modulus), 0, argument)
 
 
 def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decimal,
@@ -249,15 +252,15 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decima
         scale *= sense * a / 2 * roots.gap21         # w (u2 - u1)
         even, odd = form.slopes_of_sn2()
         turn = sense * l3 / lambda1
-        swing = turn * roots.gap21 * (form.mean.quarter_period / form.theta1.leading) ** 2
+        swing = turn * roots.gap21 * (form.mean.quarter_period / form.slope1) ** 2
         alpha, beta = factors[::sense]
         return ThetaMotion(
             alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / pi(), quarter0=quarter0,
             offset0=y0 * 2 / pi(),
             u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
             momentum=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
-            swing=(-swing * form.theta4.leading ** 2,
-                   swing * form.theta3.leading ** 2 * roots.gap32 / roots.gap31),
+            swing=(-swing * form.middle4 ** 2,
+                   swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
             m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31, size=form.size)
 
 
@@ -330,17 +333,19 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate:
     """
     sense, drift, rate = int(side.momentum.compare(ZERO)), ZERO, side.spin / 2
     farthest, real, imag = max(pole.x1, pole.x2), ONE, ZERO
-    scale = root(farthest / 2)
+    scale, sign = root(farthest / 2), 1         # sign: of the first at N = 1
     starts_in_first = quarters % 2 == pole.is_beta       # the theta1 of step 3
     if pole.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
     elif not sense:
-        first = form.theta1.scaled(-ONE if pole.is_beta else ONE), NOTHING
-        second = form.theta2, NOTHING
+        first, second = (form.theta1, NOTHING), (form.theta2, NOTHING)
+        if pole.is_beta:
+            sign = -1
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
         # vanish they leave 0 with the slope.
-        series, _ = first if starts_in_first else second
-        flip = 1 if quarters % 4 < 2 else -1
+        series, flip = (form.theta1, sign) if starts_in_first else (form.theta2, 1)
+        if quarters % 4 >= 2:
+            flip = -flip
         if flip * (series.at(*point) or series.leading * side.slope) < 0:
             scale = -scale
     else:
@@ -353,15 +358,11 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate:
                  - second[1].leading / second[0].leading * x_rate)
         real, imag = (part.at(*point) for part in (first if starts_in_first else second))
     # alpha is largest at u2, where N is odd, and beta at u1: both at the centre of theta2.
-    scale *= (form.theta4 if pole.is_beta else form.theta3).leading / second[0].leading
-    first_scale = scale * form.odd_over_even if pole.is_beta else scale
-    parts = (_scaled(first, first_scale), _scaled(second, scale))
+    scale *= (form.middle4 if pole.is_beta else form.middle3) / second[0].leading
+    parts, scales = (first, second), (scale, scale)
+    if pole.is_beta:
+        parts, scales = (second, first), (scale, sign * scale * form.odd_over_even)
     c, s = side.direction
     argument = drift * y + atan2(imag * c - real * s, real * c + imag * s)
     return Factor(rate, side.turns - argument / (2 * pi()), drift,
-                  parts[::-1] if pole.is_beta else parts, sense, argument)
-
-
-def _scaled(parts: Parts, scale: Decimal) -> Parts:
-    real, imag = parts
-    return real.scaled(scale), imag.scaled(scale)
+                  parts, scales, sense, argument)

@@ -69,12 +69,14 @@ class Constants:
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors: list[tuple[int, ...]] = [
             (even.prefactor, odd.prefactor) for even, odd in rows]
-        self.polynomials = [[[*map(float, one.polynomial(motion.size))] for one in row]
-                            for row in rows]
+        self.polynomials = [[
+            [float(scale * x) for x in one.polynomial(motion.size)]
+            for one, scale in zip(row, factor.scales, strict=True)]
+            for row, factor in zip(rows, 2 * factors, strict=True)]
         self.senses = [factor.sense for factor in factors]
         for name, factor in zip(('alpha', 'beta'), factors, strict=True):
-            for real, _ in factor.parts:
-                size = max(map(abs, real.weights))
+            for (real, _), scale in zip(factor.parts, factor.scales, strict=True):
+                size = abs(scale) * max(map(abs, real.weights))
                 if 0 < size < LEAST_AMPLITUDE:
                     raise ValueError(
                         f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '

@@ -302,8 +302,8 @@ def _cayley_klein(motion: ThetaMotion, t: Decimal) -> tuple[Complex, Complex, De
 def _factor(factor: Factor, whole: int, y: Decimal, t: Decimal,
             point: tuple[Decimal, Decimal, Decimal]) -> Complex:
     """Return alpha D or beta D; `whole`, y, `point`: N, y and the arguments of `Series.at`."""
-    parts = factor.parts[whole % 2]
-    real, imag = (part.at(*point) for part in parts)
+    parts, scale = factor.parts[whole % 2], factor.scales[whole % 2]
+    real, imag = (scale * part.at(*point) for part in parts)
     if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
         real = -real                # it passes a pole
     turn = factor.rate * t + 2 * pi() * factor.phase_turns + factor.drift * y
