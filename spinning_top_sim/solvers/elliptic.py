@@ -49,7 +49,7 @@ class GaussMean:
         return self._start / self.mean
 
     def nome(self) -> Decimal:
-        """Return q = exp(-pi K'/K) to 38 digits, for k^2 <= 1/2."""
+        """Return q = exp(-pi K'/K) to 40 digits, for k^2 <= 1/2."""
         a, (g, c) = self._start, self._means[0]
         small = a * c / (a + g) ** 2                # (1 - sqrt(k'))/(1 + sqrt(k'))/2
         power, total = small ** 4, ZERO

@@ -5,7 +5,7 @@ Jacobi's theta functions as short polynomials, in long decimals.
 theta1 .. theta4 of y are used in the real form, with the nome q = exp(-pi K'/K) [DLMF 20.2(i)], or
 in the imaginary form, after Jacobi's transformation: with the nome q' = exp(-pi K/K') and
 hyperbolic functions of x = y K/K' [DLMF 20.7(viii)].  The smaller nome is at most exp(-pi), so
-four terms reach 1e-19 and six 1e-37.  Positive constants that all series of a form share are left
+four terms reach 1e-19 and six 1e-39.  Positive constants that all series of a form share are left
 out.
 """
 
@@ -29,7 +29,7 @@ FIRST_POLYNOMIALS = ([1], [1, -2]), ([1], [1, -4]), ([1], [3, -4]), ([0], [2])
 MOST_TERMS = 6
 # Of the polynomials in doubles, and of rates, and states that are handed over: motions between
 # changes of the vertical can be chaotic, and every error grows.
-DIGITS_OF_DOUBLES, DIGITS_OF_SERIES = 19, 37
+DIGITS_OF_DOUBLES, DIGITS_OF_SERIES = 19, 39
 
 
 def _polynomials(first: Sequence[int], second: Sequence[int]) -> list[Sequence[int]]:
@@ -63,6 +63,10 @@ class Series(NamedTuple):
         # A sum of -0 is -0.
         return [reduce(add, map(mul, weights[power:], shapes[power]))
                 for power in range(len(weights))]
+
+    @property
+    def negative(self) -> 'Series':
+        return Series(self.prefactor, [-x for x in self.weights])
 
     def at(self, sin: Decimal, cos: Decimal, xi: Decimal) -> Decimal:
         """Return the sum by Clenshaw's recurrence."""

@@ -37,7 +37,7 @@ docs/theta_functions.md derives the first two steps.
    theta3 for X.
 
 Everything that cancels, cancels here: next to a pole, to the separatrix, to steady precession.  So
-there are 57 digits, and more if two roots are close.  Then 38 are enough.
+there are 57 digits, and more if two roots are close.  Then 40 are enough.
 """
 
 from __future__ import annotations
@@ -333,19 +333,18 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate:
     """
     sense, drift, rate = int(side.momentum.compare(ZERO)), ZERO, side.spin / 2
     farthest, real, imag = max(pole.x1, pole.x2), ONE, ZERO
-    scale, sign = root(farthest / 2), 1         # sign: of the first at N = 1
+    scale = root(farthest / 2)
     starts_in_first = quarters % 2 == pole.is_beta       # the theta1 of step 3
     if pole.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
     elif not sense:
         first, second = (form.theta1, NOTHING), (form.theta2, NOTHING)
         if pole.is_beta:
-            sign = -1
+            first = form.theta1.negative, NOTHING
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
         # vanish they leave 0 with the slope.
-        series, flip = (form.theta1, sign) if starts_in_first else (form.theta2, 1)
-        if quarters % 4 >= 2:
-            flip = -flip
+        series, _ = first if starts_in_first else second
+        flip = 1 if quarters % 4 < 2 else -1
         if flip * (series.at(*point) or series.leading * side.slope) < 0:
             scale = -scale
     else:
@@ -361,7 +360,7 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate:
     scale *= (form.middle4 if pole.is_beta else form.middle3) / second[0].leading
     parts, scales = (first, second), (scale, scale)
     if pole.is_beta:
-        parts, scales = (second, first), (scale, sign * scale * form.odd_over_even)
+        parts, scales = (second, first), (scale, scale * form.odd_over_even)
     c, s = side.direction
     argument = drift * y + atan2(imag * c - real * s, real * c + imag * s)
     return Factor(rate, side.turns - argument / (2 * pi()), drift,

@@ -52,7 +52,7 @@ MOST_DIGITS = DIGITS_TO_TRY[0]
 # as this has zeros.
 POLE = Decimal('1e-30')
 # A motion that misses a pole by this share of what it could passes it exactly: the set-up squares
-# the share, and has 38 digits.
+# the share, and has 40 digits.
 THROUGH = Decimal('1e-19')
 
 
@@ -168,11 +168,11 @@ class AcceleratedMotion(ExactSolution):
         """
         Return the posture in the world at a time [ns] since the start.
 
-        It is right to 36 digits, times what the motion makes of such an error.
+        It is right to 38 digits, times what the motion makes of such an error.
         """
         if not ns:                  # perhaps at a pole, where the axis does not tell its rates
             return self._posture
-        with precision(DIGITS):
+        with precision(DIGITS + 2):
             vertical = self.vertical
             alpha, beta, u_dot = _cayley_klein(self._motion, Decimal(ns).scaleb(-9))
             across = _across(exact(self.top.lambda1), *self._halves[-2:], alpha, beta, u_dot)
