@@ -80,18 +80,20 @@ class Vertical(NamedTuple):
     gravity z stays the line of the world's vertical.
 
     gravity : downwards along z positive [m/s^2]
+    top : in this gravity
     alpha, beta : Cayley-Klein parameters of the least rotation from the world to the frame
     rows : the same rotation, q(world <- frame), in doubles
     """
 
     gravity: Decimal
+    top: Top
     alpha: Complex
     beta: Complex
     rows: Quaternion
 
-    def start(self, top: Top, posture: Posture) -> HalfAngles:
+    def start(self, posture: Posture) -> HalfAngles:
         """Return a posture as a state in this frame."""
-        (a, b), (c, d) = self.alpha, self.beta
+        top, (a, b), (c, d) = self.top, self.alpha, self.beta
         alpha, beta = _product(((a, -b), (-c, -d)), (posture.alpha, posture.beta))
         cosine2, sine2 = _square(alpha), _square(beta)
         size2, l3, (o1, o2) = cosine2 + sine2, Decimal(posture.l3), posture.across
@@ -134,7 +136,7 @@ class AcceleratedMotion(ExactSolution):
 
     def __init__(self, top: Top, posture: Posture, acceleration: Exact) -> None:
         self.vertical, self._halves = about_vertical(top, posture, acceleration)
-        self.top, self._posture = in_gravity(top, float(self.vertical.gravity)), posture
+        self.top, self._posture = self.vertical.top, posture
         self._turns, self._sign, self._half_turn = 0, 1.0, 0.0
         self._motion = set_up(top, self.vertical.gravity, self._halves)
         with precision(DIGITS):
@@ -202,38 +204,32 @@ def chained(motions: Sequence[AcceleratedMotion], counts: Sequence[int],
 
 
 @lru_cache(64)
-def _verticals(gravity: float, acceleration: Exact,
+def _verticals(top: Top, acceleration: Exact,
                ) -> tuple[tuple[Decimal, Decimal, Decimal], Vertical, Vertical]:
     """Return the upward line of effective gravity, and the verticals along and against it."""
     x, y, z = (Decimal(a.numerator) / Decimal(a.denominator) for a in acceleration)
-    z += Decimal(gravity)
+    z += Decimal(top.gravity)
     size = root(x * x + y * y + z * z)
     x, y, z = line = (x / size, y / size, z / size) if size else (ZERO, ZERO, ONE)
-    return line, _upright(size, x, y, z), _upright(-size, -x, -y, -z)
+    return line, _upright(top, size, x, y, z), _upright(top, -size, -x, -y, -z)
 
 
-def _upright(gravity: Decimal, x: Decimal, y: Decimal, z: Decimal) -> Vertical:
+def _upright(top: Top, gravity: Decimal, x: Decimal, y: Decimal, z: Decimal) -> Vertical:
     alpha, beta = _least_rotation(x, y, z)
     qx, qy, qz, qw = (np.array([float(part)]) for part in (-beta[1], beta[0], alpha[1], alpha[0]))
-    return Vertical(gravity, alpha, beta, (qx, qy, qz, qw))
-
-
-@lru_cache(16)
-def in_gravity(top: Top, gravity: float) -> Top:
-    """Return the top in another gravity [m/s^2]."""
-    return replace(top, gravity=gravity)
+    return Vertical(gravity, replace(top, gravity=float(gravity)), alpha, beta, (qx, qy, qz, qw))
 
 
 def about_vertical(top: Top, posture: Posture, acceleration: Exact,
                    ) -> tuple[Vertical, HalfAngles]:
     """Return the vertical while the pivot accelerates so, and the state there."""
     with precision(MOST_DIGITS):
-        (x, y, z), up, down = _verticals(top.gravity, acceleration)
+        (x, y, z), up, down = _verticals(top, acceleration)
         (w0, z0), (y0, minus_x0) = alpha, beta = posture[:2]
         side = (2 * (x * (w0 * y0 - z0 * minus_x0) + y * (y0 * z0 + w0 * minus_x0))
                 + z * (_square(alpha) - _square(beta)))
         vertical = up if side >= 0 else down
-        return vertical, vertical.start(top, posture)
+        return vertical, vertical.start(posture)
 
 
 def rounded(start: HalfAngles) -> State:

@@ -19,7 +19,6 @@ from spinning_top_sim.solvers.vertical import (
     AcceleratedMotion,
     Posture,
     about_vertical,
-    in_gravity,
     posture_of,
     rounded,
 )
@@ -360,5 +359,5 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
         vertical = solver.vertical
     else:
         vertical, halves = about_vertical(top, posture, piece.acceleration)
-        solver = step(in_gravity(top, float(vertical.gravity)), rounded(halves))
+        solver = step(vertical.top, rounded(halves))
     return Segment(solver, start_ns, Ride(top, vertical, piece))
