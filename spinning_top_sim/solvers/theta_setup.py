@@ -126,6 +126,21 @@ class ThetaMotion(NamedTuple):
     size: int = MOST_TERMS
 
 
+class Posture(NamedTuple):
+    """
+    Attitude and angular velocity of a top at one instant, in long decimals.
+
+    alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
+    across : omega_1 + i omega_2 in the body [rad/s]
+    l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
+    """
+
+    alpha: Complex
+    beta: Complex
+    across: Complex
+    l3: float
+
+
 class HalfAngles(NamedTuple):
     """
     A state in long decimals; theta is in [0, pi/2].
@@ -246,8 +261,8 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decima
         scale = root(f3)
         # w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
         y_rate = scale * mean.mean / 2
-        factors = [_factor(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, quarter0,
-                           y0, (direction * sin, cos, xi))
+        factors = [_quotient(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, quarter0,
+                             y0, (direction * sin, cos, xi))
                    for side, pole in zip(sides, poles, strict=True)]
         scale *= sense * a / 2 * roots.gap21         # w (u2 - u1)
         even, odd = form.slopes_of_sn2()
@@ -323,12 +338,13 @@ def _nearest_quarter(roots: Roots, complement: Decimal, falling: bool,
         low * roots.gap32 if imaginary else roots.gap21 * roots.y3))
 
 
-def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate: Decimal,
-            y_rate: Decimal, quarters: int, y: Decimal,
-            point: tuple[Decimal, Decimal, Decimal]) -> Factor:
+def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate: Decimal,
+              y_rate: Decimal, quarters: int, y: Decimal,
+              point: tuple[Decimal, Decimal, Decimal]) -> Factor:
     """
-    Return alpha or beta; x_rate, y_rate: of x and y [rad/s] of the imaginary and the real form.
+    Return alpha or beta as a quotient of theta functions.
 
+    x_rate, y_rate : of x and y, the arguments of the imaginary and of the real form [rad/s]
     quarters, y, point : N, y and the arguments of `Series.at` at t = 0
     """
     sense, drift, rate = int(side.momentum.compare(ZERO)), ZERO, side.spin / 2

@@ -118,13 +118,13 @@ class ThetaFunctions:
     def __init__(self, motions: Sequence[Constants], counts: Sequence[int] | None = None) -> None:
         self._motions, self._counts, present = motions, counts, motions[0]
         self._rates: dict[str, tuple[Matrix, Matrix, Matrix, Matrix]] = {}
-        self.start_whole = self._columns([one.start_whole for one in motions])
-        self.offset, self.offset_rest = map(self._columns, np.array(
+        self.start_whole = self.columns([one.start_whole for one in motions])
+        self.offset, self.offset_rest = map(self.columns, np.array(
             [one.offsets for one in motions]).transpose(2, 0, 1))
-        self.drifts = self._columns([one.drifts for one in motions])
+        self.drifts = self.columns([one.drifts for one in motions])
         self.stretch: Column | None = None
         if any(one.stretch for one in motions):
-            self.stretch, = self._columns([(one.stretch,) for one in motions])
+            self.stretch, = self.columns([(one.stretch,) for one in motions])
         self.prefactors: list[tuple[int, ...]] = present.prefactors
         if any(one.prefactors != present.prefactors for one in motions):
             self.prefactors = [sum(rows, ()) for rows in zip(*(
@@ -138,12 +138,12 @@ class ThetaFunctions:
         self.u_dot, self.momentum, self.swing = np.array([
             (one.u_dot, one.momentum, one.swing) for one in motions]
             ).transpose(1, 0, 2).reshape(3, -1)
-        self.u_dot_coefficients = self._columns(
+        self.u_dot_coefficients = self.columns(
             _side_by_side([one.u_dot_polynomial for one in motions]).T)
         self.first = None if counts is None else np.repeat(
             np.arange(0, 2 * len(motions), 2), counts)
 
-    def _columns(self, rows: ArrayLike) -> Matrix:
+    def columns(self, rows: ArrayLike) -> Matrix:
         """Return what is given by motions, by columns for each time."""
         columns: Matrix = np.array(rows).T
         return columns if self._counts is None else np.repeat(columns, self._counts, axis=1)
@@ -153,7 +153,7 @@ class ThetaFunctions:
         if times.unit not in self._rates:
             high, low = np.array([one.rates(times.unit) for one in self._motions]
                                  ).transpose(2, 0, 1)
-            rate, rest = self._columns(high), self._columns(low)
+            rate, rest = self.columns(high), self.columns(low)
             self._rates[times.unit] = rate, *halves(rate), rest
         return products(self._rates[times.unit], times)
 
