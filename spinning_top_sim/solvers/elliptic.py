@@ -25,9 +25,15 @@ class GaussMean:
     """
     The arithmetic-geometric mean M of two numbers.
 
-    mean : M; the quarter period K(k) is (pi/2) a_0/M [DLMF 19.8.5]
+    Parameters
+    ----------
+    a, g, c : Decimal
+        a_0, g_0, and c_0, which the caller knows without cancellation.
 
-    a, g, c : a_0, g_0, and c_0, which the caller knows without cancellation
+    Attributes
+    ----------
+    mean : Decimal
+        M; the quarter period K(k) is (pi/2) a_0/M [DLMF 19.8.5].
     """
 
     def __init__(self, a: Decimal, g: Decimal, c: Decimal) -> None:

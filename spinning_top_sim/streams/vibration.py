@@ -27,9 +27,17 @@ class Vibration:
     of the band.  Its place in the middle half of the band and its phase follow from the seed.  So
     no beat is longer than two over the width of a band, and short records have the power.
 
-    is_off : whether nothing vibrates
+    Parameters
+    ----------
+    values : mapping
+        The parameters of the run.
+    response : callable
+        Returns the complex gain of the sensor at frequencies [Hz].
 
-    response : the complex gain of the sensor at frequencies [Hz]
+    Attributes
+    ----------
+    is_off : bool
+        Whether nothing vibrates.
 
     (S. Rice, "Mathematical analysis of random noise", Bell System Technical Journal 23 (1944) 282;
     M. Shinozuka, C. Jan, Journal of Sound and Vibration 25 (1972) 111)
