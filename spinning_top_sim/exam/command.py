@@ -23,8 +23,9 @@ import argparse
 import runpy
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from spinning_top_sim.exam.adapters import FILTERS
 from spinning_top_sim.exam.broad import examine_data, trials_in
@@ -105,30 +106,42 @@ def _report(arguments: argparse.Namespace) -> Report:
     if arguments.imu is not None:
         (options['imu'],) = scene_file.chosen_files(argparse.Namespace(imu=arguments.imu))
     if subject == 'a log':
-        with needed('it'):
-            from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
-
-        options['north'] = options.pop('heading', None)
-        return examine_log(arguments.log, **options)
+        return _of_log(arguments.log, options)
     if subject == 'a node':
-        before = signal.signal(signal.SIGINT, lambda *_: INTERRUPTED.set())
-        try:
-            with needed('the exam of a node', 'ros'):
-                from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415
+        return _of_node(arguments.node, options)
+    return _of_filter(arguments.filter, options)
 
-            return examine_node(command=arguments.node, **options)
-        finally:
-            signal.signal(signal.SIGINT, before)
-    name = arguments.filter
+
+def _of_log(path: Path, options: dict[str, Any]) -> Report:
+    with needed('it'):
+        from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
+
+    options['north'] = options.pop('heading', None)
+    return examine_log(path, **options)
+
+
+def _of_node(command: str | None, options: Mapping[str, Any]) -> Report:
+    before = signal.signal(signal.SIGINT, lambda *_: INTERRUPTED.set())
+    try:
+        with needed('the exam of a node', 'ros'):
+            from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415
+
+        return examine_node(command=command, **options)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _of_filter(name: str, options: Mapping[str, Any]) -> Report:
     if name in FILTERS:
         with needed(f'the filter {name}'):
             FILTERS[name]()         # imports its package once, before the runs fork
     make_filter, shown = FILTERS.get(name) or _own_filter(name), name if name in FILTERS else None
-    if arguments.data is None:
+    if 'data' not in options:
         # Published filters neither crash nor hang: without processes, the exam is faster.
         return examine(make_filter, subject=shown, isolated=shown is None, **options)
-    with cli.progress('examined', len(trials_in(arguments.data)), 'trials') as show:
-        return examine_data(make_filter, arguments.data, subject=shown, show=show)
+    folder = options['data']
+    with cli.progress('examined', len(trials_in(folder)), 'trials') as show:
+        return examine_data(make_filter, folder, subject=shown, show=show)
 
 
 def _own_filter(given: str) -> Callable[[], Filter]:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Identifies the faults of a filter by their signatures, and gives the evidence for each.
+Judges the attitudes of a run: measures, limits, and the faults that the errors alone show.
 
-A constant misinterpretation of readings or attitudes is identified by inverting it: if the error
+A constant misinterpretation of the attitudes is identified by inverting it: if the error
 disappears, it was the cause.
 """
 

@@ -10,7 +10,7 @@ from spinning_top_sim.exam import diagnosis
 from spinning_top_sim.exam.diagnosis import FAULTS
 from spinning_top_sim.exam.measures import CONVERGED_DEG
 from spinning_top_sim.exam.trial import Outcome
-from spinning_top_sim.tools.verdict import Verdict, number
+from spinning_top_sim.tools.verdict import Fault, Verdict, number
 
 MEANINGS = {
     'tilt_rms_deg': 'settled', 'tilt_max_deg': 'settled', 'heading_rms_deg': 'settled',
@@ -82,3 +82,22 @@ class Report(Verdict):
                 ElementTree.SubElement(case, 'failure', message=evidence[name])
         ElementTree.indent(suite)
         return ElementTree.tostring(suite, encoding='unicode', xml_declaration=True) + '\n'
+
+
+@dataclass
+class Findings:
+    """Faults and measures that an exam has found so far."""
+
+    faults: list[Fault] = field(default_factory=list)
+    measures: dict[str, float] = field(default_factory=dict)
+
+    def drop(self, name: str) -> None:
+        """Remove the faults of this name."""
+        self.faults = [fault for fault in self.faults if fault.name != name]
+
+    def report(self, subject: str, outcomes: Sequence[Outcome]) -> Report:
+        """Return the report, with the first fault of each name: a misreading hides others."""
+        first: dict[str, Fault] = {}
+        for fault in self.faults:
+            first.setdefault(fault.name, fault)
+        return Report(subject, [*first.values()], self.measures, outcomes)

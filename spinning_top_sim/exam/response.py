@@ -8,7 +8,7 @@ is a hypothesis: its inverse is applied to the readings or the attitudes, and th
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,16 +21,10 @@ from spinning_top_sim.exam import diagnosis, excitation, measures, scenarios
 from spinning_top_sim.exam.diagnosis import HEADING, TILT, degrees
 from spinning_top_sim.exam.excitation import axes, from_identity, gyroscope_of, moved, words
 from spinning_top_sim.exam.measures import rms
+from spinning_top_sim.exam.report import Findings
 from spinning_top_sim.exam.scenarios import Reals, Run
-from spinning_top_sim.exam.trial import (
-    Feed,
-    Hypothesis,
-    InvalidOutputError,
-    MakeFilter,
-    Outcome,
-    changed,
-    follow,
-)
+from spinning_top_sim.exam.subject import Subject
+from spinning_top_sim.exam.trial import Hypothesis, InvalidOutputError, Outcome, changed
 from spinning_top_sim.tools.verdict import Fault
 
 BIAS = np.array((0.01, -0.01, 0.02))    # of the gyroscope [rad/s]; its norm is 1.4 deg/s
@@ -71,58 +65,56 @@ LEVEL = Hypothesis(('magnetometer_wiring',), 'with the field of a level sensor',
                    given=excitation.untilted)
 
 
-class Responses:
+class Response:
     """
-    The responses of one filter: faults, measures, and the inverses of causes that are undone.
+    The response of a filter to the excitation; `findings` takes its faults and measures.
 
-    restarts : whether each run has a new filter
+    absolute : whether the heading is judged
+    undone : inverses of the causes that were found, for other runs
+    early : response to the begin of turns (3, 3), the identity for a right filter
     unclear : whether an error is left that would be taken for that by a lever arm or a bias
     """
 
-    restarts = True
-
-    def __init__(self, make_filter: MakeFilter, feed: Feed, imu: Mapping[str, Any]) -> None:
-        self._make_filter, self._feed, self._imu = make_filter, feed, imu
-        self._absolute = self.unclear = False
-        self.faults: list[Fault] = []
-        self.measures: dict[str, float] = {}
+    def __init__(self, subject: Subject, absolute: bool, findings: Findings) -> None:
+        self._subject, self._absolute, self._findings = subject, absolute, findings
         self.undone: list[Hypothesis] = []
         self._harmless: list[Hypothesis] = []
-        self._early = np.eye(3)         # the response to the begin of turns
+        self.early, self.unclear = np.eye(3), False
+        self._given = excitation.excite(subject.imu)
+        self._excited, self._rests = self._given.run, self._given.rests
 
-    def _follow(self, run: Run, undone: Sequence[Hypothesis] = ()) -> Outcome:
-        """Return the outcome of a run, fed to a new filter."""
-        return follow(self._make_filter, run, undone, self._feed)
+    def identify(self) -> None:
+        """
+        Find causes until nothing is left to explain, and undo each.
 
-    def _identify(self) -> None:
-        """Find causes until nothing is left to explain, and undo each."""
-        self._given = given = excitation.excite(self._imu)
-        self._excited, self._rests = given.run, given.rests
+        Raises InvalidOutputError if the filter fails.
+        """
         self._outcome = self._respond()
         for _ in range(4):
-            found = self._cause()
-            if found is None:
+            best = self._cause()
+            if best is None:
                 break
             before = self._whole(self._outcome)
-            one, self._outcome = found
-            self.faults += [Fault(name, f'{one.text}, the error falls from {degrees(before)} to '
-                                  f'{degrees(self._whole(self._outcome))}; all measures but those '
-                                  'of the field are those after this correction')
-                            for name in one.faults]
+            one, self._outcome = best
+            self._findings.faults += [
+                Fault(name, f'{one.text}, the error falls from {degrees(before)} to '
+                      f'{degrees(self._whole(self._outcome))}; all measures but those of the '
+                      'field are those after this correction') for name in one.faults]
             (self.undone if {*one.faults} - {'stamp_offset'} else self._harmless).insert(0, one)
             self.unclear |= one.given is excitation.of_world
         clean = np.degrees(self._clean(self._outcome))
-        self.measures |= {'tilt_clean_deg': float(max(clean[::2])),
-                          'heading_clean_deg': float(max(clean[1::2]))}
+        self._findings.measures |= {'tilt_clean_deg': float(max(clean[::2])),
+                                 'heading_clean_deg': float(max(clean[1::2]))}
         rest = self._rest()
         # A heading that nothing corrects is any.
         if 'magnetometer_wiring' in [fault.name for fault in rest]:
-            self.faults = [fault for fault in self.faults if fault.name != 'heading_offset']
-        self.faults += rest
+            self._findings.drop('heading_offset')
+        faults = self._findings.faults
+        faults += rest
         self.unclear |= bool(rest)
         if self.unclear:
-            self.faults[-1] = self.faults[-1]._replace(evidence=f'{self.faults[-1].evidence}; '
-                                                       'no lever arm and no bias is judged')
+            faults[-1] = faults[-1]._replace(
+                evidence=f'{faults[-1].evidence}; no lever arm and no bias is judged')
 
     def _clean(self, outcome: Outcome, *places: Any) -> Reals:
         """Return errors of tilt and heading, by default at rest, then in motion, rms [rad]."""
@@ -135,7 +127,8 @@ class Responses:
         return float(np.linalg.norm(self._clean(outcome, *places)))
 
     def _respond(self, more: Sequence[Hypothesis] = (), run: Run | None = None) -> Outcome:
-        return self._follow(run or self._excited, [*more, *self._harmless, *self.undone])
+        return self._subject.follow(run or self._excited,
+                                    [*more, *self._harmless, *self.undone])
 
     def _tried(self, *hypotheses: Hypothesis, screened: bool = True) -> Iterator[Tried]:
         """Yield the hypotheses with their outcomes; `screened` leaves out what is in vain."""
@@ -143,7 +136,7 @@ class Responses:
             with contextlib.suppress(InvalidOutputError):       # the filter rejects the readings
                 if one.given is None:
                     yield one, replace(self._outcome, estimates=one.read(self._outcome.estimates))
-                elif not (screened and self.restarts and self._in_vain(one)):
+                elif not (screened and self._subject.restarts and self._in_vain(one)):
                     yield one, self._respond((one,))
 
     def _in_vain(self, one: Hypothesis) -> bool:
@@ -295,7 +288,7 @@ class Responses:
                  ) -> list[tuple[Rotation, NDArray[np.intp]]]:
         """Return attitudes of filters that start at rest, those at the ends of rests, and rows."""
         found = [(Rotation.from_quat(outcome.estimates[self._rests]), self._rests)]
-        if self.restarts:
+        if self._subject.restarts:
             # Within turns too, the readings are those of a rest in the same attitude.
             starts = np.concatenate((self._rests, self._given.turns + 15, self._given.turns + 30))
             still = np.full((START, 3), excitation.NEVER_ZERO)
@@ -335,7 +328,7 @@ class Responses:
                 'in motion {} and {}').format(*map(degrees, clean))
         wrong = bool(np.any(clean > CLEAN))
         whole, early, late = gyroscope_of(self._outcome, self._given.turns)
-        self._early = early
+        self.early = early
         turns = Rotation.from_quat(self._outcome.estimates)
         if np.max((turns * turns[0].inv()).magnitude()) < STUCK:
             return [Fault('inaccurate', 'the attitude hardly changes')]
@@ -369,8 +362,8 @@ class Responses:
             if (left := rms(end[part]) / max(rms(begin[part]), 1e-6)) > STAYS
             and (self._absolute or what == 'tilt')]
 
-    def _judge_bias(self) -> None:
-        """Compare runs with and without a gyroscope bias."""
+    def judge_bias(self) -> None:
+        """Compare runs with and without a gyroscope bias, after `identify`."""
         motion, size = self._given.motion, float(np.linalg.norm(BIAS))
         run = self._excited.part(slice(motion.stop))
         outcome = self._respond((), replace(run, gyroscope=run.gyroscope + BIAS))
@@ -383,18 +376,18 @@ class Responses:
         found, late = estimates[-1], rms(apart[motion]) / size
         share, before = (estimates[[-1, len(estimates) // 4]] @ BIAS / size ** 2).tolist()
         first, again = apart[self._rests[[0, -2]]].tolist()
-        self.measures |= {'bias_error_s': late, 'bias_found': share}
+        self._findings.measures |= {'bias_error_s': late, 'bias_found': share}
         left = late > diagnosis.BIAS_LEFT_S
         right = (-BIAS_FOUND < share < 1.0 / BIAS_OFF if left else
                  np.linalg.norm(found - BIAS) < BIAS_OFF * size)
         if left and not (again < LEARNED * first or (
                 again < LEARNING * first and share > max(BIAS_FOUND, 1.2 * before))):
-            self.faults.append(Fault(
+            self._findings.faults.append(Fault(
                 'no_bias_estimate', 'with a gyroscope bias of 1 deg/s the '
                 f'{"attitude" if self._absolute else "tilt"} is {late:.3g} deg off in the end: '
                 'the bias is not learned'))
         elif not right and not math.isnan(share):
-            self.faults.append(Fault(
+            self._findings.faults.append(Fault(
                 'bias_report', f'a gyroscope bias of {np.degrees(BIAS).round(2).tolist()} deg/s '
                 f'is learned, but the estimate is {np.degrees(found).round(2).tolist()} deg/s'))
 

@@ -17,9 +17,10 @@ What a file may contain is in docs/grade_files.md.
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -94,18 +95,24 @@ def _motion(arguments: argparse.Namespace,
         **{name: given.get(f'imu.{name}') for name in (
             'gyroscope_noise_density', 'accelerometer_noise_density')})
     if fits or not (given or known):
-        found = fitting.fit(recorded.parts, lambda1=top.lambda1, gravity=top.gravity,
-                            imu=arguments.fit_imu)
-        if arguments.fit_imu:
-            body = replace(body, mounting=found.mounting, lever_arm=body.lever_arm if (
-                arguments.lever_arm or 'imu.lever_arm' in given) else found.lever_arm)
-        if any(name.startswith('top.') for name in given):
-            return body, fitting.start_of(found, recorded.parts, top), found
-        return replace(body, **vars(found.top)), found.start, found
+        return _fitted(arguments, recorded, given, body)
     if off := fitting.far_start(recorded.parts, top, start):
         raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
                          '--fit finds top and start')
     return body, start, None
+
+
+def _fitted(arguments: argparse.Namespace, recorded: Recorded, given: Mapping[str, Any],
+            body: Body) -> tuple[Body, State, fitting.Fit]:
+    """Return the same as fitted, but for the parts of `body` that are given."""
+    found = fitting.fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
+                        imu=arguments.fit_imu)
+    if arguments.fit_imu:
+        body = replace(body, mounting=found.mounting, lever_arm=body.lever_arm if (
+            arguments.lever_arm or 'imu.lever_arm' in given) else found.lever_arm)
+    if any(name.startswith('top.') for name in given):
+        return body, fitting.start_of(found, recorded.parts, body), found
+    return replace(body, **vars(found.top)), found.start, found
 
 
 def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0) -> Trajectory:
@@ -126,15 +133,8 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
         if min(at[-1], times[-1]) - max(at[0], times[0]) < 0.5 * np.ptp(times):
             notes.append(f'{name}: not at the times of the attitudes, left out')
             del parts[name]
-    every = [*(parts[name][0] for name in ('gyroscope', 'accelerations') if name in parts), times,
-             *(at for at, _ in parts.values())]
-    begin, end = max(at[0] for at in every) - SAME_S, min(at[-1] for at in every) + SAME_S
-    grid = every[0][(every[0] >= begin) & (every[0] <= end)]
-    even: Reals = np.linspace(grid[0], grid[-1], len(grid))
-    if np.max(np.abs(even - grid)) < EVEN * (even[1] - even[0]):
-        even = grid
-    else:
-        notes.append('stamps are not evenly spaced: interpolated')
+    even = _evenly([*(parts[name][0] for name in ('gyroscope', 'accelerations') if name in parts),
+                    times, *(at for at, _ in parts.values())], notes)
     error = turns(times).inv() * Rotation.from_quat(np.roll(attitudes, -1, axis=1))
     level, white = fitting.whiteness(error.as_rotvec().T)
     found = turns(even)
@@ -152,6 +152,17 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
             notes.append(f'{name}: not at the times of the attitudes, and the spin is '
                          f'{angle:.2g} rad from one sample to the next: not compared')
     return Trajectory.of({**readings, 'covariance': recorded.covariance}, even)
+
+
+def _evenly(every: Sequence[Reals], notes: list[str]) -> Reals:
+    """Return the first of these times, made evenly spaced, as far as all of them go."""
+    begin, end = max(at[0] for at in every) - SAME_S, min(at[-1] for at in every) + SAME_S
+    grid = every[0][(every[0] >= begin) & (every[0] <= end)]
+    even: Reals = np.linspace(grid[0], grid[-1], len(grid))
+    if np.max(np.abs(even - grid)) < EVEN * (even[1] - even[0]):
+        return grid
+    notes.append('stamps are not evenly spaced: interpolated')
+    return even
 
 
 def _longest(name: str, at: Reals, values: Reals, notes: list[str]) -> tuple[Reals, Reals]:

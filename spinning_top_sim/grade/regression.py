@@ -54,11 +54,10 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
     enough = max(ENOUGH * beyond(target, floor), 0.1 * floor)
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
         tried = [fitted(target, [effects[name] for cause in (*chosen, one)
-                                        for name in cause.effects]) for one in others]
+                                 for name in cause.effects]) for one in others]
         # A cause with a judge that names no fault explains nothing.
-        after = [beyond(left, floor) if one.judge is None or one.judge(
-            part[-len(one.effects):]) else np.inf
-            for one, (part, left) in zip(others, tried, strict=True)]
+        after = [np.inf if one.judge and one.judge(part[-len(one.effects):]) is None else
+                 beyond(left, floor) for one, (part, left) in zip(others, tried, strict=True)]
         good = max(AS_GOOD * min(after), min(0.02 * before, floor or np.inf))
         _, left, best = min((len(one.effects), left, k) for k, (one, left) in enumerate(
             zip(others, after, strict=True)) if left <= good)
@@ -66,9 +65,14 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
             break
         found, residual = tried[best]
         chosen.append(others.pop(best))
-    ends = np.cumsum([len(one.effects) for one in chosen], dtype=int)[:-1]
-    return [fault for one, part in zip(chosen, np.split(found, ends), strict=False)
-            if one.judge is not None and (fault := one.judge(part)) is not None], residual
+    return _named(chosen, found), residual
+
+
+def _named(causes: Sequence[Cause], found: Reals) -> list[Fault]:
+    """Return the faults that causes with these coefficients are."""
+    ends = np.cumsum([len(one.effects) for one in causes], dtype=int)[:-1]
+    return [fault for one, part in zip(causes, np.split(found, ends), strict=False)
+            if one.judge and (fault := one.judge(part))]
 
 
 def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 CHUNK_BYTES = 1 << 20   # uncompressed; a single larger message still makes a chunk of its own
 
-# The fastest level that compresses nearly as well as zstd's own default, 3:
-# `python benchmark/log_compression.py`.
+# The fastest level that compresses nearly as well as zstd's own default, 3.
 ZSTD_LEVEL = -1
 
 # The next messages of a topic: its index, log times (n,) [ns], messages (n, size).

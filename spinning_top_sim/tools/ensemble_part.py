@@ -6,9 +6,11 @@ A file gets its name when it is whole.  One that is there already is not compute
 """
 
 import contextlib
+import itertools
 import json
 import platform
 from collections.abc import Sequence
+from copy import copy
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +19,7 @@ from uuid import uuid4
 import numpy as np
 
 from spinning_top_sim.installation import version
-from spinning_top_sim.streams import journal
+from spinning_top_sim.streams import journal, messages
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
@@ -73,28 +75,32 @@ def table(specification: Specification, run: int) -> 'pyarrow.Table':
     names = {stream: _column_names(stream) for stream in simulation.streams
              if stream.parameter in specification.kept}
     # Times and numbers of the samples; empty arrays first, for a stream without any.
-    parts = {stream: [(np.empty(0, np.int64), np.empty((len(labels), 0)))]
-             for stream, labels in names.items()}
+    times = {stream: [np.empty(0, np.int64)] for stream in names}
+    numbers = {stream: [np.empty((0, len(labels)))] for stream, labels in names.items()}
+    for stream in names:
+        stream.template = copy(messages.numbers(*stream.template.counts))
     recorded = journal.recorded_streams(list(names), values)
     for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
-        for stream, times_ns, encoded in block.messages:
-            once = np.diff(times_ns, prepend=-1) > 0        # a faulty sensor sends some twice
-            numbers = np.vstack([field.T for field in stream.template.decode(encoded)])
-            parts[stream].append((times_ns[once], numbers[:, once]))
-    rows_ns = np.unique(np.concatenate([
-        times_ns for blocks in parts.values() for times_ns, _ in blocks]))
+        for stream, times_ns, rows in block.messages:
+            times[stream].append(times_ns)
+            numbers[stream].append(np.hstack(stream.template.decode(rows)))
+    every_ns = np.sort(np.concatenate([*itertools.chain(*times.values())]), kind='stable')
+    rows_ns = every_ns[np.diff(every_ns, prepend=-1) > 0]
     columns = {'run': pa.repeat(pa.scalar(run), len(rows_ns)),
                't': pa.array(rows_ns / NANOSECONDS)}
     for name, value in specification.drawn(run).items():
         # An unset value (spin.lz) is a null of the type that the other runs have.
         one = pa.scalar(value, pa.float64() if value is None else None)
         columns[name] = pa.repeat(one, len(rows_ns))
-    for stream, blocks in parts.items():
-        present = np.isin(rows_ns, np.concatenate([times_ns for times_ns, _ in blocks]))
-        numbers = np.zeros((len(names[stream]), len(rows_ns)))
-        numbers[:, present] = np.hstack([numbers for _, numbers in blocks])
-        columns.update((f'{stream.topic}.{name}', pa.array(column, mask=~present))
-                       for name, column in zip(names[stream], numbers, strict=True) if name)
+    for stream, labels in names.items():
+        # A faulty sensor sends some samples twice; they share a row.
+        present = np.searchsorted(rows_ns, np.concatenate(times[stream]))
+        absent = np.ones(len(rows_ns), bool)
+        absent[present] = False
+        cells = np.zeros((len(rows_ns), len(labels)))
+        cells[present] = np.concatenate(numbers[stream])
+        columns.update((f'{stream.topic}.{name}', pa.array(column, mask=absent))
+                       for name, column in zip(labels, cells.T, strict=True) if name)
     return pa.table(columns)
 
 
@@ -140,7 +146,7 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
         constant = ['run', *specification.drawn(0)]
         written = path.with_name(f'.{path.name}.{uuid4()}')     # readers of Parquet skip it
         parquet.write_table(
-            rows, written, compression='zstd', row_group_size=ROWS_IN_A_GROUP,
+            rows, written, compression='lz4', row_group_size=ROWS_IN_A_GROUP,
             use_dictionary=constant, write_statistics=constant, use_byte_stream_split=[
                 name for name in rows.column_names if name not in constant])
         written.replace(path)

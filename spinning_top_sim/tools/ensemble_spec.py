@@ -197,10 +197,10 @@ def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
     (kind, given), = rule.items()
     items, parameter = _list(given, f'{what}: {kind}'), parameters.BY_NAME.get(str(name))
     if kind == VALUES:
+        check = parameter.check if parameter else partial(_parameter_set, what=what, folder=folder)
         if not items:
             raise ValueError(f'{what}: values = []: must have one value at least')
-        return {kind: [_parameter_set(item, what, folder) if parameter is None
-                       else parameter.check(item) for item in items]}
+        return {kind: [*map(check, items)]}
     if parameter is None or not parameter.is_double:
         raise ValueError(f'{what}: {kind}: must be values, because the parameter is no double')
     _, allowed, is_allowed = DISTRIBUTIONS[kind]

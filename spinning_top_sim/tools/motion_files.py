@@ -16,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zipfile import is_zipfile
@@ -133,17 +134,23 @@ def read(path: Path, topic: str | None = None) -> Recorded:
 # ------------------------------------------------------------------------------------- tables
 
 def _csv(path: Path) -> Table:
-    lines = [line for line in path.read_text('utf-8-sig', errors='replace').splitlines()
-             if line.strip()]
-    comments = [line.lstrip('# ') for line in lines if line.startswith('#')]
-    lines = [line for line in lines if not line.startswith('#')] or ['']
+    text = path.read_text('utf-8-sig', errors='replace')
+    filled = [line for line in text.splitlines() if line.strip()]
+    lines = [line for line in filled if not line.startswith('#')] or ['']
     mark = next((mark for mark in ';\t,' if mark in lines[0]), ' ')
     if mark == ';':                                 # with decimal commas
         lines = [line.replace(',', '.') for line in lines]
-    names, *rows = split = [*csv.reader(lines, delimiter=mark, skipinitialspace=True)]
+    split = partial(csv.reader, delimiter=mark, skipinitialspace=True)
+    names, *rows = split(lines)
     if re.match('[-+.0-9]', lines[0]):              # no names: those of a comment, or of TUM
-        heads = csv.reader(reversed([TUM, *comments]), delimiter=mark, skipinitialspace=True)
-        names, rows = next((head for head in heads if len(head) == len(names)), names), split
+        rows = [names, *rows]
+        comments = [line.lstrip('# ') for line in filled if line.startswith('#')]
+        named = filter(lambda head: len(head) == len(rows[0]), split([*reversed(comments), TUM]))
+        names = next(named, names)
+    return _columns(names, rows)
+
+
+def _columns(names: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     whole = [row for row in rows if len(row) == len(names)]
     if len(whole) < max(len(rows) - 1, 1):      # the last may be cut off
         raise ValueError('must have a line with the names of columns, then lines with as many '
