@@ -124,15 +124,8 @@ class SteppedMotion(ABC):
 
     A subclass has the equations: f, its derivative, the error that is tolerated, and the states.
 
-    Parameters
-    ----------
-    top, start : Top, State
-        What moves, and from where.
-    y : Vector
-        The unknowns at t = 0, all complex or all real.
-    tolerance, fastest_rate : float
-        Relative error of a step, and a bound on |y'|/|y| [1/s]: the first step's length comes
-        from these two.
+    The unknowns `y` at t = 0 are all complex or all real.  The first step's length comes from the
+    relative error of a step, `tolerance`, and a bound on |y'|/|y|, `fastest_rate` [1/s].
     """
 
     derivative: Callable[..., Vector]   # f of the unknowns, which it takes one by one
@@ -194,14 +187,6 @@ class SteppedMotion(ABC):
         # First same as last: the projection moves y by less than the step's own error, so the
         # derivative at the unprojected end serves the next step too.
         self._kept.append(Step(t, y, derivative, end, y_new, derivative_new))
-
-    @functools.cached_property
-    def first(self) -> States:
-        return self.states(range(1))        # as long as the first step is kept
-
-    @property
-    def energy(self) -> float:
-        return float(self.first.energy[0])
 
     @functools.cached_property
     def exact(self) -> ExactSolution | None:

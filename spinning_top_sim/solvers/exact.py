@@ -76,14 +76,6 @@ class ClosedForm:
     def exact(self) -> Self:
         return self
 
-    @cached_property
-    def first(self) -> States:
-        return self.states(range(1))
-
-    @property
-    def energy(self) -> float:
-        return float(self.first.energy[0])
-
     def describe(self) -> Description | None:
         return None
 

@@ -33,7 +33,6 @@ class Motion(Protocol):
     chains : whether it is an `AcceleratedMotion` that `vertical.chained` takes
     start : from where it moves
     reached_ns : the last time that `states` can give without further steps [ns]
-    first, energy : the state (n = 1) and the energy [J] at the start
     exact : the closed form; None where doubles cannot hold it
 
     `SteppedMotion` says what its other members do.  `posture` returns attitude and angular
@@ -51,12 +50,6 @@ class Motion(Protocol):
 
     @property
     def reached_ns(self) -> int: ...
-
-    @property
-    def first(self) -> States: ...
-
-    @property
-    def energy(self) -> float: ...
 
     @property
     def exact(self) -> ClosedForm | None: ...

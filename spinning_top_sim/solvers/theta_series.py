@@ -64,10 +64,6 @@ class Series(NamedTuple):
         return [reduce(add, map(mul, weights[power:], shapes[power]))
                 for power in range(len(weights))]
 
-    @property
-    def negative(self) -> 'Series':
-        return Series(self.prefactor, [-x for x in self.weights])
-
     def at(self, sin: Decimal, cos: Decimal, xi: Decimal) -> Decimal:
         """Return the sum by Clenshaw's recurrence."""
         twice, value, before = 2 - 4 * xi, ZERO, ZERO

@@ -67,6 +67,7 @@ from spinning_top_sim.solvers.theta_series import (
     COS_EVEN,
     MOST_TERMS,
     NOTHING,
+    SIN_ODD,
     Parts,
     Series,
     ThetaForm,
@@ -354,9 +355,9 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rat
     if pole.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
     elif not sense:
-        first, second = (form.theta1, NOTHING), (form.theta2, NOTHING)
-        if pole.is_beta:
-            first = form.theta1.negative, NOTHING
+        sign = -1 if pole.is_beta else 1
+        first = Series(SIN_ODD, [sign * x for x in form.theta1.weights]), NOTHING
+        second = form.theta2, NOTHING
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
         # vanish they leave 0 with the slope.
         series, _ = first if starts_in_first else second
@@ -374,10 +375,9 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rat
         real, imag = (part.at(*point) for part in (first if starts_in_first else second))
     # alpha is largest at u2, where N is odd, and beta at u1: both at the centre of theta2.
     scale *= (form.middle4 if pole.is_beta else form.middle3) / second[0].leading
-    parts, scales = (first, second), (scale, scale)
-    if pole.is_beta:
-        parts, scales = (second, first), (scale, scale * form.odd_over_even)
+    parts, scales = (((second, first), (scale, scale * form.odd_over_even)) if pole.is_beta
+                     else ((first, second), (scale, scale)))
     c, s = side.direction
     argument = drift * y + atan2(imag * c - real * s, real * c + imag * s)
-    return Factor(rate, side.turns - argument / (2 * pi()), drift,
-                  parts, scales, sense, argument)
+    return Factor(rate, side.turns - argument / (2 * pi()), drift, parts, scales,
+                  sense, argument)

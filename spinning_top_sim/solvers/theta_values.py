@@ -101,17 +101,15 @@ class Constants:
 
 class ThetaFunctions:
     """
-    The constants of a motion in arrays, or those of several motions, each for so many times.
+    The `Constants` of a motion in arrays, or those of several motions, each for so many times.
 
-    start_whole, offset, offset_rest : (3, 1) or (3, n)
-    drifts : (2, 1) or (2, n)
+    Columns are (k, 1) or (k, n).  `coefficients` (k, 4, 2 motions), highest power first, `u_dot`,
+    `momentum` and `swing` have those of all motions at even and at odd N.
+
     stretch : None if there is no imaginary form
     prefactors : where they differ in a chain, of all its motions one after the other
-    coefficients : highest power first, by row, at even and at odd N, (k, 4, 2 motions)
     real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
     zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
-    u_dot, momentum, swing : at even and at odd N, (2 motions,)
-    u_dot_coefficients : (k, 1) or (k, n)
     first : of a chain, the place of each time's constants at even N in the last axis, (n,)
     """
 

@@ -71,22 +71,12 @@ class TransportMotion(SteppedMotion):
     step.  If Lz + L3 or Lz - L3 is 0, alpha or beta has the uniform part alone.  It then moves on
     a line through zero, and its modulus changes sign where the axis passes that pole.
 
-    Parameters
-    ----------
-    top, start : Top, State
-        What moves, and from where.
-    rtol, atol : float
-        Tolerated error of a step; the unknowns are scaled to 1, so the two add up.
+    The unknowns are scaled to 1, so the tolerated errors `rtol` and `atol` of a step add up.
 
-    Attributes
-    ----------
-    spin_rate : float
-        chi [rad/s].
-    uniform_rates : tuple of float
-        Rate of the uniform part of alpha's phase, in the frame that is stepped and in the body
-        [rad/s].  They differ by chi/2.  Those of beta have the other sign.
-    momenta : tuple of float
-        Lz + L3, Lz - L3 and 0: their signs are the senses in which the phases turn.
+    spin_rate : chi [rad/s]
+    uniform_rates : rate of the uniform part of alpha's phase, in the frame that is stepped and in
+        the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
+    momenta : Lz + L3, Lz - L3 and 0: their signs are the senses in which the phases turn
     """
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:

@@ -134,13 +134,6 @@ class AcceleratedMotion(ClosedForm):
     def _states_at(self, times: Times) -> States:
         return _AcceleratedStates([self], None, times)
 
-    @property
-    def energy(self) -> float:
-        o1, o2 = map(float, self._posture.across)
-        top, start = self.top, self.start
-        return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
-                + top.gravity_torque * math.cos(start.theta))
-
     def posture(self, ns: int) -> Posture:
         """
         Return the posture in the world at a time [ns] since the start.

@@ -30,21 +30,11 @@ Signal = Callable[[States], NDArray[np.float64]]
 
 class LowPass:
     """
-    A filter with the gain -3 dB at one frequency.
+    A filter with the gain -3 dB at `frequency` [Hz], of `order` 1, or Butterworth's of 2.
 
     Before t = 0 the signal has been what it is at t = 0.
 
-    Parameters
-    ----------
-    frequency : float
-        [Hz]
-    order : {1, 2}
-        The second is Butterworth's.
-
-    Attributes
-    ----------
-    memory_ns : int
-        How far back a reading reaches [ns].
+    memory_ns : how far back a reading reaches [ns]
 
     (A. Oppenheim, R. Schafer, "Discrete-Time Signal Processing", appendix B; W. Gautschi,
     "Orthogonal Polynomials", 2004, sect. 3.1, for the rule)

@@ -72,8 +72,17 @@ class Segment:
         return self.start.lz
 
     @cached_property
+    def _first(self) -> States:
+        return self.motion.states(range(1))
+
+    @cached_property
     def energy(self) -> float:
-        return self.motion.energy
+        posture, top, start = self.motion.posture(0), self.motion.top, self.start
+        if posture is None:
+            return float(self._first.energy[0])
+        o1, o2 = map(float, posture.across)     # without an evaluation of states
+        return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
+                + top.gravity_torque * math.cos(start.theta))
 
     @property
     def exact(self) -> ClosedForm | None:
@@ -136,7 +145,7 @@ class Segment:
 
     def exact_point(self, times_ns: NDArray[np.int64], along: float) -> attitude.Vector:
         """Return where a point of the axis is at times (n,) [ns]; the start's where not known."""
-        states = (self.motion.first if self.exact is None
+        states = (self._first if self.exact is None
                   else self.exact.states(times_ns - self.start_ns))
         # Of the first state alone, one value for all times.
         x, y, z = (along * np.broadcast_to(part, times_ns.shape)
