@@ -23,6 +23,8 @@ from stress import tops
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers import propagator
+from spinning_top_sim.solvers.cubic import RootsTooCloseError, cubic_roots
+from spinning_top_sim.solvers.decimal_math import DIGITS, precision
 from spinning_top_sim.solvers.exact import BLOCK, ExactSolution
 
 BOUND = 5e-15
@@ -183,6 +185,26 @@ def test_rates_of_equilibria():
     assert steady.mean_precession_rate == pytest.approx(rate, rel=1e-14)
     assert ExactSolution(replace(TOP, gravity=0.0), start(0.5, l3=0.0, lz=0.0)
                          ).nutation_period is None
+
+
+def test_roots_of_the_cubic_are_told_apart_to_all_digits_or_refused():
+    """The distance of close roots is what motions near the separatrix depend on."""
+    errors, gap = [], Decimal(1)
+    for k in range(8, 160):
+        with precision(57):
+            third, apart = Decimal(1) / 3, Decimal(10.0 ** (-k / 8))
+            # (y + 1/3) (y - 2/3) (y - 2/3 - apart)
+            a, b = 2 * third, 2 * third + apart
+            cubic = third * a * b, a * b - third * (a + b), third - a - b, Decimal(1)
+            try:
+                found = cubic_roots(*cubic)
+            except RootsTooCloseError:
+                continue
+        with precision(456):
+            gap = cubic_roots(*cubic).gap32
+            errors.append(abs(found.gap32 / gap - 1))
+    assert max(errors) < Decimal(10) ** (1 - DIGITS), float(max(errors))
+    assert gap < 2e-8               # half of the seventeen digits that may cancel
 
 
 def test_a_tiny_oscillation_has_its_rate_and_is_refused_below_what_doubles_hold():

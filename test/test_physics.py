@@ -182,7 +182,7 @@ def test_a_resting_axis_is_one_for_the_regime_the_description_and_the_solver(sce
     assert description.nutation_period is None
     assert description.theta_min == description.theta_max
     assert str(description).startswith(begin) and ' to ' not in str(description)
-    assert isinstance(simulation.segment.solver, ExactSolution)
+    assert isinstance(simulation.segment.motion, ExactSolution)
 
 
 @pytest.mark.parametrize(('low', 'high', 'text'), [

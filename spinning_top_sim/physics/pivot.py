@@ -41,30 +41,32 @@ class Piece(NamedTuple):
 
     start_ns, end_ns : first time, and the first one after it; NEVER_NS if it never ends [ns]
     acceleration : in the world [m/s^2]
-    position, velocity : (3, 1) at the start [m], [m/s]
+    begins : (9,) position [m], velocity and acceleration at the start, in doubles
     """
 
     start_ns: int
     end_ns: int
     acceleration: Exact
-    position: NDArray[np.float64]
-    velocity: NDArray[np.float64]
+    begins: NDArray[np.float64]
 
     def at(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at times (n,) [ns]."""
-        return kinematics([self], [1], times_ns)
+        return kinematics([self], [len(times_ns)], times_ns)
 
 
 def kinematics(pieces: Sequence[Piece], counts: Sequence[int],
                times_ns: NDArray[np.int64]) -> Kinematics:
     """Return what the pivot does at times (n,) [ns], in each piece at so many of them."""
     starts_ns = np.repeat([piece.start_ns for piece in pieces], counts)
-    position, velocity, a = (np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(*(
-        (piece.position, piece.velocity, _doubles([piece.acceleration]).T)
-        for piece in pieces), strict=True))
+    start, velocity, acceleration = np.repeat(
+        np.array([piece.begins for piece in pieces]).T, counts, axis=1).reshape(3, 3, -1)
     t = (times_ns - starts_ns) * 1e-9
-    return Kinematics(position + t * (velocity + 0.5 * t * a), velocity + t * a,
-                      np.broadcast_to(a, (3, len(t))))
+    position = 0.5 * t * acceleration
+    position += velocity
+    position *= t
+    position += start
+    velocity += t * acceleration
+    return Kinematics(position, velocity, acceleration)
 
 
 class PivotPath:
@@ -102,18 +104,18 @@ class PivotPath:
             velocities.append(_sum((1, v), (t, acceleration)))
             self._starts.append(self._starts[-1] + duration_ns)
             self._accelerations.append(acceleration)
-        self._cycle_ns, self._per_cycle = 0, np.zeros(3)
+        self._cycle_ns, self._per_cycle = 0, np.zeros(9)
         if repeat and any(any(one) for one in self._accelerations):
             if velocities[-1] != velocities[0]:
                 change = [float(x) for x in _sum((1, velocities[-1]), (-1, velocities[0]))]
                 raise ValueError(f'a repeated path changes the velocity by {change} m/s: it must '
                                  'end with the velocity that it starts with')
             self._cycle_ns = self._starts.pop()
-            self._per_cycle = _doubles([_sum((1, places.pop()), (-1, places[0]))])[0]
+            self._per_cycle[:3] = _doubles([_sum((1, places.pop()), (-1, places[0]))])
             velocities.pop()
         else:
             self._accelerations.append(ZERO)
-        self._places, self._velocities = _doubles(places), _doubles(velocities)
+        self._begins = np.hstack([*map(_doubles, (places, velocities, self._accelerations))])
 
     @classmethod
     def through(cls, waypoints: Sequence[Given], *, speed: float, acceleration: float,
@@ -191,8 +193,7 @@ class PivotPath:
         end = (self._starts[k + 1] if k + 1 < len(self._starts)
                else self._cycle_ns or NEVER_NS - offset)
         return Piece(offset + self._starts[k], offset + end, self._accelerations[k],
-                     (self._places[k] + cycle * self._per_cycle)[:, np.newaxis],
-                     self._velocities[k][:, np.newaxis])
+                     self._begins[k] + cycle * self._per_cycle)
 
     def lasting(self, t_ns: int) -> Piece:
         """Return the piece from a time [ns] on with those that have the same acceleration."""

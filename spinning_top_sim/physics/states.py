@@ -70,22 +70,23 @@ class States:
         and of the angular velocity, which cost no copy.
     """
 
-    solver = 'rk45'             # that computes them
+    method = 'rk45'             # that computes them
 
-    def __init__(self, top: Top, start: State, n: int) -> None:
+    def __init__(self, top: Top, start: State, n: int, *, lz: Column | None = None,
+                 gravity: Column | None = None, torque: Column | None = None) -> None:
         self.top, self.start, self._n = top, start, n
         self._l3 = start.l3
         # Columns where the effective gravity of a moving pivot changes.
-        self._lz: Column | float = start.lz
-        self._gravity: Column | float = top.gravity
-        self._torque: Column | float = top.gravity_torque
+        self._lz = start.lz if lz is None else lz
+        self._gravity = top.gravity if gravity is None else gravity
+        self._torque = top.gravity_torque if torque is None else torque
 
     def __len__(self) -> int:
         return self._n
 
     def __repr__(self) -> str:
         span = f' from {self.t.min():g} to {self.t.max():g} s' if self._n else ''
-        return f'<States by {self.solver!r}: {self._n} times{span}>'
+        return f'<States by {self.method!r}: {self._n} times{span}>'
 
     @cached_property
     def t(self) -> Column:

@@ -33,7 +33,7 @@ class WorldStates(States):
 
     def __init__(self, top: Top, moved: States, rotation: Quaternion) -> None:
         super().__init__(top, moved.start, len(moved))
-        self.solver, self._moved, self._rotation = moved.solver, moved, rotation
+        self.method, self._moved, self._rotation = moved.method, moved, rotation
 
     @cached_property
     def t(self) -> Column:

@@ -109,7 +109,7 @@ def atan2(y: Decimal, x: Decimal) -> Decimal:
         return ZERO
     angle, values, _, series = _tables(getcontext().prec)
     tangent = y / x
-    part = round(math.atan(tangent) / float(angle))
+    part = round(math.atan(tangent) * 2 * PARTS / math.pi)
     if part:
         s, c = values[abs(part)]
         s = s if part > 0 else -s

@@ -14,6 +14,7 @@ import math
 from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from operator import attrgetter
 from typing import NamedTuple
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.times import NANOSECONDS, Times
 
 # The unknowns of one state: complex numbers, of which floats are some.
@@ -118,21 +120,17 @@ def components(vectors: Sequence[float] | Sequence[Vector]) -> Rows:
 
 class SteppedMotion(ABC):
     """
-    A motion by steps of equations y' = f(y), from t = 0; every time counts from there.
+    A `Motion` by steps of equations y' = f(y).
 
     A subclass has the equations: f, its derivative, the error that is tolerated, and the states.
 
-    top, start : what moves, and from where
-    ns_limit : the last time that it can give at all [ns]
-    steps, evaluations : counts
-
-    y : the unknowns at t = 0, all complex or all real
-    tolerance, fastest_rate : relative error of a step, and a bound on |y'|/|y| [1/s]: the first
-        step's length comes from these two
+    The unknowns `y` at t = 0 are all complex or all real.  The first step's length comes from the
+    relative error of a step, `tolerance`, and a bound on |y'|/|y|, `fastest_rate` [1/s].
     """
 
     derivative: Callable[..., Vector]   # f of the unknowns, which it takes one by one
     ns_limit = 2 ** 63 - 1              # steps go on for ever
+    chains = False
 
     def __init__(self, top: Top, start: State, y: Vector, tolerance: float,
                  fastest_rate: float) -> None:
@@ -189,6 +187,15 @@ class SteppedMotion(ABC):
         # First same as last: the projection moves y by less than the step's own error, so the
         # derivative at the unprojected end serves the next step too.
         self._kept.append(Step(t, y, derivative, end, y_new, derivative_new))
+
+    @functools.cached_property
+    def exact(self) -> ExactSolution | None:
+        with suppress(ValueError):
+            return ExactSolution(self.top, self.start)
+        return None
+
+    def posture(self, ns: int) -> None:
+        return None
 
     @property
     def reached_ns(self) -> int:

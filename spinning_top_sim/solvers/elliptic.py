@@ -23,11 +23,9 @@ NOME_COEFFICIENTS = 1, 2, 15, 150, 1707, 20910, 268616, 3567400, 48555069, 67345
 
 class GaussMean:
     """
-    The arithmetic-geometric mean M of two numbers.
+    The arithmetic-geometric mean M of a_0 and g_0; the caller knows c_0 without cancellation.
 
     mean : M; the quarter period K(k) is (pi/2) a_0/M [DLMF 19.8.5]
-
-    a, g, c : a_0, g_0, and c_0, which the caller knows without cancellation
     """
 
     def __init__(self, a: Decimal, g: Decimal, c: Decimal) -> None:

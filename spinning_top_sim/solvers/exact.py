@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from decimal import Decimal
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,14 @@ from spinning_top_sim.physics.regimes import Description, axis_rests, precession
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import DIGITS, exact, pi, precision
-from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
-from spinning_top_sim.solvers.theta_values import MOST, ThetaFunctions, ThetaValues, in_range
+from spinning_top_sim.solvers.theta_setup import Posture, ThetaMotion, set_up
+from spinning_top_sim.solvers.theta_values import (
+    MOST,
+    Constants,
+    ThetaFunctions,
+    ThetaValues,
+    in_range,
+)
 from spinning_top_sim.solvers.times import LARGEST_NS, Times
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
@@ -29,7 +36,78 @@ MOST_TURNS = 2.0 ** 52
 BLOCK = 8192
 
 
-class ExactSolution:
+class ClosedForm:
+    """
+    A motion in theta functions, from its start at t = 0.
+
+    top, start : what moves, and from where
+    time_limit, ns_limit : the farthest time either way [s], [ns]
+    bottom_rate, top_rate : (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
+    constants : of the motion, in doubles
+
+    Raises ValueError if doubles cannot hold the constants.
+    """
+
+    steps = evaluations = 0
+    reached_ns = LARGEST_NS
+    chains = False
+    start: State
+
+    def __init__(self, top: Top, motion: ThetaMotion, l3: Decimal, lz: Decimal) -> None:
+        self.top = top
+        with precision(DIGITS):
+            alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * exact(top.lambda1)
+            bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
+            in_range('the fastest rate', max(map(abs, (
+                motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
+                l3 / exact(top.lambda3)))))
+            self.bottom_rate, self.top_rate = float(bottom_rate), float(top_rate)
+            self.constants = Constants(motion)
+            fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
+                          abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
+            limit = min(Decimal(MOST_TURNS) / fastest, MOST)
+            self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
+
+    @cached_property
+    def theta(self) -> ThetaFunctions:
+        return ThetaFunctions([self.constants])
+
+    @property
+    def exact(self) -> Self:
+        return self
+
+    def describe(self) -> Description | None:
+        return None
+
+    def posture(self, ns: int) -> Posture | None:
+        return None
+
+    def reach(self, ns: int, max_steps: int | None = None) -> bool:
+        return True                     # there are no steps to take
+
+    def release(self, before_ns: int) -> None:
+        pass                            # nor to forget
+
+    def states(self, times_ns: NDArray[np.int64] | range) -> States:
+        """Return the states at integer nanoseconds (n,), in any order and of any sign."""
+        return self._states(Times.from_ns(times_ns), self.ns_limit, 'ns')
+
+    def states_at_seconds(self, t: Column) -> States:
+        """Return the states at t (n,) [s], in any order and of any sign."""
+        return self._states(Times.from_seconds(t), self.time_limit, 's')
+
+    def _states(self, times: Times, limit: float, unit: str) -> States:
+        if not times.latest <= float(limit):    # rounded as the times are; catches NaN too
+            raise ValueError(
+                f't = {times.latest!r} {unit}: must be finite and within {limit:.6g} {unit}, '
+                'where a phase of this motion reaches 2^52 turns or int64 ends')
+        return self._states_at(times)
+
+    def _states_at(self, times: Times) -> States:
+        raise NotImplementedError
+
+
+class ExactSolution(ClosedForm):
     """
     The motion of `top` that is in the state `start` at t = 0, in closed form.
 
@@ -63,40 +141,22 @@ class ExactSolution:
         For motions whose constants doubles cannot hold, and from every evaluation for bad times.
     """
 
-    steps = evaluations = 0
-    reached_ns = LARGEST_NS
-
     def __init__(self, top: Top, start: State) -> None:
-        self.top = top
-        self._turns = round(start.theta / math.tau)
-        theta = start.theta - self._turns * math.tau
+        self.turns = round(start.theta / math.tau)
+        theta = start.theta - self.turns * math.tau
         # A state continued through a pole is solved from the same attitude with theta in [0, pi].
-        self._sign, self._half_turn = (-1.0, math.pi) if theta < 0.0 else (1.0, 0.0)
+        self.sign, self._half_turn = (-1.0, math.pi) if theta < 0.0 else (1.0, 0.0)
         self.start = State(
-            theta=min(abs(theta), math.pi), theta_dot=self._sign * start.theta_dot,
+            theta=min(abs(theta), math.pi), theta_dot=self.sign * start.theta_dot,
             phi=start.phi + self._half_turn, psi=start.psi - self._half_turn,
             l3=start.l3, lz=start.lz)
         motion = set_up(top, Decimal(top.gravity), self.start)
+        super().__init__(top, motion, Decimal(start.l3), Decimal(start.lz))
         with precision(DIGITS):
-            self._take_constants(motion, Decimal(start.l3), Decimal(start.lz))
             self._take_means(motion)
         self._check_start()
 
-    def _take_constants(self, motion: ThetaMotion, l3: Decimal, lz: Decimal) -> None:
-        alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * exact(self.top.lambda1)
-        bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
-        in_range('the fastest rate', max(map(abs, (
-            motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
-            l3 / exact(self.top.lambda3)))))
-        self._bottom_rate, self._top_rate = float(bottom_rate), float(top_rate)
-        self._theta = ThetaFunctions(motion)
-        fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
-                      abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
-        limit = min(Decimal(MOST_TURNS) / fastest, MOST)
-        self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
-
     def _take_means(self, motion: ThetaMotion) -> None:
-        """Take what the motion about a vertical that changes has no use for."""
         start, alpha, beta = self.start, motion.alpha, motion.beta
         self.m, self.m1 = float(motion.m), float(motion.m1)
         # 2 K/w, two quarter periods
@@ -104,18 +164,18 @@ class ExactSolution:
         self.mean_precession_rate = float(alpha.rate + beta.rate)
         self.mean_spin_rate = float(alpha.rate - beta.rate)
         # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
-        self._phi_phase = float(
+        self.phi_phase = float(
             Decimal(start.phi) - alpha.start_argument - beta.start_argument) - self._half_turn
-        self._psi_phase = float(
+        self.psi_phase = float(
             Decimal(start.psi) - alpha.start_argument + beta.start_argument) + self._half_turn
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""
-        start, first = self.start, self._at_start
+        start, first = self.start, self.at_start
         alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
-        across = self._across(cosine, sine)
+        across = axis_rate(self.bottom_rate, self.top_rate, cosine, sine)
         for name, error, size in (
                 ('theta', beta * cosine - alpha * sine, alpha * sine),
                 ('theta_dot', theta_dot - start.theta_dot,
@@ -126,35 +186,16 @@ class ExactSolution:
                                  'size')
 
     @cached_property
-    def _at_start(self) -> ThetaValues:
-        return ThetaValues(self._theta, Times.from_ns(range(1)))
-
-    def _across(self, cosine: Number, sine: Number) -> Number:
-        """
-        Return phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) in half angles [rad/s].
-
-        Nothing cancels, and at a pole that can be reached the singular term is absent.
-        """
-        across = 0.0 * cosine
-        if self._bottom_rate:
-            across = across + self._bottom_rate * (sine / cosine)
-        if self._top_rate:
-            across = across + self._top_rate * (cosine / sine)
-        return across
-
-    def _across_of(self, states: _ExactStates) -> Column:
-        # A moving pivot has another formula beside it.  Here there is none, so that earlier logs
-        # are computed again to the last bit.
-        across: Column = self._across(*states._rows('half_theta'))
-        return across
+    def at_start(self) -> ThetaValues:
+        return ThetaValues(self.theta, Times.from_ns(range(1)))
 
     @property
     def theta_min(self) -> float:
-        return self._theta.bounds[0]
+        return self.theta.bounds[0]
 
     @property
     def theta_max(self) -> float:
-        return self._theta.bounds[1]
+        return self.theta.bounds[1]
 
     def describe(self) -> Description:
         top, start = self.top, self.start
@@ -169,36 +210,41 @@ class ExactSolution:
             separatrix_distance=self.m1,
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
-    def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        return True                     # there are no steps to take
-
-    def release(self, before_ns: int) -> None:
-        pass                            # nor to forget
-
-    def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """Return the states at integer nanoseconds (n,), in any order and of any sign."""
-        return self._states(Times.from_ns(times_ns), self.ns_limit, 'ns')
-
-    def states_at_seconds(self, t: Column) -> States:
-        """Return the states at t (n,) [s], in any order and of any sign."""
-        return self._states(Times.from_seconds(t), self.time_limit, 's')
-
-    def _states(self, times: Times, limit: float, unit: str) -> States:
-        if not times.latest <= float(limit):    # rounded as the times are; catches NaN too
-            raise ValueError(
-                f't = {times.latest!r} {unit}: must be finite and within {limit:.6g} {unit}, '
-                'where a phase of this motion reaches 2^52 turns or int64 ends')
+    def _states_at(self, times: Times) -> States:
         return _ExactStates(self, times)
 
 
-class _ExactStates(States):
-    """The states of an exact solution, on the branch of its start."""
+def axis_rate(bottom_rate: float, top_rate: float, cosine: Number, sine: Number) -> Number:
+    """
+    Return phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) in half angles [rad/s].
 
-    solver = 'exact'
+    Nothing cancels, and at a pole that can be reached the singular term is absent.
 
-    def __init__(self, solution: ExactSolution, times: Times) -> None:
-        super().__init__(solution.top, solution.start, len(times))
-        self._solution, self._times = solution, times
+    bottom_rate, top_rate : of `ClosedForm`
+    """
+    rate = 0.0 * cosine
+    if bottom_rate:
+        rate = rate + bottom_rate * (sine / cosine)
+    if top_rate:
+        rate = rate + top_rate * (cosine / sine)
+    return rate
+
+
+class ThetaStates(States):
+    """
+    States by theta functions.
+
+    theta : of the motion, or of several
+    times : since the start of the motion that each belongs to
+    columns : those of `States`, where they are not those of the start
+    """
+
+    method = 'exact'
+
+    def __init__(self, top: Top, start: State, theta: ThetaFunctions, times: Times,
+                 **columns: Column) -> None:
+        super().__init__(top, start, len(times), **columns)
+        self._theta, self._times = theta, times
 
     @cached_property
     def t(self) -> Column:
@@ -206,22 +252,19 @@ class _ExactStates(States):
 
     @cached_property
     def _block(self) -> ThetaValues:
-        if len(self) == 1 and not self._times.latest:
-            return self._solution._at_start
-        return ThetaValues(self._solution._theta, self._times)
+        return ThetaValues(self._theta, self._times)
 
     def _rows(self, name: str) -> NDArray[np.float64]:
         """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
         blocks = (self._block,) if len(self) <= BLOCK else (
-            ThetaValues(self._solution._theta, self._times[first:first + BLOCK])
+            ThetaValues(self._theta, self._times[first:first + BLOCK])
             for first in range(0, len(self), BLOCK))
         rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
         return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
-        rows = self._rows('quaternion')
-        x, y, z, w = -rows if self._solution._turns % 2 else rows
+        x, y, z, w = self._rows('quaternion')
         return x, y, z, w
 
     @cached_property
@@ -230,26 +273,55 @@ class _ExactStates(States):
         return cosine * cosine, sine * sine
 
     @cached_property
-    def angles(self) -> tuple[Column, Column, Column]:
-        solution = self._solution
-        precession, phi, theta, spin, psi = self._rows('angles')
-        return (precession + (phi + solution._phi_phase),
-                solution._sign * theta + solution._turns * math.tau,
-                spin + (psi + solution._psi_phase))
-
-    @cached_property
-    def theta_dot(self) -> Column:
-        theta_dot: Column = self._solution._sign * self._axis_rates[0]
-        return theta_dot
-
-    @cached_property
     def _axis_rates(self) -> NDArray[np.float64]:
         """Theta' of the motion with theta in [0, pi] at the start, cos(psi) and sin(psi)."""
         return self._rows('rates')
+
+    def _across(self) -> Column:
+        """Return phi' sin(theta) [rad/s]."""
+        raise NotImplementedError
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
         """omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top"."""
         theta_dot, cos_psi, sin_psi = self._axis_rates
-        across = self._solution._across_of(self)
+        across = self._across()
         return theta_dot * sin_psi - across * cos_psi, theta_dot * cos_psi + across * sin_psi
+
+
+class _ExactStates(ThetaStates):
+    """The states of an exact solution, on the branch of its start."""
+
+    def __init__(self, solution: ExactSolution, times: Times) -> None:
+        super().__init__(solution.top, solution.start, solution.theta, times)
+        self._solution = solution
+
+    @cached_property
+    def _block(self) -> ThetaValues:
+        if len(self) == 1 and not self._times.latest:
+            return self._solution.at_start
+        return ThetaValues(self._theta, self._times)
+
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        x, y, z, w = super().rows_quaternion
+        return (-x, -y, -z, -w) if self._solution.turns % 2 else (x, y, z, w)
+
+    @cached_property
+    def angles(self) -> tuple[Column, Column, Column]:
+        solution = self._solution
+        precession, phi, theta, spin, psi = self._rows('angles')
+        return (precession + (phi + solution.phi_phase),
+                solution.sign * theta + solution.turns * math.tau,
+                spin + (psi + solution.psi_phase))
+
+    @cached_property
+    def theta_dot(self) -> Column:
+        theta_dot: Column = self._solution.sign * self._axis_rates[0]
+        return theta_dot
+
+    def _across(self) -> Column:
+        # A moving pivot has another formula beside it.  Here there is none, so that earlier logs
+        # are computed again to the last bit.
+        cosine, sine = self._rows('half_theta')
+        return axis_rate(self._solution.bottom_rate, self._solution.top_rate, cosine, sine)

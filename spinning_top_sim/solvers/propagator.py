@@ -14,7 +14,8 @@ from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.euler import EulerMotion
-from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.exact import ClosedForm, ExactSolution
+from spinning_top_sim.solvers.theta_setup import Posture
 from spinning_top_sim.solvers.theta_values import MOST
 from spinning_top_sim.solvers.transport import TransportMotion
 
@@ -22,19 +23,38 @@ METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
 
 
-class Propagator(Protocol):
-    """A motion from its start at t = 0; `SteppedMotion` says what its members do."""
+class Motion(Protocol):
+    """
+    A motion from its start at t = 0; every time counts from there.
+
+    top : what moves
+    ns_limit : the last time that it can give at all [ns]
+    steps, evaluations : counts
+    chains : whether it is an `AcceleratedMotion` that `vertical.chained` takes
+    start : from where it moves
+    reached_ns : the last time that `states` can give without further steps [ns]
+    exact : the closed form; None where doubles cannot hold it
+
+    `SteppedMotion` says what its other members do.  `posture` returns attitude and angular
+    velocity in the world at a time [ns], or None if they are known in doubles only.
+    """
 
     top: Top
     ns_limit: int
     steps: int
     evaluations: int
+    chains: bool
 
     @property
     def start(self) -> State: ...
 
     @property
     def reached_ns(self) -> int: ...
+
+    @property
+    def exact(self) -> ClosedForm | None: ...
+
+    def posture(self, ns: int) -> Posture | None: ...
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool: ...
 
@@ -46,7 +66,7 @@ class Propagator(Protocol):
 
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',
-              rtol: float = 1e-11, atol: float = 1e-12) -> Propagator:
+              rtol: float = 1e-11, atol: float = 1e-12) -> Motion:
     """
     Return the motion that begins at `start`; `solve` explains the settings.
 
@@ -81,7 +101,7 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
     return motion
 
 
-def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -> Propagator:
+def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -> Motion:
     if equations == 'euler':
         return EulerMotion(top, start, rtol, atol)
     if top.gravity_torque == 0.0 or axis_rests(top, start):

@@ -42,7 +42,7 @@ def _polynomials(first: Sequence[int], second: Sequence[int]) -> list[Sequence[i
 
 # By prefactor and power of xi, the coefficients of the multiples that have such a power.
 MULTIPLE_ANGLES = [
-    [[row[power] if power < len(row) else 0 for row in rows[power:]]
+    [[Decimal(row[power]) if power < len(row) else ZERO for row in rows[power:]]
      for power in range(MOST_TERMS)]
     for rows in (_polynomials(*pair) for pair in FIRST_POLYNOMIALS)]
 
@@ -63,9 +63,6 @@ class Series(NamedTuple):
         # A sum of -0 is -0.
         return [reduce(add, map(mul, weights[power:], shapes[power]))
                 for power in range(len(weights))]
-
-    def scaled(self, scale: Decimal) -> 'Series':
-        return Series(self.prefactor, [scale * x for x in self.weights])
 
     def at(self, sin: Decimal, cos: Decimal, xi: Decimal) -> Decimal:
         """Return the sum by Clenshaw's recurrence."""
@@ -97,6 +94,7 @@ class ThetaForm:
         form, and at most 1/2
     size : coefficients of a polynomial that doubles need
     theta1 .. theta4 : the functions of y, or what the transformation makes of them
+    slope1, middle3, middle4 : the derivative of theta1, and theta3 and theta4, at y = 0
     odd_over_even : the factor that the transforms of theta1 and theta4 have lost, squared; those
         of theta2 and theta3 have not
     """
@@ -122,13 +120,15 @@ class ThetaForm:
         self.theta3 = Series(COS_EVEN, self._even)
         pair = Series(COS_ODD, self._odd), Series(COS_EVEN, _alternating(self._even))
         self.theta2, self.theta4 = pair[::-1] if imaginary else pair
+        self.slope1, self.middle3, self.middle4 = (
+            one.leading for one in (self.theta1, self.theta3, self.theta4))
         self.odd_over_even = 4 * root(q) if imaginary else ONE
 
     def slopes_of_sn2(self) -> tuple[Decimal, Decimal]:
         """Return c with d(sn^2 chi)/dchi = c theta1(2y)/D(y)^4, for theta4 and theta3 as D."""
         # 2 sn cn dn by the quotients of DLMF 22.2 and the duplication of theta1 [DLMF 20.7.10];
         # c from the first term at y = 0, where chi = (2K/pi) y.
-        even = self.theta4.leading ** 4 * self.mean.quarter_period / self.theta1.leading
+        even = self.middle4 ** 4 * self.mean.quarter_period / self.slope1
         return even, -even * self.odd_over_even ** 2
 
     def shifted(self, amplitude: Decimal, sense: int) -> tuple[Parts, Parts]:

@@ -67,6 +67,7 @@ from spinning_top_sim.solvers.theta_series import (
     COS_EVEN,
     MOST_TERMS,
     NOTHING,
+    SIN_ODD,
     Parts,
     Series,
     ThetaForm,
@@ -83,8 +84,9 @@ class Factor(NamedTuple):
     rate : r [rad/s]
     phase_turns : c [turns]
     drift : kappa
-    parts : R and s J at even and at odd N.  If it changes its sign at a pole, R is a sine series
-        at one of them, and has the factor (-1)^floor(N/2).
+    parts : R and s J at even and at odd N, less their common factors.  If it changes its sign at
+        a pole, R is a sine series at one of them, and has the factor (-1)^floor(N/2).
+    scales : these factors
     sense : s
     start_argument : of (R + i s J) exp(i kappa y), less that of the start's `direction` [rad]
     """
@@ -93,6 +95,7 @@ class Factor(NamedTuple):
     phase_turns: Decimal
     drift: Decimal
     parts: tuple[Parts, Parts]
+    scales: tuple[Decimal, Decimal]
     sense: int
     start_argument: Decimal
 
@@ -122,6 +125,21 @@ class ThetaMotion(NamedTuple):
     m: Decimal = ZERO
     m1: Decimal = ONE
     size: int = MOST_TERMS
+
+
+class Posture(NamedTuple):
+    """
+    Attitude and angular velocity of a top at one instant, in long decimals.
+
+    alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
+    across : omega_1 + i omega_2 in the body [rad/s]
+    l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
+    """
+
+    alpha: Complex
+    beta: Complex
+    across: Complex
+    l3: float
 
 
 class HalfAngles(NamedTuple):
@@ -214,9 +232,10 @@ def _resting(side: _Side, lambda1: Decimal) -> Factor:
     rate = side.spin / 2
     if side.momentum:
         rate += side.momentum / (4 * lambda1 * side.modulus ** 2)
-    parts = Series(COS_EVEN, (side.modulus,)), NOTHING
+    parts = Series(COS_EVEN, (ONE,)), NOTHING
     argument = -atan2(side.direction[1], side.direction[0])
-    return Factor(rate, side.turns - argument / (2 * pi()), ZERO, (parts, parts), 0, argument)
+    return Factor(rate, side.turns - argument / (2 * pi()), ZERO, (parts, parts),
+                  (side.modulus, side.modulus), 0, argument)
 
 
 def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decimal,
@@ -243,21 +262,21 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decima
         scale = root(f3)
         # w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
         y_rate = scale * mean.mean / 2
-        factors = [_factor(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, quarter0,
-                           y0, (direction * sin, cos, xi))
+        factors = [_quotient(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, quarter0,
+                             y0, (direction * sin, cos, xi))
                    for side, pole in zip(sides, poles, strict=True)]
         scale *= sense * a / 2 * roots.gap21         # w (u2 - u1)
         even, odd = form.slopes_of_sn2()
         turn = sense * l3 / lambda1
-        swing = turn * roots.gap21 * (form.mean.quarter_period / form.theta1.leading) ** 2
+        swing = turn * roots.gap21 * (form.mean.quarter_period / form.slope1) ** 2
         alpha, beta = factors[::sense]
         return ThetaMotion(
             alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / pi(), quarter0=quarter0,
             offset0=y0 * 2 / pi(),
             u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
             momentum=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
-            swing=(-swing * form.theta4.leading ** 2,
-                   swing * form.theta3.leading ** 2 * roots.gap32 / roots.gap31),
+            swing=(-swing * form.middle4 ** 2,
+                   swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
             m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31, size=form.size)
 
 
@@ -320,12 +339,13 @@ def _nearest_quarter(roots: Roots, complement: Decimal, falling: bool,
         low * roots.gap32 if imaginary else roots.gap21 * roots.y3))
 
 
-def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate: Decimal,
-            y_rate: Decimal, quarters: int, y: Decimal,
-            point: tuple[Decimal, Decimal, Decimal]) -> Factor:
+def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate: Decimal,
+              y_rate: Decimal, quarters: int, y: Decimal,
+              point: tuple[Decimal, Decimal, Decimal]) -> Factor:
     """
-    Return alpha or beta; x_rate, y_rate: of x and y [rad/s] of the imaginary and the real form.
+    Return alpha or beta as a quotient of theta functions.
 
+    x_rate, y_rate : of x and y, the arguments of the imaginary and of the real form [rad/s]
     quarters, y, point : N, y and the arguments of `Series.at` at t = 0
     """
     sense, drift, rate = int(side.momentum.compare(ZERO)), ZERO, side.spin / 2
@@ -335,7 +355,8 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate:
     if pole.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
     elif not sense:
-        first = form.theta1.scaled(-ONE if pole.is_beta else ONE), NOTHING
+        sign = -1 if pole.is_beta else 1
+        first = Series(SIN_ODD, [sign * x for x in form.theta1.weights]), NOTHING
         second = form.theta2, NOTHING
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
         # vanish they leave 0 with the slope.
@@ -353,15 +374,10 @@ def _factor(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate:
                  - second[1].leading / second[0].leading * x_rate)
         real, imag = (part.at(*point) for part in (first if starts_in_first else second))
     # alpha is largest at u2, where N is odd, and beta at u1: both at the centre of theta2.
-    scale *= (form.theta4 if pole.is_beta else form.theta3).leading / second[0].leading
-    first_scale = scale * form.odd_over_even if pole.is_beta else scale
-    parts = (_scaled(first, first_scale), _scaled(second, scale))
+    scale *= (form.middle4 if pole.is_beta else form.middle3) / second[0].leading
+    parts, scales = (((second, first), (scale, scale * form.odd_over_even)) if pole.is_beta
+                     else ((first, second), (scale, scale)))
     c, s = side.direction
     argument = drift * y + atan2(imag * c - real * s, real * c + imag * s)
-    return Factor(rate, side.turns - argument / (2 * pi()), drift,
-                  parts[::-1] if pole.is_beta else parts, sense, argument)
-
-
-def _scaled(parts: Parts, scale: Decimal) -> Parts:
-    real, imag = parts
-    return real.scaled(scale), imag.scaled(scale)
+    return Factor(rate, side.turns - argument / (2 * pi()), drift, parts, scales,
+                  sense, argument)

@@ -13,20 +13,19 @@ All arithmetic is elementwise, so that a value does not depend on the other valu
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from copy import copy
+from collections.abc import Sequence
 from decimal import Decimal
 from functools import cached_property
 from operator import sub
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.solvers.decimal_math import double_double, pi
-from spinning_top_sim.solvers.theta_series import SIN_ODD, Series
+from spinning_top_sim.solvers.decimal_math import DIGITS, double_double, pi, precision
+from spinning_top_sim.solvers.theta_series import SIN_ODD
 from spinning_top_sim.solvers.theta_setup import ThetaMotion
-from spinning_top_sim.solvers.times import Rates, Times
+from spinning_top_sim.solvers.times import UNITS, Times, halves, products
 
 # glibc gives freed memory back at once, and clears the pages again at the next use, until it has
 # freed a block of this size [mallopt(3): M_MMAP_THRESHOLD].  It doubles the speed of large blocks.
@@ -40,83 +39,121 @@ HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the thr
 LEAST_AMPLITUDE, MOST = Decimal('1e-145'), Decimal('1e290')
 
 
-class ThetaFunctions:
+class Constants:
     """
-    The constants of a motion in doubles.
+    The constants of one motion in doubles.
 
     Raises ValueError if doubles cannot hold an amplitude or a rate.
 
-    rates, offset, offset_rest, start_whole : of the three phases, (3, 1).  At t = 0 a phase is
-        start_whole + offset + offset_rest.
-    drifts : kappa/2 of alpha and beta, (2, 1)
-    prefactors : at even and at odd N, of the rows R of alpha and beta, s J of alpha and beta;
-        where they differ in a chain, of all its motions one after the other
-    stretch : K/K' times a quarter turn, 0 in the real form; None if there is no other
-    coefficients : of the polynomials, highest power first, by row, at even and at odd N, (k, 4, 2)
-    real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
-    zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
-    u_dot, u_dot_coefficients : of u'
+    start_whole, offsets : of the three phases.  At t = 0 a phase is their sum; the latter are two
+        doubles each.
+    drifts : kappa/2 of alpha and beta
+    stretch : K/K' times a quarter turn, 0 in the real form
+    prefactors, polynomials : at even and at odd N, of the rows R of alpha and beta, s J of alpha
+        and beta; the coefficients of 1, xi, xi^2 ...
+    senses : s of alpha and beta
+    u_dot, u_dot_polynomial : of u'
     momentum, swing : of (Lz - L3 u)/lambda1
-    chains : whether the motion can be part of a chain: it nutates, and passes no pole
-    first : of a chain, the place of each time's constants at even N in the last axis, (n,)
     """
-
-    first: NDArray[np.int64] | None = None
 
     def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
-        self.rates = Rates([motion.quarter_rate, *(x.rate / pi() for x in factors)])
+        self._rates = [motion.quarter_rate, *(x.rate / pi() for x in factors)]
+        self._rates_in: dict[str, list[tuple[float, float]]] = {}
         turns = [2 * x.phase_turns for x in factors]
-        whole = [motion.quarter0, *map(round, turns)]
-        rest = [motion.offset0, *map(sub, turns, whole[1:])]
-        self.start_whole = _column(whole)
-        self.offset, self.offset_rest = map(_column, zip(*map(double_double, rest), strict=True))
-        self.drifts = _column(0.5 * float(factor.drift) for factor in factors)
-        self.stretch: Column | float | None = (
-            QUARTER * float(motion.stretch) if motion.stretch else None)
+        self.start_whole = [motion.quarter0, *map(round, turns)]
+        self.offsets = [*map(double_double, (
+            motion.offset0, *map(sub, turns, self.start_whole[1:])))]
+        self.drifts = [0.5 * float(factor.drift) for factor in factors]
+        self.stretch = QUARTER * float(motion.stretch) if motion.stretch else 0.0
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors: list[tuple[int, ...]] = [
             (even.prefactor, odd.prefactor) for even, odd in rows]
-        series = [motion.u_dot_series, motion.u_dot_series]
-        coefficients = _coefficients([*rows, series], motion.size)
-        self.coefficients, self.u_dot_coefficients = coefficients[:, :4], coefficients[:, 4, :1]
-        self.real = [k for k, factor in enumerate(factors) if not factor.sense]
-        self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
-                      if SIN_ODD in pair}
+        self.polynomials = [[
+            [float(scale * x) for x in one.polynomial(motion.size)]
+            for one, scale in zip(row, factor.scales, strict=True)]
+            for row, factor in zip(rows, 2 * factors, strict=True)]
+        self.senses = [factor.sense for factor in factors]
         for name, factor in zip(('alpha', 'beta'), factors, strict=True):
-            for real, _ in factor.parts:
-                size = max(map(abs, real.weights))
+            for (real, _), scale in zip(factor.parts, factor.scales, strict=True):
+                size = abs(scale) * max(map(abs, real.weights))
                 if 0 < size < LEAST_AMPLITUDE:
                     raise ValueError(
                         f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
                         f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
-        self.u_dot = np.array([in_range("cos(theta)'", x) for x in motion.u_dot])
-        self.momentum, self.swing = (
-            np.array([*map(float, pair)]) for pair in (motion.momentum, motion.swing))
-        self.chains = any(motion.u_dot) and not self.real
-        self._quarter0 = motion.quarter0
+        self.u_dot = [in_range("cos(theta)'", x) for x in motion.u_dot]
+        self.u_dot_polynomial = [*map(float, motion.u_dot_series.polynomial(motion.size))]
+        self.momentum, self.swing = ([*map(float, pair)] for pair in (
+            motion.momentum, motion.swing))
 
-    @classmethod
-    def chained(cls, parts: Sequence[ThetaFunctions], counts: Sequence[int]) -> ThetaFunctions:
-        """Return the constants of motions, of each for so many times."""
-        chain = copy(parts[0])
-        chain.rates = Rates.chained([part.rates for part in parts], counts)
-        chain.offset, chain.offset_rest, chain.start_whole, chain.drifts = (
-            np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(*(
-                (part.offset, part.offset_rest, part.start_whole, part.drifts)
-                for part in parts), strict=True))
-        if any(part.stretch for part in parts):
-            chain.stretch = np.repeat([part.stretch or 0.0 for part in parts], counts)
-        if any(part.prefactors != chain.prefactors for part in parts):
-            chain.prefactors = [sum(rows, ()) for rows in zip(*(
-                part.prefactors for part in parts), strict=True)]
-        chain.coefficients = _side_by_side([part.coefficients for part in parts])
-        chain.u_dot_coefficients = np.repeat(_side_by_side([
-            part.u_dot_coefficients for part in parts]), counts, axis=1)
-        chain.u_dot, chain.momentum, chain.swing = map(np.concatenate, zip(*(
-            (part.u_dot, part.momentum, part.swing) for part in parts), strict=True))
-        chain.first = np.repeat(np.arange(0, 2 * len(parts), 2), counts)
-        return chain
+    @property
+    def chains(self) -> bool:
+        """Whether the motion can be part of a chain: it nutates, and passes no pole."""
+        return any(self.u_dot) and all(self.senses)
+
+    def rates(self, unit: str) -> list[tuple[float, float]]:
+        """Return the rates of the three phases, per unit of `Times`, as two doubles each."""
+        if unit not in self._rates_in:
+            with precision(DIGITS):
+                self._rates_in[unit] = [double_double(x * UNITS[unit]) for x in self._rates]
+        return self._rates_in[unit]
+
+
+class ThetaFunctions:
+    """
+    The `Constants` of a motion in arrays, or those of several motions, each for so many times.
+
+    Columns are (k, 1) or (k, n).  `coefficients` (k, 4, 2 motions), highest power first, `u_dot`,
+    `momentum` and `swing` have those of all motions at even and at odd N.
+
+    stretch : None if there is no imaginary form
+    prefactors : where they differ in a chain, of all its motions one after the other
+    real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
+    zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
+    first : of a chain, the place of each time's constants at even N in the last axis, (n,)
+    """
+
+    def __init__(self, motions: Sequence[Constants], counts: Sequence[int] | None = None) -> None:
+        self._motions, self._counts, present = motions, counts, motions[0]
+        self._rates: dict[str, tuple[Matrix, Matrix, Matrix, Matrix]] = {}
+        self.start_whole = self.columns([one.start_whole for one in motions])
+        self.offset, self.offset_rest = map(self.columns, np.array(
+            [one.offsets for one in motions]).transpose(2, 0, 1))
+        self.drifts = self.columns([one.drifts for one in motions])
+        self.stretch: Column | None = None
+        if any(one.stretch for one in motions):
+            self.stretch, = self.columns([(one.stretch,) for one in motions])
+        self.prefactors: list[tuple[int, ...]] = present.prefactors
+        if any(one.prefactors != present.prefactors for one in motions):
+            self.prefactors = [sum(rows, ()) for rows in zip(*(
+                one.prefactors for one in motions), strict=True)]
+        self.coefficients = _side_by_side([pair[k] for pairs in zip(*(
+            one.polynomials for one in motions), strict=True) for pair in pairs for k in (0, 1)]
+            ).reshape(-1, 4, 2 * len(motions))
+        self.real = [k for k, sense in enumerate(present.senses) if not sense]
+        self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(present.prefactors[:2])
+                      if SIN_ODD in pair}
+        self.u_dot, self.momentum, self.swing = np.array([
+            (one.u_dot, one.momentum, one.swing) for one in motions]
+            ).transpose(1, 0, 2).reshape(3, -1)
+        self.u_dot_coefficients = self.columns(
+            _side_by_side([one.u_dot_polynomial for one in motions]).T)
+        self.first = None if counts is None else np.repeat(
+            np.arange(0, 2 * len(motions), 2), counts)
+
+    def columns(self, rows: ArrayLike) -> Matrix:
+        """Return what is given by motions, by columns for each time."""
+        columns: Matrix = np.array(rows).T
+        return columns if self._counts is None else np.repeat(columns, self._counts, axis=1)
+
+    def turned(self, times: Times) -> tuple[Matrix, Matrix]:
+        """Return what the three phases have grown by (3, n), as two doubles each."""
+        if times.unit not in self._rates:
+            high, low = np.array([one.rates(times.unit) for one in self._motions]
+                                 ).transpose(2, 0, 1)
+            rate, rest = self.columns(high), self.columns(low)
+            self._rates[times.unit] = rate, *halves(rate), rest
+        return products(self._rates[times.unit], times)
 
     @property
     def _middles(self) -> Matrix:
@@ -141,8 +178,9 @@ class ThetaFunctions:
         alpha, beta, *_ = self._middles
         first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
         slope = (second - first + 2.0) % 4.0 - 2.0
-        start = (first + slope * self._quarter0 + 1.0) % 4.0 - 1.0
-        return start - slope * self._quarter0, slope
+        quarter0 = int(self.start_whole[0, 0])
+        start = (first + slope * quarter0 + 1.0) % 4.0 - 1.0
+        return start - slope * quarter0, slope
 
 
 class ThetaValues:
@@ -150,7 +188,7 @@ class ThetaValues:
 
     def __init__(self, constants: ThetaFunctions, times: Times) -> None:
         self._constants = constants
-        self._turned, self._turned_rest = high, rest = constants.rates.products(times)
+        self._turned, self._turned_rest = high, rest = constants.turned(times)
         whole = np.rint(high)
         part = high - whole
         shift = part + constants.offset
@@ -317,25 +355,10 @@ def in_range(name: str, value: Decimal) -> float:
     return float(value)
 
 
-def _coefficients(rows: Sequence[Sequence[Series]], most: int) -> NDArray[np.float64]:
-    """Return the polynomials' coefficients in doubles, highest of at least 2 powers first."""
-    doubles = [[*map(float, x.polynomial(most))] for row in rows for x in row]
-    size = max(2, *map(len, doubles))
-    return np.array([(size - len(x)) * [0.0] + x[::-1] for x in doubles]
-                    ).T.reshape(size, len(rows), -1)
-
-
-def _side_by_side(parts: Sequence[Matrix]) -> Matrix:
-    """Join coefficients at their last axis, with zeros for the highest powers of the shorter."""
-    size, ends = max(map(len, parts)), np.cumsum([part.shape[-1] for part in parts])
-    joined = np.zeros((size, *parts[0].shape[1:-1], ends[-1]))
-    for part, end in zip(parts, ends, strict=True):
-        joined[size - len(part):, ..., end - part.shape[-1]:end] = part
-    return joined
-
-
-def _column(values: Iterable[float]) -> Matrix:
-    return np.array([[x] for x in values])
+def _side_by_side(polynomials: Sequence[list[float]]) -> Matrix:
+    """Return coefficients with the highest of at least 2 powers first, (k, n)."""
+    size = max(2, *map(len, polynomials))
+    return np.array([(size - len(one)) * [0.0] + one[::-1] for one in polynomials]).T
 
 
 def _horner(coefficients: Matrix, xi: Column) -> Matrix:

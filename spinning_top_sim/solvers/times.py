@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from decimal import Decimal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number
-from spinning_top_sim.solvers.decimal_math import DIGITS, double_double, precision
 
+Matrix = NDArray[np.float64]
 NANOSECONDS = 1_000_000_000
 UNITS = {'s': Decimal(1), 'ns': Decimal('1e-9')}
 # The largest time [ns] that is taken as an integer: the end of int64 lies a second behind it.
@@ -81,44 +80,24 @@ class Times:
         return Times(self.unit, self.high[part], low, self.latest)
 
 
-class Rates:
-    """k rates [1/s] as two doubles each: their products with times have no error that grows."""
+def products(rates: tuple[Matrix, Matrix, Matrix, Matrix],
+             times: Times) -> tuple[Matrix, Matrix]:
+    """
+    Return rate * t, (k, n), as nearest doubles and what they leave out: no error grows.
 
-    def __init__(self, per_second: Sequence[Decimal]) -> None:
-        self._per_second = per_second
-        # (k, 1) by unit: nearest doubles, their halves, and what they leave out
-        self._constants: dict[str, tuple[NDArray[np.float64], ...]] = {}
-
-    @classmethod
-    def chained(cls, parts: Sequence[Rates], counts: Sequence[int]) -> Rates:
-        """Return rates for integer nanoseconds, those of each part for so many times."""
-        chain = cls(())
-        chain._constants['ns'] = tuple(np.repeat(np.hstack(rows), counts, axis=1) for rows in zip(
-            *(part._of('ns') for part in parts), strict=True))
-        return chain
-
-    def _of(self, unit: str) -> tuple[NDArray[np.float64], ...]:
-        if unit not in self._constants:
-            with precision(DIGITS):
-                high, low = np.array([
-                    double_double(rate * UNITS[unit]) for rate in self._per_second]).T
-            rates = high[:, np.newaxis]
-            self._constants[unit] = rates, *halves(rates), low[:, np.newaxis]
-        return self._constants[unit]
-
-    def products(self, times: Times) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return rate * t, (k, n), as nearest doubles and what they leave out."""
-        rate, r1, r2, rate_low = self._of(times.unit)
-        t1, t2 = halves(times.high)
-        high = rate * times.high
-        # Exact up to the last product of halves (Dekker).
-        rest = r1 * t1
-        rest -= high
-        rest += r1 * t2
-        rest += r2 * t1
-        rest += r2 * t2
-        small = rate_low * times.high
-        if not isinstance(times.low, float):
-            small += rate * times.low
-        rest += small
-        return high, rest
+    rates : nearest doubles, the halves of these, and what they leave out, (k, 1) or (k, n)
+    """
+    rate, r1, r2, rate_low = rates
+    t1, t2 = halves(times.high)
+    high = rate * times.high
+    # Exact up to the last product of halves (Dekker).
+    rest = r1 * t1
+    rest -= high
+    rest += r1 * t2
+    rest += r2 * t1
+    rest += r2 * t2
+    small = rate_low * times.high
+    if not isinstance(times.low, float):
+        small += rate * times.low
+    rest += small
+    return high, rest

@@ -5,7 +5,7 @@ import cmath
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,10 +25,19 @@ POLE_SHARE = 1e-4
 # Real and imaginary parts of alpha, beta and m.
 Parts = Sequence[Column]
 
-# The functions sqrt, copysign and where of the projection, for columns and for one state, where
-# numpy would take ten times as long.
-COLUMNS = np.sqrt, np.copysign, np.where
-ONE_STATE = math.sqrt, math.copysign, lambda condition, x, y: x if condition else y
+
+class _Functions(NamedTuple):
+    """What a projection computes with."""
+
+    sqrt: Callable[..., Any]
+    copysign: Callable[..., Any]
+    where: Callable[..., Any]
+
+
+COLUMNS = _Functions(sqrt=np.sqrt, copysign=np.copysign, where=np.where)
+# Of one state: numpy would take ten times as long.
+ONE_STATE = _Functions(sqrt=math.sqrt, copysign=math.copysign,
+                       where=lambda condition, x, y: x if condition else y)
 
 
 class TransportMotion(SteppedMotion):
@@ -62,7 +71,8 @@ class TransportMotion(SteppedMotion):
     step.  If Lz + L3 or Lz - L3 is 0, alpha or beta has the uniform part alone.  It then moves on
     a line through zero, and its modulus changes sign where the axis passes that pole.
 
-    rtol, atol : tolerated error of a step; the unknowns are scaled to 1, so the two add up
+    The unknowns are scaled to 1, so the tolerated errors `rtol` and `atol` of a step add up.
+
     spin_rate : chi [rad/s]
     uniform_rates : rate of the uniform part of alpha's phase, in the frame that is stepped and in
         the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
@@ -144,7 +154,7 @@ class TransportMotion(SteppedMotion):
         return complex(*projected[:2]), complex(*projected[2:4]), complex(*projected[4:])
 
     def project(self, y: Sequence[Any], pole_share: float,
-                functions: tuple[Callable[..., Any], ...] = COLUMNS) -> tuple[Any, ...]:
+                functions: _Functions = COLUMNS) -> tuple[Any, ...]:
         """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
         # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows
         # from L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +35,13 @@ from spinning_top_sim.solvers.decimal_math import (
     root,
     sin_cos,
 )
-from spinning_top_sim.solvers.exact import ExactSolution, _ExactStates
+from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
 from spinning_top_sim.solvers.theta_series import SIN_ODD
 from spinning_top_sim.solvers.theta_setup import (
     DIGITS_TO_TRY,
     Factor,
     HalfAngles,
+    Posture,
     ThetaMotion,
     set_up,
 )
@@ -56,21 +57,6 @@ POLE = Decimal('1e-30')
 THROUGH = Decimal('1e-19')
 
 
-class Posture(NamedTuple):
-    """
-    Attitude and angular velocity of a top at one instant, in long decimals.
-
-    alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
-    across : omega_1 + i omega_2 in the body [rad/s]
-    l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
-    """
-
-    alpha: Complex
-    beta: Complex
-    across: Complex
-    l3: float
-
-
 class Vertical(NamedTuple):
     """
     The line of effective gravity, and a frame with its z axis along it.
@@ -80,18 +66,20 @@ class Vertical(NamedTuple):
     gravity z stays the line of the world's vertical.
 
     gravity : downwards along z positive [m/s^2]
+    top : in this gravity
     alpha, beta : Cayley-Klein parameters of the least rotation from the world to the frame
     rows : the same rotation, q(world <- frame), in doubles
     """
 
     gravity: Decimal
+    top: Top
     alpha: Complex
     beta: Complex
     rows: Quaternion
 
-    def start(self, top: Top, posture: Posture) -> HalfAngles:
+    def start(self, posture: Posture) -> HalfAngles:
         """Return a posture as a state in this frame."""
-        (a, b), (c, d) = self.alpha, self.beta
+        top, (a, b), (c, d) = self.top, self.alpha, self.beta
         alpha, beta = _product(((a, -b), (-c, -d)), (posture.alpha, posture.beta))
         cosine2, sine2 = _square(alpha), _square(beta)
         size2, l3, (o1, o2) = cosine2 + sine2, Decimal(posture.l3), posture.across
@@ -115,7 +103,7 @@ class Vertical(NamedTuple):
         return HalfAngles(sine, cosine, theta_dot / unit, alpha, beta, +l3, lz)
 
 
-class AcceleratedMotion(ExactSolution):
+class AcceleratedMotion(ClosedForm):
     """
     The exact motion while the pivot accelerates uniformly, in the frame of `vertical`.
 
@@ -133,36 +121,18 @@ class AcceleratedMotion(ExactSolution):
     """
 
     def __init__(self, top: Top, posture: Posture, acceleration: Exact) -> None:
-        self.vertical, self._halves = about_vertical(top, posture, acceleration)
-        self.top, self._posture = in_gravity(top, float(self.vertical.gravity)), posture
-        self._turns, self._sign, self._half_turn = 0, 1.0, 0.0
-        self._motion = set_up(top, self.vertical.gravity, self._halves)
-        with precision(DIGITS):
-            self._take_constants(self._motion, *self._halves[-2:])
-        self.chains = self._theta.chains        # whether it can be `chained`
+        self.vertical, self.halves = about_vertical(top, posture, acceleration)
+        self._posture = posture
+        self._motion = set_up(top, self.vertical.gravity, self.halves)
+        super().__init__(self.vertical.top, self._motion, *self.halves[-2:])
+        self.chains = self.constants.chains
 
     @cached_property
     def start(self) -> State:       # type: ignore[override]
-        return rounded(self._halves)
+        return rounded(self.halves)
 
-    def _across_of(self, states: _ExactStates) -> Column:
-        if self._theta.real or not self._theta.u_dot.any():
-            return super()._across_of(states)
-        # Of two sums that may cancel, the one with the smaller terms.  The usual one cancels
-        # where a fast top hardly precesses.
-        (one, two), (cosine, sine) = states._rows('across'), states._rows('half_theta')
-        tangent: Column = sine / cosine
-        bottom, top = self._bottom_rate * tangent, self._top_rate / tangent
-        cancels = np.abs(bottom) + np.abs(top) > np.abs(one) + np.abs(two)
-        across: Column = np.where(cancels, one + two, bottom + top)
-        return across
-
-    @property
-    def energy(self) -> float:
-        o1, o2 = map(float, self._posture.across)
-        top, start = self.top, self.start
-        return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
-                + top.gravity_torque * math.cos(start.theta))
+    def _states_at(self, times: Times) -> States:
+        return _AcceleratedStates([self], None, times)
 
     def posture(self, ns: int) -> Posture:
         """
@@ -175,64 +145,72 @@ class AcceleratedMotion(ExactSolution):
         with precision(DIGITS + 2):
             vertical = self.vertical
             alpha, beta, u_dot = _cayley_klein(self._motion, Decimal(ns).scaleb(-9))
-            across = _across(exact(self.top.lambda1), *self._halves[-2:], alpha, beta, u_dot)
+            across = _across(exact(self.top.lambda1), *self.halves[-2:], alpha, beta, u_dot)
             alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
             return Posture(alpha, beta, across, self._posture.l3)
 
 
-class _Chain(AcceleratedMotion):
-    """Motions one after the other, each at `counts` of the times, for states only."""
+class _AcceleratedStates(ThetaStates):
+    """States of a motion, or of several motions that chain, of each at so many of the times."""
 
-    def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int]) -> None:
-        self.top, self.start, self._turns = motions[0].top, motions[0].start, 0
-        self._theta = ThetaFunctions.chained([motion._theta for motion in motions], counts)
-        rates: Any = np.array([(motion._bottom_rate, motion._top_rate) for motion in motions])
-        self._bottom_rate, self._top_rate = np.repeat(rates.T, counts, axis=1)
+    def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int] | None,
+                 times: Times) -> None:
+        first = motions[0]
+        theta = first.theta if counts is None else ThetaFunctions(
+            [one.constants for one in motions], counts)
+        lz, gravity, torque, *self._rates = theta.columns([
+            (float(one.halves.lz), one.top.gravity, one.top.gravity_torque, one.bottom_rate,
+             one.top_rate) for one in motions])
+        super().__init__(first.top, first.start, theta, times, lz=lz, gravity=gravity,
+                         torque=torque)
+
+    def _across(self) -> Column:
+        (cosine, sine), (bottom_rate, top_rate) = self._rows('half_theta'), self._rates
+        if self._theta.real or not self._theta.u_dot.any():
+            return axis_rate(float(bottom_rate[0]), float(top_rate[0]), cosine, sine)
+        # Of two sums that may cancel, the one with the smaller terms.  The usual one cancels
+        # where a fast top hardly precesses.
+        one, two = self._rows('across')
+        tangent: Column = sine / cosine
+        bottom, top = bottom_rate * tangent, top_rate / tangent
+        cancels = np.abs(bottom) + np.abs(top) > np.abs(one) + np.abs(two)
+        across: Column = np.where(cancels, one + two, bottom + top)
+        return across
 
 
 def chained(motions: Sequence[AcceleratedMotion], counts: Sequence[int],
             times_ns: NDArray[np.int64]) -> States:
-    """Return the states of motions, of each at so many of the times [ns]."""
-    states = _ExactStates(_Chain(motions, counts), Times.from_ns(times_ns))
-    states._lz, states._gravity, states._torque = np.repeat(np.array([
-        (float(motion._halves.lz), motion.top.gravity, motion.top.gravity_torque)
-        for motion in motions]).T, counts, axis=1)
-    return states
+    """Return the states of motions that chain, of each at so many of the times [ns]."""
+    return _AcceleratedStates(motions, counts, Times.from_ns(times_ns))
 
 
 @lru_cache(64)
-def _verticals(gravity: float, acceleration: Exact,
+def _verticals(top: Top, acceleration: Exact,
                ) -> tuple[tuple[Decimal, Decimal, Decimal], Vertical, Vertical]:
     """Return the upward line of effective gravity, and the verticals along and against it."""
     x, y, z = (Decimal(a.numerator) / Decimal(a.denominator) for a in acceleration)
-    z += Decimal(gravity)
+    z += Decimal(top.gravity)
     size = root(x * x + y * y + z * z)
     x, y, z = line = (x / size, y / size, z / size) if size else (ZERO, ZERO, ONE)
-    return line, _upright(size, x, y, z), _upright(-size, -x, -y, -z)
+    return line, _upright(top, size, x, y, z), _upright(top, -size, -x, -y, -z)
 
 
-def _upright(gravity: Decimal, x: Decimal, y: Decimal, z: Decimal) -> Vertical:
+def _upright(top: Top, gravity: Decimal, x: Decimal, y: Decimal, z: Decimal) -> Vertical:
     alpha, beta = _least_rotation(x, y, z)
     qx, qy, qz, qw = (np.array([float(part)]) for part in (-beta[1], beta[0], alpha[1], alpha[0]))
-    return Vertical(gravity, alpha, beta, (qx, qy, qz, qw))
-
-
-@lru_cache(16)
-def in_gravity(top: Top, gravity: float) -> Top:
-    """Return the top in another gravity [m/s^2]."""
-    return replace(top, gravity=gravity)
+    return Vertical(gravity, replace(top, gravity=float(gravity)), alpha, beta, (qx, qy, qz, qw))
 
 
 def about_vertical(top: Top, posture: Posture, acceleration: Exact,
                    ) -> tuple[Vertical, HalfAngles]:
     """Return the vertical while the pivot accelerates so, and the state there."""
     with precision(MOST_DIGITS):
-        (x, y, z), up, down = _verticals(top.gravity, acceleration)
+        (x, y, z), up, down = _verticals(top, acceleration)
         (w0, z0), (y0, minus_x0) = alpha, beta = posture[:2]
         side = (2 * (x * (w0 * y0 - z0 * minus_x0) + y * (y0 * z0 + w0 * minus_x0))
                 + z * (_square(alpha) - _square(beta)))
         vertical = up if side >= 0 else down
-        return vertical, vertical.start(top, posture)
+        return vertical, vertical.start(posture)
 
 
 def rounded(start: HalfAngles) -> State:
@@ -290,7 +268,7 @@ def _cayley_klein(motion: ThetaMotion, t: Decimal) -> tuple[Complex, Complex, De
         xi = sine * sine
     cosine = root(1 - xi)
     point = sine, cosine, xi
-    alpha, beta = (_factor(factor, whole, y, t, point) for factor in (motion.alpha, motion.beta))
+    alpha, beta = (_value(factor, whole, y, t, point) for factor in (motion.alpha, motion.beta))
     size2 = _square(alpha) + _square(beta)
     slope = motion.u_dot_series.at(2 * sine * cosine, 1 - 2 * xi, 4 * xi * (1 - xi))
     u_dot = motion.u_dot[whole % 2] * slope / (size2 * size2)
@@ -298,11 +276,11 @@ def _cayley_klein(motion: ThetaMotion, t: Decimal) -> tuple[Complex, Complex, De
     return _scaled(scale, alpha), _scaled(scale, beta), u_dot
 
 
-def _factor(factor: Factor, whole: int, y: Decimal, t: Decimal,
-            point: tuple[Decimal, Decimal, Decimal]) -> Complex:
+def _value(factor: Factor, whole: int, y: Decimal, t: Decimal,
+           point: tuple[Decimal, Decimal, Decimal]) -> Complex:
     """Return alpha D or beta D; `whole`, y, `point`: N, y and the arguments of `Series.at`."""
-    parts = factor.parts[whole % 2]
-    real, imag = (part.at(*point) for part in parts)
+    parts, scale = factor.parts[whole % 2], factor.scales[whole % 2]
+    real, imag = (scale * part.at(*point) for part in parts)
     if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
         real = -real                # it passes a pole
     turn = factor.rate * t + 2 * pi() * factor.phase_turns + factor.drift * y

@@ -30,7 +30,7 @@ Signal = Callable[[States], NDArray[np.float64]]
 
 class LowPass:
     """
-    A filter with the gain -3 dB at `frequency` [Hz]: of first order, or Butterworth's of second.
+    A filter with the gain -3 dB at `frequency` [Hz], of `order` 1, or Butterworth's of 2.
 
     Before t = 0 the signal has been what it is at t = 0.
 
@@ -70,7 +70,7 @@ class LowPass:
 
     def _edges(self, segment: Segment) -> NDArray[np.float64]:
         """Return how long before a sample the panels begin and end [ns], (panels + 1, 1)."""
-        rate = fastest_rate(segment.solver.top, segment.l3, segment.energy)
+        rate = fastest_rate(segment.motion.top, segment.l3, segment.energy)
         # A specific force has squares of rates, thus twice their frequency.
         seconds = ANGLE / (self._corner + 2.0 * rate)
         panels = min(math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS)

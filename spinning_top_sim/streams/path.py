@@ -4,11 +4,10 @@
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import cached_property, reduce
 from itertools import pairwise
 from operator import attrgetter
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +19,10 @@ from spinning_top_sim.physics.states import Point, States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.physics.world_states import WorldStates
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.propagator import Propagator
-from spinning_top_sim.solvers.vertical import (
-    AcceleratedMotion,
-    Posture,
-    Vertical,
-    chained,
-    posture_at,
-)
+from spinning_top_sim.solvers.exact import ClosedForm
+from spinning_top_sim.solvers.propagator import Motion
+from spinning_top_sim.solvers.theta_setup import Posture
+from spinning_top_sim.solvers.vertical import AcceleratedMotion, Vertical, chained, posture_at
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS
 
 
@@ -50,23 +44,24 @@ class Segment:
     """
     A motion from its start, or from a command, until the next command or change of the pivot's.
 
-    Times are simulated times [ns]; those of `solver` count from `start_ns`.  Where the pivot
-    moves, `solver`, `exact`, `start` and the constants are about the effective vertical.
+    Times are simulated times [ns]; those of `motion` count from `start_ns`.  Where the pivot
+    moves, `motion`, `exact`, `start` and the constants are about the effective vertical.
 
     ride : what the pivot does; None while it rests at the origin
-    reached_ns : time up to which the solver needs no further steps
+    reached_ns : time up to which the motion needs no further steps
     start, energy, l3, lz : at its start
+    chains : whether it can be evaluated together with others
     filtered : state of the low pass of the IMU at the start; None without one, or from t = 0 on
     """
 
-    def __init__(self, solver: Propagator, start_ns: int, ride: Ride | None = None) -> None:
-        self.solver, self.start_ns, self.ride = solver, start_ns, ride
-        self.reached_ns = start_ns + solver.reached_ns
+    def __init__(self, motion: Motion, start_ns: int, ride: Ride | None = None) -> None:
+        self.motion, self.start_ns, self.ride = motion, start_ns, ride
+        self.chains, self.reached_ns = motion.chains, start_ns + motion.reached_ns
         self.filtered: NDArray[np.float64] | None = None
 
     @property
     def start(self) -> State:
-        return self.solver.start
+        return self.motion.start
 
     @property
     def l3(self) -> float:
@@ -78,29 +73,22 @@ class Segment:
 
     @cached_property
     def _first(self) -> States:
-        return self.solver.states(range(1))
+        return self.motion.states(range(1))
 
     @cached_property
     def energy(self) -> float:
-        if isinstance(self.solver, AcceleratedMotion):
-            return self.solver.energy
-        return float(self._first.energy[0])
+        posture, top, start = self.motion.posture(0), self.motion.top, self.start
+        if posture is None:
+            return float(self._first.energy[0])
+        o1, o2 = map(float, posture.across)     # without an evaluation of states
+        return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
+                + top.gravity_torque * math.cos(start.theta))
 
     @property
-    def chains(self) -> bool:
-        """Whether it can be evaluated together with others."""
-        return isinstance(self.solver, AcceleratedMotion) and self.solver.chains
-
-    @cached_property
-    def exact(self) -> ExactSolution | None:
+    def exact(self) -> ClosedForm | None:
         """The closed form; None where doubles cannot hold it, or not up to the last stamp."""
-        if isinstance(self.solver, ExactSolution):
-            return self.solver
-        with suppress(ValueError):
-            exact = ExactSolution(self.solver.top, self.solver.start)
-            if exact.ns_limit >= LAST_STAMP_NS:
-                return exact
-        return None
+        exact = self.motion.exact
+        return exact if exact is not None and exact.ns_limit >= LAST_STAMP_NS else None
 
     @property
     def end_ns(self) -> int:
@@ -109,14 +97,14 @@ class Segment:
 
     def reach(self, t_ns: int, max_steps: int) -> bool:
         """
-        Let the solver step up to a time [ns]; return False if that takes more steps.
+        Let the motion step up to a time [ns]; return False if that takes more steps.
 
         Raises IntegrationError if the equations cannot go on; `reached_ns` tells where they stop.
         """
         try:
-            return self.solver.reach(t_ns - self.start_ns, max_steps)
+            return self.motion.reach(t_ns - self.start_ns, max_steps)
         finally:
-            self.reached_ns = self.start_ns + self.solver.reached_ns
+            self.reached_ns = self.start_ns + self.motion.reached_ns
 
     def states(self, times: range | NDArray[np.int64]) -> States:
         """Return the states in the world at ascending times [ns]."""
@@ -124,7 +112,7 @@ class Segment:
 
     def own_states(self, times: range | NDArray[np.int64]) -> States:
         """Return the states about the vertical of the segment at ascending times [ns]."""
-        return self.solver.states(self._since_start(times))
+        return self.motion.states(self._since_start(times))
 
     def _in_world(self, states: States) -> States:
         ride = self.ride
@@ -132,9 +120,8 @@ class Segment:
 
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time [ns]."""
-        if isinstance(self.solver, AcceleratedMotion):
-            return self.solver.posture(t_ns - self.start_ns)
-        return posture_at(self.states(range(t_ns, t_ns + 1)))
+        return (self.motion.posture(t_ns - self.start_ns)
+                or posture_at(self.states(range(t_ns, t_ns + 1))))
 
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at times (n,) [ns]."""
@@ -149,7 +136,7 @@ class Segment:
 
     def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
         """Return the angles (n,) [rad] to the exact attitudes, NaN where these are not known."""
-        if self.exact is self.solver:
+        if self.exact is self.motion:
             return np.zeros(len(times))
         if self.exact is None:
             return np.full(len(times), math.nan)
@@ -174,9 +161,8 @@ def states_of(segments: Sequence[Segment], counts: Sequence[int],
     """Return the states in the world in segments that chain, in each at so many times [ns]."""
     motions, rides = [], []
     for segment in segments:
-        assert isinstance(segment.solver, AcceleratedMotion) and segment.ride
-        motions.append(segment.solver)
-        rides.append(segment.ride)
+        motions.append(cast(AcceleratedMotion, segment.motion))
+        rides.append(cast(Ride, segment.ride))
     since_ns = times_ns - np.repeat([segment.start_ns for segment in segments], counts)
     x, y, z, w = np.repeat(np.hstack([ride.vertical.rows for ride in rides]), counts, axis=1)
     return WorldStates(rides[0].top, chained(motions, counts, since_ns), (x, y, z, w))
@@ -202,12 +188,12 @@ class Path:
     @property
     def steps(self) -> int:
         """Integration steps taken so far."""
-        return self._gone_steps + sum(one.solver.steps for one in self._segments)
+        return self._gone_steps + sum(one.motion.steps for one in self._segments)
 
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side so far."""
-        return self._gone_evaluations + sum(one.solver.evaluations for one in self._segments)
+        return self._gone_evaluations + sum(one.motion.evaluations for one in self._segments)
 
     def after(self, t_ns: int) -> Segment:
         """
@@ -244,15 +230,15 @@ class Path:
     def _forget(self, segments: list[Segment]) -> None:
         for one in segments:
             self._segments.remove(one)
-            self._gone_steps += one.solver.steps
-            self._gone_evaluations += one.solver.evaluations
+            self._gone_steps += one.motion.steps
+            self._gone_evaluations += one.motion.evaluations
 
     def release(self, now_ns: int) -> None:
         """Forget the segments and integration steps that only times before this one [ns] need."""
         present = self._segments[self._number(now_ns)]
         oldest_ns = now_ns - max(self._keep_ns, self.keep_steps_ns)
         self._forget(self._segments[:self._number(oldest_ns - 1)])
-        present.solver.release(now_ns - self.keep_steps_ns - present.start_ns)
+        present.motion.release(now_ns - self.keep_steps_ns - present.start_ns)
 
     def exact_points(self, times_ns: NDArray[np.int64], along: float) -> NDArray[np.float64]:
         """Return where a point of the axis is at ascending times (n,) [ns], (n, 3)."""
@@ -301,7 +287,7 @@ class Path:
 
 def _within(segment: Segment, begins: range, length_ns: int, point: Point) -> list[Increments]:
     """Return the increments over consecutive panels of intervals within a segment."""
-    rate = integrals.fastest_rate(segment.solver.top, segment.l3, segment.energy)
+    rate = integrals.fastest_rate(segment.motion.top, segment.l3, segment.energy)
     count = integrals.panels(rate, length_ns)
     edges = [length_ns * k // count for k in range(count + 1)]
     return [integrals.increments(

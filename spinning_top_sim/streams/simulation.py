@@ -14,12 +14,11 @@ from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.exact import MOST_TURNS
-from spinning_top_sim.solvers.propagator import Propagator, propagate
+from spinning_top_sim.solvers.propagator import Motion, propagate
+from spinning_top_sim.solvers.theta_setup import Posture
 from spinning_top_sim.solvers.vertical import (
     AcceleratedMotion,
-    Posture,
     about_vertical,
-    in_gravity,
     posture_of,
     rounded,
 )
@@ -330,7 +329,7 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
         if spin > MOST_RATE:
             raise ValueError(f'it turns too fast: {spin:.3g} times a second, must be at most '
                              f'{MOST_RATE:.2g}')
-        ns_limit = segment.solver.ns_limit
+        ns_limit = segment.motion.ns_limit
         if ns_limit < LAST_STAMP_NS:
             raise ValueError(f'it turns too fast: its phases are known for '
                              f'{ns_limit / NANOSECONDS:.3g} s, must be for '
@@ -354,11 +353,11 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
     posture, piece = start, pivot.lasting(start_ns)
     if isinstance(posture, State):
         posture = posture_of(top, posture)
-    solver: Propagator
+    motion: Motion
     if values['solver.method'] == 'exact':
-        solver = AcceleratedMotion(top, posture, piece.acceleration)
-        vertical = solver.vertical
+        motion = accelerated = AcceleratedMotion(top, posture, piece.acceleration)
+        vertical = accelerated.vertical
     else:
         vertical, halves = about_vertical(top, posture, piece.acceleration)
-        solver = step(in_gravity(top, float(vertical.gravity)), rounded(halves))
-    return Segment(solver, start_ns, Ride(top, vertical, piece))
+        motion = step(vertical.top, rounded(halves))
+    return Segment(motion, start_ns, Ride(top, vertical, piece))

@@ -22,14 +22,14 @@ class Vibration:
     """
     A vibration of angular velocity and specific force in the frame of the IMU.
 
+    A sensor with the complex gain `response` at frequencies [Hz] reads it.
+
     Each axis is a sum of sines: that of `imu.vibration.frequency`, with the phase 0 at t = 0, and
     `LINES` for a spectral density.  Of these, each has a band of the same width; its power is that
     of the band.  Its place in the middle half of the band and its phase follow from the seed.  So
     no beat is longer than two over the width of a band, and short records have the power.
 
     is_off : whether nothing vibrates
-
-    response : the complex gain of the sensor at frequencies [Hz]
 
     (S. Rice, "Mathematical analysis of random noise", Bell System Technical Journal 23 (1944) 282;
     M. Shinozuka, C. Jan, Journal of Sound and Vibration 25 (1972) 111)

@@ -33,7 +33,7 @@ def animate(_: str, motion: MotionReport, data: Attitudes, path: Path) -> None:
 def _columns(motion: MotionReport, data: Attitudes, seconds: float) -> SimpleNamespace:
     """Return the first samples, at least two, with the columns of `States` that are drawn."""
     data = data.first(max(2, int(np.searchsorted(data.time, seconds, 'right'))))
-    top = motion.segment.solver.top
+    top = motion.segment.motion.top
     unknown = np.full(len(data.time), np.nan)       # such as the rates in a log of poses alone
     constants = data.constants(top)
     return SimpleNamespace(

@@ -210,7 +210,7 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
         motion.samples.append((data.stamps_ns, data.rows))
     if segment.ride:                # there are other constants in each of its pieces
         return
-    values = data.constants(segment.solver.top)
+    values = data.constants(segment.motion.top)
     if values is not None and stream.topic != 'imu/data':       # which is noisy
         drifts = found.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})
         for (name, largest), value in zip(drifts.items(), values, strict=True):

@@ -75,7 +75,7 @@ class Counting:
 
 def states_of(simulation):
     """Count the states that the present motion is asked for."""
-    return Counting(simulation.segment.solver, 'states', len)
+    return Counting(simulation.segment.motion, 'states', len)
 
 
 def messages_of(simulation):
