@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Judges the attitudes of a run: measures, limits, and the faults that the errors alone show.
-
-A constant misinterpretation of the attitudes is identified by inverting it: if the error
-disappears, it was the cause.
-"""
+"""Judges the attitudes of a run: measures, limits, and the faults that the errors show."""
 
 import itertools
 import math
@@ -12,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import measures, scenarios
 from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.exam.trial import ChangeRows, Hypothesis, Outcome, changed
+from spinning_top_sim.exam.trial import Outcome
 from spinning_top_sim.tools.verdict import Fault
 
 FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component_order',
@@ -34,32 +28,6 @@ FIRST_ORDER_LEFT = 0.5          # of that error, with rates for which first-orde
 LEVER_ARM = np.radians(1.0)     # between the attitudes with and without the lever arm
 AHEAD, DELAYED = -1.5, 0.75     # steps; a filter that corrects before its step is ahead by one
 BIAS_LEFT_S = 0.05              # error relative to the bias that causes it [rad/(rad/s)]
-
-
-def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
-            ) -> ChangeRows:
-    """Return the multiplication of attitudes by quaternions x, y, z, w on both sides."""
-    return lambda estimates: (Rotation.from_quat(left) * Rotation.from_quat(estimates)
-                              * Rotation.from_quat(right)).as_quat()
-
-
-_HALF = 0.5 ** 0.5
-_CONJUGATE, _W_LAST = np.array((-1.0, -1.0, -1.0, 1.0)), [1, 2, 3, 0]
-NED_WORLD = Hypothesis(('frame_ned',), 'read as attitude in a world north-east-down',
-                       read=_turned((_HALF, _HALF, 0.0, 0.0)))
-GRAVITY_SIGN = Hypothesis(('gravity_sign',), 'with the sign of the accelerometer changed',
-                          given=changed(('accelerometer',), np.negative))
-# These need the attitudes only.
-READINGS = (
-    Hypothesis(('component_order',), 'read as w, x, y, z', read=lambda q: q[:, _W_LAST]),
-    Hypothesis(('conjugated',), 'conjugated', read=lambda q: q * _CONJUGATE),
-    NED_WORLD,
-    Hypothesis(('frame_ned',), 'read as attitude of axes forward-right-down in a world '
-               'north-east-down', read=_turned((_HALF, _HALF, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))),
-    Hypothesis(('frame_ned',), 'read as attitude in a world north-west-up',
-               read=_turned((0.0, 0.0, _HALF, _HALF))),
-    Hypothesis(('conjugated', 'component_order'), 'read as w, x, y, z and conjugated',
-               read=lambda q: q[:, _W_LAST] * _CONJUGATE))
 
 
 def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
@@ -107,14 +75,6 @@ def quality(outcomes: Sequence[Outcome], imu: Mapping[str, Any],
 def error_of(outcome: Outcome, absolute: bool) -> float:
     """Return the rms attitude error [rad]."""
     return rms(outcome.errors.attitude(absolute))
-
-
-def ambiguous(one: Hypothesis, absolute: bool) -> Hypothesis:
-    """Return a hypothesis that has both names where two cannot be told apart."""
-    if absolute or one.faults not in (('gravity_sign',), NED_WORLD.faults):
-        return one
-    return one._replace(faults=('frame_ned', 'gravity_sign'),
-                        text=f'{one.text}; the two cannot be told apart without a heading')
 
 
 def stamp_fault(outcome: Outcome, absolute: bool) -> tuple[measures.Offset, Fault | None]:

@@ -16,6 +16,7 @@ from spinning_top_sim.exam import diagnosis, measures, scenarios
 from spinning_top_sim.exam.diagnosis import degrees
 from spinning_top_sim.exam.excitation import from_identity, words
 from spinning_top_sim.exam.field import examine_field
+from spinning_top_sim.exam.hypotheses import WITHOUT_FIELD, ChangeReadings, Hypothesis
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.report import Findings, Report
@@ -23,9 +24,6 @@ from spinning_top_sim.exam.response import Response
 from spinning_top_sim.exam.scenarios import Run
 from spinning_top_sim.exam.subject import LastingSubject, Subject
 from spinning_top_sim.exam.trial import (
-    WITHOUT_FIELD,
-    ChangeReadings,
-    Hypothesis,
     InvalidOutputError,
     MakeFilter,
     Outcome,

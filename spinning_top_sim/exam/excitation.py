@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from spinning_top_sim.exam import scenarios
+from spinning_top_sim.exam.hypotheses import AXES
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.exam.trial import Outcome
 
-AXES = 'xyz'
 # Turns about an axis of the sensor [deg], each followed by a rest; the last one leads back.
 TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0),
          (1, 110.0), (2, -120.0))
@@ -136,26 +136,3 @@ def words(matrix: Reals) -> str:
             f'{column[j]:+.3g} times about {AXES[j]}' for j in range(3)
             if abs(column[j] - (j == k)) >= large and column[j]) or 'not at all')
         for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) >= large)
-
-
-def axes(matrix: Reals) -> str:
-    """Return a signed permutation in words."""
-    return ', '.join(f'{"-" if row.sum() < 0 else ""}{AXES[int(np.argmax(np.abs(row)))]}'
-                     for row in matrix)
-
-
-def moved(rows: Reals, samples: int) -> Reals:
-    """Return the rows so many samples later; the first or the last is repeated."""
-    return rows[np.clip(np.arange(len(rows)) + samples, 0, len(rows) - 1)]
-
-
-def of_world(run: Run) -> Run:
-    """Return rates about axes of the world."""
-    return replace(run, gyroscope=Rotation.from_quat(run.truth).apply(run.gyroscope))
-
-
-def untilted(run: Run) -> Run:
-    """Return the field as if the sensor were level, with the same heading (z, y', x'')."""
-    true = Rotation.from_quat(run.truth)
-    level = Rotation.from_euler('z', true.as_euler('ZYX')[:, :1])
-    return replace(run, magnetometer=level.inv().apply(true.apply(run.magnetometer)))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from spinning_top_sim.exam import diagnosis
+from spinning_top_sim.exam import diagnosis, hypotheses
 from spinning_top_sim.exam.diagnosis import degrees
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import OF_PLACE, Reals, Run
@@ -175,9 +175,9 @@ def _judge(subject: str, outcome: Outcome, heading: bool) -> Report:
     before = diagnosis.error_of(settled, heading)
     after, best = min(((diagnosis.error_of(replace(
         settled, estimates=one.read(settled.estimates)), heading), one)
-        for one in diagnosis.READINGS), key=lambda pair: pair[0])
+        for one in hypotheses.MISREADINGS), key=lambda pair: pair[0])
     if before > GROSS and after < diagnosis.EXPLAINED * before:
-        found = diagnosis.ambiguous(best._replace(
+        found = hypotheses.ambiguous(best._replace(
             text=f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
             'measures are those after this correction'), heading)
     corrected = outcome if found is None else replace(

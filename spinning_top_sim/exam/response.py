@@ -8,7 +8,7 @@ is a hypothesis: its inverse is applied to the readings or the attitudes, and th
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -17,52 +17,50 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import diagnosis, excitation, measures, scenarios
+from spinning_top_sim.exam import diagnosis, excitation, hypotheses, measures, scenarios
 from spinning_top_sim.exam.diagnosis import HEADING, TILT, degrees
-from spinning_top_sim.exam.excitation import axes, from_identity, gyroscope_of, moved, words
+from spinning_top_sim.exam.excitation import from_identity, gyroscope_of, words
+from spinning_top_sim.exam.hypotheses import (
+    Hypothesis,
+    axes,
+    changed,
+    delayed,
+    moved,
+    permuted,
+    sharpened,
+    wired,
+)
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.report import Findings
 from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.exam.subject import Subject
-from spinning_top_sim.exam.trial import Hypothesis, InvalidOutputError, Outcome, changed
+from spinning_top_sim.exam.trial import InvalidOutputError, Outcome
 from spinning_top_sim.tools.verdict import Fault
 
 BIAS = np.array((0.01, -0.01, 0.02))    # of the gyroscope [rad/s]; its norm is 1.4 deg/s
-SIGNED = [sign * one for one in Rotation.create_group('O').as_matrix().round()
-          for sign in (1.0, -1.0)][1:]
-
-# Limits of a right filter.
-CLEAN = np.array((TILT, HEADING, TILT, HEADING))     # of tilt and heading at rest, in motion
-GAIN, GROSS_GAIN = 0.003, 0.25  # by which the gyroscope's matrix differs from the identity
-LIKELY = 4                      # signed permutations of a sensor that are tried
+# Errors of a right filter: tilt and heading at rest, then in motion, rms [rad].
+CLEAN = np.array((TILT, HEADING, TILT, HEADING))
+# The largest entry of the gyroscope's matrix less the identity: what is looked into, and what is
+# too much for any other error to be judged.
+GAIN, GROSS_GAIN = 0.003, 0.25
 START = 50                      # samples after which a filter that starts has an attitude
-SURE = 0.2                      # of the largest error that explains: nothing else is tried
+SURE = 0.2                      # share of the limit of an explanation: nothing else is tried
 WORST = 30.0                    # condition of a matrix that can be inverted
-EARLY_RESTS = slice(2, 5)       # when the error of the start is over
-STAYS = 0.98                    # of a kick
-# Of the search for an affine change: what a fit leaves of the error at rest; steps, and by what
-# the whole error falls in one.
-FITS, STEPS, LESS = 0.1, 4, 0.7
-# Of the effect of a bias is left in the same attitude, without and with a growing estimate.
-LEARNED, LEARNING, BIAS_FOUND = 0.5, 0.9, 0.05
-NEAR = 0.5                      # error in which a kick is judged [rad]
-BIAS_OFF = 0.5                  # by which the reported bias differs, relative
-STUCK = np.radians(1.0)         # by which attitudes differ at least
+EARLY_RESTS = slice(2, 5)       # rests of a short run, when the error of the start is over
+STAYS = 0.98                    # share of a kick that a filter without correction leaves
+NEAR = 0.5                      # largest error without a kick with which a kick is judged [rad]
+STUCK = np.radians(1.0)         # attitudes that differ less are always the same
+# The search for the affine change of a sensor.
+FITS = 0.1                      # share of the error at rest that a good fit leaves
+STEPS = 4
+LESS = 0.7                      # a step that leaves more of the whole error is the last one
+# A bias counts as learned if at most LEARNED of its first effect is left in the same attitude
+# later; LEARNING suffices if the estimate that the filter reports grows.
+LEARNED, LEARNING = 0.5, 0.9
+BIAS_FOUND = 0.05               # share of the bias in the estimate that is more than none
+BIAS_OFF = 0.5                  # relative error of an estimate that is wrong
 
 Tried = tuple[Hypothesis, Outcome]
-
-
-def wired(name: str, text: str, matrix: Any, offset: Any = 0.0,
-          fault: str = '') -> Hypothesis:
-    """Return the hypothesis that the readings of a sensor need this matrix and offset."""
-    return Hypothesis((fault or f'{name}_wiring',), text, given=changed(
-        (name,), lambda rows: rows @ matrix.T + offset))
-
-
-UNITS = [wired('accelerometer', f'with the accelerometer multiplied by {by:.4g}', by * np.eye(3))
-         for by in (scenarios.GRAVITY, 1.0 / scenarios.GRAVITY)]
-LEVEL = Hypothesis(('magnetometer_wiring',), 'with the field of a level sensor',
-                   given=excitation.untilted)
 
 
 class Response:
@@ -101,7 +99,7 @@ class Response:
                       f'{degrees(self._whole(self._outcome))}; all measures but those of the '
                       'field are those after this correction') for name in one.faults]
             (self.undone if {*one.faults} - {'stamp_offset'} else self._harmless).insert(0, one)
-            self.unclear |= one.given is excitation.of_world
+            self.unclear |= one.given is hypotheses.of_world
         clean = np.degrees(self._clean(self._outcome))
         self._findings.measures |= {'tilt_clean_deg': float(max(clean[::2])),
                                  'heading_clean_deg': float(max(clean[1::2]))}
@@ -161,9 +159,9 @@ class Response:
         whole, early, late = gyroscope_of(self._outcome, self._given.turns)
         return (self._best(self._of_attitudes()) or self._best(self._of_delays(late))
                 or self._best(self._of_gyroscope(whole, early), mends_turns=gross)
-                or self._best(self._of_sensor('accelerometer', 2, (0, 1), diagnosis.GRAVITY_SIGN,
-                                              *UNITS))
-                or self._best(self._of_sensor('magnetometer', 1, (0,), LEVEL))
+                or self._best(self._of_sensor('accelerometer', 2, (0, 1), hypotheses.GRAVITY_SIGN,
+                                              *hypotheses.UNITS))
+                or self._best(self._of_sensor('magnetometer', 1, (0,), hypotheses.LEVEL))
                 or self._best(self._of_smoothing()))
 
     def _best(self, tried: Iterator[Tried], mends_turns: bool = False) -> Tried | None:
@@ -173,7 +171,7 @@ class Response:
             error = self._whole(outcome)
             if error < least and (error <= limit or (
                     mends_turns and not self._turns_wrong(outcome))):
-                least, best = error, (diagnosis.ambiguous(one, self._absolute), outcome)
+                least, best = error, (hypotheses.ambiguous(one, self._absolute), outcome)
             if error <= SURE * limit:
                 break
         return best
@@ -190,7 +188,7 @@ class Response:
         tangents = [np.tan(0.5 * turns.magnitude()) for turns in (estimated, true)]
         scale = max(float(np.median(tangents[0] / np.maximum(tangents[1], 1e-9))), 1e-3)
         return self._tried(
-            *diagnosis.READINGS,
+            *hypotheses.MISREADINGS,
             Hypothesis(('frame_ned',), 'read as attitude of axes '
                        f'{axes(square.as_matrix())} of the sensor',
                        read=lambda q: (Rotation.from_quat(q) * square.inv()).as_quat()),
@@ -227,7 +225,7 @@ class Response:
                         fault='gyroscope_units') for text, by in (
                             ('pi/180', math.radians(1.0)), ('180/pi', math.degrees(1.0)))),
                 Hypothesis(('gyroscope_wiring',), 'with rates about axes of the world (a product '
-                           'on the wrong side)', given=excitation.of_world), screened=False)
+                           'on the wrong side)', given=hypotheses.of_world), screened=False)
         for matrix in (early, whole):
             scale = float(np.trace(matrix)) / 3.0
             uniform = np.max(np.abs(matrix - scale * np.eye(3))) < 0.3 * abs(scale - 1.0)
@@ -247,7 +245,8 @@ class Response:
         Try more hypotheses, and changes of the axes of a sensor that attitudes at rest show.
 
         axis, level : axes of the world along which the readings of a right filter are positive,
-            and zero
+            and zero: up and the horizontal ones for the accelerometer, north and east for the
+            magnetometer.  `fit` is largest where readings, turned by the attitudes, are so.
         """
         tilt, heading, *_ = self._clean(self._outcome)
         if (max(tilt, heading) < HEADING or not self._absolute if name == 'magnetometer' else
@@ -364,7 +363,14 @@ class Response:
             > STAYS and (self._absolute or what == 'tilt')]
 
     def judge_bias(self) -> None:
-        """Compare runs with and without a gyroscope bias, after `identify`."""
+        """
+        Compare runs with and without a gyroscope bias, after `identify`.
+
+        `left` is whether the attitude is off in the end, relative to the bias.  That is no fault
+        if the filter learns: the effect in the attitude of the first rest is smaller `again`,
+        much smaller or with an estimate that grows, and no axis is left out while another is
+        learned (`partly`).  Otherwise the estimate, if there is one, must be `right`.
+        """
         motion, size = self._given.motion, float(np.linalg.norm(BIAS))
         run = self._excited.part(slice(motion.stop))
         outcome = self._respond((), replace(run, gyroscope=run.gyroscope + BIAS))
@@ -393,23 +399,3 @@ class Response:
             self._findings.faults.append(Fault(
                 'bias_report', f'a gyroscope bias of {np.degrees(BIAS).round(2).tolist()} deg/s '
                 f'is learned, but the estimate is {np.degrees(found).round(2).tolist()} deg/s'))
-
-
-def permuted(name: str, fit: Callable[[Reals], Any]) -> list[Hypothesis]:
-    """Return the hypotheses that the filter has those signed permutations that fit best."""
-    return [wired(name, f'with {axes(one.T)} of the {name} for its x, y, z', one.T)
-            for one in sorted(SIGNED, key=fit, reverse=True)[:LIKELY]]
-
-
-def delayed(names: Sequence[str], samples: int) -> Hypothesis:
-    """Return the hypothesis that sensors are so many samples late."""
-    return Hypothesis(('lag',), f'with the {" and ".join(names)} {samples} samples earlier',
-                      given=changed(names, lambda rows: moved(rows, samples)))
-
-
-def sharpened(names: Sequence[str], samples: float) -> Hypothesis:
-    """Return the hypothesis of a low pass of first order with this time constant [samples]."""
-    return Hypothesis(('lag',), f'with the inverse of a low pass of {samples:.3g} samples on the '
-                      f'{" and ".join(names)}', given=changed(
-                          names, lambda rows: rows + samples * np.diff(
-                              rows, axis=0, prepend=rows[:1])))

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import measures, scenarios
+from spinning_top_sim.exam.hypotheses import Hypothesis
 from spinning_top_sim.exam.scenarios import Run, Scenario
-from spinning_top_sim.exam.trial import Feed, Hypothesis, MakeFilter, Outcome, feed, follow
+from spinning_top_sim.exam.trial import Feed, MakeFilter, Outcome, feed, follow
 
 FIELD_ASKED = 200, 1000     # updates after which a filter has shown whether it uses the field
 # A filter that goes on is first turned to the attitude at which a run begins [s].

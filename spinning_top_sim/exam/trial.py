@@ -4,12 +4,13 @@
 import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spinning_top_sim.exam.hypotheses import Hypothesis
 from spinning_top_sim.exam.measures import Errors, errors_of
 from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.tools.cli import printable
@@ -53,9 +54,6 @@ class Filter(Protocol):
 
 
 MakeFilter = Callable[[], Filter]
-# From a run to that whose readings are fed instead.
-ChangeReadings = Callable[[Run], Run]
-ChangeRows = Callable[[Reals], Reals]
 
 
 class InvalidOutputError(Exception):
@@ -99,26 +97,6 @@ class Outcome:
     def last(self, fraction: float = 0.5) -> 'Outcome':
         """Return the last part; by default the second half, in which the filter has settled."""
         return self.part(slice(round(len(self.estimates) * (1.0 - fraction)), None))
-
-
-class Hypothesis(NamedTuple):
-    """A possible cause of errors, and its inverse: other readings, or other attitudes."""
-
-    faults: tuple[str, ...]
-    text: str
-    given: ChangeReadings | None = None
-    read: ChangeRows = lambda estimates: estimates
-
-
-def changed(names: Sequence[str], change: ChangeRows) -> ChangeReadings:
-    """Return what changes the readings (n, 3) of these sensors."""
-    def with_changes(run: Run) -> Run:
-        readings: Any = {name: change(getattr(run, name)) for name in names}
-        return replace(run, **readings)
-    return with_changes
-
-
-WITHOUT_FIELD = changed(('magnetometer',), lambda rows: np.full_like(rows, np.nan))
 
 
 def feed(make_filter: MakeFilter, run: Run) -> Output:

@@ -11,11 +11,15 @@ from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Reals
 
 MOST_CAUSES = 3
-ENOUGH = 0.2            # of the discrepancy may remain: further causes are not looked for
-WORTHWHILE = 0.8        # of what remains is left at most by another cause
+# Further causes are looked for while more than these shares of the discrepancy and of the noise
+# remain.
+ENOUGH, ENOUGH_OF_NOISE = 0.2, 0.1
+WORTHWHILE = 0.8        # share of what remains that another cause leaves at most
 TINY = 1e-6             # rms of an effect that cannot be seen
-NEAR = 0.25             # of a coefficient to the value that it has for a fault
-AS_GOOD = 2.0           # a cause with fewer columns may leave so many times more
+NEAR = 0.25             # distance of a coefficient from the value that it has for a fault
+# Among causes that are as good as the best, the one with the fewest columns wins: those that leave
+# so many times more, or so small a share of what there was (at most the noise).
+AS_GOOD, AS_GOOD_SHARE = 2.0, 0.02
 
 Judge = Callable[[Reals], Fault | None]     # of the coefficients of a cause; None: no fault
 
@@ -51,14 +55,14 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
     """
     chosen: list[Cause] = []
     residual, found, others = target, np.empty(0), [*causes]
-    enough = max(ENOUGH * beyond(target, floor), 0.1 * floor)
+    enough = max(ENOUGH * beyond(target, floor), ENOUGH_OF_NOISE * floor)
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
         tried = [fitted(target, [effects[name] for cause in (*chosen, one)
                                  for name in cause.effects]) for one in others]
         # A cause with a judge that names no fault explains nothing.
         after = [np.inf if one.judge and one.judge(part[-len(one.effects):]) is None else
                  beyond(left, floor) for one, (part, left) in zip(others, tried, strict=True)]
-        good = max(AS_GOOD * min(after), min(0.02 * before, floor or np.inf))
+        good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * before, floor or np.inf))
         _, left, best = min((len(one.effects), left, k) for k, (one, left) in enumerate(
             zip(others, after, strict=True)) if left <= good)
         if left > WORTHWHILE * before:

@@ -22,18 +22,20 @@ from spinning_top_sim.grade.regression import NEAR, Cause, beyond, fitted, inste
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
-LAGS = range(-3, 31)        # samples that are tried
-LATE = 0.75                 # steps
-# Of the reading, beside its noise: it is not what it should be.  Velocities are means over a step,
-# compared with those of its ends; rates of the state may be those of the middle of a step.
-STRANGE = {'rates': 2e-2, 'velocities': 5e-2}       # others 2e-3
-CONSISTENT = 1e-3           # of the reading: the lag is not looked for
-TURNED = 0.02               # of the discrepancy is left at most by a turn of the axes
-UNEXPLAINED = 0.5           # of the discrepancy is left: no cause explains it
-NOISY = 1e-4                # of the reading: smaller noise is rounding
-NOISE_BAND = 0.05           # of the noise, to either side of what is declared, beside its doubt
-FOUR_SIGMA = 4.0            # that doubt
-LEAST_KURTOSIS = 2.4        # normal 3, uniform 1.8
+LAGS = range(-3, 31)        # lags that are tried [samples]
+LATE = 0.75                 # lag from which on it is a fault [steps]
+# Discrepancies and noise are relative to the rms of the reading.  From this discrepancy beyond
+# the noise on, a cause is looked for.  It is larger for velocities, which are means over a step
+# compared with those of its ends, and for rates, which may be those of the middle of a step.
+STRANGE = {'rates': 2e-2, 'velocities': 5e-2}
+STRANGE_OTHERS = 2e-3
+CONSISTENT = 1e-3           # discrepancy below which no lag is looked for
+TURNED = 0.02               # share of the discrepancy that a turn of the axes leaves at most
+UNEXPLAINED = 0.5           # share that causes leave where they explain nothing
+NOISY = 1e-4                # smaller noise is rounding
+NOISE_BAND = 0.05           # share by which noise may differ from what is declared
+FOUR_SIGMA = 4.0            # standard deviations by which its measurement may differ besides
+LEAST_KURTOSIS = 2.4        # of normal noise; it is 3, and 1.8 of uniform noise
 DENSITIES = {'gyroscope': 'gyroscope_noise_density',
              'accelerations': 'accelerometer_noise_density'}
 KINDS = ('gyroscope', 'accelerations', 'magnetometer', 'rotations', 'velocities')
@@ -128,7 +130,13 @@ def faults_of_rates(motions: Sequence[Motion]) -> list[Fault]:
 
 
 def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, float]]:
-    """Return faults and measures of the readings of one of KINDS, or of the rates told."""
+    """
+    Return faults and measures of the readings of one of KINDS, or of the rates told.
+
+    Of all that follows, `noise` of each motion and `floor` of all are the rms of white noise in
+    the discrepancy, by differences; `doubt` is the relative error of that, and `most` what the
+    noise may be at most.
+    """
     runs = [one for motion in motions if (one := _readings_of(kind, motion))]
     if not runs:
         return [], {}
@@ -162,7 +170,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
 def _explained(kind: str, motions: Sequence[Motion], target: Reals, effects: Mapping[str, Reals],
                floor: float, most: float) -> tuple[list[Fault], Reals, bool]:
     """Return the causes of a discrepancy, what they leave of it, and whether that is noise."""
-    before, strange = beyond(target, most), STRANGE.get(kind, 2e-3)
+    before, strange = beyond(target, most), STRANGE.get(kind, STRANGE_OTHERS)
     if motions[0].derived and kind != 'rates':
         # Rates of the attitudes may be half a step apart from those of the simulator.
         turns = (one.trajectory.rotation[:2] for one in motions)

@@ -319,7 +319,7 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
     try:
         with np.errstate(over='ignore', invalid='ignore'):
             segment = _new_segment(top, start, start_ns, values, pivot)
-            # Steps are asked for their energy as long as the first one is kept.
+            # This also keeps `energy`: that of the first step, which is forgotten later.
             if ((isinstance(start, State) or values['solver.method'] != 'exact')
                     and not math.isfinite(segment.energy)):
                 raise ValueError(f'the energy would be {segment.energy!r} J')
