@@ -36,7 +36,7 @@ def ros_arguments(namespace: str, parameters: Mapping[str, Any]) -> list[str]:
 
 
 # -P: of this checkout, by PYTHONPATH, and not of whatever lies in the working directory.
-SIM_NODE = ('-P', '-m', 'spinning_top_sim.nodes.sim_node')
+SIM_NODE = ('-P', '-m', 'spinning_top_sim', 'node')
 
 
 def sim_node(namespace: str, parameters: Mapping[str, Any]) -> list[str]:

@@ -5,7 +5,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from spinning_top_sim.nodes import throttle
+from spinning_top_sim.nodes.publishers import THROTTLED, THROTTLED_RATE
 from spinning_top_sim.nodes.tick_loop import LoopState
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING, all_streams
@@ -113,7 +113,7 @@ def page() -> str:
         return ', '.join(f'`{name}`' for name in names)
 
     lines.append(AFTER_TOPICS.format(
-        throttled=throttle.TOPICS['ground_truth/odom'], rate=throttle.RATE,
+        throttled=THROTTLED['ground_truth/odom'], rate=THROTTLED_RATE,
         slowest=parameters.LOWEST_RATE_OF_INTERVALS,
         states=listed(state.name.lower() for state in LoopState), joints=listed(JOINTS),
         invariants=listed(INVARIANTS), timing=listed(TIMING)))

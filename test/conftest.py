@@ -19,7 +19,7 @@ def pytest_xdist_make_scheduler(config, log):
 def pytest_collection_modifyitems(items):
     """Begin with the files of the longest tests, so that at the end no worker waits for one."""
     long = {f'test_{name}.py' for name in (
-        'attitude_filter', 'docs', 'tour', 'view_node', 'sim_node_life', 'grade_files', 'recover')}
+        'attitude_filter', 'docs', 'view_node', 'sim_node_life', 'grade_files', 'recover')}
     items.sort(key=lambda item: item.path.name not in long)
 
 
@@ -50,13 +50,33 @@ def diagnostics(peer):
 
 @pytest.fixture(scope='session')
 def stepped(tmp_path_factory):
-    from helpers.inspected import stepped_log
+    """Four motions by steps, with noise, in a namespace."""
+    from helpers.inspected import log_of
 
-    return stepped_log(tmp_path_factory.mktemp('log') / 'stepped.mcap')
+    return log_of(tmp_path_factory.mktemp('log') / 'stepped.mcap', '--duration', 3, '--namespace',
+                  '/a/b', '--command', '1.0:2.0:1.5', '--command', '0:1.7:1.4', '--command',
+                  '2.0031:1.6:1.0', '-p', 'imu.gyroscope_noise_density:=0.01', '-p',
+                  'markers.enabled:=true')
 
 
 @pytest.fixture(scope='session')
 def short(tmp_path_factory):
-    from helpers.inspected import short_log
+    """Two motions in half a second."""
+    from helpers.inspected import log_of
 
-    return short_log(tmp_path_factory.mktemp('log') / 'short.mcap')
+    return log_of(tmp_path_factory.mktemp('log') / 'short.mcap', '--duration', 0.5, '--command',
+                  '0.3:1.7:1.4')
+
+
+@pytest.fixture(scope='session')
+def log(tmp_path_factory):
+    from helpers.logs import small_log
+
+    return small_log(tmp_path_factory.mktemp('log') / 'run.mcap')
+
+
+@pytest.fixture
+def no_sync(monkeypatch):
+    from helpers.logs import without_sync
+
+    without_sync(monkeypatch)

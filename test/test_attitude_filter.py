@@ -15,8 +15,6 @@ from spinning_top_sim.tools.simulate import main as simulate
 
 EXAMPLE = ROOT / 'examples/attitude_filter.py'
 SETTLE = 15.0
-LOGS = {'lever arm': ('-p', 'imu.lever_arm:=[0.1, 0.0, 0.0]'),
-        'nine axes': ('-p', 'mag.enabled:=true')}
 
 
 @pytest.fixture(scope='module')
@@ -31,37 +29,25 @@ def example():
 
 
 @pytest.fixture(scope='module')
-def logs(tmp_path_factory):
-    """Return waves for each of LOGS."""
-    folder = tmp_path_factory.mktemp('logs')
-    paths = {name: folder / f'{number}.mcap' for number, name in enumerate(LOGS)}
-    for name, path in paths.items():
-        assert simulate(['--quiet', '-o', str(path), '-p', 'imu.rpy:=[0.3, -0.2, 1.0]', '-p',
-                         'solver.method:=exact', '--params', str(ROOT / 'config/wavy.yaml'),
-                         '--duration', '18', *LOGS[name]]) == 0
-    return paths
+def log(tmp_path_factory):
+    """Return waves with nine axes."""
+    path = tmp_path_factory.mktemp('logs') / 'wavy.mcap'
+    assert simulate(['--quiet', '-o', str(path), '--scene', 'wavy', '--duration', '18',
+                     '-p', 'imu.rpy:=[0.3, -0.2, 1.0]', '-p', 'mag.enabled:=true',
+                     '-p', 'solver.method:=exact']) == 0
+    return path
 
 
-@pytest.fixture(scope='module')
-def summaries(example, logs):
-    """Return the function that returns the summaries of filters on one of LOGS, by filter."""
-    return lambda name, *filters, **options: {
-        one.name: one.summary(SETTLE) for one in example.compare(logs[name], filters, **options)}
+def test_nine_axes_know_the_heading(example, log):
+    def summaries(*filters, **options):
+        return {one.name: one.summary(SETTLE) for one in example.compare(log, filters, **options)}
 
-
-def test_nine_axes_know_the_heading(summaries):
-    found = summaries('nine axes', 'vqf9', 'vqf')
+    found = summaries('vqf9', 'vqf')
     assert found['vqf9'].compared == 1800 and found['vqf9'].tilt_max < 0.01
     assert found['vqf9'].heading_max < 0.03
     assert math.isnan(found['vqf'].heading_max)
-    wrong = summaries('nine axes', 'vqf9', declination=0.0)['vqf9']
+    wrong = summaries('vqf9', declination=0.0)['vqf9']
     assert wrong.heading_max == pytest.approx(math.degrees(math.atan2(1.57, 21.02)), abs=0.03)
-
-
-def test_a_lever_arm_misleads_what_takes_the_accelerometer_for_still(summaries):
-    found = summaries('lever arm', 'vqf', 'madgwick')
-    assert found['vqf'].tilt_rms < 0.3 and found['vqf'].converged < SETTLE
-    assert found['madgwick'].tilt_rms > 1.0 and found['madgwick'].converged == math.inf
 
 
 def feed(example, samples):
@@ -87,10 +73,10 @@ def test_lost_samples_are_bridged(example):
     assert len(comparison.errors) == len(stamps) - 3
 
 
-def test_a_wrong_settling_time_or_namespace_is_told(example, logs, capsys):
-    assert example.main(['it', str(logs['lever arm']), '--settle', '40']) == 1
+def test_a_wrong_settling_time_or_namespace_is_told(example, log, capsys):
+    assert example.main(['it', str(log), '--settle', '40']) == 1
     assert '--settle 40' in capsys.readouterr().err
-    assert example.main(['it', str(logs['lever arm']), '--namespace', 'other']) == 1
+    assert example.main(['it', str(log), '--namespace', 'other']) == 1
     assert 'no topic /other/imu/data_raw; it has /pose' in capsys.readouterr().err
 
 

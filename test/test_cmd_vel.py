@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from helpers.reference import RIDES, scene_parameters
 from helpers.simulations import play, stream
+from helpers.simulations import simulate as simulated
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.solvers.vertical import AcceleratedMotion
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.tools import inspect, simulate
 
 S = 10 ** 9
@@ -22,20 +21,16 @@ SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.speed': 1.5
 METHODS = ('exact', 'rk45')
 
 
-def simulation_of(kind=Simulation, **values):
-    return kind(parameters.checked({**values}))
-
-
 def test_the_specific_force_is_that_of_the_place_in_the_world():
     values = {'solver.method': 'exact', 'imu.lever_arm': (0.1, -0.2, 0.3),
               'ground_truth_imu.rate': 1000.0, 'ground_truth_imu_odom.enabled': True,
               'ground_truth_imu_odom.rate': 1000.0, **SHUTTLE}
-    simulation = simulation_of(**values)
+    simulation = simulated(values)
     force, place = (np.vstack([stream(simulation, topic).template.decode(data)[number]
                                for _, _, data in taken]) for topic, number, taken in (
-        ('ground_truth/imu', 2, play(simulation_of(**values), S // 2, 'ground_truth/imu')),
+        ('ground_truth/imu', 2, play(simulated(values), S // 2, 'ground_truth/imu')),
         ('ground_truth/imu_odom', 0,
-         play(simulation_of(**values), S // 2, 'ground_truth/imu_odom'))))
+         play(simulated(values), S // 2, 'ground_truth/imu_odom'))))
     q = simulation.segment.states(range(0, S // 2 + 1, 10 ** 6)).rows_quaternion
     acceleration = (place[2:] - 2 * place[1:-1] + place[:-2]) * 1e6
     expected = attitude.rotated_back(tuple(part[1:-1] for part in q),
@@ -45,7 +40,7 @@ def test_the_specific_force_is_that_of_the_place_in_the_world():
 
 @pytest.mark.parametrize('method', METHODS)
 def test_a_driven_pivot_goes_to_the_velocity_and_stops(method):
-    simulation = simulation_of(**{'solver.method': method, 'pivot.cmd_timeout': 1.0})
+    simulation = simulated({'solver.method': method, 'pivot.cmd_timeout': 1.0})
     list(simulation.play((), S))
     assert simulation.drive((0.0, 0.0, 0.0)) is None and simulation.segment.ride is None
     assert simulation.drive((0.0, 0.8, 0.0)) == 2 * S
@@ -70,7 +65,7 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops(method):
 
 
 def test_a_velocity_of_zero_brakes_a_pivot_that_moves():
-    simulation = simulation_of(**{'pivot.cmd_timeout': 0.0})
+    simulation = simulated({'pivot.cmd_timeout': 0.0})
     for t_ns, velocity, found in ((S, 0.8, 0.0), (2 * S, 0.0, 0.8), (3 * S, 0.0, 0.0)):
         list(simulation.play((), t_ns))
         assert simulation.segment.pivot(np.array([t_ns])).velocity[1] == pytest.approx(found)
@@ -85,7 +80,7 @@ def test_a_storm_of_velocities_costs_the_same_from_first_to_last(monkeypatch):
         counts[-1] += len(times)
         return states(motion, times)
     monkeypatch.setattr(AcceleratedMotion, 'states', counted)
-    simulation = simulation_of(**{'solver.method': 'exact', 'imu.bandwidth': 1.0})
+    simulation = simulated({'solver.method': 'exact', 'imu.bandwidth': 1.0})
     imu = [stream(simulation, 'imu/data_raw')]
     simulation.drive((0.0, 0.0, 0.1))
     for k in range(1, 61):
@@ -98,14 +93,14 @@ def test_a_storm_of_velocities_costs_the_same_from_first_to_last(monkeypatch):
 
 @pytest.mark.parametrize('velocity', [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 1e5)])
 def test_a_bad_velocity_is_refused_with_its_value(velocity):
-    simulation = simulation_of()
+    simulation = simulated()
     with pytest.raises(ValueError, match=r'linear = \[.*(nan|inf|100000).*within 10000 m/s'):
         simulation.drive(velocity)
     assert not simulation.history
 
 
 def test_commands_of_the_spin_count_about_the_vertical_of_the_world():
-    simulation = simulation_of(**{'solver.method': 'exact', **SHUTTLE})
+    simulation = simulated({'solver.method': 'exact', **SHUTTLE})
     list(simulation.play((), S // 2))
     before = simulation.state()
     simulation.command(1.2, 0.9)
@@ -124,7 +119,7 @@ def test_a_transform_is_the_pose(frame):
     typesys = pytest.importorskip('rosbags.typesys')
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     values = {'solver.method': 'exact', 'tf.enabled': True, 'world_frame': frame, **SHUTTLE}
-    sent = {topic: play(simulation_of(**values), S, topic)[-1][2] for topic in ('/tf', 'pose')}
+    sent = {topic: play(simulated(values), S, topic)[-1][2] for topic in ('/tf', 'pose')}
     (found,) = store.deserialize_cdr(sent['/tf'], 'tf2_msgs/msg/TFMessage').transforms
     pose = store.deserialize_cdr(sent['pose'], 'geometry_msgs/msg/PoseStamped')
     assert found.header == pose.header and found.header.frame_id == frame
@@ -137,7 +132,7 @@ def test_a_transform_is_the_pose(frame):
 
 def test_odometry_has_the_twist_in_the_frame_of_the_body():
     values = {'solver.method': 'exact', **SHUTTLE}
-    simulation = simulation_of(**values)
+    simulation = simulated(values)
     (position, q, velocity, rates) = stream(simulation, 'ground_truth/odom').template.decode(
         play(simulation, S, 'ground_truth/odom')[-1][2])
     pivot, state = simulation.segment.pivot(np.array([S])), simulation.state()
@@ -149,7 +144,7 @@ def test_odometry_has_the_twist_in_the_frame_of_the_body():
 
 @pytest.mark.parametrize('method', METHODS)
 def test_rates_of_the_angles_are_their_derivatives_in_the_world(method):
-    simulation = simulation_of(**{'solver.method': method, **SHUTTLE})
+    simulation = simulated({'solver.method': method, **SHUTTLE})
     simulation.segment.reach(S // 2, 10 ** 6)
     states = simulation.segment.states(range(S // 2 - 20_000_000, S // 2 + 1, 20_000))
     for angle, rate in ((states.phi, states.phi_dot), (states.theta, states.theta_dot),
@@ -175,11 +170,11 @@ def test_a_table_has_the_pivot(tmp_path):
 
 @pytest.mark.parametrize('scene', RIDES)
 def test_a_scene_with_a_moving_pivot_goes_on(scene):
-    simulation = simulation_of(**scene_parameters(scene))
+    simulation = simulated(scene_parameters(scene))
     assert len(list(play(simulation, 20 * S, 'ground_truth/odom'))) == 2001
     assert simulation.top.is_realizable
     assert len(simulation.path._segments) < 10           # the others are forgotten
-    force = simulation_of(**scene_parameters(scene))
+    force = simulated(scene_parameters(scene))
     readings = np.vstack([stream(force, 'ground_truth/imu').template.decode(data)[2]
                           for _, _, data in play(force, 9 * S, 'ground_truth/imu')])
     expected = {'shuttle': (9.80665, math.hypot(9.80665, 2.0)), 'elevator': (7.80665, 11.80665),

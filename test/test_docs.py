@@ -2,6 +2,7 @@
 """The documents say what the code does."""
 
 import importlib
+import os
 import re
 import runpy
 from collections import Counter
@@ -129,3 +130,21 @@ def test_pages_link_to_what_there_is(page):
         heads = re.findall(r'^#+ (.*)$', target.read_text(), re.MULTILINE) if anchor else ()
         anchors = {re.sub(r'[^\w -]', '', head.lower()).replace(' ', '-') for head in heads}
         assert not anchor or anchor in anchors, (path, anchor)
+
+
+def test_the_tour_runs_to_its_end_and_is_committed_without_outputs():
+    nbclient, nbformat = pytest.importorskip('nbclient'), pytest.importorskip('nbformat')
+    pytest.importorskip('ipykernel')
+    notebook = nbformat.read(ROOT / 'examples/tour.ipynb', as_version=4)
+    assert all(cell.get('outputs', []) == [] for cell in notebook.cells)
+    # Its assertions, too: an error in a cell is raised here.
+    nbclient.NotebookClient(notebook, timeout=240, kernel_name='python3', resources={
+        'metadata': {'path': str(ROOT)}}).execute(
+            env={**os.environ, 'PYTHONPATH': os.pathsep.join(
+                filter(None, [str(ROOT), os.environ.get('PYTHONPATH')]))})
+    outputs = [output for cell in notebook.cells for output in cell.get('outputs', ())]
+    pictures = [output for output in outputs if 'image/png' in output.get('data', {})]
+    assert len(pictures) == 5
+    assert any('cusps' in output.get('text', '') for output in outputs)
+    assert any('<div class="animation"' in output.get('data', {}).get('text/html', '')
+               for output in outputs)

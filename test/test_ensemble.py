@@ -97,6 +97,16 @@ def test_every_stream_has_columns_or_is_left_out():
         'imu/mag.magnetic_field_covariance.8'}
 
 
+def fields_in(log, values):
+    """Return the fields of each message by topic and time."""
+    templates = {f'/{stream.topic}': stream.template for stream in all_streams(values)}
+    fields = {topic: {} for topic in templates}
+    with LogReader(log) as reader:
+        for message in reader.messages(templates):
+            fields[message.topic][message.log_time] = templates[message.topic].decode(message.data)
+    return fields
+
+
 def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
     """Also where the IMU loses samples, and sends some twice."""
     (folder, path), run = whole, 7
@@ -111,14 +121,7 @@ def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
     assert not [name for name in every.column_names if 'data_raw.orientation' in name]
     log = tmp_path / 'run.mcap'
     assert main([str(path), '--row', str(run), '-o', str(log)]) == 0
-    templates = {f'/{stream.topic}': stream.template for stream in all_streams(values)}
-    logged = {topic: {} for topic in templates}
-    with LogReader(log) as reader:
-        for message in reader.messages():
-            if message.topic in templates:
-                logged[message.topic][message.log_time] = (
-                    templates[message.topic].decode(message.data))
-    lost = 0
+    logged, lost = fields_in(log, values), 0
     for topic, column, field in (('imu/data_raw', 'linear_acceleration.y', 2),
                                  ('ground_truth/imu', 'orientation.w', 0)):
         values = rows[f'{topic}.{column}'].to_pylist()
@@ -282,8 +285,6 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
     ({'runs': 1.5}, 'runs = 1.5: must be an integer >= 1'),
     ({'duration': 0.0}, 'duration = 0.0: must be a number >= 1e-09'),
     ({'run': 3}, "'run'")])
-
-
 def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, changes, said):
     path = written(tmp_path, **changes)
     code = main([str(path), '-o', str(tmp_path / 'out')])

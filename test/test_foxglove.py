@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The layout of Foxglove: its topics and message paths are those of the node."""
 
-import importlib
 import json
 import re
 
 import pytest
 from helpers.reference import ROOT
 
+from spinning_top_sim.nodes.replayer import message_class
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.journal import NODE_NAME, resolve_topic
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, all_streams
@@ -21,11 +21,6 @@ TYPES['/diagnostics'] = 'diagnostic_msgs/msg/DiagnosticArray'
 TYPES['/robot_description'] = 'std_msgs/msg/String'
 PATHS = [path for panel in PANELS.values() for path in panel.get('paths', ())]
 PART = re.compile(r'(\w+)(?:\[(\d+|:)\])?(?:\{(\w+)=="([^"]*)"\})?')
-
-
-def message_class(type_name):
-    package, *_, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
 def end_of(path):

@@ -10,7 +10,6 @@ from helpers.readings import run
 from helpers.simulations import SECOND
 
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect
 from spinning_top_sim.tools import simulate as simulate_command
 from spinning_top_sim.tools.survey import survey
@@ -121,10 +120,3 @@ def test_a_log_is_verified(tmp_path, capsys):
             report, at_ns = topics[f'/{topic}'], SECOND + 10 * PERIOD_NS + late_ns
             assert (report.count, report.missing) == (count - lost, lost)
             assert report.gaps_ns == lost * [(at_ns, at_ns)]
-
-
-def test_the_library_is_needed_only_with_a_receiver(monkeypatch):
-    monkeypatch.setattr(parameters, 'find_spec', lambda name: None)
-    parameters.checked({})
-    with pytest.raises(ValueError, match=r'needs pymap3d.*pip install .*pymap3d\S*>=3'):
-        parameters.checked({'gnss.enabled': True})

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from helpers.faulty_simulators import Stepped
-from helpers.recordings import write_rows
+from helpers.recordings import JAZZY, write_rows
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
@@ -28,6 +28,7 @@ RATES = MOTION.angular_velocity
 FORCE = np.stack(np.broadcast_arrays(*MOTION.specific_force(ARM)), axis=1)
 EXACT = ExactSolution(TOP, START)
 NS = np.rint(1e9 * T).astype(np.int64) + 1_700_000_000_123_456_789
+MAKE = {name.rpartition('/')[2]: one for name, one in JAZZY.types.items()}
 LOOPING = ('--scene', 'looping', '--lever-arm', *map(str, ARM))
 
 
@@ -160,48 +161,40 @@ def test_rows_may_be_uneven_out_of_order_or_without_some_sensors(tmp_path):
 
 def foreign_log(path, late):
     """Write a log of another program: poses, and readings that come some steps late."""
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_JAZZY)
-    make = {name.rpartition('/')[2]: one for name, one in store.types.items()}
     pose, reading, rows = 'geometry_msgs/msg/PoseStamped', 'sensor_msgs/msg/Imu', []
 
     def vector(v):
-        return make['Vector3'](*map(float, v))
+        return MAKE['Vector3'](*map(float, v))
 
     for k, stamp in enumerate(NS.tolist()):
-        header = make['Header'](make['Time'](stamp // 10 ** 9, stamp % 10 ** 9), 'world')
-        place = make['Pose'](make['Point'](0.0, 0.0, 0.0), make['Quaternion'](*Q[k].tolist()))
+        header = MAKE['Header'](MAKE['Time'](stamp // 10 ** 9, stamp % 10 ** 9), 'world')
+        place = MAKE['Pose'](MAKE['Point'](0.0, 0.0, 0.0), MAKE['Quaternion'](*Q[k].tolist()))
         now, unknown = max(k - late, 0), np.zeros(9)
-        imu_message = make['Imu'](
-            header, make['Quaternion'](0.0, 0.0, 0.0, 1.0), np.array([-1.0, *unknown[1:]]),
+        imu_message = MAKE['Imu'](
+            header, MAKE['Quaternion'](0.0, 0.0, 0.0, 1.0), np.array([-1.0, *unknown[1:]]),
             vector(RATES[now]), unknown, vector(FORCE[now]), unknown)
         received = stamp + 3_000_000 + 200_000 * (k % 7)
-        rows += [(number, received, bytes(store.serialize_cdr(message, kind)))
+        rows += [(number, received, bytes(JAZZY.serialize_cdr(message, kind)))
                  for number, (message, kind) in enumerate((
-                     (make['PoseStamped'](header, place), pose), (imu_message, reading)))]
+                     (MAKE['PoseStamped'](header, place), pose), (imu_message, reading)))]
     return write_rows(path, [RecordedTopic('/body/pose', pose), RecordedTopic('/imu', reading)],
                       rows)
 
 
 def test_transforms_that_move_and_poses_without_a_header_are_read(tmp_path):
     from mcap.writer import Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_JAZZY)
-    make = {name.rpartition('/')[2]: one for name, one in store.types.items()}
 
     def turn(q):
-        return make['Transform'](make['Vector3'](0.0, 0.0, 0.0), make['Quaternion'](*q))
+        return MAKE['Transform'](MAKE['Vector3'](0.0, 0.0, 0.0), MAKE['Quaternion'](*q))
 
     def transforms(k):
-        header = make['Header'](make['Time'](*divmod(int(NS[k]), 10 ** 9)), 'world')
-        return make['TFMessage']([
-            make['TransformStamped'](header, 'camera', turn((0.0, 0.0, 0.0, 1.0))),
-            make['TransformStamped'](header, 'top', turn(Q[k].tolist()))])
+        header = MAKE['Header'](MAKE['Time'](*divmod(int(NS[k]), 10 ** 9)), 'world')
+        return MAKE['TFMessage']([
+            MAKE['TransformStamped'](header, 'camera', turn((0.0, 0.0, 0.0, 1.0))),
+            MAKE['TransformStamped'](header, 'top', turn(Q[k].tolist()))])
 
     def pose(k):
-        return make['Pose'](make['Point'](0.0, 0.0, 0.0), make['Quaternion'](*Q[k].tolist()))
+        return MAKE['Pose'](MAKE['Point'](0.0, 0.0, 0.0), MAKE['Quaternion'](*Q[k].tolist()))
 
     for name, content in (('tf2_msgs/msg/TFMessage', transforms),
                           ('geometry_msgs/msg/Pose', pose)):
@@ -212,7 +205,7 @@ def test_transforms_that_move_and_poses_without_a_header_are_read(tmp_path):
             channel = writer.register_channel('/a', 'cdr', writer.register_schema(
                 name, 'ros2msg', b''))
             for k, stamp in enumerate(NS[:100].tolist()):
-                writer.add_message(channel, stamp, bytes(store.serialize_cdr(content(k), name)),
+                writer.add_message(channel, stamp, bytes(JAZZY.serialize_cdr(content(k), name)),
                                    stamp)
             writer.finish()
         recorded = motion_files.read(path)

@@ -210,18 +210,14 @@ def test_overrides_win_over_integers_in_files(installed, tmp_path):
     assert (given['spin.l3'], given['top.mass'], given['record.uri']) == (1.5, 2.5, 'a b')
 
 
-def options_of(node):
-    from spinning_top_sim.nodes.replay_node import _parser
-
-    return _parser().parse_args(node.arguments)
-
-
 def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(installed, log):
     run = started('replay', file=str(log), rate='2', start='0.5', loop='true', clock='50',
                   rviz='true')
     node = run.nodes['spinning_top_sim/replay_node']
     assert node.executable in EXECUTABLES
-    options = options_of(node)
+    from spinning_top_sim.nodes.replay_node import _parser
+
+    options = _parser().parse_args(node.arguments)
     assert (options.file, options.rate, options.start, options.loop, options.clock,
             options.partial) == (log, 2.0, 0.5, True, 50.0, False)
     tf = run.nodes[f'{RSP}/{RSP}']

@@ -63,8 +63,6 @@ def test_the_body_has_the_mass_and_the_moments_of_the_top(scene):
     ({'lambda1': 1e300, 'lambda3': 1e300}, {'radius': LARGEST}),
     ({'lambda1': 5e-324, 'lambda3': 5e-324}, {'radius': SMALLEST}),
 ])
-
-
 def test_every_top_can_be_drawn(changed, expected):
     shape = Shape(Top(**{**CUSP, **changed}))
     assert math.copysign(1.0, shape.tip) == expected.pop('tip', math.copysign(1.0, shape.tip))
@@ -139,13 +137,6 @@ def test_the_trace_goes_on_through_commands():
         newest = (t_ns - 1) // 25_000_000
         expected = [axes[max(m, 0) * 25_000_000] for m in range(newest - 39, newest + 1)]
         assert decoded(run, t_ns)[3][:-1] == pytest.approx(tip * np.array(expected), abs=1e-8)
-
-
-def test_a_reset_begins_the_trace_anew():
-    run = markers_of(commands=((SECOND, 2.0, 1.5),), duration_ns=2 * SECOND)
-    run.simulation.restart(run.simulation.values)
-    assert {t: data for _, t, data in play(run.simulation, SECOND, 'markers')} == {
-        t: data for t, data in run.sent.items() if t <= SECOND}
 
 
 @pytest.mark.parametrize('frame', ['', 'x' * 7, 'θ'])

@@ -17,10 +17,6 @@ HANGING = {'top.com_distance': -0.2, 'top.lambda1': 0.2}
 SCENES = {'cusp': IMU, 'heavy_top': IMU, 'fast_gyroscope': {}, 'wavy': {**HANGING, **IMU}}
 
 
-def values_of(scene):
-    return parameters.checked({**scene_parameters(scene), **SCENES[scene]})
-
-
 def numbers(text):
     return [float(word) for word in text.split()]
 
@@ -69,7 +65,7 @@ READ = {'mjcf': read_mjcf, 'urdf': read_urdf, 'sdf': read_sdf}
 def test_every_format_has_the_top_its_start_and_its_imu(file_format, scene):
     if file_format == 'urdf':
         pytest.importorskip('xacro')
-    values = values_of(scene)
+    values = parameters.checked({**scene_parameters(scene), **SCENES[scene]})
     top, text = parameters.top_of(values), model(values, file_format, scene)
     start = solve(top, parameters.start_state(values), [0.0])
     mass, centre, moments, gravity, attitude, place = READ[file_format](

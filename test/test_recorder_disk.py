@@ -20,10 +20,10 @@ from helpers.recordings import (
     METADATA,
     TOPICS,
     complete_messages,
-    parsed_qos,
     pose_cdr,
     rows_of,
     some_messages,
+    write,
 )
 from helpers.reference import ROOT
 from mcap.reader import make_reader
@@ -35,7 +35,6 @@ from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import McapRecorder, create_file
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 
 PATIENCE_S = 20.0  # for what happens at once on an idle machine
 
@@ -56,14 +55,6 @@ def eventually(condition):
     while not condition():
         assert time.monotonic() < deadline, 'did not happen in time'
         time.sleep(0.005)
-
-
-@pytest.mark.parametrize('value', [
-    '1.5', '[1]', '{}', 'true', '"7"', '~', '.nan', 'keep_some', str(1 << 63), '-' + '9' * 20])
-def test_a_policy_that_is_not_understood_is_the_default(value):
-    keys = ('history', 'depth', 'reliability', 'deadline')
-    text = '- ' + '\n  '.join(f'{key}: {value}' for key in keys)
-    assert parsed_qos(text) == (DEFAULT_QOS,)
 
 
 def test_too_little_space_at_the_start_leaves_no_file(tmp_path):
@@ -138,15 +129,15 @@ def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_module, 'QUEUE_BYTES', 10_000)
     recorder = McapRecorder(
         tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0)
-    recorder.write(0, 0, pose_cdr(0))
+    write(recorder, 0, 0, pose_cdr(0))
     assert blocked.wait(PATIENCE_S)  # with the first message, out of the queue
     written = 1
     while recorder.room:
-        recorder.write(0, written, pose_cdr(written))
+        write(recorder, 0, written, pose_cdr(written))
         written += 1
     assert 10 < written < 100
     assert not recorder.wait_for_room(0.01)
-    recorder.write(0, written, pose_cdr(written))  # a burst may go on
+    write(recorder, 0, written, pose_cdr(written))  # a burst may go on
     disk_is_back.set()
     assert recorder.wait_for_room(PATIENCE_S)
     summary = recorder.close()
@@ -163,7 +154,7 @@ def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, 
         topics = [RecordedTopic('/a', {ARRAY!r})]
         recorder = McapRecorder(sys.argv[1], topics, {{}}, min_free_bytes=0, max_loss=60.0)
         for number in range(100):
-            recorder.write(0, number, bytes(8))
+            recorder.write_all([(0, number, bytes(8))], 8)
         {ending}
         """
     subprocess.run([sys.executable, '-c', textwrap.dedent(code), tmp_path / 'run.mcap'],
@@ -199,7 +190,7 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(
             return
         for _ in range(max(1, round(duration / step_s))):
             now += step_s
-            recorder.write(0, len(handed_over), b'')
+            write(recorder, 0, len(handed_over), b'')
             handed_over.append(now)
             waits.append(now - handed_over[on_disk])
             shown.append(recorder.possible_loss)
@@ -245,7 +236,7 @@ def test_recording_goes_on_while_the_disk_is_slow_and_says_what_may_be_lost(tmp_
         assert (recorder.warning, recorder.possible_loss) == (None, 0.0)
         slow_disk.clear()
         for number in range(3):
-            recorder.write(0, number, pose_cdr(number))
+            write(recorder, 0, number, pose_cdr(number))
             eventually(lambda n=number: numbers_in(path) == list(range(n + 1)))
         eventually(lambda: recorder.warning)
         assert recorder.possible_loss > 0.05
@@ -263,7 +254,7 @@ def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
     recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02,
                                  min_free_bytes=0)
     slow_disk.clear()
-    recorder.write(0, 1, pose_cdr(1))
+    write(recorder, 0, 1, pose_cdr(1))
     eventually(lambda: recorder.warning)
     assert 'could not be closed within 0.05 s' in (recorder.close(timeout=0.05).error or '')
     slow_disk.set()
@@ -293,13 +284,13 @@ def test_a_full_disk_stops_the_recording_and_costs_what_is_not_written(
     at_end = max_loss < 1.0
     recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0, max_loss=max_loss)
     for number in range(2000):      # many times half of the queue: chunks of 1 MB
-        recorder.write(0, number, rng.randbytes(1000))
+        write(recorder, 0, number, rng.randbytes(1000))
     eventually(lambda: recorder.counters.messages > (1999 if at_end else 1000))
     disk.size = recorder.counters.bytes + room
     for number in range(2000, 2000 if at_end else 5000):
-        recorder.write(0, number, rng.randbytes(1000))
+        write(recorder, 0, number, rng.randbytes(1000))
     summary = recorder.close()
-    recorder.write(0, 0, b'after the end')
+    write(recorder, 0, 0, b'after the end')
     kept = summary.messages
     assert recorder.error == f'recording to {path} stopped: No space left on device'
     assert recorder.state == 'failed' and summary.error == recorder.error and recorder.room
@@ -323,11 +314,11 @@ def test_a_fault_stops_the_recording_with_its_reason(tmp_path, monkeypatch, reas
     path = tmp_path / 'logs' / 'run.mcap'
     path.parent.mkdir()
     recorder = McapRecorder(path, TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
-    recorder.write(0, 0, pose_cdr(0))
+    write(recorder, 0, 0, pose_cdr(0))
     FAULTS[reason](path, monkeypatch)
-    recorder.write(0, 1, pose_cdr(1))
+    write(recorder, 0, 1, pose_cdr(1))
     eventually(lambda: recorder.state == 'failed')
-    recorder.write(0, 2, b'late')
+    write(recorder, 0, 2, b'late')
     summary = recorder.close()
     assert recorder.error == summary.error == f'recording to {path} stopped: {reason.strip()}'
     assert recorder.room and summary.messages + summary.lost == 3 and summary.lost >= 1
@@ -337,7 +328,7 @@ def test_a_fault_stops_the_recording_with_its_reason(tmp_path, monkeypatch, reas
 
 def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
     recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
-    recorder.write(len(TOPICS), 0, b'')
+    write(recorder, len(TOPICS), 0, b'')
     summary = recorder.close()
     assert recorder.state == 'failed' and 'stopped: KeyError:' in (summary.error or '')
     assert (is_indexed(summary.path), summary.lost) == (True, 1)

@@ -26,6 +26,8 @@ from helpers.recordings import (
     pose_cdr,
     rows_of,
     some_messages,
+    write,
+    write_rows,
 )
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -51,7 +53,7 @@ def record(path, messages, **options):
     with closing(McapRecorder(
             path, TOPICS, METADATA, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
-            recorder.write(*message)
+            write(recorder, *message)
         return recorder.close()
 
 
@@ -138,22 +140,20 @@ def test_channels_carry_qos_and_type_hash(tmp_path):
         assert (profile.history, profile.depth) == (QosHistory.KEEP_LAST, 3)
 
 
-@pytest.mark.parametrize('text', [
-    '[{depth: 7, reliability: best_effort, deadline: {sec: 1, nsec: 2}}]',
-    '# what it offers\n- depth: 7   # last ones\n  reliability: 2\n  deadline: {sec: 1, nsec: 2}',
-    '- {"depth": 7, "reliability": 2, "histroy": 3, deadline: {"sec": 1, "nsec": 2}}',
-])
+GIVEN = {'depth': 7, 'reliability': 2, 'deadline': {'sec': 1, 'nsec': 2}}
+OFFERED = {     # any style of YAML; a policy that is not understood is the default
+    '[{depth: 7, reliability: best_effort, deadline: {sec: 1, nsec: 2}}]': [GIVEN],
+    '# offered\n- depth: 7  # last\n  reliability: 2\n  deadline: {sec: 1, nsec: 2}': [GIVEN],
+    '- {"depth": 7, "reliability": 2, "histroy": 3, deadline: {"sec": 1, "nsec": 2}}': [GIVEN],
+    **{f'- {{history: {x}, depth: {x}, reliability: {x}, deadline: {x}}}': [{}] for x in (
+        '1.5', '[1]', '{}', 'true', '"7"', '~', '.nan', 'keep_some', 1 << 63, '-' + '9' * 20)},
+    **dict.fromkeys(('', '7', '- depth: ' + '9' * 5000, '[' * 1000, '!!timestamp x', '\x00',
+                     '? {} : 1'), ())}
 
 
-def test_offered_qos_is_read_in_any_style_of_yaml(text):
-    assert parsed_qos(text) == (
-        dict(DEFAULT_QOS) | {'depth': 7, 'reliability': 2, 'deadline': {'sec': 1, 'nsec': 2}},)
-
-
-@pytest.mark.parametrize('text', [
-    '', '7', '- depth: ' + '9' * 5000, '[' * 1000, '!!timestamp x', '\x00', '? {} : 1'])
-def test_what_is_no_list_of_profiles_offers_none(text):
-    assert parsed_qos(text) == ()
+@pytest.mark.parametrize('text', OFFERED)
+def test_offered_qos_is_what_is_understood(text):
+    assert parsed_qos(text) == tuple(dict(DEFAULT_QOS) | given for given in OFFERED[text])
 
 
 @pytest.mark.parametrize('count', [0, 101])
@@ -184,24 +184,15 @@ def test_bag_metadata_agrees_with_the_messages(tmp_path, monkeypatch, count):
 
 
 def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
-    """Statistics and bag metadata tell the earliest and the latest stamp of all chunks."""
-    path = tmp_path / 'run.mcap'
-    file = create_file(path, TOPICS, METADATA, compression='none')
-    for chunk in ((50, 40), (20, 30)):
-        for stamp in chunk:
-            file.append(0, stamp, pose_cdr(stamp))
-        file.write_chunk()
-    file.finish()
+    path = write_rows(tmp_path / 'run.mcap', TOPICS, [
+        (0, stamp, pose_cdr(stamp)) for stamp in (50, 40, 20, 30)], per_chunk=2)
     with path.open('rb') as stream:
         reader = make_reader(stream)
         summary = reader.get_summary()
-        bag = yaml.safe_load(next(
-            item.metadata['serialized_metadata'] for item in reader.iter_metadata()
-            if item.name == 'rosbag2'))
-    assert [(index.message_start_time, index.message_end_time)
-            for index in summary.chunk_indexes] == [(40, 50), (20, 30)]
-    assert summary.statistics.message_start_time == 20
-    assert summary.statistics.message_end_time == 50
+        bag = yaml.safe_load(next(one.metadata['serialized_metadata'] for one in
+                                  reader.iter_metadata() if one.name == 'rosbag2'))
+    assert [(one.message_start_time, one.message_end_time) for one in (
+        *summary.chunk_indexes, summary.statistics)] == [(40, 50), (20, 30), (20, 50)]
     for times in (bag, bag['files'][0]):
         assert times['starting_time']['nanoseconds_since_epoch'] == 20
         assert times['duration']['nanoseconds'] == 30
@@ -236,7 +227,7 @@ def test_messages_of_any_length_are_all_kept(tmp_path):
             size = (1000, rng.choice([12, 12, 12, 700]), time_ns % 7)[topic]
             data = rng.randbytes(size)
             wanted[topic].append((time_ns, data))
-            recorder.write(topic, time_ns, data)
+            write(recorder, topic, time_ns, data)
     found = [[], [], []]
     names = [topic.name for topic in TOPICS]
     with (tmp_path / 'run.mcap').open('rb') as file:

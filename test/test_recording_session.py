@@ -44,7 +44,8 @@ class Recorded:
                 for name, type_name in names]
 
     def start(self):
-        return self.session.start(self.values)()
+        self.session.start(self.values)
+        return self.session.open()
 
     def is_held(self):
         return self.lock._lock.locked()
@@ -157,4 +158,5 @@ def test_a_recording_that_has_failed_gives_way_to_the_next(tmp_path):
     node._check_recording = lambda: Simulator._check_recording(node)
     assert Simulator._record(node, SetBool.Request(data=True)).startswith('recording to ')
     assert told == ['recording stopped: the disk is gone; the simulation goes on']
-    recorded.stop()
+    assert ' messages, ' in Simulator._record(node, SetBool.Request())
+    assert Simulator._record(node, SetBool.Request()) == 'not recording'

@@ -20,15 +20,12 @@ from helpers.logs import (
     SOME_LOST,
     TOPICS,
     flipped,
-    metadata_of,
     places,
     run,
     seen_by_mcap,
     seen_by_rosbags,
     seen_by_us,
-    small_log,
     torn,
-    without_sync,
     write_anew,
     write_log,
 )
@@ -40,16 +37,6 @@ from mcap_ros2.decoder import DecoderFactory
 from spinning_top_sim.recording.reader import LogReader
 
 
-@pytest.fixture(scope='module')
-def log(tmp_path_factory):
-    return small_log(tmp_path_factory.mktemp('log') / 'run.mcap')
-
-
-@pytest.fixture
-def no_sync(monkeypatch):
-    without_sync(monkeypatch)
-
-
 def check_with_all_readers(path, messages) -> None:
     """A recovered log of ours: the messages, for everyone, and what it says of the run."""
     assert seen_by_us(path) == seen_by_mcap(path) == seen_by_rosbags(path) == messages
@@ -57,8 +44,8 @@ def check_with_all_readers(path, messages) -> None:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         values = [message.x if schema.name == POINT else message.data
                   for schema, _, _, message in reader.iter_decoded_messages()]
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     assert values == [float(number) for number in range(len(messages))]
-    metadata = metadata_of(path)
     assert metadata['spinning_top_sim'] == METADATA
     assert f'message_count: {len(messages)}\n' in metadata['rosbag2']['serialized_metadata']
     with LogReader(path) as reader:
@@ -67,26 +54,28 @@ def check_with_all_readers(path, messages) -> None:
         assert [topic.name for topic in reader.topics] == [topic.name for topic in TOPICS]
 
 
-def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
-    """The exit code says whether a message was in what is gone."""
+def cuts(log):
+    """Return for sizes of a torn log its whole chunks, and the exit code of `recover`."""
     ends = [end for _, _, end in log.chunks]
     index_ends = [start for _, start, _ in log.chunks[1:]]
     # Around the ends of chunks and indexes after each byte; elsewhere not.
     edges = [0, *ends, *index_ends, len(log.content)]
-    cuts = {cut for edge in edges for cut in range(edge - 10, edge + 11)
-            if 0 <= cut <= len(log.content)}.union(range(0, len(log.content), 97))
+    sizes = {cut for edge in edges for cut in range(edge - 10, edge + 11)
+             if 0 <= cut <= len(log.content)}.union(range(0, len(log.content), 97))
+    for size in sorted(sizes, reverse=True):
+        whole = sum(end <= size for end in ends)
+        yield size, whole, (
+            FAILED if whole == 0 else
+            ALL_KEPT if whole == CHUNKS or size <= index_ends[whole - 1] else SOME_LOST)
+
+
+def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
+    """The exit code says whether a message was in what is gone."""
     torn, output = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap'
     seen = {}
     torn.write_bytes(log.content)
-    for size in sorted(cuts, reverse=True):
+    for size, whole_chunks, expected in cuts(log):
         os.truncate(torn, size)
-        whole_chunks = sum(end <= size for end in ends)
-        if whole_chunks == 0:
-            expected = FAILED
-        elif whole_chunks == CHUNKS or size <= index_ends[whole_chunks - 1]:
-            expected = ALL_KEPT
-        else:
-            expected = SOME_LOST
         code, out, err = run(torn, '-o', output)
         assert code == expected, (size, out, err)
         assert err.count('\n') == (code == FAILED), (size, err)
@@ -108,6 +97,11 @@ def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
         check_with_all_readers(output, log.messages[:whole_chunks * MESSAGES_PER_CHUNK])
 
 
+def kind_at(log, position):
+    return next((Opcode(opcode) for opcode, start, end in log.records
+                 if start <= position < end), None)
+
+
 def test_a_flipped_bit_is_never_passed_over(tmp_path, log, no_sync):
     """
     Anywhere in a whole file: it is said, and what is kept is what was there.
@@ -127,9 +121,7 @@ def test_a_flipped_bit_is_never_passed_over(tmp_path, log, no_sync):
         code, out, err = run(broken, '-o', output)
         assert code in (ALL_KEPT, SOME_LOST), (position, err)
         assert 'found: ' in out or 'lost: ' in out, (position, out)
-        kind = next((Opcode(opcode) for opcode, start, end in log.records
-                     if start <= position < end), None)
-        codes.setdefault(kind, set()).add(code)
+        codes.setdefault(kind_at(log, position), set()).add(code)
         content = output.read_bytes()
         output.unlink()
         output.write_bytes(content)

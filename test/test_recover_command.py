@@ -4,14 +4,11 @@
 import os
 import random
 import signal
-import subprocess
-import sys
 import tracemalloc
 
 import pytest
-from helpers.logs import ALL_KEPT, FAILED, SOME_LOST, TOPICS, run, small_log
+from helpers.logs import ALL_KEPT, FAILED, SOME_LOST, TOPICS, run
 from helpers.recordings import write_rows
-from helpers.reference import ROOT
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.errors import LogError
@@ -19,18 +16,6 @@ from spinning_top_sim.recording.log_file import LogFile
 from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recovery import recover
-
-
-@pytest.fixture(scope='module')
-def log(tmp_path_factory):
-    return small_log(tmp_path_factory.mktemp('log') / 'run.mcap')
-
-
-def run_process(*argv, **options) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, '-m', 'spinning_top_sim', 'recover', *map(str, argv)],
-        env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60,
-        check=False, **options)
 
 
 def test_messages_can_be_chosen(log, tmp_path):
@@ -52,9 +37,8 @@ def test_exit_codes(tmp_path, log):
     whole.write_bytes(log.content)
     torn.write_bytes(log.content[:log.chunks[2][2] - 1])
     head.write_bytes(log.content[:log.chunks[0][1]])
-    done = run_process(whole)
-    assert (done.returncode, done.stderr) == (ALL_KEPT, '')
-    assert 'kept all: 36 messages in 3 chunks' in done.stdout
+    code, out, err = run(whole)
+    assert (code, err) == (ALL_KEPT, '') and 'kept all: 36 messages in 3 chunks' in out
     code, out, err = run(torn, '--output', tmp_path / 'out.mcap')
     assert (code, err) == (SOME_LOST, '')
     _, start, end = log.chunks[2]

@@ -19,6 +19,7 @@ import rclpy
 from helpers.definitions import add_definitions
 from helpers.node_harness import SimNode, wait_for
 from helpers.own_node import InThisProcess, run_main
+from helpers.recordings import write
 from mcap.writer import Writer as McapWriter
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
@@ -63,7 +64,7 @@ def write_log(path, count, step_ns=2_000_000, padding=0, topics=OURS, **options)
                    RecordedTopic(twist, TWIST, {'depth': 7, 'reliability': 2})],
             {}, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
-            recorder.write(*message)
+            write(recorder, *message)
     return [[data for index, _, data in messages if index == topic] for topic in (0, 1)]
 
 
@@ -209,9 +210,9 @@ def test_a_torn_log_is_refused_with_a_hint_and_played_in_part(tmp_path, capfd):
     path.write_bytes(whole[:len(whole) // 2])
     run = run_main(replay_node.main, capfd, path)
     (line,) = run.err.splitlines()
-    assert run.code == 2 and 'torn' in line and 'recover' in line and '--partial' in line
+    assert run.code == 2 and 'damaged' in line and 'recover' in line and '--partial' in line
     raw, code = play_all(path, '--partial')
-    assert code == 0 and 'torn' in capfd.readouterr().err
+    assert code == 0 and 'damaged' in capfd.readouterr().err
     for found, all_of_it in zip(raw, wanted, strict=True):
         assert 40 < len(found) < 110
         assert_same([found], [all_of_it[:len(found)]])
@@ -263,7 +264,7 @@ class Replay(SimNode):
 
     def __init__(self, folder, file, *options, arguments=()):
         super().__init__(folder, namespace='/', arguments=arguments, program=(
-            '-m', 'spinning_top_sim.nodes.replay_node', str(file), *options))
+            '-m', 'spinning_top_sim', 'replay', str(file), *options))
         self.name = f'{self.namespace}/replay'
 
 

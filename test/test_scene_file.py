@@ -5,7 +5,6 @@ import contextlib
 
 import pytest
 
-from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 from spinning_top_sim.tools.simulate import main
 
@@ -60,21 +59,6 @@ def test_what_rcl_refuses_is_refused(tmp_path, capfd, text):
         read_scene(path)
 
 
-def test_a_file_gives_the_parameters_that_the_node_starts_with(tmp_path):
-    pytest.importorskip('rclpy')
-    from spinning_top_sim.nodes.ros_parameters import declare
-
-    path = scene(tmp_path / 'p.yaml', **{
-        'imu.gyroscope_noise_density': '1e-9', 'max_error': '1e5', 'spin.l3': '2',
-        'imu.lever_arm': '[0, 0, 1]', 'markers.enabled': 'yes', 'use_sim_time': 'true',
-        'start_type_description_service': 'false', 'world_frame': '"1"', 'seed': '0x10'})
-    ours = parameters.checked(read_scene(path))
-    with ros_node(path) as node:
-        assert ours == declare(node)
-    assert (ours['imu.gyroscope_noise_density'], ours['max_error']) == (1e-9, 1e5)
-    assert (ours['imu.lever_arm'], ours['world_frame'], ours['seed']) == ((0.0, 0.0, 1.0), '1', 16)
-
-
 @pytest.mark.parametrize('sections', [
     ['/**/spinning_top'], ['spinning_top', '/**'], ['/**', 'spinning_top'], ['/**', 'other']])
 def test_the_last_section_of_the_node_decides(tmp_path, sections):
@@ -93,13 +77,6 @@ def test_a_file_may_have_parameters_of_ros_only(tmp_path, section):
         assert read_scene(path) == {}
     assert main(['-o', str(tmp_path / 'run.mcap'), '--params', str(path), '--duration', '0.01',
                  '-p', 'use_sim_time:=true', '-p', 'qos_overrides./a.b:=1', '--quiet']) == 0
-
-
-@pytest.mark.parametrize('name', ['1', '[a]', '<<'])
-def test_a_name_that_is_no_text_is_refused(tmp_path, name):
-    path = scene(tmp_path / 'p.yaml', **{name: '1.5'})
-    with pytest.raises(ValueError, match=r'p\.yaml'):
-        read_scene(path)
 
 
 def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):

@@ -14,7 +14,6 @@ pytest.importorskip('rclpy')
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.node_logs import (
-    PERIODS_NS,
     SECOND,
     TRACEBACK,
     assert_clean_end,
@@ -25,6 +24,7 @@ from helpers.node_logs import (
     the_log,
 )
 from helpers.own_node import OwnNode
+from helpers.simulations import play, simulate, stream
 
 from spinning_top_sim.nodes import reports
 from spinning_top_sim.recording.reader import LogReader
@@ -32,42 +32,19 @@ from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 
 
-@pytest.fixture(scope='module')
-def finished(tmp_path_factory):
-    """A run of 0.5 s that ended by itself."""
-    values = {'duration': 0.5, 'record.enabled': True, 'invariants.rate': 100.0,
-              'imu.gyroscope_noise_density': 0.001, 'seed': 5}
-    with SimNode(tmp_path_factory.mktemp('finished'), values) as node:
-        assert_clean_end(node, node.wait())
-    return (node, *log_of(the_log(node.folder)))
-
-
-def test_the_duration_ends_the_run_and_its_last_sample_is_in_the_log(finished):
-    node, log, metadata = finished
-    epoch = int(metadata['spinning_top_sim']['epoch_ns'])
-    for name, period in PERIODS_NS.items():
-        times = [time - epoch for time, _ in log[node.topic(name)]]
-        assert times == list(range(0, SECOND // 2 + 1, period))
-    assert the_log(node.folder).name in node.out
-
-
-def test_the_published_orientation_error_is_the_one_computed_from_the_log(finished):
+def test_the_published_orientation_error_is_that_of_the_published_pose():
     """Column 7 of ~/invariants against the pose of the same instant and the exact solution."""
-    node, log, metadata = finished
-    epoch = int(metadata['spinning_top_sim']['epoch_ns'])
-    values = parameters.checked({})
-    exact = ExactSolution(parameters.top_of(values), parameters.start_state(values))
-    poses = {t: np.frombuffer(data[-32:], '<f8') for t, data in log[node.topic('pose')]}
-    rows = log[node.topic('~/invariants')]
-    assert len(rows) == 51
-    published, computed = [], []
-    truth = exact.states(np.array([t - epoch for t, _ in rows])).rows_quaternion
-    for (t, data), q in zip(rows, np.transpose(truth), strict=True):
-        p = poses[t]
-        computed.append(4.0 * np.arctan2(np.linalg.norm(p - q), np.linalg.norm(p + q)))
-        published.append(np.frombuffer(data[-64:], '<f8')[7])
-    assert 1e-14 < max(published) < 1e-9
-    assert published == pytest.approx(computed, rel=1e-6, abs=2e-15)
+    run = simulate(invariants__rate=100.0)
+    taken = play(run, SECOND // 2, 'pose', '~/invariants')
+    invariants, poses = (np.vstack([stream(run, topic).template.decode(data)[place]
+                                    for name, _, data in taken if name == topic])
+                         for topic, place in (('~/invariants', 0), ('pose', 1)))
+    exact = ExactSolution(run.top, parameters.start_state(run.values))
+    truth = exact.states(range(0, SECOND // 2 + 1, SECOND // 100)).quaternion
+    computed = 4.0 * np.arctan2(*(np.linalg.norm(part, axis=1)
+                                  for part in (poses - truth, poses + truth)))
+    assert 1e-14 < invariants[:, 7].max() < 1e-9
+    assert invariants[:, 7] == pytest.approx(computed, rel=1e-6, abs=2e-15)
 
 
 @pytest.mark.parametrize('numbers', [
@@ -78,7 +55,7 @@ def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, numbers):
         os.killpg(node.process.pid, numbers[0])
         time.sleep(0.05)
         code = node.end(numbers[1])
-        peer.stop_listening(pose)
+        pose.muted = True
     assert_clean_end(node, code)
     path = the_log(node.folder)
     log, _ = log_of(path)

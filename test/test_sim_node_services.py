@@ -16,8 +16,6 @@ from helpers.node_logs import (
     SECOND,
     TRACEBACK,
     assert_clean_end,
-    by_parameters,
-    decoded,
     settled,
     stamp_of,
     stamps_of,
@@ -34,7 +32,7 @@ def served(peer, tmp_path_factory):
         clock = peer.listen('/clock', Clock).wait(3)
         pose = peer.listen(node.topic('pose'), PoseStamped).wait(3)
         assert clock.last().clock.sec > 1_000_000_000
-        peer.stop_listening(clock)
+        clock.muted = True
         yield SimpleNamespace(node=node, pose=pose)
         assert_clean_end(node, node.end())
 
@@ -52,31 +50,13 @@ def test_services_answer_and_act(peer, served):
     assert peer.switch(node, 'set_pause', False).success
     pose.wait(count + 50)
     assert (np.diff(stamps_of(pose)) % PERIODS_NS['pose'] == 0).all(), 'one grid'
-    by_parameters(peer, node, 0.9, 0.2)
+    assert peer.set_together(node, spin__l3=0.9, spin__lz=0.2).successful
     answer = peer.trigger(node, 'reset')
     epoch = int(answer.message.split()[-2])
     wait_for('samples after it', lambda: stamp_of(pose.raw[-1]) > epoch)
     stamps = stamps_of(pose)
     assert epoch in stamps and (np.diff(stamps) > 0).all()
     assert peer.get(node, 'spin.l3', 'spin.lz') == [1.6, 1.6 * math.cos(math.radians(30.0))]
-
-
-def test_recordings_start_and_stop(peer, diagnostics, served):
-    """And are made where the node runs: who asks need not know where."""
-    node, pose = served.node, served.pose
-    assert peer.set_together(node, record__uri='here.mcap').successful
-    assert str(node.folder / 'here.mcap') in peer.switch(node, 'record', True).message
-    assert 'already' in peer.switch(node, 'record', True).message
-    pose.wait_more(50)
-    assert diagnostics.next(node)['recorder'] == 'recording'
-    answer = peer.switch(node, 'record', False)
-    assert answer.success
-    counts = decoded(node.folder / 'here.mcap')
-    assert f'{sum(counts.values())} messages' in answer.message
-    assert counts[node.topic('pose')] >= 50
-    assert counts[node.topic('imu/data_raw')] >= 100
-    assert 'exists' in peer.switch(node, 'record', True).message
-    assert peer.switch(node, 'record', False).message == 'not recording'
 
 
 def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagnostics, tmp_path):
@@ -112,5 +92,5 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
         waits()                             # it has stopped
         assert_clean_end(node, node.end())
     assert TRACEBACK not in node.err
-    peer.stop_listening(pose)
+    pose.muted = True
     clock.stop()

@@ -13,14 +13,18 @@ import rclpy
 import yaml
 from helpers.node_logs import TRACEBACK, log_of, the_log
 from helpers.own_node import OwnNode, as_a_process, run_main
+from helpers.standard_node import StandardNode, finished
 from rclpy.executors import SingleThreadedExecutor
 from test_scene_file import scene
 
-from spinning_top_sim.nodes import executable, replay_node, sim_node
+from spinning_top_sim.nodes import executable, replay_node, sim_node, simulation_handlers
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.recorded_run import read_run_description
+
+# Of simulation_interfaces.
+STOPPED, QUITTING, INCORRECT_STATE, FAILED, TRANSITION_ERROR = 0, 3, 3, 4, 102
 
 
 @pytest.fixture
@@ -125,7 +129,7 @@ def start_values(*arguments):
     argv = ['--ros-args', '-r', '__ns:=/last', *arguments]
     with as_a_process():
         rclpy.init(args=argv)
-        node = sim_node._prepare(argv)()
+        node = sim_node._prepare(argv)[1]()
         values = node.start_values
         node.stop()
         node.destroy_node()
@@ -151,6 +155,16 @@ def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(tmp_path):
     found = start_values(*options, '--params-file', str(file))
     assert [found[name] for name in names] == [3.0, 1.0, 250.0, 1.0, 2.0, (1.0, 2.0, 3.0)]
     assert start_values('-p', 'spin.l3:=2', '-p', 'spin.l3:=1.5')['spin.l3'] == 1.5
+
+
+@pytest.mark.parametrize(('installed', 'wanted'), [(True, True), (False, True), (True, False)])
+def test_simulation_interfaces_is_offered_where_it_is_installed_and_not_switched_off(
+        monkeypatch, installed, wanted):
+    offered = []
+    monkeypatch.setattr(sim_node, 'find_spec', lambda name: installed or None)
+    monkeypatch.setattr(simulation_handlers, 'offer', offered.append)
+    start_values('-p', f'simulation_interfaces:={str(wanted).lower()}')
+    assert len(offered) == (installed and wanted)
 
 
 def test_of_several_files_the_last_that_is_for_the_node_wins(tmp_path):
@@ -194,3 +208,27 @@ def test_remapping_and_qos_overrides_work(tmp_path):
     assert '/ns/pose' not in offered
     assert offered['/ns/attitude']['reliability'] == 2
     assert offered['/ns/imu/data_raw']['depth'] == 3
+
+
+def test_before_the_clock_nothing_can_be_set(tmp_path):
+    with StandardNode(tmp_path, use_sim_time=True) as top:
+        assert top.state == STOPPED
+        for name in ('PLAYING', 'PAUSED'):
+            assert top.set_state(name) == TRANSITION_ERROR
+        for expected, name, request in (
+                (FAILED, 'StepSimulation', {'steps': 1}),
+                (INCORRECT_STATE, 'ResetSimulation', {'scope': 0}),
+                (INCORRECT_STATE, 'SetEntityState', {'entity': 'spinning_top'})):
+            code, text = top.refused(name, **request)
+            assert (code, text) == (expected, 'waiting for /clock (use_sim_time is set)')
+
+
+def test_steps_beyond_the_duration_say_so(tmp_path):
+    with StandardNode(tmp_path, duration=0.05) as top:
+        goal, coroutine = top.pause().steps(9)
+        assert finished(coroutine).result.error_message == (
+            'interrupted after 5 of 9 steps: `duration` ends before the steps do')
+        assert (goal.end, top.state) == ('aborted', QUITTING)
+    with StandardNode(tmp_path, duration=0.05) as top:
+        assert top.pause().refused('StepSimulation', steps=6) == (
+            FAILED, 'at t = 0.050000000 s: `duration` ends before the steps do')

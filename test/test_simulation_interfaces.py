@@ -17,7 +17,7 @@ import rclpy
 from helpers.node_harness import wait_for
 from helpers.standard_node import KINDS, StandardNode, finished
 
-from spinning_top_sim.nodes.simulation_standard import FEATURES
+from spinning_top_sim.nodes.simulation_handlers import FEATURES
 from spinning_top_sim.tools import inspect
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)

@@ -6,6 +6,7 @@ STRESS_TOPS=100000 in the environment takes as many random tops; `python test/st
 same on all processors.
 """
 
+import importlib
 import math
 import os
 
@@ -31,6 +32,14 @@ def test_random_tops(seeds):
     assert found.counts['rk45: q'] > 0.8 * len(seeds)
 
 
+def momenta(random, scale, theta):
+    l3, lz = (float(x) for x in scale * random.uniform(-2.0, 2.0, 2))
+    lz = {0: lz, 1: l3, 2: -l3}[int(random.integers(0, 3))]
+    if abs(math.sin(theta)) < 0.1:      # else by 1/sin(theta) too fast for a test
+        lz = l3 if math.cos(theta) > 0.0 else -l3
+    return (0.0, 0.0) if random.integers(0, 4) == 0 else (l3, lz)
+
+
 @pytest.mark.parametrize('method', ['rk45', 'exact'])
 @pytest.mark.parametrize('scene', ['planar_pendulum', 'waking_sleeper', 'cusp'])
 def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
@@ -44,12 +53,7 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
         now += int(random.integers(1, 700_000_000))
         assert simulation.advance(now)
         before = simulation.state()
-        l3, lz = (float(x) for x in scale * random.uniform(-2.0, 2.0, 2))
-        lz = {0: lz, 1: l3, 2: -l3}[int(random.integers(0, 3))]
-        if abs(math.sin(before.theta[0])) < 0.1:    # else by 1/sin(theta) too fast for a test
-            lz = l3 if math.cos(before.theta[0]) > 0.0 else -l3
-        if random.integers(0, 4) == 0:
-            l3 = lz = 0.0
+        l3, lz = momenta(random, scale, before.theta[0])
         simulation.command(l3, lz)
         after = simulation.state()
         assert (simulation.l3, simulation.lz) == (l3, lz)
@@ -70,3 +74,13 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
             exact = truth.states(range(later, later + 1))
             assert math.dist(simulation.state().quaternion[0], exact.quaternion[0]) < 1e-7
         now += 200_000_000
+
+
+@pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0)])
+def test_a_seed_of_a_part_of_make_stress(tmp_path, monkeypatch, request, part, seed):
+    pytest.importorskip('rclpy')
+    module = importlib.import_module(f'stress.{part}')
+    if part == 'nodes':
+        peer = request.getfixturevalue('peer')
+        monkeypatch.setattr(module, 'shared_peer', lambda: peer)
+    assert module.check(seed, tmp_path)

@@ -6,7 +6,6 @@ That serializer leaves padding as it finds it in memory, so bytes may differ exa
 the template has a zero and a change of that byte changes no field.
 """
 
-import importlib
 import random
 
 import numpy as np
@@ -27,6 +26,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu, JointState, MagneticField, NavSatFix  # noqa: E402
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String  # noqa: E402
 
+from spinning_top_sim.nodes.replayer import message_class  # noqa: E402
 from spinning_top_sim.streams import messages  # noqa: E402
 
 STAMPS = (0, 1, SECOND - 1, SECOND, 1_700_000_000 * SECOND + 123_456_789, -1, -SECOND,
@@ -40,11 +40,6 @@ def numbers(count):
     """Return numbers that differ from slot to slot, so that no two can be mixed up."""
     dice = random.Random(count)
     return [dice.uniform(-10.0, 10.0) for _ in range(count)]
-
-
-def message_class(type_name):
-    package, _, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
 def set_stamp(stamp, stamp_ns):

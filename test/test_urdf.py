@@ -2,7 +2,6 @@
 """The robot description: its forward kinematics, by a library of other people, are the pose."""
 
 import runpy
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -25,10 +24,6 @@ ILLEGAL = {'no mass': {'top.mass': 0.0}, 'too flat': {'top.lambda3': 1.0},
 
 def described(values, folder=ROOT / 'urdf'):
     return urdf.robot_description(parameters.checked(values), folder)
-
-
-def element(values):
-    return ElementTree.fromstring(described(values))
 
 
 def robot(tmp_path, values):
@@ -84,7 +79,7 @@ def test_frames_that_no_tree_has_are_refused(values, named):
 @pytest.mark.parametrize('name', ILLEGAL)
 def test_an_inertia_that_no_body_has_is_left_out_with_a_warning(name):
     values = ILLEGAL[name]
-    assert list(element(values).iter('inertial')) == []
+    assert '<inertial' not in described(values)
     warning = urdf.inertia_warning(parameters.checked(values))
     for parameter, value in values.items():
         assert f'{parameter} = {value!r}' in warning

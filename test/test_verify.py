@@ -25,11 +25,6 @@ def columns(tmp_path_factory):
                   '-p', 'imu.accelerometer_random_walk:=0.01')
 
 
-def chunks_of(path):
-    with open(path, 'rb') as file:
-        return make_reader(file).get_summary().chunk_indexes
-
-
 def verified(capsys, path):
     code, content = as_json(capsys, path, '--verify')
     assert code == (0 if content['verify']['identical'] else 1)
@@ -112,41 +107,35 @@ def test_another_machine_is_warned_of(short, capsys, monkeypatch):
 
 def test_live_logs_verify(tmp_path, capsys):
     """From the start, and from the middle with commands before; rates change, resets happen."""
-    pytest.importorskip('rclpy')
-    from geometry_msgs.msg import PoseStamped
-    from helpers.node_harness import Peer, SimNode
-
+    own_node = pytest.importorskip('helpers.own_node')
     whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
-    options = {'status_period': 0.0, 'record.uri': str(whole), 'start_paused': True,
-               'imu.gyroscope_noise_density': 0.01, 'increments.enabled': True,
-               'imu.sampling': 'mean', 'imu.lever_arm': [0.1, -0.2, 0.3]}
-    with SimNode(tmp_path, options, namespace='/live') as node, Peer() as peer:
-        pose = peer.listen(node.topic('pose'), PoseStamped)
+    with own_node.OwnNode(
+            tmp_path, record__uri=str(whole), start_paused=True, increments__enabled=True,
+            imu__gyroscope_noise_density=0.01, imu__sampling='mean',
+            imu__lever_arm=[0.1, -0.2, 0.3]) as node:
 
         def set_now(**values):
-            assert all(result.successful for result in peer.set_each(node, **values))
-            pose.wait_more(5)
-        assert peer.set_together(node, spin__l3=1.7, spin__lz=1.4).successful
-        assert peer.switch(node, 'record', True).success
-        assert peer.set_together(node, spin__l3=1.65, spin__lz=1.4).successful   # before t = 0
-        peer.switch(node, 'set_pause', False)
-        pose.wait(10)
+            assert node.set(**values).successful
+            node.step(7)
+
+        assert node.set(spin__l3=1.7, spin__lz=1.4).successful
+        assert node.switch('record', True).success
+        assert node.set(spin__l3=1.65, spin__lz=1.4).successful         # before t = 0
+        node.step(10)
         set_now(imu__rate=125.0, pose__rate=50.0)
         set_now(spin__lz=1.3)
-        assert peer.switch(node, 'record', False).success
+        assert node.switch('record', False).success
         set_now(record__uri=str(part), joint_states__rate=33.0)
-        assert peer.switch(node, 'record', True).success
+        assert node.switch('record', True).success
         set_now(spin__l3=1.8)
         set_now(imu__rate=250.0, imu__gyroscope_noise_density=0.02, solver__method='exact')
-        assert peer.trigger(node, 'reset').success
-        pose.wait_more(5)
-        peer.switch(node, 'set_pause', True)
-        assert peer.trigger(node, 'reset').success
-        assert peer.set_together(node, spin__l3=1.9, spin__lz=1.3).successful    # before t = 0
-        assert peer.trigger(node, 'step').success
-        peer.switch(node, 'set_pause', False)
+        assert node.trigger('reset').success
+        node.step(5)
+        assert node.trigger('reset').success
+        assert node.set(spin__l3=1.9, spin__lz=1.3).successful          # before t = 0
+        node.step(1)
         set_now(ground_truth_imu__rate=100.0)
-        assert node.end() == 0, node.err
+    capsys.readouterr()
     for path, causes in ((whole, ['start', 'command', 'command']),
                          (part, ['start', 'command', 'reset', 'reset', 'command'])):
         code, content = as_json(capsys, path, '--verify')
@@ -161,7 +150,8 @@ def test_live_logs_verify(tmp_path, capsys):
 
 def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):
     torn = tmp_path / 'torn.mcap'
-    last = chunks_of(columns)[-1]
+    with open(columns, 'rb') as file:
+        last = make_reader(file).get_summary().chunk_indexes[-1]
     torn.write_bytes(columns.read_bytes()[:last.chunk_start_offset + last.chunk_length // 2])
     code, out, _ = told(capsys, torn, '--verify')
     assert code == 1

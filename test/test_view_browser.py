@@ -19,7 +19,7 @@ from spinning_top_sim.tools import simulate
 from spinning_top_sim.view import command
 
 pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')
-VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
+VIEW = ('-m', 'spinning_top_sim', 'view', '--no-browser', '--port', '0')
 STAMP = r'stamp (\d+)\.(\d{9})'
 
 
@@ -43,12 +43,6 @@ def apart(shown, orientation):
     """Return the angle between a drawn attitude and a published one [rad]."""
     published = orientation.x, orientation.y, orientation.z, orientation.w
     return float(angle_between(*(tuple(np.array([x]) for x in q) for q in (shown, published)))[0])
-
-
-def write_log(path, duration):
-    assert simulate.main(['--scene', 'cusp', '--duration', duration, '-o', str(path), '--command',
-                          '2.5:2.0:1.5']) == 0
-    return path
 
 
 def test_live(browser, peer, tmp_path):
@@ -115,25 +109,23 @@ def test_live(browser, peer, tmp_path):
             assert view.end(signal.SIGINT) == 0, view.err
 
 
-def turned(attitude):
-    return attitude if attitude != [0, 0, 0, 1] else None
-
-
 def stamp_of(poses):
     seconds, nanoseconds = Time.from_msg(poses.last().header.stamp).seconds_nanoseconds()
     return str(seconds), f'{nanoseconds:09d}'
 
 
 def test_file_without_a_network(browser, tmp_path):
-    page, ride = tmp_path / 'page.html', tmp_path / 'ride.mcap'
-    assert simulate.main(['--scene', 'shuttle', '--duration', '6', '-o', str(ride)]) == 0
-    log = write_log(tmp_path / 'cusp.mcap', '6')
+    page, ride, log = (tmp_path / name for name in ('page.html', 'ride.mcap', 'cusp.mcap'))
+    for path, scene in ((ride, 'shuttle'), (log, 'cusp')):
+        assert simulate.main(['--scene', scene, '--duration', '6', '-o', str(path),
+                              '--command', '2.5:2.0:1.5']) == 0
     assert command.main([str(ride), str(log), '--html', str(page)]) == 0
     assert page.stat().st_size < 3e6        # for 6 s of two tops
     poses = poses_of(ride)
     with Visit(browser, str(page), offline=True, framed=True) as visit:
         # Before the first picture, and where it begins again, viser turns nothing.
-        shown = wait_for('a picture', lambda: turned(visit.attitude()))
+        wait_for('a picture', lambda: visit.attitude() != [0, 0, 0, 1])
+        shown = visit.attitude()
         assert min(apart(shown, pose) for pose in poses.values()) < 1e-6
         visit.wait("String(window.__viserMutable.nodePoseData['/top0/body'].wxyz) != "
                    f"'{','.join(map(str, [shown[3], *shown[:3]]))}'")

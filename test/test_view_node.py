@@ -12,23 +12,23 @@ from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.simulations import record
 
-from spinning_top_sim.nodes import throttle
+from spinning_top_sim.nodes import publishers
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.view.track import Track
 
-VIEW = ('-m', 'spinning_top_sim.view.command', '--no-browser', '--port', '0')
+VIEW = ('-m', 'spinning_top_sim', 'view', '--no-browser', '--port', '0')
 PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
 
 
 @pytest.mark.parametrize(('period', 'count'), [(0.001, 300), (0.1, 101)])
 def test_a_throttle_lets_few_messages_through_and_the_last_one(monkeypatch, period, count):
     now, sent = 0.0, []
-    monkeypatch.setattr(throttle.time, 'monotonic', lambda: now)
+    monkeypatch.setattr(publishers.time, 'monotonic', lambda: now)
     publisher = SimpleNamespace(publish=sent.append, get_subscription_count=lambda: 1)
-    one = throttle.Throttle(publisher)
+    one = publishers.Throttle(publisher)
     number = 0
     while now < 10.0:
         number += 1
@@ -59,9 +59,9 @@ def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypa
     values = parameters.checked({'spin.lz': 1.4})
     live._stale, live._track = False, Track('', values)
     live._page.set_tracks([live._track])
-    for seconds, publishers in ((100, 1), (200, 0), (300, 1), (5, 1)):
+    for seconds, count in ((100, 1), (200, 0), (300, 1), (5, 1)):
         epoch_ns = seconds * NANOSECONDS
-        monkeypatch.setattr(live, 'count_publishers', lambda _, number=publishers: number)
+        monkeypatch.setattr(live, 'count_publishers', lambda _, number=count: number)
         live._listen_as_needed()
         run = LiveSimulation(values, epoch_ns)
         taken = record(run, 'ground_truth/odom', 'pose', 'joint_states')

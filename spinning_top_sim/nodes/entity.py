@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.nodes.simulation_standard import RefusedError
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.pivot import Kinematics
 from spinning_top_sim.physics.placement import state_of
@@ -21,6 +20,14 @@ TAGS = ('spinning_top', 'heavy_symmetric_top', 'imu')
 # of a quaternion's length.
 SMALLEST_LENGTH, SMALLEST_SPEED, LENGTH_ERROR = 1e-6, 1e-6, 1e-3
 UNSUPPORTED, INVALID_POSE = 0, 101      # of Result and SetEntityState
+
+
+class RefusedError(RuntimeError):
+    """A request is refused with a result code."""
+
+    def __init__(self, code: int, reason: object) -> None:
+        super().__init__(str(reason))
+        self.code = code
 
 
 def fill_state(message: Message, states: States, pivot: Kinematics, stamp_ns: int,

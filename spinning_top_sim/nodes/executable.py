@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 from spinning_top_sim.installation import remedy
 from spinning_top_sim.recording.errors import text_of
+from spinning_top_sim.tools.cli import printable
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -36,14 +37,14 @@ class RunnableNode(Protocol):
 
 
 def run(name: str, argv: Sequence[str] | None,
-        prepare: Callable[[list[str]], Callable[[], RunnableNode]]) -> int:
+        prepare: Callable[[list[str]], tuple[list[str], Callable[[], RunnableNode]]]) -> int:
     """
     Run the node of `spinning-top NAME`; return its exit code.
 
     It is 0 after an ordinary end, or 2 with one line that says why the node cannot start.
 
     argv : arguments, None for those of the program
-    prepare : takes the arguments, to which it may add some of ROS; returns what makes the node
+    prepare : takes the arguments; returns those for ROS, and what makes the node
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     name = f'spinning-top {name}'
@@ -51,7 +52,7 @@ def run(name: str, argv: Sequence[str] | None,
     _handle(signal.SIGINT, lambda *_: _exit(130))
     _open_standard_streams()
     try:
-        make_node = prepare(argv)
+        argv, make_node = prepare(argv)
         interrupts = _initialize_ros([name, *argv])
     except Exception as error:
         return _cannot_start(name, error)
@@ -144,8 +145,7 @@ def _cannot_start(name: str, error: Exception) -> int:
 
 def one_line(text: object) -> str:
     """Return a text as one line, without control characters and positions in the code of rcl."""
-    line = ' '.join(re.sub(r',\s*at \S+:\d+', '', str(text)).split())
-    line = ''.join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
+    line = printable(' '.join(re.sub(r',\s*at \S+:\d+', '', str(text)).split()))
     return line if len(line) <= 600 else f'{line[:300]} ... {line[-300:]}'
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The publishers of the streams of a simulation."""
+"""The publishers of the streams of a simulation, and those with a limited rate, for displays."""
 
 import importlib
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
@@ -12,10 +13,46 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from spinning_top_sim.nodes.recording_session import Topic
-from spinning_top_sim.nodes.throttle import TOPICS, Throttle
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.live import Output
 from spinning_top_sim.streams.stream import Stream
+
+Publish = Callable[[bytes], object]
+
+THROTTLED_RATE = 30.0           # messages a second of real time, at most
+THROTTLED = {'ground_truth/odom': 'ground_truth/odom_throttle'}
+
+
+class Throttle:
+    """Publishes at most THROTTLED_RATE messages of a stream a second: to send one is expensive."""
+
+    def __init__(self, publisher: Publisher) -> None:
+        self.publisher = publisher
+        self._due = 0.0                         # time on the monotonic clock of the next message
+        self._withheld: bytes | None = None     # the newest message, until it is published
+
+    def sink(self, publish_all: Publish | None) -> Publish | None:
+        """Return what takes the messages of the stream; `publish_all` takes each of them."""
+        if not self.publisher.get_subscription_count():
+            self._withheld = None
+            return publish_all
+
+        def publish(message: bytes) -> None:
+            if publish_all is not None:
+                publish_all(message)
+            self._withheld = message
+            self.flush()
+
+        return publish
+
+    def flush(self, at_once: bool = False) -> None:
+        """Publish the newest message if it is due, or in any case with `at_once`."""
+        now = time.monotonic()
+        if self._withheld is not None and (at_once or now >= self._due):
+            # On average the rate is THROTTLED_RATE, whatever the rate of the stream.
+            self._due = max(self._due, now - 1.0 / THROTTLED_RATE) + 1.0 / THROTTLED_RATE
+            self.publisher.publish(self._withheld)
+            self._withheld = None
 
 
 class StreamPublishers:
@@ -50,12 +87,12 @@ class StreamPublishers:
                 package, _, name = stream.type_name.split('/')
                 message_class = getattr(importlib.import_module(f'{package}.msg'), name)
                 self.by_topic[topic] = self.create(message_class, topic)
-                if topic in TOPICS:
-                    self._throttles[topic] = Throttle(self.create(message_class, TOPICS[topic]))
+                if topic in THROTTLED:
+                    self._throttles[topic] = Throttle(self.create(message_class, THROTTLED[topic]))
             elif topic in self.by_topic and not enabled:
                 output.publish = None
                 self._node.destroy_publisher(self.by_topic.pop(topic))
-                if topic in TOPICS:
+                if topic in THROTTLED:
                     self._node.destroy_publisher(self._throttles.pop(topic).publisher)
 
     def update_subscribers(self, outputs: Sequence[Output]) -> None:

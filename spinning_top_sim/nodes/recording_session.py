@@ -41,18 +41,15 @@ class RecordingSession:
         self._recorder: McapRecorder | None = None
         self._pending: list[tuple[Sequence[Entry], int]] = []   # while a log is being opened
         self._write: Write | None = None        # writes into the recorder, or into `_pending`
+        # Streams, their topics and the run, of a log that is to be opened
+        self._begun: tuple[Sequence[Stream], Sequence[Topic], Mapping[str, Any]] = (), (), {}
         self._journal_index = 0                 # index of the journal's first topic in the log
         self._file_lock = threading.Lock()      # held while a log is opened or closed
 
-    def start(self, values: Mapping[str, Any]) -> Callable[[], str]:
-        """
-        Begin to record into memory; return a function that opens the log, before the next start.
-
-        It returns a text with the path, or raises RecordingError and records nothing.
-        """
+    def start(self, values: Mapping[str, Any]) -> None:
+        """Begin to record into memory, until `open`; does nothing while a log is open."""
         if self._recorder is not None:
-            path = self._recorder.path
-            return lambda: f'recording already to {path}'
+            return
         with self._lock:
             simulation = self._simulation
             streams = journal.recorded_streams(simulation.streams, values)
@@ -63,11 +60,18 @@ class RecordingSession:
             self._journal_index = len(streams)
             self._feed(lambda *messages: self._pending.append(messages), streams)
             self.write_event('start')
-        return lambda: self._open(streams, topics, run)
+            self._begun = streams, topics, run
 
-    def _open(self, streams: Sequence[Stream], topics: Sequence[Topic],
-              run: Mapping[str, Any]) -> str:
+    def open(self) -> str:
+        """
+        Open the log that `start` has begun; return a text with its path.
+
+        Raises RecordingError, and records nothing.
+        """
         with self._file_lock:
+            if self._recorder is not None:
+                return f'recording already to {self._recorder.path}'
+            streams, topics, run = self._begun
             try:
                 recorder = _open_log(topics, run)
             except Exception as error:

@@ -42,11 +42,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run('replay', argv, _prepare)
 
 
-def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
+def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
     options = _parser().parse_args(without_ros_arguments(argv))
     from spinning_top_sim.nodes.replayer import Replayer, open_log  # noqa: PLC0415
     log = open_log(options.file, options.partial)
-    return lambda: Replayer(log, options)
+    return argv, lambda: Replayer(log, options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--clock', type=not_negative, nargs='?', const=40.0, default=0.0, metavar='HZ',
         help="publish the log's time on /clock, HZ times a second "
         '(default 40), instead of a recorded /clock')
-    add('--partial', action='store_true', help='play what is whole of a torn log')
+    add('--partial', action='store_true', help='play what is whole of a damaged log')
     add('-p', '--start-paused', action='store_true', help='wait for ~/set_pause false')
     add('-d', '--delay', type=not_negative, default=0.0, metavar='S',
         help='wait S seconds before the first message')
@@ -86,7 +86,3 @@ def _number(lowest: float, highest: float, allowed: str) -> Callable[[str], floa
                 return float(text)
         raise argparse.ArgumentTypeError(f'{text}: must be {allowed}')
     return parse
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -193,14 +193,14 @@ class Replayer(Node):
 
 
 def open_log(path: Path, partial: bool) -> LogReader:
-    """Open a log.  Raises LogError, and without `partial` ValueError for a torn log."""
+    """Open a log.  Raises LogError, and without `partial` ValueError for a damaged log."""
     log = LogReader(path)
-    torn = not log.whole and (log.damage.truncated or log.damage.losses)
-    if torn and not partial:
-        raise ValueError(f'{path} is torn: `recover` makes a whole log of it, --partial plays '
+    damaged = not log.whole and (log.damage.truncated or log.damage.losses)
+    if damaged and not partial:
+        raise ValueError(f'{path} is damaged: `recover` makes a whole log of it, --partial plays '
                          'what is whole')
-    if torn:
-        print(f'spinning-top replay: {path} is torn, playing what is whole', file=sys.stderr)
+    if damaged:
+        print(f'spinning-top replay: {path} is damaged, playing what is whole', file=sys.stderr)
     return log
 
 

@@ -3,7 +3,6 @@
 
 import array
 import contextlib
-import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
@@ -16,7 +15,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameters import Parameter
-from spinning_top_sim.tools.scene_file import parse_yaml
+from spinning_top_sim.tools.scene_file import likely_name, parse_yaml
 
 SPIN = ('spin.l3', 'spin.lz')
 
@@ -38,9 +37,8 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
         if name in parameters.BY_NAME:
             given[name] = _as_doubles(parameters.BY_NAME[name], last_given.get(name, value))
         elif not name.startswith('qos_overrides.'):
-            near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
-            hint = f'; did you mean {near[0]}?' if near else ''
-            node.get_logger().warning(f'there is no parameter {name}: ignored{hint}')
+            node.get_logger().warning(
+                f'there is no parameter {name}: ignored{likely_name(name)}')
         # It is declared with its descriptor below, or by `create_publisher`.
         node.undeclare_parameter(name)
     values = parameters.checked(given)

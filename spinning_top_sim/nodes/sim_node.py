@@ -2,7 +2,6 @@
 """The command `spinning-top node`, the executable `sim_node`."""
 
 import argparse
-import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
@@ -58,7 +57,7 @@ def _interface() -> Iterator[str]:
         yield textwrap.indent(textwrap.fill(parameter.describe(), 74), 6 * ' ')
 
 
-def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
+def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
     words = without_ros_arguments(argv)
     if words:
         from spinning_top_sim.tools import cli  # noqa: PLC0415
@@ -70,7 +69,7 @@ def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
         given = [word for path in chosen_files(arguments)
                  for word in ('--params-file', str(path))]
         given += [word for parameter in arguments.param for word in ('-p', parameter)]
-        argv[:] = ['--ros-args', *given, '--', *argv[len(words):]]
+        argv = ['--ros-args', *given, '--', *argv[len(words):]]
     from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
 
     def make_node() -> RunnableNode:
@@ -80,8 +79,4 @@ def _prepare(argv: list[str]) -> Callable[[], RunnableNode]:
             simulation_handlers.offer(node)
         return node
 
-    return make_node
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    return argv, make_node

@@ -8,8 +8,9 @@ mean RESULT_OPERATION_FAILED.
 """
 
 import importlib
+import re
 import types
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from functools import partial
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from rclpy.action import ActionServer, CancelResponse
 
 from spinning_top_sim.nodes import entity
-from spinning_top_sim.nodes.simulation_standard import FEATURES, RefusedError, service_name
+from spinning_top_sim.nodes.entity import RefusedError
 from spinning_top_sim.nodes.simulator import Simulator
 from spinning_top_sim.nodes.tick_loop import LoopState
 from spinning_top_sim.physics.pivot import Kinematics
@@ -25,6 +26,26 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
+
+# Each service, and the values of SimulatorFeatures that announce it.
+FEATURES: Mapping[str, tuple[str, ...]] = {
+    'GetSimulatorFeatures': (),
+    'GetSimulationState': ('SIMULATION_STATE_GETTING',),
+    'SetSimulationState': ('SIMULATION_STATE_SETTING', 'SIMULATION_STATE_PAUSE'),
+    'StepSimulation': ('STEP_SIMULATION_SINGLE', 'STEP_SIMULATION_MULTIPLE'),
+    'SimulateSteps': ('STEP_SIMULATION_ACTION',),
+    'ResetSimulation': ('SIMULATION_RESET', 'SIMULATION_RESET_STATE'),
+    'GetEntities': (),
+    'GetEntitiesStates': ('ENTITY_STATE_GETTING',),
+    'GetEntityState': ('ENTITY_STATE_GETTING',),
+    'SetEntityState': ('ENTITY_STATE_SETTING',),
+    'GetEntityInfo': ('ENTITY_INFO_GETTING',),
+}
+
+
+def service_name(type_name: str) -> str:
+    """Return the name of a service from its type: get_entities for GetEntities."""
+    return re.sub(r'(?<!^)(?=[A-Z])', '_', type_name).lower()
 
 
 def offer(node: Simulator) -> None:

@@ -105,12 +105,12 @@ class Simulator(Node):
         if not self._date.follows:
             time.sleep((self.simulation.epoch_ns - now_ns) / NANOSECONDS)
         self.loop.start()
-        open_log = (self._session.start(self.start_values) if self.values['record.enabled']
-                    else None)
+        if self.values['record.enabled']:
+            self._session.start(self.start_values)
         self._pacer.start()
-        if open_log is not None:
+        if self.values['record.enabled']:
             try:
-                self._log.info(open_log())
+                self._log.info(self._session.open())
             except RecordingError as error:     # no client waits for an answer
                 self._session.error = str(error)
                 self._log.error(f'not recording: {error}')
@@ -308,7 +308,8 @@ class Simulator(Node):
             return summary or 'not recording'
         self.check_started()
         self._check_recording()
-        return self._session.start(self.start_values)()
+        self._session.start(self.start_values)
+        return self._session.open()
 
     @property
     def _log(self) -> Any:

@@ -2,7 +2,7 @@
 """
 MCAP logs: what turns (topic, stamp, CDR bytes) into files and back.
 
-`writer` records while a simulation runs, with `mcap_writer` and `chunks`.  `reader` opens a log:
+`recorder` records while a simulation runs, with `mcap_writer` and `chunks`.  `reader` opens a log:
 `log_file` reads its bytes and its summary, `records` decodes, `scan` finds what is left of a
 damaged file, and `recovery` writes that anew.
 

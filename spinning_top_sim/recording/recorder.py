@@ -18,19 +18,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from mcap.records import Channel, Header, Metadata, Schema
+
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.chunks import CHUNK_BYTES
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError, why_not_written
+from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
-
-try:
-    from mcap.records import Channel, Header, Metadata, Schema
-
-    from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
-except ImportError as error:
-    raise RecordingError(
-        f'recording needs the Python package mcap with zstandard and lz4: {error}') from error
 
 METADATA_NAME = 'spinning_top_sim'
 OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
@@ -130,9 +125,6 @@ class McapRecorder:
             path=self.path, bytes=self._file.size, counts=counts,
             queued=missing if running else 0, lost=0 if running else missing,
             error=self.error)
-
-    def write(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
-        self.write_all([(topic_index, log_time_ns, data)], len(data))
 
     def write_all(self, entries: Sequence[Entry], size: int) -> None:
         """

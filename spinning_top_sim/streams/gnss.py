@@ -36,7 +36,7 @@ class Gnss(Stream):
 
     def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
         level, vertical = (0.0, 0.0) if is_exact else values[self._noise]
-        super().__init__(values, 'gnss', topic, self.type_name, self._template(
+        super().__init__(values, 'gnss', topic, self.type_name, self._template_of(
             values, (level ** 2, level ** 2, vertical ** 2)))
         self._seed = values['seed']
         self._deviation = np.array([[level], [level], [vertical]])
@@ -45,7 +45,8 @@ class Gnss(Stream):
         self._edges_ns = np.rint(np.array(() if is_exact else values['gnss.outages'])
                                  * NANOSECONDS).astype(np.int64)
 
-    def _template(self, values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
+    @staticmethod
+    def _template_of(values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
         raise NotImplementedError
 
     def times(self, after_ns: int, until_ns: int) -> range:
@@ -71,9 +72,13 @@ class Fix(Gnss):
     type_name = 'sensor_msgs/msg/NavSatFix'
     _index, _noise, _purpose = 0, 'gnss.position_noise', noise.Purpose.GNSS_POSITION
 
-    def _template(self, values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
+    def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
+        super().__init__(values, topic, is_exact=is_exact)
         self._origin = values['gnss.origin']
         self._no_fix = messages.nav_sat_fix(values['body_frame'], None)
+
+    @staticmethod
+    def _template_of(values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
         return messages.nav_sat_fix(values['body_frame'], messages.diagonal(*variances))
 
     def encode(self, *samples: Samples) -> Encoded:
@@ -92,13 +97,14 @@ class Velocity(Gnss):
     type_name = 'geometry_msgs/msg/TwistWithCovarianceStamped'
     _index, _noise, _purpose = 1, 'gnss.velocity_noise', noise.Purpose.GNSS_VELOCITY
 
-    def _template(self, values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
-        return messages.twist_with_covariance(values['world_frame'], variances)
-
     def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
         super().__init__(values, topic, is_exact=is_exact)
         edges_ns = self._edges_ns.tolist()
         self.silences_ns = list(zip(edges_ns[::2], edges_ns[1::2], strict=True))
+
+    @staticmethod
+    def _template_of(values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
+        return messages.twist_with_covariance(values['world_frame'], variances)
 
     def encode(self, *samples: Samples) -> Encoded:
         t_ns, stamps_ns, velocity, is_out = self._measured(*samples)

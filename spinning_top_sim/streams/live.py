@@ -91,7 +91,7 @@ class LiveSimulation(Simulation):
         # `version`, `epoch_ns`, and which outputs had no subscribers, when the queue was computed.
         self._holds_for: tuple[int, int, list[bool]] = -1, 0, []
         self._work: Iterator[Block | None] | None = None
-        self._block = SMALLEST_BLOCK
+        self._block_size = SMALLEST_BLOCK
 
     def restart(self, values: Mapping[str, Any]) -> None:
         super().restart(values)
@@ -158,8 +158,8 @@ class LiveSimulation(Simulation):
         """
         self._refresh()
         if self._work is None and self.computed_ns < until_ns:
-            ahead_ns = min(self._span_ns(self._used, self._block), LONGEST_AHEAD_NS)
-            self._block = min(2 * self._block, LARGEST_BLOCK)
+            ahead_ns = min(self._span_ns(self._used, self._block_size), LONGEST_AHEAD_NS)
+            self._block_size = min(2 * self._block_size, LARGEST_BLOCK)
             self._begin_block(self._used, max(until_ns, self.computed_ns + ahead_ns))
         if self._work is None:
             return True
@@ -180,7 +180,7 @@ class LiveSimulation(Simulation):
             self._holds_for = holds_for
             self._used = [output for output in self.outputs if output.is_used]
             self._queue.clear()
-            self._work, self.computed_ns, self._block = None, self.now_ns, SMALLEST_BLOCK
+            self._work, self.computed_ns, self._block_size = None, self.now_ns, SMALLEST_BLOCK
 
     def _send(self, t_ns: int, instant: Instant, publish_from_ns: int) -> None:
         """Send the messages of one time, to the log before others."""

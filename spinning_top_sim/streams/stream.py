@@ -155,6 +155,8 @@ class Stream:
         # A copy, with rows of its own: equal streams share the template.
         self.template, self.fields, self._timing = copy(template), fields, timing
         self.rate_parameter = rate_parameter or f'{parameter}.rate'
+        if self.rate_parameter not in values:
+            raise LookupError(f'{topic}: parameters.STREAM_DEFAULTS has no {self.rate_parameter}')
         self.period_ns = period_ns(values[self.rate_parameter])
 
     @property

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the attitude from serialized messages of other nodes (OMG DDS-XTypes, XCDR1)."""
+"""Reads the messages of other programs, and the attitude in them, by rosbags."""
 
-import struct
-from typing import NamedTuple
+import math
+from functools import cache
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,16 +13,14 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 
 NO_ORIENTATION = -1.0           # first variance of a sensor_msgs/Imu without orientation
-
-
-# By type: how many strings and doubles are between the header and the quaternion, and the rows of
-# the covariance matrix after it, of which the last three are for rotations; 0: none.
+# By type: where the quaternion is, and the covariance matrix, whose last three rows are those of
+# rotations.
 LAYOUTS = {
-    'sensor_msgs/msg/Imu': (0, 0, 3),
-    'geometry_msgs/msg/QuaternionStamped': (0, 0, 0),
-    'geometry_msgs/msg/PoseStamped': (0, 3, 0),
-    'geometry_msgs/msg/PoseWithCovarianceStamped': (0, 3, 6),
-    'nav_msgs/msg/Odometry': (1, 3, 6)}
+    'sensor_msgs/msg/Imu': ('orientation', 'orientation_covariance'),
+    'geometry_msgs/msg/QuaternionStamped': ('quaternion', ''),
+    'geometry_msgs/msg/PoseStamped': ('pose.orientation', ''),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': ('pose.pose.orientation', 'pose.covariance'),
+    'nav_msgs/msg/Odometry': ('pose.pose.orientation', 'pose.covariance')}
 
 
 class Attitude(NamedTuple):
@@ -31,31 +31,38 @@ class Attitude(NamedTuple):
     covariance: NDArray[np.float64]
 
 
+@cache
+def _types() -> Any:
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def deserialized(data: bytes, type_name: str) -> Any:
+    """Return a message of a type of ROS 2 Jazzy.  Raises ValueError."""
+    types = _types()
+    try:
+        return types.deserialize_cdr(data, type_name)
+    except Exception as error:      # whatever rosbags raises
+        raise ValueError(f'no {type_name}: {error}') from error
+
+
 def decode(data: bytes, type_name: str) -> Attitude:
     """
     Return the attitude in a serialized message of a type of LAYOUTS.
 
-    Raises ValueError if the message is too short or has no orientation.
+    Raises ValueError if it is no such message or has no orientation.
     """
-    strings, skipped, size = LAYOUTS[type_name]
-    order = '<' if data[1:2] == b'\1' else '>'
-    try:
-        seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, 4)
-        at = 12
-        for _ in range(1 + strings):         # the first one is the frame
-            at += -at % 4
-            at += 4 + struct.unpack_from(f'{order}I', data, at)[0]
-    except struct.error as error:
-        raise ValueError(str(error)) from error
-    at += (4 - at) % 8 + 8 * skipped         # aligned after the encapsulation header
-    quaternion = np.frombuffer(data, f'{order}f8', 4, at)
+    message, (place, matrix_place) = deserialized(data, type_name), LAYOUTS[type_name]
+    stamp, q = message.header.stamp, attrgetter(place)(message)
     covariance = np.full((3, 3), np.nan)
-    if size:
-        matrix = np.frombuffer(data, f'{order}f8', size * size, at + 32).reshape(size, size)
+    if matrix_place:
+        numbers = attrgetter(matrix_place)(message)
         # The first variance of a pose is that of the position.
-        if size == 3 and matrix[0, 0] == NO_ORIENTATION:
+        if len(numbers) == 9 and numbers[0] == NO_ORIENTATION:
             raise ValueError('it has no orientation')
+        matrix = numbers.reshape(math.isqrt(len(numbers)), -1)[-3:, -3:]
         # A matrix of zeros means unknown (sensor_msgs); the streams of this package are exact.
-        if np.max(np.abs(matrix[-3:, -3:])) > EXACT_VARIANCE:
-            covariance = matrix[-3:, -3:]
-    return Attitude(seconds * NANOSECONDS + nanoseconds, quaternion, covariance)
+        if np.max(np.abs(matrix)) > EXACT_VARIANCE:
+            covariance = matrix
+    return Attitude(stamp.sec * NANOSECONDS + stamp.nanosec, np.array((q.x, q.y, q.z, q.w)),
+                    covariance)

@@ -103,9 +103,8 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
         path.unlink()
     if failed:
         run, reason = next(iter(failed.items()))
-        cli.print_line(f'spinning-top ensemble: '
-                       f'{len(failed)} of {specification.runs} runs failed, see '
-                       f'{MANIFEST}; run {run}: {reason}', sys.stderr)
+        cli.print_line(f'spinning-top ensemble: {len(failed)} of {specification.runs} runs failed'
+                       f', see {MANIFEST}; run {run}: {reason}', sys.stderr)
     if not arguments.quiet:
         cli.print_line(f'{arguments.output}: {specification.runs - len(failed)} runs')
     return cli.OK
@@ -117,9 +116,8 @@ def _compute_row(arguments: argparse.Namespace) -> int:
         manifest = _read_manifest(path)
         specification = ensemble_spec.parse(manifest['specification'], str(path))
         if manifest['versions'] != versions():
-            cli.print_line('spinning-top ensemble: '
-                           'the last bits may differ: the dataset is of other versions, '
-                           f'{manifest["versions"]}', sys.stderr)
+            cli.print_line('spinning-top ensemble: the last bits may differ: the dataset is of '
+                           f'other versions, {manifest["versions"]}', sys.stderr)
     else:
         specification = ensemble_spec.read(path)
     if not 0 <= arguments.row < specification.runs:

@@ -30,6 +30,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 from spinning_top_sim.tools import recorded_run
+from spinning_top_sim.tools.attitudes import deserialized
 
 ATTITUDES, GYROSCOPE, RATES = 'attitudes', 'gyroscope', 'rates'
 ACCELERATIONS, MAGNETOMETER, ANGLES = 'accelerations', 'magnetometer', 'angles'
@@ -283,15 +284,18 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
         if not reader.whole:
             recorded.notes.append('the log is truncated: read as far as it goes')
         tables, first = _log_tables(reader, types, end_ns)
-    rests = {key: all(len({*cells}) == 1 for name, cells in table.items() if name != 'stamp_ns')
-             for key, table in tables.items()}          # such as a fixed frame among transforms
     chosen = sorted(tables, key=lambda one: (
-        one[0] != wanted, rests[one], MESSAGES.index(types[one[0]]), one))
+        one[0] != wanted, _rests(tables[one]), MESSAGES.index(types[one[0]]), one))
     recorded.add({' '.join(filter(None, one)): tables[one] for one in chosen}, origin)
     for topic, message in first.items():
         recorded.covariance.update((kind, matrix) for kind, matrix in _covariances(message)
                                    if f'{kind} of {topic}: ' in ''.join(recorded.notes))
     return recorded
+
+
+def _rests(table: Table) -> bool:
+    """Return whether nothing in it changes, such as a fixed frame among transforms."""
+    return all(len({*cells}) == 1 for name, cells in table.items() if name != 'stamp_ns')
 
 
 def _covariances(message: Any) -> Iterator[tuple[str, Reals]]:
@@ -322,16 +326,12 @@ def _log_tables(reader: LogReader, types: Mapping[str, str], end_ns: int,
 def _contents(reader: LogReader, types: Mapping[str, str],
               end_ns: int) -> Iterator[tuple[str, int, Any]]:
     """Yield topics, log times and messages, or transforms in them.  Raises LogError."""
-    with needed('a log', 'rosbags'):
-        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
-
-    store = get_typestore(Stores.ROS2_JAZZY)
     for message in reader.messages(types, end=end_ns):
         try:
-            content: Any = store.deserialize_cdr(message.data, types[message.topic])
-        except Exception as error:      # whatever rosbags raises
-            raise LogError(f'cannot read {reader.path}: a message of {message.topic} is no '
-                           f'{types[message.topic]}: {error}') from error
+            content = deserialized(message.data, types[message.topic])
+        except ValueError as error:
+            raise LogError(f'cannot read {reader.path}: a message of {message.topic} is '
+                           f'{error}') from error
         for one in getattr(content, 'transforms', [content]):
             yield message.topic, message.log_time, one
 

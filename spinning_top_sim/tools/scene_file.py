@@ -158,14 +158,18 @@ def is_of_ros(name: str) -> bool:
     return name.partition('.')[0] in ROS_PARAMETERS
 
 
+def likely_name(name: str) -> str:
+    """Return what to say of the parameter whose name is most like an unknown one."""
+    near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
+    return f'; did you mean {near[0]}?' if near else ''
+
+
 def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
     """Return the values without those of ROS.  Raises ValueError for unknown parameters."""
     ours = {name: value for name, value in values.items() if not is_of_ros(name)}
     for name, value in ours.items():
         if name not in parameters.BY_NAME:
-            near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
-            hint = f'; did you mean {near[0]}?' if near else ''
-            raise ValueError(f'{source}: there is no parameter {name}{hint}')
+            raise ValueError(f'{source}: there is no parameter {name}{likely_name(name)}')
         if value is None:
             raise ValueError(f'{source}: {name} has no value')
         if isinstance(value, list) and len(set(map(type, value))) > 1:

@@ -36,9 +36,9 @@ class Table(Stream):
     def size(self) -> int:
         return 8 * len(self.units)
 
-    def encode(self, *parts: Samples) -> Encoded:
-        return (np.concatenate([one.t_ns for one in parts]),
-                np.concatenate([self._rows(one) for one in parts]))
+    def encode(self, *samples: Samples) -> Encoded:
+        return (np.concatenate([one.t_ns for one in samples]),
+                np.concatenate([self._rows(one) for one in samples]))
 
     def _rows(self, samples: Samples) -> NDArray[np.float64]:
         states = samples.states

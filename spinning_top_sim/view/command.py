@@ -127,7 +127,7 @@ def _open_page(arguments: argparse.Namespace, title: str) -> Page:
 
 
 def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, argv: list[str],
-             ) -> Callable[[], RunnableNode]:
+             ) -> tuple[list[str], Callable[[], RunnableNode]]:
     """Return what opens the page; a node of a scene or IMU runs until `stack` is closed."""
     if arguments.html is not None:
         raise ValueError(f'--html {arguments.html}: must have a log')
@@ -139,8 +139,4 @@ def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, argv: l
         if files:
             stack.enter_context(_node(files, argv[len(without_ros_arguments(argv)):]))
         return view
-    return make_node
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    return argv, make_node

@@ -2,7 +2,6 @@
 """The page of a running sim_node: a node that subscribes to it, and calls its services."""
 
 import math
-import struct
 import threading
 import time
 import traceback
@@ -25,7 +24,7 @@ from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.installation import parameter_files
-from spinning_top_sim.nodes import throttle
+from spinning_top_sim.nodes.publishers import THROTTLED
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -107,12 +106,12 @@ class LiveView(Node):
             self._inbox.append((topic, data))
             self._arrived.set()
         self._listeners[topic] = self.create_subscription(
-            KIND_OF[topic], throttle.TOPICS.get(topic, topic), _receive, QOS, raw=True)
+            KIND_OF[topic], THROTTLED.get(topic, topic), _receive, QOS, raw=True)
 
     def _listen_as_needed(self) -> None:
         """Subscribe to the topics that are shown only: each message costs the node some time."""
         needed = {'pose', 'joint_states'}
-        if self.count_publishers(throttle.TOPICS['ground_truth/odom']):     # both in one
+        if self.count_publishers(THROTTLED['ground_truth/odom']):     # both in one
             needed = {'ground_truth/odom'}
         if self._page.arrows[shapes.ARROWS.index('specific force')].value:
             needed |= {'ground_truth/imu'}
@@ -184,11 +183,11 @@ class LiveView(Node):
             topic, data = self._inbox.popleft()
             arrived[topic].append(data)
         for topic, messages in arrived.items():
-            stamps_ns = [_stamp_ns(data) for data in messages]
+            samples = self._track.decode(topic, messages)
             known_ns = self._track.samples[topic].stamps_ns
-            if len(known_ns) and stamps_ns[-1] < known_ns[-1] - RESTART_NS:
+            if len(known_ns) and (samples.stamps_ns[-1:] < known_ns[-1] - RESTART_NS).any():
                 self._track.drop_before(known_ns[-1] + 1)        # the sim_node was started again
-            self._track.add(topic, self._track.decode(topic, stamps_ns, messages))
+            self._track.add(topic, samples)
         for topic in KIND_OF.keys() - self._listeners.keys():   # these get old
             self._track.samples[topic] = empty(topic)
 
@@ -265,9 +264,3 @@ class LiveView(Node):
                         for name, value in values.items()])).result
         if not result.successful:
             raise RequestError(result.reason)
-
-
-def _stamp_ns(data: bytes) -> int:
-    """Return the stamp of a serialized message that begins with a std_msgs/Header [ns]."""
-    seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
-    return int(seconds) * NANOSECONDS + int(nanoseconds)

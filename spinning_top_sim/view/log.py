@@ -60,7 +60,7 @@ def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) ->
     parts = defaultdict(list)
     for topic, group in reader.groups(names):
         stamps_ns, data = zip(*((one.log_time, one.data) for one in group), strict=True)
-        parts[names[topic]].append(track.decode(names[topic], stamps_ns, data))
+        parts[names[topic]].append(track.decode(names[topic], data, stamps_ns))
     for name, samples in parts.items():
         track.samples[name] = joined(samples)
 

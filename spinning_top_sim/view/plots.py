@@ -18,6 +18,7 @@ from spinning_top_sim.view.track import (
     PRECESSION,
     Series,
     Track,
+    energies,
 )
 
 Reals = NDArray[np.float64]
@@ -54,7 +55,7 @@ def motion_plots(tops: Sequence[Shown]) -> list[Plot]:
         times, rows = top.part(top.track.rates)
         if len(rows):
             rate.append(Line('φ′', BLUE, times, rows[:, PRECESSION], dash))
-            kinetic, height = shapes.energies(top.track.top, rows)
+            kinetic, height = energies(top.track.top, rows)
             energy += [Line('kinetic', RED, times, kinetic, dash),
                        Line('potential', BLUE, times, height, dash),
                        Line('sum', GREEN, times, kinetic + height, dash)]

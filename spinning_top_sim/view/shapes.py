@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.top import Top
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.view.track import Track
 
@@ -84,12 +83,6 @@ def axis_of(rows: Vectors) -> Vectors:
 def tilt(axis: Vectors) -> Vectors:
     """Return theta (n,) [deg] of an axis (n, 3)."""
     return np.degrees(np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), axis[:, 2]))
-
-
-def energies(top: Top, rows: Vectors) -> tuple[Vectors, Vectors]:
-    """Return kinetic and potential energy (n,) [J] of rows with attitude and angular velocity."""
-    moments = np.array((top.lambda1, top.lambda1, top.lambda3))
-    return 0.5 * rows[:, 4:7] ** 2 @ moments, top.gravity_torque * axis_of(rows)[:, 2]
 
 
 def in_world(quaternion: Vectors, vector: Vectors) -> Vectors:

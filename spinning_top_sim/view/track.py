@@ -121,10 +121,12 @@ class Track:
         self._templates = {stream.topic: stream.template for stream in all_streams(values)
                            if stream.topic in WIDTHS}
 
-    def decode(self, topic: str, stamps_ns: Sequence[int], messages: Sequence[bytes]) -> Series:
-        """Return serialized messages of a topic as samples."""
-        stamps = np.array(stamps_ns, np.int64)
-        fields = self._templates[topic].decode(b''.join(messages))
+    def decode(self, topic: str, messages: Sequence[bytes],
+               stamps_ns: Sequence[int] | None = None) -> Series:
+        """Return serialized messages of a topic as samples; by default with the stamps in them."""
+        template, data = self._templates[topic], b''.join(messages)
+        stamps = template.stamps_ns(data) if stamps_ns is None else np.array(stamps_ns, np.int64)
+        fields = template.decode(data)
         if topic == '~/invariants':
             return Series(stamps, fields[0])
         found = attitudes_of(topic, self._imu, stamps, fields)
@@ -220,15 +222,22 @@ def constants_and_state(top: Top, row: NDArray[np.float64],
     quaternion, omega = row[:4], row[4:7]
     state = placement.state_of(top, quaternion, np.array(
         attitude.rotated(tuple(quaternion), tuple(omega))))
-    up = float(attitude.vertical_in_body(tuple(quaternion))[2])
-    moments = np.array((top.lambda1, top.lambda1, top.lambda3))
-    energy = 0.5 * float(moments @ omega ** 2) + top.gravity_torque * up
+    energy = float(np.sum(energies(top, row[np.newaxis])))
     dust = SNAP * max(abs(state.l3), abs(state.lz), _natural_momentum(top))
     l3, lz = (0.0 if abs(value) < dust else value for value in (state.l3, state.lz))
     lz = next((pole for pole in (l3, -l3) if abs(lz - pole) < dust), lz)
     theta_dot = state.theta_dot if top.lambda1 * abs(state.theta_dot) > dust else 0.0
     return (energy, state.l3, state.lz), State(theta=state.theta, theta_dot=theta_dot, l3=l3,
                                                lz=lz)
+
+
+def energies(top: Top, rows: NDArray[np.float64],
+             ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return kinetic and potential energy (n,) [J] of rows with attitude and angular velocity."""
+    moments = np.array((top.lambda1, top.lambda1, top.lambda3))
+    x, y, z, w = rows[:, :4].T
+    return (0.5 * rows[:, 4:7] ** 2 @ moments,
+            top.gravity_torque * attitude.axis_in_world((x, y, z, w))[2])
 
 
 def _natural_momentum(top: Top) -> float:

@@ -43,16 +43,13 @@ def _number(random_: random.Random, row: Parameter) -> float | int:
         -LARGEST if row.above is None else math.nextafter(row.above, 1.0))
     high = LARGEST if row.maximum is None else row.maximum
     size = row.smallest or 0.0
-    wanted = random_.choice((low, high, _default(row), _double(random_), _double(random_),
+    default = row.default if isinstance(row.default, int | float) else 1.0
+    wanted = random_.choice((low, high, default, _double(random_), _double(random_),
                              random_.uniform(-10.0, 10.0)))
     if low >= 0.0:
         wanted = abs(wanted)
     chosen = min(max(wanted if abs(wanted) >= size else 0.0, low), high)
     return int(chosen) if isinstance(row.default, int) else chosen
-
-
-def _default(row: Parameter) -> float:
-    return row.default if isinstance(row.default, int | float) else 1.0
 
 
 def actions(random_: random.Random) -> list[tuple[str, object]]:

@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,15 +12,13 @@ from spinning_top_sim import solve
 from spinning_top_sim.physics import attitude
 
 
-def exact(top, start, times, dt):
+def exact(top, start, times, dt, **options):
     """Return attitudes x y z w, body rates and angular accelerations of the exact motion."""
-    motion = solve(top, start.state, times)
+    motion = solve(top, start.state, times, **options)
     return motion.quaternion, motion.angular_velocity, motion.angular_acceleration
 
 
-def rk45(top, start, times, dt):
-    motion = solve(top, start.state, times, method='rk45')
-    return motion.quaternion, motion.angular_velocity, motion.angular_acceleration
+rk45 = partial(exact, method='rk45')
 
 
 def right_torque(top, spin, across, up, height):

@@ -59,15 +59,3 @@ def rewritten(source, target, change=lambda topic, number, data: data, metadata=
                     writer.add_message(channels[channel.id], at_ns, one, at_ns)
         writer.finish()
     return target
-
-
-def stepped_log(path):
-    """Four motions by steps, with noise, in a namespace."""
-    return log_of(path, '--duration', 3, '--command', '1.0:2.0:1.5',
-                  '--command', '0:1.7:1.4', '--command', '2.0031:1.6:1.0', '--namespace', '/a/b',
-                  '-p', 'imu.gyroscope_noise_density:=0.01', '-p', 'markers.enabled:=true')
-
-
-def short_log(path):
-    """Two motions in half a second."""
-    return log_of(path, '--duration', 0.5, '--command', '0.3:1.7:1.4')

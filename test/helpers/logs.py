@@ -121,11 +121,6 @@ def seen_by_rosbags(path) -> list[tuple[str, int, bytes]]:
     return read
 
 
-def metadata_of(path) -> dict[str, dict[str, str]]:
-    with open(path, 'rb') as file:
-        return {record.name: record.metadata for record in make_reader(file).iter_metadata()}
-
-
 def places(log, each=8):
     """Some bytes of every record: most of its head, and seeded ones of the rest; and the magic."""
     choice = random.Random(5)

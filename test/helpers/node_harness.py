@@ -23,11 +23,7 @@ from pathlib import Path
 
 import rclpy
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.srv import (
-    GetParameters,
-    SetParameters,
-    SetParametersAtomically,
-)
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -75,12 +71,10 @@ class SimNode:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.name = f'{namespace.rstrip("/")}/spinning_top'
         self.namespace = namespace.rstrip('/')
-        options = [item for name, value in (parameters or {}).items()
-                   for item in ('-p', f'{name}:={as_yaml(value)}')]
         self.command = [
             *DIE_WITH_PARENT, sys.executable,
             *(program or ('-m', 'spinning_top_sim', 'node')),
-            '--ros-args', '-r', f'__ns:={namespace}', *options, *arguments]
+            '--ros-args', '-r', f'__ns:={namespace}', *options(parameters or {}), *arguments]
 
     def __enter__(self):
         source = str(Path(spinning_top_sim.__file__).parents[1])
@@ -151,14 +145,19 @@ class SimNode:
         return name if name.startswith('/') else f'{self.namespace}/{name}'
 
 
-def as_yaml(value):
-    """Return a parameter's value as the command line takes it."""
-    return value if isinstance(value, str) else (
-        json.dumps(value).replace('Infinity', '.inf').replace('NaN', '.nan'))
+def options(parameters):
+    """Return the arguments that set parameters."""
+    return [item for name, value in parameters.items() for item in ('-p', f'{name}:=' + (
+        value if isinstance(value, str)
+        else json.dumps(value).replace('Infinity', '.inf').replace('NaN', '.nan')))]
 
 
 class Topic:
-    """The messages that have arrived on one topic, serialized, in order."""
+    """
+    The messages that have arrived on one topic, serialized, in order.
+
+    muted: further ones are ignored; rclpy cannot destroy a subscription that is waited for
+    """
 
     def __init__(self, kind):
         self.kind = kind
@@ -179,9 +178,8 @@ class Topic:
         """Wait until `count` more messages have arrived."""
         return self.wait(len(self.raw) + count, timeout)
 
-    def messages(self, start=0):
-        """Return the messages from `start` on, deserialized."""
-        return [deserialize_message(data, self.kind) for data in self.raw[start:]]
+    def messages(self):
+        return [deserialize_message(data, self.kind) for data in self.raw]
 
     def last(self):
         return deserialize_message(self.raw[-1], self.kind)
@@ -242,10 +240,6 @@ class Peer:
             raw=True)
         return topic
 
-    def stop_listening(self, topic):
-        """Ignore further messages; rclpy cannot destroy a subscription that is waited for."""
-        topic.muted = True
-
     def call(self, kind, name, request, timeout=PATIENCE_S, again=False):
         """
         Call a service and return its answer.
@@ -282,11 +276,6 @@ class Peer:
         request = SetParametersAtomically.Request(parameters=_parameters(values))
         return self.call(SetParametersAtomically, node.topic('~/set_parameters_atomically'),
                          request).result
-
-    def set_each(self, node, **values):
-        """Set parameters one by one (`__` for the dot); return a result for each."""
-        request = SetParameters.Request(parameters=_parameters(values))
-        return self.call(SetParameters, node.topic('~/set_parameters'), request).results
 
     def get(self, node, *names):
         answer = self.call(GetParameters, node.topic('~/get_parameters'),
@@ -352,15 +341,12 @@ class DrivenClock:
         self._peer, self.now_ns = peer, now_ns
         self._publisher = peer.node.create_publisher(Clock, topic, 10)
 
-    def publish(self, seconds, nanoseconds=0):
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = seconds, nanoseconds
-        self._publisher.publish(message)
-
     def drive(self, what, until):
         def goes_on():
             self.now_ns += 5_000_000
-            self.publish(*divmod(self.now_ns, 10 ** 9))
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(self.now_ns, 10 ** 9)
+            self._publisher.publish(message)
             return until()
         wait_for(what, goes_on)
 

@@ -109,21 +109,6 @@ def decoded(path):
     return counts[0]
 
 
-def by_parameters(peer, node, l3, lz):
-    result = peer.set_together(node, spin__l3=l3, spin__lz=lz)
-    assert result.successful, result.reason
-
-
-def assert_steps(stamps, period, skipped):
-    """Whether stamps are a period apart; or periods, where the node says that it skipped some."""
-    steps = np.diff(stamps)
-    assert (steps > 0).all()
-    assert (steps % period == 0).all()
-    # Only a machine that holds the node up for half a second makes it skip.
-    if int(skipped) == 0:
-        assert set(steps) == {period}
-
-
 def assert_received_from(received, logged):
     """Whether all that was received is in the log, in the same order."""
     place = {data: index for index, data in enumerate(logged)}

@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from helpers.node_harness import as_yaml, numbers, wait_for
+from helpers.node_harness import numbers, options, wait_for
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.simulator import Simulator
 
@@ -41,9 +41,7 @@ class OwnNode(InThisProcess):
     def __init__(self, folder, *arguments, **values):
         given = {'status_period': 0.0, 'record.uri': f'{folder}/run.mcap',
                  'record.min_free_bytes': 0, **dotted(values)}
-        options = [item for name, value in given.items()
-                   for item in ('-p', f'{name}:={as_yaml(value)}')]
-        argv = ['--ros-args', *options, *arguments]
+        argv = ['--ros-args', *options(given), *arguments]
         rclpy.init(args=argv)
         self.node = Simulator(argv)
         self.loop, self.simulation = self.node.loop, self.node.simulation

@@ -51,6 +51,10 @@ def write_rows(path, topics, rows, per_chunk=None):
     return path
 
 
+def write(recorder, topic_index, log_time_ns, data):
+    recorder.write_all([(topic_index, log_time_ns, data)], len(data))
+
+
 def some_messages(count: int) -> list[tuple[int, int, bytes]]:
     """Messages of the first two topics in turn, 1 ms apart."""
     makers = (pose_cdr, array_cdr)

@@ -196,6 +196,7 @@ OWN = {     # and these
         'declination': ({'declination': np.radians(5.0)}, 'heading_offset'),
         'bias gain < 0': ({'learns': -0.15}, 'no_bias_estimate diverges'),
         'no bias': ({'learns': 0.0}, 'no_bias_estimate'),
+        'bias about z': ({'learns': np.array((0.0, 0.0, 0.15))}, 'no_bias_estimate'),
         'bias in deg/s': ({'report': np.degrees}, 'bias_report'),
         'bias clamped': ({'most': np.radians(0.1)}, 'no_bias_estimate'),
         'bias negated': ({'report': np.negative}, 'bias_report')},
