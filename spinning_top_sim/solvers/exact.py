@@ -145,29 +145,26 @@ class ExactSolution(ClosedForm):
         self.turns = round(start.theta / math.tau)
         theta = start.theta - self.turns * math.tau
         # A state continued through a pole is solved from the same attitude with theta in [0, pi].
-        self.sign, self._half_turn = (-1.0, math.pi) if theta < 0.0 else (1.0, 0.0)
+        self.sign, half_turn = (-1.0, math.pi) if theta < 0.0 else (1.0, 0.0)
         self.start = State(
             theta=min(abs(theta), math.pi), theta_dot=self.sign * start.theta_dot,
-            phi=start.phi + self._half_turn, psi=start.psi - self._half_turn,
+            phi=start.phi + half_turn, psi=start.psi - half_turn,
             l3=start.l3, lz=start.lz)
         motion = set_up(top, Decimal(top.gravity), self.start)
         super().__init__(top, motion, Decimal(start.l3), Decimal(start.lz))
-        with precision(DIGITS):
-            self._take_means(motion)
-        self._check_start()
-
-    def _take_means(self, motion: ThetaMotion) -> None:
-        start, alpha, beta = self.start, motion.alpha, motion.beta
+        alpha, beta, phi, psi = motion.alpha, motion.beta, self.start.phi, self.start.psi
         self.m, self.m1 = float(motion.m), float(motion.m1)
-        # 2 K/w, two quarter periods
-        self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
-        self.mean_precession_rate = float(alpha.rate + beta.rate)
-        self.mean_spin_rate = float(alpha.rate - beta.rate)
-        # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
-        self.phi_phase = float(
-            Decimal(start.phi) - alpha.start_argument - beta.start_argument) - self._half_turn
-        self.psi_phase = float(
-            Decimal(start.psi) - alpha.start_argument + beta.start_argument) + self._half_turn
+        with precision(DIGITS):
+            # 2 K/w, two quarter periods
+            self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
+            self.mean_precession_rate = float(alpha.rate + beta.rate)
+            self.mean_spin_rate = float(alpha.rate - beta.rate)
+            # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
+            self.phi_phase = float(
+                Decimal(phi) - alpha.start_argument - beta.start_argument) - half_turn
+            self.psi_phase = float(
+                Decimal(psi) - alpha.start_argument + beta.start_argument) + half_turn
+        self._check_start()
 
     def _check_start(self) -> None:
         """Refuse constants so far apart that doubles lose the start among them."""
@@ -232,10 +229,8 @@ def axis_rate(bottom_rate: float, top_rate: float, cosine: Number, sine: Number)
 
 class ThetaStates(States):
     """
-    States by theta functions.
+    States by the theta functions of a motion, or of several, each at its own times.
 
-    theta : of the motion, or of several
-    times : since the start of the motion that each belongs to
     columns : those of `States`, where they are not those of the start
     """
 

@@ -30,7 +30,7 @@ class Motion(Protocol):
     top : what moves
     ns_limit : the last time that it can give at all [ns]
     steps, evaluations : counts
-    chains : whether it is an `AcceleratedMotion` that `vertical.chained` takes
+    chains : whether it is an `AcceleratedMotion` that can be read together with others
     start : from where it moves
     reached_ns : the last time that `states` can give without further steps [ns]
     exact : the closed form; None where doubles cannot hold it

@@ -45,8 +45,8 @@ class Constants:
 
     Raises ValueError if doubles cannot hold an amplitude or a rate.
 
-    start_whole, offsets : of the three phases.  At t = 0 a phase is their sum; the latter are two
-        doubles each.
+    rates : of the three phases [1/s], in long decimals
+    start_whole, offsets : at t = 0 a phase is their sum; the latter are two doubles each
     drifts : kappa/2 of alpha and beta
     stretch : K/K' times a quarter turn, 0 in the real form
     prefactors, polynomials : at even and at odd N, of the rows R of alpha and beta, s J of alpha
@@ -58,8 +58,7 @@ class Constants:
 
     def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
-        self._rates = [motion.quarter_rate, *(x.rate / pi() for x in factors)]
-        self._rates_in: dict[str, list[tuple[float, float]]] = {}
+        self.rates = [motion.quarter_rate, *(x.rate / pi() for x in factors)]
         turns = [2 * x.phase_turns for x in factors]
         self.start_whole = [motion.quarter0, *map(round, turns)]
         self.offsets = [*map(double_double, (
@@ -90,13 +89,6 @@ class Constants:
     def chains(self) -> bool:
         """Whether the motion can be part of a chain: it nutates, and passes no pole."""
         return any(self.u_dot) and all(self.senses)
-
-    def rates(self, unit: str) -> list[tuple[float, float]]:
-        """Return the rates of the three phases, per unit of `Times`, as two doubles each."""
-        if unit not in self._rates_in:
-            with precision(DIGITS):
-                self._rates_in[unit] = [double_double(x * UNITS[unit]) for x in self._rates]
-        return self._rates_in[unit]
 
 
 class ThetaFunctions:
@@ -149,9 +141,10 @@ class ThetaFunctions:
     def turned(self, times: Times) -> tuple[Matrix, Matrix]:
         """Return what the three phases have grown by (3, n), as two doubles each."""
         if times.unit not in self._rates:
-            high, low = np.array([one.rates(times.unit) for one in self._motions]
-                                 ).transpose(2, 0, 1)
-            rate, rest = self.columns(high), self.columns(low)
+            with precision(DIGITS):
+                rate, rest = map(self.columns, np.array([
+                    [double_double(x * UNITS[times.unit]) for x in one.rates]
+                    for one in self._motions]).transpose(2, 0, 1))
             self._rates[times.unit] = rate, *halves(rate), rest
         return products(self._rates[times.unit], times)
 

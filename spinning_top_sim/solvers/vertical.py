@@ -18,7 +18,6 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.pivot import Exact
@@ -132,7 +131,7 @@ class AcceleratedMotion(ClosedForm):
         return rounded(self.halves)
 
     def _states_at(self, times: Times) -> States:
-        return _AcceleratedStates([self], None, times)
+        return AcceleratedStates([self], None, times)
 
     def posture(self, ns: int) -> Posture:
         """
@@ -150,7 +149,7 @@ class AcceleratedMotion(ClosedForm):
             return Posture(alpha, beta, across, self._posture.l3)
 
 
-class _AcceleratedStates(ThetaStates):
+class AcceleratedStates(ThetaStates):
     """States of a motion, or of several motions that chain, of each at so many of the times."""
 
     def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int] | None,
@@ -176,12 +175,6 @@ class _AcceleratedStates(ThetaStates):
         cancels = np.abs(bottom) + np.abs(top) > np.abs(one) + np.abs(two)
         across: Column = np.where(cancels, one + two, bottom + top)
         return across
-
-
-def chained(motions: Sequence[AcceleratedMotion], counts: Sequence[int],
-            times_ns: NDArray[np.int64]) -> States:
-    """Return the states of motions that chain, of each at so many of the times [ns]."""
-    return _AcceleratedStates(motions, counts, Times.from_ns(times_ns))
 
 
 @lru_cache(64)

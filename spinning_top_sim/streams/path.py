@@ -22,7 +22,13 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ClosedForm
 from spinning_top_sim.solvers.propagator import Motion
 from spinning_top_sim.solvers.theta_setup import Posture
-from spinning_top_sim.solvers.vertical import AcceleratedMotion, Vertical, chained, posture_at
+from spinning_top_sim.solvers.times import Times
+from spinning_top_sim.solvers.vertical import (
+    AcceleratedMotion,
+    AcceleratedStates,
+    Vertical,
+    posture_at,
+)
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS
 
 
@@ -165,7 +171,8 @@ def states_of(segments: Sequence[Segment], counts: Sequence[int],
         rides.append(cast(Ride, segment.ride))
     since_ns = times_ns - np.repeat([segment.start_ns for segment in segments], counts)
     x, y, z, w = np.repeat(np.hstack([ride.vertical.rows for ride in rides]), counts, axis=1)
-    return WorldStates(rides[0].top, chained(motions, counts, since_ns), (x, y, z, w))
+    states = AcceleratedStates(motions, counts, Times.from_ns(since_ns))
+    return WorldStates(rides[0].top, states, (x, y, z, w))
 
 
 class Path:
