@@ -16,6 +16,7 @@ import math
 from collections.abc import Sequence
 from decimal import Decimal
 from functools import cached_property
+from itertools import chain
 from operator import sub
 
 import numpy as np
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.solvers.decimal_math import DIGITS, double_double, pi, precision
 from spinning_top_sim.solvers.theta_series import SIN_ODD
-from spinning_top_sim.solvers.theta_setup import ThetaMotion
+from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import UNITS, Times, halves, products
 
 # glibc gives freed memory back at once, and clears the pages again at the next use, until it has
@@ -73,13 +74,8 @@ class Constants:
             for one, scale in zip(row, factor.scales, strict=True)]
             for row, factor in zip(rows, 2 * factors, strict=True)]
         self.senses = [factor.sense for factor in factors]
-        for name, factor in zip(('alpha', 'beta'), factors, strict=True):
-            for (real, _), scale in zip(factor.parts, factor.scales, strict=True):
-                size = abs(scale) * max(map(abs, real.weights))
-                if 0 < size < LEAST_AMPLITUDE:
-                    raise ValueError(
-                        f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
-                        f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
+        _check_amplitude('alpha', motion.alpha)
+        _check_amplitude('beta', motion.beta)
         self.u_dot = [in_range("cos(theta)'", x) for x in motion.u_dot]
         self.u_dot_polynomial = [*map(float, motion.u_dot_series.polynomial(motion.size))]
         self.momentum, self.swing = ([*map(float, pair)] for pair in (
@@ -91,6 +87,15 @@ class Constants:
         return any(self.u_dot) and all(self.senses)
 
 
+def _check_amplitude(name: str, factor: Factor) -> None:
+    for (real, _), scale in zip(factor.parts, factor.scales, strict=True):
+        size = abs(scale) * max(map(abs, real.weights))
+        if 0 < size < LEAST_AMPLITUDE:
+            raise ValueError(
+                f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
+                f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
+
+
 class ThetaFunctions:
     """
     The `Constants` of a motion in arrays, or those of several motions, each for so many times.
@@ -99,9 +104,11 @@ class ThetaFunctions:
     `momentum` and `swing` have those of all motions at even and at odd N.
 
     stretch : None if there is no imaginary form
-    prefactors : where they differ in a chain, of all its motions one after the other
-    real : the numbers, 0 and 1, of those of alpha and beta that have s = 0
-    zeros : of the ones that pass a pole: 0 or 1, whether R = 0 at even or at odd N and y = 0
+    prefactors : of the rows of `Constants`: at even N, at odd N; where the motions of a chain
+        differ, those of the first motion, then of the second, ...
+    real : the numbers, 0 for alpha and 1 for beta, of those that have s = 0
+    zeros : by the same number, of those that pass their pole exactly: whether R = 0 at y = 0 is
+        at even N (0) or at odd N (1)
     first : of a chain, the place of each time's constants at even N in the last axis, (n,)
     """
 
@@ -112,15 +119,12 @@ class ThetaFunctions:
         self.offset, self.offset_rest = map(self.columns, np.array(
             [one.offsets for one in motions]).transpose(2, 0, 1))
         self.drifts = self.columns([one.drifts for one in motions])
-        self.stretch: Column | None = None
-        if any(one.stretch for one in motions):
-            self.stretch, = self.columns([(one.stretch,) for one in motions])
-        self.prefactors: list[tuple[int, ...]] = present.prefactors
-        if any(one.prefactors != present.prefactors for one in motions):
-            self.prefactors = [sum(rows, ()) for rows in zip(*(
-                one.prefactors for one in motions), strict=True)]
-        self.coefficients = _side_by_side([pair[k] for pairs in zip(*(
-            one.polynomials for one in motions), strict=True) for pair in pairs for k in (0, 1)]
+        (stretch,) = self.columns([(one.stretch,) for one in motions])
+        self.stretch = stretch if np.any(stretch) else None
+        self.prefactors = _prefactors(motions)
+        self.coefficients = _side_by_side(
+            [*chain.from_iterable(chain.from_iterable(zip(*(
+                one.polynomials for one in motions), strict=True)))]
             ).reshape(-1, 4, 2 * len(motions))
         self.real = [k for k, sense in enumerate(present.senses) if not sense]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(present.prefactors[:2])
@@ -176,6 +180,13 @@ class ThetaFunctions:
         return start - slope * quarter0, slope
 
 
+def _prefactors(motions: Sequence[Constants]) -> list[tuple[int, ...]]:
+    present = motions[0].prefactors
+    if all(one.prefactors == present for one in motions):
+        return present
+    return [sum(rows, ()) for rows in zip(*(one.prefactors for one in motions), strict=True)]
+
+
 class ThetaValues:
     """The motion at n times, in columns that are computed when they are first asked for."""
 
@@ -187,7 +198,8 @@ class ThetaValues:
         shift = part + constants.offset
         shift += rest
         np.rint(shift, out=shift)
-        # No step rounds where the result is small.
+        # No difference rounds where the result is small: its terms are within a factor of two of
+        # each other then (Sterbenz).
         half = 0.5 * shift
         part -= half
         half -= constants.offset
