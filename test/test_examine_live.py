@@ -48,7 +48,7 @@ def running():
 
 
 def test_a_node_that_runs_gets_one_run_after_the_other(run, running, monkeypatch, capfd):
-    twice = run.after(run)
+    twice = run.preceded_by(run)
     direct = follow(partial(Vqf, magnetic=False), twice.part(slice(1, None)))
     with monkeypatch.context() as alone, live.NodeExam('imu/data') as node:
         alone.setattr(live, 'DISCOVERY_S', 0.0)

@@ -67,8 +67,8 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
     lead = scenarios.along(path(np.arange(ends[-1] + 1)), imu)
     end = len(lead.t) + len(motion.t)
     last = np.tile(motion.truth[-1], (3 * answer + 1, 1))
-    still = replace(scenarios.along(Rotation.from_quat(last), imu).after(motion.after(lead)),
-                    name='excitation')
+    still = replace(scenarios.along(Rotation.from_quat(last), imu).preceded_by(
+        motion.preceded_by(lead)), name='excitation')
     still.gyroscope[:] += NEVER_ZERO
     run = replace(still, gyroscope=still.gyroscope.copy())
     kick = Rotation.from_quat(last[0]).inv().apply(KICK) / KICK_S

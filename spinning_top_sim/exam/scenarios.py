@@ -101,7 +101,7 @@ class Run:
         return Rotation.from_quat(self.truth[0]) * Rotation.from_rotvec(
             -self.gyroscope[0] * self.dt[0])
 
-    def after(self, lead: 'Run') -> 'Run':
+    def preceded_by(self, lead: 'Run') -> 'Run':
         """Return this run with another one before it, of the same name; there t <= 0."""
         return Run(self.name, *(np.concatenate((getattr(lead, one.name), getattr(self, one.name)))
                                 for one in fields(self)[1:]))

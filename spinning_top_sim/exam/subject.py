@@ -73,7 +73,7 @@ class LastingSubject(Subject):
         """Return the outcome of a run.  Raises InvalidOutputError."""
         lead = scenarios.turning(self.imu, self._attitude, run.start, TURN_S)
         self._attitude = Rotation.from_quat(run.truth[-1])
-        return super().follow(run.after(lead), undone).part(slice(len(lead.t), None))
+        return super().follow(run.preceded_by(lead), undone).part(slice(len(lead.t), None))
 
     def uses_field(self) -> bool:
         """Turn the field to and fro; return whether the attitude follows."""
@@ -96,6 +96,6 @@ class LastingSubject(Subject):
         """Return the convergence time after a jump of the true attitude by 90 degrees of tilt."""
         run = self.record(scenarios.SLOW)
         tilted = Rotation.from_euler('x', 90.0, degrees=True) * run.start
-        tilt = self.follow(run.after(scenarios.turning(
+        tilt = self.follow(run.preceded_by(scenarios.turning(
             self.imu, tilted, tilted, TURN_S))).errors.tilt[-len(run.t):]
         return {'convergence_s': measures.convergence_time(run.t, tilt)}

@@ -2,10 +2,10 @@
 """
 Rotation and velocity increments of a body, exact to rounding however short the interval is.
 
-Increments are the differences of the states at both ends.  These errors do not add up in a sum of
-increments, but over a short time, such as 0.1 ms, they are large beside the difference: there the
-increments are integrals of the body's rates, whose rounding shrinks with the interval.  Means are
-integrals, too, by a Gauss-Legendre rule at whole nanoseconds.
+Increments are the differences of the states at both ends.  The rounding errors of these do not add
+up in a sum of increments, but over a short time, such as 0.1 ms, they are large beside the
+difference: there the increments are integrals of the body's rates, whose rounding shrinks with
+the interval.  Means are integrals, too, by a Gauss-Legendre rule at whole nanoseconds.
 """
 
 import math
@@ -97,6 +97,7 @@ def increments(states: Callable[[range], States], begins: range, length_ns: int,
     first = states(begins)
     x, y, z, w = first.rows_quaternion
     inverse = -x, -y, -z, w
+    # Rotation less the identity, velocity, angles and forces: 4, 3, 3 and 3 rows.
     sums = np.zeros((13, len(begins)))
     for offset_ns, weight in _rule(length_ns, _nodes(rate * length_ns * 1e-9)):
         now = states(range(begins.start + offset_ns, begins.stop + offset_ns, begins.step))
@@ -109,7 +110,7 @@ def increments(states: Callable[[range], States], begins: range, length_ns: int,
             *attitude.rotated_back((-x, -y, -z, w), force), *rates, *force)
         for row, derivative in enumerate(derivatives):
             sums[row] += weight * derivative
-    sums[3] += 1.0
+    sums[3] += 1.0              # w of the identity
     if rate * length_ns * 1e-9 >= LEAST_ANGLE:
         last = states(range(begins.start + length_ns, begins.stop + length_ns, begins.step))
         sums[:7] = _differences(first, last, length_ns * 1e-9, point)

@@ -70,7 +70,7 @@ class States:
         and of the angular velocity, which cost no copy.
     """
 
-    method = 'rk45'             # that computes them
+    method = 'rk45'             # name of the method that computes them
 
     def __init__(self, top: Top, start: State, n: int, *, lz: Column | None = None,
                  gravity: Column | None = None, torque: Column | None = None) -> None:
@@ -94,6 +94,7 @@ class States:
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
+        """Return phi, theta, psi [rad]."""
         raise NotImplementedError
 
     @cached_property
@@ -111,6 +112,7 @@ class States:
 
     @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
+        """Return the squares of cosine and sine of theta/2."""
         x, y, z, w = self.rows_quaternion
         return w * w + z * z, x * x + y * y
 
@@ -136,7 +138,7 @@ class States:
 
     @cached_property
     def phi_dot(self) -> Column:
-        """Eq. (31) of "Analysis of Symmetric Spinning Top"."""
+        """Eq. (31) of "Analysis of Symmetric Spinning Top"; for one Lz, where the pivot rests."""
         lz = self.start.lz
         return attitude.precession_rate(self.top, self._l3, lz, *self.half_angle_squares)
 

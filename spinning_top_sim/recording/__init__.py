@@ -7,5 +7,4 @@ MCAP logs: what turns (topic, stamp, CDR bytes) into files and back.
 damaged file, and `recovery` writes that anew.
 
 What never belongs here: rclpy, a clock of the simulation, the content of a message, physics.
-mcap and its compressors are imported when a recording starts, not before.
 """

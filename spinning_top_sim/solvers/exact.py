@@ -22,7 +22,7 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.decimal_math import DIGITS, exact, pi, precision
 from spinning_top_sim.solvers.theta_setup import Posture, ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import (
-    MOST,
+    LARGEST_NUMBER,
     Constants,
     ThetaFunctions,
     ThetaValues,
@@ -33,7 +33,7 @@ from spinning_top_sim.solvers.times import LARGEST_NS, Times
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
 # Times that are evaluated together: the temporaries of more do not fit into the cache.
-BLOCK = 8192
+TIMES_TOGETHER = 8192
 
 
 class ClosedForm:
@@ -65,7 +65,7 @@ class ClosedForm:
             self.constants = Constants(motion)
             fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
                           abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
-            limit = min(Decimal(MOST_TURNS) / fastest, MOST)
+            limit = min(Decimal(MOST_TURNS) / fastest, LARGEST_NUMBER)
             self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
 
     @cached_property
@@ -251,9 +251,9 @@ class ThetaStates(States):
 
     def _rows(self, name: str) -> NDArray[np.float64]:
         """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
-        blocks = (self._block,) if len(self) <= BLOCK else (
-            ThetaValues(self._theta, self._times[first:first + BLOCK])
-            for first in range(0, len(self), BLOCK))
+        blocks = (self._block,) if len(self) <= TIMES_TOGETHER else (
+            ThetaValues(self._theta, self._times[first:first + TIMES_TOGETHER])
+            for first in range(0, len(self), TIMES_TOGETHER))
         rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
         return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
 
@@ -316,7 +316,7 @@ class _ExactStates(ThetaStates):
         return theta_dot
 
     def _across(self) -> Column:
-        # A moving pivot has another formula beside it.  Here there is none, so that earlier logs
-        # are computed again to the last bit.
+        # `_AcceleratedStates` chooses between two formulas.  Here there is only the first, because
+        # a choice would change the last bits of earlier logs.
         cosine, sine = self._rows('half_theta')
         return axis_rate(self._solution.bottom_rate, self._solution.top_rate, cosine, sine)

@@ -16,7 +16,7 @@ from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ClosedForm, ExactSolution
 from spinning_top_sim.solvers.theta_setup import Posture
-from spinning_top_sim.solvers.theta_values import MOST
+from spinning_top_sim.solvers.theta_values import LARGEST_NUMBER
 from spinning_top_sim.solvers.transport import TransportMotion
 
 METHODS = ('rk45', 'exact')
@@ -91,7 +91,7 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
         with np.errstate(over='raise', divide='raise', invalid='raise'):
             motion = _stepped(top, start, equations, rtol, atol)
             first = motion.states(range(1))
-            held = all(abs(float(column[0])) <= MOST for column in (
+            held = all(abs(float(column[0])) <= LARGEST_NUMBER for column in (
                 first.energy, first.phi_dot, first.psi_dot, *first.angular_acceleration.T))
     except ArithmeticError:
         held = False

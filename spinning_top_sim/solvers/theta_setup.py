@@ -7,7 +7,8 @@ E. T. Whittaker, *Analytical Dynamics*, 4th ed., sect. 71 and 72; theta function
 Watson, *Modern Analysis*, ch. XXI; D. F. Lawden, *Elliptic Functions and Applications*; DLMF,
 https://dlmf.nist.gov, ch. 19, 20 and 22.
 
-docs/theta_functions.md derives the first two steps.
+docs/theta_functions.md derives steps 1, 2 and 4.  Its a and b are A and B here, and its r is
+r - s pi w/(2 K) here.
 
 1. *Nutation.*  u = cos(theta) = u1 + (u2 - u1) sn^2(chi) [DLMF 22.13(i)], where chi grows at the
    constant rate w, w^2 = P (u3 - u1)/(2 lambda1), P = M g R, with the parameter

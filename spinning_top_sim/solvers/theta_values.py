@@ -37,7 +37,7 @@ QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
 SIGNS = np.array((1.0, -1.0))   # of an even and of an odd number of half turns
 HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the three phases' units
 # Smaller amplitudes leave no room for their squares in doubles, larger numbers none for halves.
-LEAST_AMPLITUDE, MOST = Decimal('1e-145'), Decimal('1e290')
+LEAST_AMPLITUDE, LARGEST_NUMBER = Decimal('1e-145'), Decimal('1e290')
 
 
 class Constants:
@@ -354,9 +354,9 @@ class ThetaValues:
 
 def in_range(name: str, value: Decimal) -> float:
     """Return a number as a double.  Raises ValueError where its products would overflow."""
-    if abs(value) > MOST:
-        raise ValueError(f'{name} is {value:.3e}: must be at most {MOST} for doubles to hold '
-                         f'the motion; the constants of the top are too far apart in size')
+    if abs(value) > LARGEST_NUMBER:
+        raise ValueError(f'{name} is {value:.3e}: must be at most {LARGEST_NUMBER} for doubles to '
+                         'hold the motion; the constants of the top are too far apart in size')
     return float(value)
 
 

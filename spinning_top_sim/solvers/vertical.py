@@ -51,8 +51,8 @@ MOST_DIGITS = DIGITS_TO_TRY[0]
 # An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
 # as this has zeros.
 POLE = Decimal('1e-30')
-# A motion that misses a pole by this share of what it could passes it exactly: the set-up squares
-# the share, and has 40 digits.
+# If the distance by which a motion misses a pole is less than this share of the largest possible,
+# it passes exactly: the set-up squares the share, and has 40 digits.
 THROUGH = Decimal('1e-19')
 
 

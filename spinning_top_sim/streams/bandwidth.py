@@ -87,7 +87,7 @@ class LowPass:
         t_ns : within the segment, all less than `memory_ns` after its start, or none of them
         """
         back_ns = np.minimum(t_ns - segment.start_ns, self.memory_ns)
-        carried = segment.filtered if t_ns[0] < segment.start_ns + self.memory_ns else None
+        carried = segment.filter_state if t_ns[0] < segment.start_ns + self.memory_ns else None
         if back_ns.min() == self.memory_ns:     # the same for all samples
             back_ns = back_ns[:1]
         edges = self._edges(segment)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.exact import BLOCK
+from spinning_top_sim.solvers.exact import TIMES_TOGETHER
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.path import Path, Segment
 from spinning_top_sim.streams.stream import Rows, Samples, Stream
@@ -50,10 +50,11 @@ def blocks(path: Path, streams: Sequence[Stream], epoch_ns: int, after_ns: int, 
     """
     end_ns = min(until_ns, LAST_STAMP_NS - epoch_ns)
     while after_ns < end_ns:
+        # Times where segments meet, with begin and end of the block.
         edges, failure = yield from _reach(
             path, after_ns, min(end_ns, after_ns + span_ns), most_steps)
         if edges[-1] > after_ns:
-            # Once for all streams of one rate.
+            # Once for all streams of one rate: the ranges of their times are the key.
             samples = cache(partial(_samples, path, epoch_ns))
             messages = []
             for stream in streams:
@@ -79,7 +80,7 @@ def _samples(path: Path, epoch_ns: int, *ranges: range) -> list[Samples]:
     for times in filter(len, ranges):
         segment = path.after(times.start - 1)
         count += len(times)
-        if chains and segment.chains and count <= BLOCK:
+        if chains and segment.chains and count <= TIMES_TOGETHER:
             groups[-1].append((segment, times))
         else:
             groups.append([(segment, times)])

@@ -28,7 +28,7 @@ from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Samples, period_ns
 from spinning_top_sim.streams.vibration import Vibration
 
-# Of an interval between two samples.
+# The longest interval over which means and increments are taken [ns].
 LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
 KINDS = ('gyroscope', 'accelerometer')
 # Parameters of the errors that both kinds of axes have.
@@ -150,7 +150,7 @@ class Imu:
     def carry(self, before: Segment, after: Segment) -> None:
         """Let a segment begin with the state of the filter at the end of the one before it."""
         if self._low_pass is not None:
-            after.filtered = self._low_pass.carried(before, after.start_ns, self._signal)
+            after.filter_state = self._low_pass.carried(before, after.start_ns, self._signal)
 
     def measured_increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
         """Return `increments` with the errors of the sensor and its vibration."""

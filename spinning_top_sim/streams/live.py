@@ -24,8 +24,8 @@ from spinning_top_sim.streams.stream import Stream
 # Samples of the fastest stream in a block.  A command makes what is computed useless, and the next
 # one may come soon: after it, blocks begin small and double.
 LARGEST_BLOCK, SMALLEST_BLOCK = 256, 16
-# Nor does a block have more bytes, take more integration steps, or reach further ahead.
-MOST_BYTES, MOST_STEPS, LONGEST_AHEAD_NS = 4 << 20, 256, 300_000_000
+MOST_BYTES, MOST_STEPS = 4 << 20, 256           # of a block
+LONGEST_AHEAD_NS = 300_000_000                  # from the last sample that is sent
 
 # A message for a log: number of the stream in the log, stamp [ns], CDR.
 Entry = tuple[int, int, bytes]
@@ -88,7 +88,8 @@ class LiveSimulation(Simulation):
         self._write: Write = lambda entries, size: None
         self._queue: deque[tuple[int, Instant]] = deque()       # by time [ns]
         self._used: list[Output] = []               # those whose samples are in the queue
-        # `version`, `epoch_ns`, and which outputs had no subscribers, when the queue was computed.
+        # The queue is right as long as these are as they were when it was computed: `version`,
+        # `epoch_ns`, and which outputs had no subscribers.
         self._holds_for: tuple[int, int, list[bool]] = -1, 0, []
         self._work: Iterator[Block | None] | None = None
         self._block_size = SMALLEST_BLOCK
@@ -143,7 +144,7 @@ class LiveSimulation(Simulation):
                 if self.now_ns > begin_ns and give_way():
                     return False
                 self._compute(target_ns, publish_from_ns)
-        finally:
+        finally:        # also what was sent before an error
             if publish_from_ns > begin_ns + 1:
                 until_ns = min(self.now_ns, publish_from_ns - 1)
                 for output in self.outputs:

@@ -57,13 +57,13 @@ class Segment:
     reached_ns : time up to which the motion needs no further steps
     start, energy, l3, lz : at its start
     chains : whether it can be evaluated together with others
-    filtered : state of the low pass of the IMU at the start; None without one, or from t = 0 on
+    filter_state : of the low pass of the IMU at the start; None without one, or from t = 0 on
     """
 
     def __init__(self, motion: Motion, start_ns: int, ride: Ride | None = None) -> None:
         self.motion, self.start_ns, self.ride = motion, start_ns, ride
         self.chains, self.reached_ns = motion.chains, start_ns + motion.reached_ns
-        self.filtered: NDArray[np.float64] | None = None
+        self.filter_state: NDArray[np.float64] | None = None
 
     @property
     def start(self) -> State:

@@ -30,12 +30,12 @@ from spinning_top_sim.streams.path import Path, Ride, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
-# Steps that the first nanosecond of a motion may take, and those of a block offline, so that the
-# interpolants of these stay in the cache.
-FIRST_STEPS, OFFLINE_STEPS = 500, 2000
-# Offline, a block has so many bytes, but covers no more time than this, for the sake of progress;
-# nor are there more blocks than this.
-OFFLINE_BYTES, LONGEST_OFFLINE_NS, MOST_BLOCKS = 4 << 20, 100 * NANOSECONDS, 20_000
+FIRST_STEPS = 500               # that the first nanosecond of a motion may take
+# Limits of a block offline.
+OFFLINE_STEPS = 2000            # their interpolants stay in the cache
+OFFLINE_BYTES = 4 << 20
+LONGEST_OFFLINE_NS = 100 * NANOSECONDS      # for the sake of progress
+MOST_BLOCKS = 20_000            # of a run; then they are longer
 # Turns a second whose phases doubles hold up to the last stamp.
 MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
 
