@@ -25,7 +25,7 @@ from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers import propagator
 from spinning_top_sim.solvers.cubic import RootsTooCloseError, cubic_roots
 from spinning_top_sim.solvers.decimal_math import DIGITS, precision
-from spinning_top_sim.solvers.exact import BLOCK, ExactSolution
+from spinning_top_sim.solvers.exact import TIMES_TOGETHER, ExactSolution
 
 BOUND = 5e-15
 G = 9.81
@@ -238,7 +238,7 @@ def test_a_range_has_the_bits_of_its_times_in_any_pieces(name):
     end = solution.ns_limit
     for times in (range(-3, 700), range(700, -3, -1), range(10 ** 9, 50_000 * 10 ** 9, 10 ** 9),
                   range(end - 2000, end, 3), range(-end, 3000 - end, 3),
-                  range(0, 2 * BLOCK * 10 ** 6 + 1, 10 ** 6), range(-end, end, end // 7),
+                  range(0, 2 * TIMES_TOGETHER * 10 ** 6 + 1, 10 ** 6), range(-end, end, end // 7),
                   range(-end, 600 * 2 ** 43 - end, 2 ** 43)):
         of_range, of_array = solution.states(times), solution.states(np.array(times))
         for column in ('quaternion', 'theta', 'phi', 'angular_velocity'):
