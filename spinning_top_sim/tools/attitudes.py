@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.installation import needed
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 
@@ -33,7 +34,8 @@ class Attitude(NamedTuple):
 
 @cache
 def _types() -> Any:
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
+    with needed('a log', 'rosbags'):
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 0.3 s
     return get_typestore(Stores.ROS2_JAZZY)
 
 
