@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from spinning_top_sim.installation import needed
 from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal
@@ -156,9 +157,10 @@ class RecordingSession:
 
 def _open_log(topics: Sequence[Topic], run: Mapping[str, Any]) -> McapRecorder:
     """Open the log that `record.uri` names; in a folder, under the first free name."""
-    from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
-    from spinning_top_sim.recording.recorder import McapRecorder  # noqa: PLC0415
-    from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
+    with needed('a recording'):
+        from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
+        from spinning_top_sim.recording.recorder import McapRecorder  # noqa: PLC0415
+        from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
 
     values, metadata = run['values_at_recording'], provenance(**run)
     recorded = [RecordedTopic(*topic) for topic in topics]
