@@ -12,10 +12,11 @@ import yaml  # type: ignore[import-untyped]
 from helpers.reference import ROOT
 
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import ensemble_spec
 from spinning_top_sim.tools.ensemble import main
-from spinning_top_sim.tools.ensemble_part import compute_part, table
+from spinning_top_sim.tools.ensemble_part import EPOCH_NS, compute_part, samples, table
 
 pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='Dask is not there')
 pa = pytest.importorskip('pyarrow')
@@ -79,15 +80,21 @@ def whole(tmp_path_factory):
     return folder / 'data', path
 
 
+def table_of(specification, run):
+    simulation = Simulation(specification.values(run), EPOCH_NS)
+    return table(specification, {run: samples(specification, simulation)})
+
+
 def test_every_stream_has_columns_or_is_left_out():
     """Those without a rate of their own, too; each number has a name."""
     names = list(ensemble_spec.STREAMS)
     sample = {'imu.lever_arm': {'values': [[0.1, 0.0, 0.0]]}}
     for some in ([name] for name in names):
-        one = table(ensemble_spec.parse({'runs': 1, 'duration': 0.1, 'streams': some}, 'test'), 0)
+        one = table_of(ensemble_spec.parse(
+            {'runs': 1, 'duration': 0.1, 'streams': some}, 'test'), 0)
         assert one.num_rows > 1 and len(set(one.column_names)) == one.num_columns > 3
-    row = table(ensemble_spec.parse({'runs': 1, 'duration': 0.1, 'streams': names,
-                                     'sample': sample}, 'test'), 0).to_pylist()[0]
+    row = table_of(ensemble_spec.parse({'runs': 1, 'duration': 0.1, 'streams': names,
+                                        'sample': sample}, 'test'), 0).to_pylist()[0]
     assert row['joint_states.position.nutation_joint'] == pytest.approx(np.radians(30.0))
     assert row['~/invariants.data.l3'] == 1.6
     assert row['imu.lever_arm'] == [0.1, 0.0, 0.0]
@@ -260,7 +267,7 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
     specification = ensemble_spec.parse(
         {'duration': 0.05, 'runs_per_part': 4, **content}, 'test')
     assert parts_of(specification, tmp_path) == {}
-    runs = [table(specification, run) for run in range(specification.runs)]
+    runs = [table_of(specification, run) for run in range(specification.runs)]
     assert parquet.read_table(tmp_path / 'data').equals(pa.concat_tables(runs).combine_chunks())
     mag = [one['imu/mag.magnetic_field.x'] for one in runs]
     assert [len(column) - column.null_count for column in mag] == counts

@@ -9,14 +9,15 @@ import contextlib
 import itertools
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.streams import journal, messages
@@ -30,6 +31,9 @@ from spinning_top_sim.tools.simulate import write_log
 
 if TYPE_CHECKING:
     import pyarrow
+
+# By column, values (n,) and whether each is absent (n,).
+Samples = dict[str, tuple[NDArray[np.float64], NDArray[np.bool_]]]
 
 EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
 DATA = 'data'                   # folder of the files of a dataset
@@ -60,64 +64,83 @@ def _column_names(stream: Stream) -> Sequence[str]:
     return names
 
 
-def table(specification: Specification, run: int) -> 'pyarrow.Table':
+def samples(specification: Specification, simulation: Simulation) -> Samples:
     """
-    Return a run as a table: run, t [s], what is drawn for it, and its samples.
+    Play a run; return its columns: t [s], and the numbers of the streams that are kept.
 
-    A row has the samples of one time; where a stream has none, its columns are null.  All runs
-    have the same columns.
-    Raises ValueError if no motion begins, IntegrationError if it ends early.
+    A row has the samples of one time; where a stream has none, its columns are absent.  All runs
+    have the same columns.  Raises IntegrationError if the motion ends early.
     """
-    import pyarrow as pa  # noqa: PLC0415
-
-    values = specification.values(run)
-    simulation = Simulation(values, EPOCH_NS)
+    values = simulation.values
     names = {stream: _column_names(stream) for stream in simulation.streams
              if stream.parameter in specification.kept}
     # Times and numbers of the samples; empty arrays first, for a stream without any.
     times = {stream: [np.empty(0, np.int64)] for stream in names}
-    numbers = {stream: [np.empty((0, len(labels)))] for stream, labels in names.items()}
+    numbers = {stream: [np.empty((len(labels), 0))] for stream, labels in names.items()}
     for stream in names:
         stream.template = copy(messages.numbers(*stream.template.counts))
     recorded = journal.recorded_streams(list(names), values)
     for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
         for stream, times_ns, rows in block.messages:
             times[stream].append(times_ns)
-            numbers[stream].append(np.hstack(stream.template.decode(rows)))
+            numbers[stream].append(np.vstack([
+                field.T for field in stream.template.decode(rows)]))
     every_ns = np.sort(np.concatenate([*itertools.chain(*times.values())]), kind='stable')
     rows_ns = every_ns[np.diff(every_ns, prepend=-1) > 0]
-    columns = {'run': pa.repeat(pa.scalar(run), len(rows_ns)),
-               't': pa.array(rows_ns / NANOSECONDS)}
-    for name, value in specification.drawn(run).items():
-        # An unset value (spin.lz) is a null of the type that the other runs have.
-        one = pa.scalar(value, pa.float64() if value is None else None)
-        columns[name] = pa.repeat(one, len(rows_ns))
+    columns = {'t': (rows_ns / NANOSECONDS, np.zeros(len(rows_ns), bool))}
     for stream, labels in names.items():
-        # A faulty sensor sends some samples twice; they share a row.
-        present = np.searchsorted(rows_ns, np.concatenate(times[stream]))
-        absent = np.ones(len(rows_ns), bool)
-        absent[present] = False
-        cells = np.zeros((len(rows_ns), len(labels)))
-        cells[present] = np.concatenate(numbers[stream])
-        columns.update((f'{stream.topic}.{name}', pa.array(column, mask=absent))
-                       for name, column in zip(labels, cells.T, strict=True) if name)
-    return pa.table(columns)
+        times_ns, cells = np.concatenate(times[stream]), np.hstack(numbers[stream])
+        absent = np.zeros(len(rows_ns), bool)
+        if not np.array_equal(times_ns, rows_ns):
+            # A faulty sensor sends some samples twice; they share a row.
+            present = np.searchsorted(rows_ns, times_ns)
+            sent, cells = cells, np.zeros((len(labels), len(rows_ns)))
+            cells[:, present] = sent
+            absent[:] = True
+            absent[present] = False
+        columns.update((f'{stream.topic}.{name}', (column, absent))
+                       for name, column in zip(labels, cells, strict=True) if name)
+    return columns
+
+
+def table(specification: Specification, found: Mapping[int, Samples]) -> 'pyarrow.Table':
+    """Return the samples of runs as a table, beside the number of the run and what is drawn."""
+    import pyarrow as pa  # noqa: PLC0415
+
+    def repeated(values: Sequence[Any]) -> 'pyarrow.Array':
+        # An unset value (spin.lz) is a null of the type that the other runs have.
+        return pa.concat_arrays([
+            pa.repeat(pa.scalar(value, pa.float64() if value is None else None), len(one['t'][0]))
+            for value, one in zip(values, found.values(), strict=True)])
+
+    def column(name: str) -> 'pyarrow.Array':
+        values, absent = (np.concatenate(parts) for parts in zip(*(
+            one[name] for one in found.values()), strict=True))
+        return pa.array(values, mask=absent)
+
+    drawn = [specification.drawn(run) for run in found]
+    time, *others = next(iter(found.values()))
+    return pa.table({'run': repeated([*found]), time: column(time),
+                     **{name: repeated([one[name] for one in drawn]) for name in drawn[0]},
+                     **{name: column(name) for name in others}})
 
 
 def write_row(specification: Specification, run: int, path: Path) -> None:
     """
     Compute one run into a new file, .mcap or .parquet.
 
-    Raises RecordingError or OSError if it exists, ValueError or IntegrationError as `table` does.
+    Raises RecordingError or OSError if it exists, ValueError if no motion begins, IntegrationError
+    if it ends early.
     """
     from pyarrow import parquet  # noqa: PLC0415
 
+    values = specification.values(run)
+    simulation = Simulation(values, EPOCH_NS)
     if path.suffix == '.mcap':
-        values = specification.values(run)
-        write_log(path, Simulation(values, EPOCH_NS),
-                  [(round(values['duration'] * NANOSECONDS), None)], lambda done: None, '/')
+        write_log(path, simulation, [(round(values['duration'] * NANOSECONDS), None)],
+                  lambda done: None, '/')
     else:
-        rows = table(specification, run)
+        rows = table(specification, {run: samples(specification, simulation)})
         with open(path, 'xb') as file:
             parquet.write_table(rows, file)
 
@@ -129,20 +152,22 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
     The file depends on the specification and the versions alone.
     Raises OSError if the file cannot be written.
     """
-    import pyarrow as pa  # noqa: PLC0415
     from pyarrow import parquet  # noqa: PLC0415
 
     path = Path(folder, DATA, f'part-{part:06d}.parquet')
     with contextlib.suppress(OSError, ValueError, KeyError):    # it is missing, or not whole
         return dict(json.loads(parquet.read_metadata(path).metadata[FAILED]))
-    failed, tables = {}, []
+    begun, found = {}, {}
+    failed: dict[str, str] = {}
+    # All runs begin before one is played: caches of the processor hold the code of one of both.
     for run in specification.part(part):
-        try:
-            tables.append(table(specification, run))
-        except Exception as error:
-            failed[str(run)] = reason_of(error)
-    if tables:
-        rows = pa.concat_tables(tables).replace_schema_metadata({FAILED: json.dumps(failed)})
+        with _noted(failed, run):
+            begun[run] = Simulation(specification.values(run), EPOCH_NS)
+    for run, simulation in begun.items():
+        with _noted(failed, run):
+            found[run] = samples(specification, simulation)
+    if found:
+        rows = table(specification, found).replace_schema_metadata({FAILED: json.dumps(failed)})
         constant = ['run', *specification.drawn(0)]
         written = path.with_name(f'.{path.name}.{uuid4()}')     # readers of Parquet skip it
         parquet.write_table(
@@ -151,3 +176,11 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
                 name for name in rows.column_names if name not in constant])
         written.replace(path)
     return failed
+
+
+@contextlib.contextmanager
+def _noted(failed: dict[str, str], run: int) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        failed[str(run)] = reason_of(error)
