@@ -57,6 +57,7 @@ def offer(node: Simulator) -> None:
         if hasattr(services, name):
             node.create_service(getattr(services, name), service_name(name),
                                 partial(handlers.serve, name))
+    node.has_goals = True
     # The node keeps the action server.
     ActionServer(node, actions.SimulateSteps, 'simulate_steps', handlers.simulate_steps,
                  cancel_callback=lambda _: CancelResponse.ACCEPT)

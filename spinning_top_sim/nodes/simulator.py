@@ -46,6 +46,7 @@ class Simulator(Node):
     def __init__(self, argv: Sequence[str] = ()) -> None:
         super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()        # completes after `duration`
+        self.has_goals = False                  # those of actions end with the motion
         self._terminal = reports.Terminal()
         values = ros_parameters.declare(self, argv)
         simulation = self.simulation = LiveSimulation(values)
@@ -147,7 +148,8 @@ class Simulator(Node):
                 self._outputs.flush(at_once=self.loop.state is LoopState.ENDED)
         if self.loop.state is LoopState.ENDED and not self.finished.done():
             wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
-            time.sleep(LAST_ANSWERS_S)      # a goal of SimulateSteps ends with the motion
+            if self.has_goals:
+                time.sleep(LAST_ANSWERS_S)
             self.finished.set_result(None)
         return wants_idle
 
