@@ -162,8 +162,8 @@ class _Exam:
             self._do(partial(self._do_noisy_run, seed))
         if not self.outcomes:
             return
-        self.findings.measures = (diagnosis.marks(self.outcomes, self._absolute)
-                               | self.findings.measures)
+        self.findings.measures = (
+            diagnosis.marks(self.outcomes, self._absolute) | self.findings.measures)
         self._do(self._judge_integration)
         if not self._response.unclear:
             self._do(self._judge_lever_arm)

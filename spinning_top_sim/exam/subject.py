@@ -47,8 +47,9 @@ class Subject:
 
     def uses_field(self) -> bool:
         """Return whether the field changes the attitudes: only then the heading can be judged."""
+        slow = self.record(scenarios.SLOW)
         for updates in FIELD_ASKED:
-            run = self.record(scenarios.SLOW).part(slice(updates))
+            run = slow.part(slice(updates))
             other = replace(run, magnetometer=run.magnetometer[:, [1, 2, 0]])
             one, two = (self.follow(fed).estimates for fed in (run, other))
             if np.max(np.abs(one - two)) > 1e-9:

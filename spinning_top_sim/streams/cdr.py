@@ -45,9 +45,11 @@ class CdrWriter:
         self.buffer += struct.pack(f'<{len(values)}{code}', *values)
         return self
 
-    def field(self, count: int) -> Self:
-        self.append('d', *(count * (0.0,)))
-        self.fields.append((len(self.buffer) - 8 * count, count))
+    def field(self, *counts: int) -> Self:
+        """Append fields of so many doubles each."""
+        for count in counts:
+            self.append('d', *(count * (0.0,)))
+            self.fields.append((len(self.buffer) - 8 * count, count))
         return self
 
     def stamp(self) -> Self:
@@ -94,12 +96,6 @@ class Template:
 
     def __len__(self) -> int:
         return len(self._buffer)
-
-    def __copy__(self) -> Self:
-        # An ensemble copies dozens in each run; `copy` itself takes seven times as long.
-        other = type(self).__new__(type(self))
-        other.__dict__.update(self.__dict__)
-        return other
 
     def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
         """Return messages (n, size) with stamps (n,) [ns]; they are valid until the next call."""

@@ -38,19 +38,13 @@ def stamped(frame_id: str, *counts: int) -> Template:
     geometry_msgs/PoseStamped (3, 4), Vector3Stamped (3) and QuaternionStamped (4), and
     sensor_msgs/MagneticField (3, 9): the field and its covariance; quaternions are x, y, z, w.
     """
-    writer = CdrWriter().header(frame_id)
-    for count in counts:
-        writer.field(count)
-    return Template(writer)
+    return Template(CdrWriter().header(frame_id).field(*counts))
 
 
 @lru_cache(64)
 def numbers(*counts: int) -> Template:
     """Fields alone, for those who need no message around them."""
-    writer = CdrWriter()
-    for count in counts:
-        writer.field(count)
-    return Template(writer)
+    return Template(CdrWriter().field(*counts))
 
 
 @lru_cache(64)
@@ -104,7 +98,7 @@ def odometry(frame_id: str, child_frame_id: str) -> Template:
     """
     writer = CdrWriter().header(frame_id).string(child_frame_id)
     for count in (4, 3):
-        writer.field(3).field(count).append('d', *diagonal(*6 * (0.0,)))
+        writer.field(3, count).append('d', *diagonal(*6 * (0.0,)))
     return Template(writer)
 
 
@@ -112,7 +106,7 @@ def odometry(frame_id: str, child_frame_id: str) -> Template:
 def transform(frame_id: str, child_frame_id: str) -> Template:
     """tf2_msgs/TFMessage with one transform; fields: translation, rotation x, y, z, w."""
     return Template(CdrWriter().append('I', 1).header(frame_id).string(child_frame_id)
-                    .field(3).field(4))
+                    .field(3, 4))
 
 
 @lru_cache(64)
@@ -159,7 +153,7 @@ def _append_marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int,
     if kind == LINE_STRIP:
         writer.append('d', *ORIGIN, *NO_ROTATION)
     else:
-        writer.field(3).field(4)
+        writer.field(3, 4)
     writer.append('d', *scale).append('f', *color)
     writer.append('I', 0, 0)                                # lifetime: for ever
     writer.append('?', False)                               # frame_locked
