@@ -163,9 +163,9 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
     for run in specification.part(part):
         with _noted(failed, run):
             begun[run] = Simulation(specification.values(run), EPOCH_NS)
-    for run, simulation in begun.items():
+    for run in [*begun]:
         with _noted(failed, run):
-            found[run] = samples(specification, simulation)
+            found[run] = samples(specification, begun.pop(run))     # which holds much memory
     if found:
         rows = table(specification, found).replace_schema_metadata({FAILED: json.dumps(failed)})
         constant = ['run', *specification.drawn(0)]
