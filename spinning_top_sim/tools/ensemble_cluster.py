@@ -18,6 +18,11 @@ Result = TypeVar('Result')
 
 LOOPBACK = '127.0.0.1'
 CONNECT_S, FIRST_WORKER_S = 10.0, 60.0
+CONFIGURATION = {
+    'distributed.worker.profile.enabled': False,        # it grows with time
+    # Dask's threshold lets glibc return each array to the system: a third of the time of a run.
+    'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2 ** 26,
+    'distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_': 2 ** 25}
 
 
 @contextlib.contextmanager
@@ -33,8 +38,7 @@ def connect(workers: int | None, scheduler: str | None) -> Iterator[distributed.
         handler.setLevel(logging.CRITICAL)          # errors are raised by the client
     with contextlib.ExitStack() as stack:
         if scheduler is None:
-            # The profile that Dask keeps grows with time.
-            stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
+            stack.enter_context(dask.config.set(CONFIGURATION))
             resource_tracker.ensure_running()   # if it started later, it would unblock SIGINT
             # A terminal sends Ctrl-C to the workers, too, but only this process reacts.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
