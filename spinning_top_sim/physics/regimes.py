@@ -10,8 +10,7 @@ Mechanics*, 3rd ed., sect. 5.7; Klein & Sommerfeld, *Theorie des Kreisels*, ch. 
 
 import math
 from dataclasses import dataclass
-from decimal import Decimal
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.top import State, Top
 
-Real = TypeVar('Real', float, Decimal)
+Real = Any              # float, or a multiprecision number
 # Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
 COINCIDE = 1e-12
 # What one sees of each motion, by its name.

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The roots of the nutation's cubic and their distances, in long decimals without cancellation."""
+"""The roots of the nutation's cubic and their distances, without cancellation."""
 
 import math
-from decimal import Decimal, getcontext
 from typing import NamedTuple
 
-from spinning_top_sim.solvers.decimal_math import ZERO, root
+from gmpy2 import get_context, mpfr, sqrt
+
+from spinning_top_sim.solvers.multiprecision import ONE, ZERO
 
 MOST_NEWTON_STEPS = 50
-KEPT_DIGITS = 40        # what must be left of the digits after the discriminant has cancelled
+KEPT_BITS = 136         # what must be left of the precision after the discriminant has cancelled
 
 
 class RootsTooCloseError(ArithmeticError):
@@ -18,18 +19,18 @@ class RootsTooCloseError(ArithmeticError):
 class Roots(NamedTuple):
     """The roots y1 <= 0 <= y2 < y3 and the gaps y2 - y1 and y3 - y2."""
 
-    y1: Decimal
-    y2: Decimal
-    y3: Decimal
-    gap21: Decimal
-    gap32: Decimal
+    y1: mpfr
+    y2: mpfr
+    y3: mpfr
+    gap21: mpfr
+    gap32: mpfr
 
     @property
-    def gap31(self) -> Decimal:
+    def gap31(self) -> mpfr:
         return self.y3 - self.y1
 
 
-def cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> Roots:
+def cubic_roots(f0: mpfr, f1: mpfr, f2: mpfr, f3: mpfr) -> Roots:
     """
     Return the roots of f0 + f1 y + f2 y^2 + f3 y^3, all real, with f0 >= 0 and f3 > 0.
 
@@ -40,7 +41,7 @@ def cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> Roots:
         low, high, gap = _quadratic_roots(-a2, a1)
         return (Roots(ZERO, low, high, low, gap) if low > 0
                 else Roots(low, ZERO, high, -low, high))
-    y, side = _isolated_root(a2, a1, a0)
+    y, side = _isolated_sqrt(a2, a1, a0)
     product = -a0 / y
     # The sum of the other two.  Next to a pole one of them is small, and -a2 - y cancels.
     total = -a2 - y if 2 * abs(y) < abs(a2) else (a1 - product) / y
@@ -48,30 +49,30 @@ def cubic_roots(f0: Decimal, f1: Decimal, f2: Decimal, f3: Decimal) -> Roots:
     return Roots(y, low, high, low - y, gap) if side < 0 else Roots(low, high, y, gap, y - high)
 
 
-def _quadratic_roots(total: Decimal, product: Decimal) -> tuple[Decimal, Decimal, Decimal]:
+def _quadratic_roots(total: mpfr, product: mpfr) -> tuple[mpfr, mpfr, mpfr]:
     """Return the roots x1 <= x2 of x^2 - total x + product, and x2 - x1."""
     discriminant = total * total - 4 * product
-    if discriminant < total * total * Decimal(10) ** (KEPT_DIGITS - getcontext().prec):
+    if discriminant < total * total * ONE / 2 ** (get_context().precision - KEPT_BITS):
         raise RootsTooCloseError
-    gap = root(discriminant)
+    gap = sqrt(discriminant)
     large = (total + gap) / 2 if total > 0 else (total - gap) / 2
     small = product / large
     return min(large, small), max(large, small), gap
 
 
-def _isolated_root(a2: Decimal, a1: Decimal, a0: Decimal) -> tuple[Decimal, int]:
+def _isolated_sqrt(a2: mpfr, a1: mpfr, a0: mpfr) -> tuple[mpfr, int]:
     """
     Return the root of y^3 + a2 y^2 + a1 y + a0 that lies alone on its side of -a2/3, and the side.
 
     It is 2 cos(arccos(|p|/(2 radius^3))/3) times `radius` from there, where p is the value of the
     cubic (Viete).  Newton's method from the nearest double converges quadratically.
     """
-    centre, radius = -a2 / 3, root(a2 * a2 - 3 * a1) / 3
+    centre, radius = -a2 / 3, sqrt(a2 * a2 - 3 * a1) / 3
     value = ((centre + a2) * centre + a1) * centre + a0
     side = -1 if value > 0 else 1
     ratio = min(1.0, float(abs(value / (2 * radius ** 3))))
-    y = centre + side * radius * Decimal(2.0 * math.cos(math.acos(ratio) / 3.0))
-    resolution = Decimal(10) ** (3 - getcontext().prec)
+    y = centre + side * radius * (2.0 * math.cos(math.acos(ratio) / 3.0))
+    resolution = ONE / 2 ** (get_context().precision - 10)
     for _ in range(MOST_NEWTON_STEPS):
         step = (((y + a2) * y + a1) * y + a0) / ((3 * y + 2 * a2) * y + a1)
         y -= step

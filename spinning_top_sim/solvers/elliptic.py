@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Elliptic integrals by Gauss' arithmetic-geometric mean, in long decimals.
+Elliptic integrals by Gauss' arithmetic-geometric mean, in multiprecision.
 
 One sequence of means of a_0 and g_0 gives the complete integral of the first kind and the nome,
 and, with one more square root a step, an incomplete integral.
@@ -12,13 +12,14 @@ The modulus is k = c_0/a_0, its complement k' = g_0/a_0.  The arguments a_0, g_0
 common scale: the functions depend on their ratios only, but for the mean itself.
 """
 
-from decimal import Decimal, getcontext
+from gmpy2 import mpfr, sqrt
 
-from spinning_top_sim.solvers.decimal_math import ZERO, root
+from spinning_top_sim.solvers.multiprecision import ONE, ZERO
 
 # Coefficients of lambda, lambda^5, lambda^9 ... in the nome [DLMF 19.5.6; A002103 of oeis.org].
 # The first one that is left out contributes less than 1e-44 for k^2 <= 1/2.
 NOME_COEFFICIENTS = 1, 2, 15, 150, 1707, 20910, 268616, 3567400, 48555069, 673458874
+NEGLIGIBLE = mpfr(1e-21)          # c/a, the square of which does not count
 
 
 class GaussMean:
@@ -28,25 +29,23 @@ class GaussMean:
     mean : M; the quarter period K(k) is (pi/2) a_0/M [DLMF 19.8.5]
     """
 
-    def __init__(self, a: Decimal, g: Decimal, c: Decimal) -> None:
-        # The size of c/a whose square is negligible.
-        self._tolerance = tolerance = Decimal(10) ** (-(getcontext().prec // 2) - 1)
+    def __init__(self, a: mpfr, g: mpfr, c: mpfr) -> None:
         self._start, self._squares = a, [c * c]
-        self._means: list[tuple[Decimal, Decimal]] = []     # g_n and c_n
-        while not self._means or c > a * tolerance:
+        self._means: list[tuple[mpfr, mpfr]] = []     # g_n and c_n
+        while not self._means or c > a * NEGLIGIBLE:
             product, a = a * g, (a + g) / 2
             c = self._squares[-1] / (4 * a)         # [DLMF 19.8.3]
-            g = root(product) if c > a * tolerance else a
+            g = sqrt(product) if c > a * NEGLIGIBLE else a
             self._means.append((g, c))
             self._squares.append(c * c)
         self.mean = a
 
     @property
-    def quarter_period(self) -> Decimal:
+    def quarter_period(self) -> mpfr:
         """2 K(k)/pi."""
         return self._start / self.mean
 
-    def nome(self) -> Decimal:
+    def nome(self) -> mpfr:
         """Return q = exp(-pi K'/K) to 40 digits, for k^2 <= 1/2."""
         a, (g, c) = self._start, self._means[0]
         small = a * c / (a + g) ** 2                # (1 - sqrt(k'))/(1 + sqrt(k'))/2
@@ -55,7 +54,7 @@ class GaussMean:
             total = total * power + coefficient
         return small * total
 
-    def amplitude(self, square: Decimal, sense: int) -> Decimal:
+    def amplitude(self, square: mpfr, sense: int) -> mpfr:
         """
         Return sin(pi u/(2K)) from sn^2(u), or sinh(pi u/(2K)) from -sn^2(iu).
 
@@ -66,12 +65,12 @@ class GaussMean:
         """
         if not square:
             return ZERO
-        h = self._start / root(square)
+        h = self._start / sqrt(square)
         for c2 in self._squares:
             # Two terms of the root are enough where c is small.
             h2 = h * h
-            h = (h + sense * c2 / (4 * h) if c2 < h2 * self._tolerance
-                 else (h + root(h2 + sense * c2)) / 2)
+            h = (h + sense * c2 / (4 * h) if c2 < h2 * NEGLIGIBLE
+                 else (h + sqrt(h2 + sense * c2)) / 2)
         amplitude = self.mean / h
         # The square may be 1 but for rounding: the sine is then 1.
-        return min(amplitude, Decimal(1)) if sense < 0 else amplitude
+        return min(amplitude, ONE) if sense < 0 else amplitude

@@ -8,18 +8,18 @@ The exact motion of the heavy symmetric top, at the same cost and accuracy for e
 from __future__ import annotations
 
 import math
-from decimal import Decimal
 from functools import cached_property
 from typing import Self
 
 import numpy as np
+from gmpy2 import const_pi, mpfr
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.decimal_math import DIGITS, exact, pi, precision
+from spinning_top_sim.solvers.multiprecision import BITS, exact, precision
 from spinning_top_sim.solvers.theta_setup import Posture, ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import (
     LARGEST_NUMBER,
@@ -53,9 +53,9 @@ class ClosedForm:
     chains = False
     start: State
 
-    def __init__(self, top: Top, motion: ThetaMotion, l3: Decimal, lz: Decimal) -> None:
+    def __init__(self, top: Top, motion: ThetaMotion, l3: mpfr, lz: mpfr) -> None:
         self.top = top
-        with precision(DIGITS):
+        with precision(BITS):
             alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * exact(top.lambda1)
             bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
             in_range('the fastest rate', max(map(abs, (
@@ -63,9 +63,9 @@ class ClosedForm:
                 l3 / exact(top.lambda3)))))
             self.bottom_rate, self.top_rate = float(bottom_rate), float(top_rate)
             self.constants = Constants(motion)
-            fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * pi()),
-                          abs(beta.rate) / (2 * pi()), Decimal('1e-300'))
-            limit = min(Decimal(MOST_TURNS) / fastest, LARGEST_NUMBER)
+            fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * const_pi()),
+                          abs(beta.rate) / (2 * const_pi()), 1e-300)
+            limit = min(MOST_TURNS / fastest, LARGEST_NUMBER)
             self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
 
     @cached_property
@@ -150,20 +150,20 @@ class ExactSolution(ClosedForm):
             theta=min(abs(theta), math.pi), theta_dot=self.sign * start.theta_dot,
             phi=start.phi + half_turn, psi=start.psi - half_turn,
             l3=start.l3, lz=start.lz)
-        motion = set_up(top, Decimal(top.gravity), self.start)
-        super().__init__(top, motion, Decimal(start.l3), Decimal(start.lz))
+        motion = set_up(top, exact(top.gravity), self.start)
+        super().__init__(top, motion, exact(start.l3), exact(start.lz))
         alpha, beta, phi, psi = motion.alpha, motion.beta, self.start.phi, self.start.psi
         self.m, self.m1 = float(motion.m), float(motion.m1)
-        with precision(DIGITS):
+        with precision(BITS):
             # 2 K/w, two quarter periods
             self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
             self.mean_precession_rate = float(alpha.rate + beta.rate)
             self.mean_spin_rate = float(alpha.rate - beta.rate)
             # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
             self.phi_phase = float(
-                Decimal(phi) - alpha.start_argument - beta.start_argument) - half_turn
+                phi - alpha.start_argument - beta.start_argument) - half_turn
             self.psi_phase = float(
-                Decimal(psi) - alpha.start_argument + beta.start_argument) + half_turn
+                psi - alpha.start_argument + beta.start_argument) + half_turn
         self._check_start()
 
     def _check_start(self) -> None:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Jacobi's theta functions as short polynomials, in long decimals.
+Jacobi's theta functions as short polynomials, in multiprecision.
 
 theta1 .. theta4 of y are used in the real form, with the nome q = exp(-pi K'/K) [DLMF 20.2(i)], or
 in the imaginary form, after Jacobi's transformation: with the nome q' = exp(-pi K/K') and
@@ -11,14 +11,15 @@ out.
 
 import math
 from collections.abc import Sequence
-from decimal import Decimal
 from functools import reduce
 from itertools import count, zip_longest
 from operator import add, mul
 from typing import NamedTuple
 
-from spinning_top_sim.solvers.decimal_math import ONE, ZERO, root
+from gmpy2 import frexp, mpfr, sqrt
+
 from spinning_top_sim.solvers.elliptic import GaussMean
+from spinning_top_sim.solvers.multiprecision import ONE, ZERO
 
 # What the terms of a series have in common: one of the four prefactors 1, cos y, sin y and
 # sin y cos y.  The rest of cos(n y) or sin(n y) is a polynomial in xi = sin^2 y [DLMF 4.21(iii)],
@@ -42,7 +43,7 @@ def _polynomials(first: Sequence[int], second: Sequence[int]) -> list[Sequence[i
 
 # By prefactor and power of xi, the coefficients of the multiples that have such a power.
 MULTIPLE_ANGLES = [
-    [[Decimal(row[power]) if power < len(row) else ZERO for row in rows[power:]]
+    [[mpfr(row[power]) if power < len(row) else ZERO for row in rows[power:]]
      for power in range(MOST_TERMS)]
     for rows in (_polynomials(*pair) for pair in FIRST_POLYNOMIALS)]
 
@@ -55,16 +56,16 @@ class Series(NamedTuple):
     """
 
     prefactor: int
-    weights: Sequence[Decimal]
+    weights: Sequence[mpfr]
 
-    def polynomial(self, most: int) -> list[Decimal]:
+    def polynomial(self, most: int) -> list[mpfr]:
         """Return the coefficients of xi^0, xi^1 ... of so many terms."""
         weights, shapes = self.weights[:most], MULTIPLE_ANGLES[self.prefactor]
         # A sum of -0 is -0.
         return [reduce(add, map(mul, weights[power:], shapes[power]))
                 for power in range(len(weights))]
 
-    def at(self, sin: Decimal, cos: Decimal, xi: Decimal) -> Decimal:
+    def at(self, sin: mpfr, cos: mpfr, xi: mpfr) -> mpfr:
         """Return the sum by Clenshaw's recurrence."""
         twice, value, before = 2 - 4 * xi, ZERO, ZERO
         for weight in reversed(self.weights):
@@ -76,7 +77,7 @@ class Series(NamedTuple):
         return (value + before) * sin if self.prefactor == SIN_ODD else 2 * before * sin * cos
 
     @property
-    def leading(self) -> Decimal:
+    def leading(self) -> mpfr:
         """At y = 0, the value of a cosine series, or the derivative of a sine series."""
         return sum(map(mul, self.weights, MULTIPLE_ANGLES[self.prefactor][0]), ZERO)
 
@@ -102,8 +103,8 @@ class ThetaForm:
     def __init__(self, mean: GaussMean, imaginary: bool) -> None:
         self.mean, self.imaginary = mean, imaginary
         q = mean.nome()
-        exponent = q.adjusted()
-        depth = -exponent - math.log10(q.scaleb(-exponent))
+        exponent, significand = frexp(q)
+        depth = -math.log10(significand) - exponent * math.log10(2.0)
         # Terms k are of size q^(k^2 - k/2) or less beside the first one.
         self.size, terms = (
             next(k for k in count(2) if (2 * k * k - k) * depth > 2 * wanted)
@@ -122,16 +123,16 @@ class ThetaForm:
         self.theta2, self.theta4 = pair[::-1] if imaginary else pair
         self.slope1, self.middle3, self.middle4 = (
             one.leading for one in (self.theta1, self.theta3, self.theta4))
-        self.odd_over_even = 4 * root(q) if imaginary else ONE
+        self.odd_over_even = 4 * sqrt(q) if imaginary else ONE
 
-    def slopes_of_sn2(self) -> tuple[Decimal, Decimal]:
+    def slopes_of_sn2(self) -> tuple[mpfr, mpfr]:
         """Return c with d(sn^2 chi)/dchi = c theta1(2y)/D(y)^4, for theta4 and theta3 as D."""
         # 2 sn cn dn by the quotients of DLMF 22.2 and the duplication of theta1 [DLMF 20.7.10];
         # c from the first term at y = 0, where chi = (2K/pi) y.
         even = self.middle4 ** 4 * self.mean.quarter_period / self.slope1
         return even, -even * self.odd_over_even ** 2
 
-    def shifted(self, amplitude: Decimal, sense: int) -> tuple[Parts, Parts]:
+    def shifted(self, amplitude: mpfr, sense: int) -> tuple[Parts, Parts]:
         """
         Return the parts R and s J of i s theta1(y - i s A) and of theta2(y - i s A).
 
@@ -139,7 +140,7 @@ class ThetaForm:
         sense : s
         """
         square = -amplitude * amplitude if self.imaginary else amplitude * amplitude
-        other, twice = root(1 + square), 2 + 4 * square      # twice: 2 cosh 2A, or 2 cos 2A
+        other, twice = sqrt(1 + square), 2 + 4 * square      # twice: 2 cosh 2A, or 2 cos 2A
         sines = _weighted(self._odd, -amplitude, amplitude, twice)
         cosines = _weighted(self._odd, other, other, twice)
         theta1 = (Series(COS_ODD, _alternating(sines)),
@@ -152,16 +153,16 @@ class ThetaForm:
         return theta1, (Series(COS_ODD, cosines), Series(SIN_ODD, _signed(sense, sines)))
 
 
-def _alternating(weights: Sequence[Decimal]) -> list[Decimal]:
+def _alternating(weights: Sequence[mpfr]) -> list[mpfr]:
     return [-x if k % 2 else x for k, x in enumerate(weights)]
 
 
-def _signed(sign: int, weights: Sequence[Decimal]) -> Sequence[Decimal]:
+def _signed(sign: int, weights: Sequence[mpfr]) -> Sequence[mpfr]:
     return weights if sign > 0 else [-x for x in weights]
 
 
-def _weighted(weights: Sequence[Decimal], before: Decimal, value: Decimal,
-              twice: Decimal) -> list[Decimal]:
+def _weighted(weights: Sequence[mpfr], before: mpfr, value: mpfr,
+              twice: mpfr) -> list[mpfr]:
     """Return weights times sines or cosines of A, 3A ..., or of 0, 2A ..., from two of them."""
     products = []
     for weight in weights:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The heavy symmetric top in theta functions: what is computed once for a motion, in long decimals.
+The heavy symmetric top in theta functions: what is computed once for a motion, in multiprecision.
 
 The solution is Klein's.  F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI;
 E. T. Whittaker, *Analytical Dynamics*, 4th ed., sect. 71 and 72; theta functions: Whittaker and
@@ -38,32 +38,29 @@ r - s pi w/(2 K) here.
    theta3 for X.
 
 Everything that cancels, cancels here: next to a pole, to the separatrix, to steady precession.  So
-there are 57 digits, and more if two roots are close.  Then 40 are enough.
+there are 57 digits, and more if two roots are close; some 40 are left.
 """
 
 from __future__ import annotations
 
-from decimal import Decimal, DecimalException
 from typing import NamedTuple
+
+from gmpy2 import asinh, const_pi, mpfr, sign, sin_cos, sqrt
 
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.cubic import Roots, RootsTooCloseError, cubic_roots
-from spinning_top_sim.solvers.decimal_math import (
-    DIGITS,
+from spinning_top_sim.solvers.elliptic import GaussMean
+from spinning_top_sim.solvers.multiprecision import (
+    BITS,
     ONE,
     ZERO,
     Complex,
-    asinh,
     atan2,
     exact,
     half_turns,
-    pi,
     precision,
-    root,
-    sin_cos,
 )
-from spinning_top_sim.solvers.elliptic import GaussMean
 from spinning_top_sim.solvers.theta_series import (
     COS_EVEN,
     MOST_TERMS,
@@ -74,8 +71,8 @@ from spinning_top_sim.solvers.theta_series import (
     ThetaForm,
 )
 
-DIGITS_TO_TRY = 57, 114, 228, 456
-NO_GRAVITY = Decimal('1e-1000')     # so small that u3 is infinite to all digits
+BITS_TO_TRY = BITS, 2 * BITS, 4 * BITS, 8 * BITS
+NO_GRAVITY = mpfr('1e-1000')        # so small that u3 is infinite to all bits
 
 
 class Factor(NamedTuple):
@@ -92,13 +89,13 @@ class Factor(NamedTuple):
     start_argument : of (R + i s J) exp(i kappa y), less that of the start's `direction` [rad]
     """
 
-    rate: Decimal
-    phase_turns: Decimal
-    drift: Decimal
+    rate: mpfr
+    phase_turns: mpfr
+    drift: mpfr
     parts: tuple[Parts, Parts]
-    scales: tuple[Decimal, Decimal]
+    scales: tuple[mpfr, mpfr]
     sense: int
-    start_argument: Decimal
+    start_argument: mpfr
 
 
 class ThetaMotion(NamedTuple):
@@ -115,22 +112,22 @@ class ThetaMotion(NamedTuple):
 
     alpha: Factor
     beta: Factor
-    stretch: Decimal | None = None
-    quarter_rate: Decimal = ZERO
+    stretch: mpfr | None = None
+    quarter_rate: mpfr = ZERO
     quarter0: int = 0
-    offset0: Decimal = ZERO
-    u_dot: tuple[Decimal, Decimal] = (ZERO, ZERO)
+    offset0: mpfr = ZERO
+    u_dot: tuple[mpfr, mpfr] = (ZERO, ZERO)
     u_dot_series: Series = NOTHING
-    momentum: tuple[Decimal, Decimal] = (ZERO, ZERO)
-    swing: tuple[Decimal, Decimal] = (ZERO, ZERO)
-    m: Decimal = ZERO
-    m1: Decimal = ONE
+    momentum: tuple[mpfr, mpfr] = (ZERO, ZERO)
+    swing: tuple[mpfr, mpfr] = (ZERO, ZERO)
+    m: mpfr = ZERO
+    m1: mpfr = ONE
     size: int = MOST_TERMS
 
 
 class Posture(NamedTuple):
     """
-    Attitude and angular velocity of a top at one instant, in long decimals.
+    Attitude and angular velocity of a top at one instant, in multiprecision.
 
     alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
     across : omega_1 + i omega_2 in the body [rad/s]
@@ -145,43 +142,43 @@ class Posture(NamedTuple):
 
 class HalfAngles(NamedTuple):
     """
-    A state in long decimals; theta is in [0, pi/2].
+    A state in multiprecision; theta is in [0, pi/2].
 
     sin_half, cos_half, theta_dot : of theta/2; [rad/s]
     alpha, beta : complex numbers of any modulus with the arguments (phi + psi)/2, (phi - psi)/2
     l3, lz : [kg m^2/s]
     """
 
-    sin_half: Decimal
-    cos_half: Decimal
-    theta_dot: Decimal
+    sin_half: mpfr
+    cos_half: mpfr
+    theta_dot: mpfr
     alpha: Complex
     beta: Complex
-    l3: Decimal
-    lz: Decimal
+    l3: mpfr
+    lz: mpfr
 
 
-def set_up(top: Top, gravity: Decimal, start: State | HalfAngles) -> ThetaMotion:
+def set_up(top: Top, gravity: mpfr, start: State | HalfAngles) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the numbers as they are.
 
     gravity : instead of that of the top
 
-    Raises ValueError if none of DIGITS_TO_TRY tell the roots of the cubic apart.  They are never
+    Raises ValueError if none of BITS_TO_TRY tell the roots of the cubic apart.  They are never
     equal: on the separatrix, or in steady precession with theta' != 0, cos(theta0) would be
     algebraic, and no double but 0 has an algebraic cosine.
     """
-    for tried in DIGITS_TO_TRY:
+    for tried in BITS_TO_TRY:
         with precision(tried):
             try:
                 return _set_up(top, gravity, start)
             except RootsTooCloseError:
                 continue
-            except (DecimalException, OverflowError) as error:
+            except ArithmeticError as error:
                 raise ValueError(f'{top} from {start}: the constants are too far apart in size '
                                  f'for the exact solution ({type(error).__name__})') from error
     raise ValueError(f'{top} from {start}: closer to the separatrix or to steady precession than '
-                     f'{DIGITS_TO_TRY[-1]} digits can tell')
+                     f'{BITS_TO_TRY[-1]} bits can tell')
 
 
 class _Side(NamedTuple):
@@ -194,24 +191,22 @@ class _Side(NamedTuple):
     modulus, slope : its modulus, and twice the derivative of that
     """
 
-    momentum: Decimal
-    spin: Decimal
-    turns: Decimal
+    momentum: mpfr
+    spin: mpfr
+    turns: mpfr
     direction: Complex
-    modulus: Decimal
-    slope: Decimal
+    modulus: mpfr
+    slope: mpfr
 
 
-def _set_up(top: Top, gravity: Decimal, start: State | HalfAngles) -> ThetaMotion:
+def _set_up(top: Top, gravity: mpfr, start: State | HalfAngles) -> ThetaMotion:
     torque = exact(top.mass) * gravity * exact(top.com_distance)
     lambda1, lambda3 = exact(top.lambda1), exact(top.lambda3)
     alpha_turns, beta_turns, alpha, beta = ZERO, ZERO, (ONE, ZERO), (ONE, ZERO)
     if isinstance(start, HalfAngles):
         sin_half, cos_half, theta_dot, alpha, beta, l3, lz = start
     else:
-        # Rounded now (+): a sum rounds its result, and -L3 must cancel Lz = L3 to the last digit.
-        theta, theta_dot, l3, lz = (
-            +Decimal(x) for x in (start.theta, start.theta_dot, start.l3, start.lz))
+        theta, theta_dot, l3, lz = map(mpfr, (start.theta, start.theta_dot, start.l3, start.lz))
         phi, psi = half_turns(start.phi), half_turns(start.psi)
         alpha_turns, beta_turns = phi + psi, phi - psi
         sin_half, cos_half = sin_cos(theta / 2)
@@ -228,19 +223,19 @@ def _set_up(top: Top, gravity: Decimal, start: State | HalfAngles) -> ThetaMotio
         falling=sense * theta_dot > 0)
 
 
-def _resting(side: _Side, lambda1: Decimal) -> Factor:
+def _resting(side: _Side, lambda1: mpfr) -> Factor:
     """Return alpha = cos(theta/2) exp i(r t + c), or beta likewise, with constant theta."""
     rate = side.spin / 2
     if side.momentum:
         rate += side.momentum / (4 * lambda1 * side.modulus ** 2)
     parts = Series(COS_EVEN, (ONE,)), NOTHING
     argument = -atan2(side.direction[1], side.direction[0])
-    return Factor(rate, side.turns - argument / (2 * pi()), ZERO, (parts, parts),
+    return Factor(rate, side.turns - argument / (2 * const_pi()), ZERO, (parts, parts),
                   (side.modulus, side.modulus), 0, argument)
 
 
-def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decimal,
-              momentum: Decimal, cubic: tuple[Decimal, Decimal, Decimal, Decimal], falling: bool,
+def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, sense: int, l3: mpfr,
+              momentum: mpfr, cubic: tuple[mpfr, mpfr, mpfr, mpfr], falling: bool,
               ) -> ThetaMotion:
     """
     Return a motion with P >= 0; with sense -1 that of which this is the mirror image.
@@ -250,35 +245,34 @@ def _nutating(sides: tuple[_Side, ...], lambda1: Decimal, sense: int, l3: Decima
     roots, f3 = cubic_roots(*cubic), cubic[3]
     imaginary = roots.gap21 > roots.gap32
     poles = _poles(sides, roots, lambda1 ** 2 * f3, imaginary)
-    with precision(DIGITS):
-        a, g, c = root(roots.gap31), root(roots.gap32), root(roots.gap21)
-        mean = GaussMean(a, g, c)
-        form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary)
-        quarter0, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
-        stretch = form.mean.mean / mean.mean if imaginary else None
-        sin = form.mean.amplitude(square, 1 if imaginary else -1)
-        xi = -sin * sin if imaginary else sin * sin
-        cos = root(1 - xi)
-        y0 = direction * (asinh(sin) / stretch if stretch else atan2(sin, cos))
-        scale = root(f3)
-        # w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
-        y_rate = scale * mean.mean / 2
-        factors = [_quotient(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, quarter0,
-                             y0, (direction * sin, cos, xi))
-                   for side, pole in zip(sides, poles, strict=True)]
-        scale *= sense * a / 2 * roots.gap21         # w (u2 - u1)
-        even, odd = form.slopes_of_sn2()
-        turn = sense * l3 / lambda1
-        swing = turn * roots.gap21 * (form.mean.quarter_period / form.slope1) ** 2
-        alpha, beta = factors[::sense]
-        return ThetaMotion(
-            alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / pi(), quarter0=quarter0,
-            offset0=y0 * 2 / pi(),
-            u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
-            momentum=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
-            swing=(-swing * form.middle4 ** 2,
-                   swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
-            m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31, size=form.size)
+    a, g, c = sqrt(roots.gap31), sqrt(roots.gap32), sqrt(roots.gap21)
+    mean = GaussMean(a, g, c)
+    form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary)
+    quarter0, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
+    stretch = form.mean.mean / mean.mean if imaginary else None
+    sin = form.mean.amplitude(square, 1 if imaginary else -1)
+    xi = -sin * sin if imaginary else sin * sin
+    cos = sqrt(1 - xi)
+    y0 = direction * (asinh(sin) / stretch if stretch else atan2(sin, cos))
+    scale = sqrt(f3)
+    # w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
+    y_rate = scale * mean.mean / 2
+    factors = [_quotient(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, quarter0,
+                         y0, (direction * sin, cos, xi))
+               for side, pole in zip(sides, poles, strict=True)]
+    scale *= sense * a / 2 * roots.gap21         # w (u2 - u1)
+    even, odd = form.slopes_of_sn2()
+    turn = sense * l3 / lambda1
+    swing = turn * roots.gap21 * (form.mean.quarter_period / form.slope1) ** 2
+    alpha, beta = factors[::sense]
+    return ThetaMotion(
+        alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / const_pi(), quarter0=quarter0,
+        offset0=y0 * 2 / const_pi(),
+        u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
+        momentum=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
+        swing=(-swing * form.middle4 ** 2,
+               swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
+        m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31, size=form.size)
 
 
 class _Pole(NamedTuple):
@@ -292,12 +286,12 @@ class _Pole(NamedTuple):
     """
 
     is_beta: bool
-    x1: Decimal
-    x2: Decimal
-    zero: Decimal | None
+    x1: mpfr
+    x2: mpfr
+    zero: mpfr | None
 
 
-def _poles(sides: tuple[_Side, ...], roots: Roots, scale: Decimal,
+def _poles(sides: tuple[_Side, ...], roots: Roots, scale: mpfr,
            imaginary: bool) -> tuple[_Pole, _Pole]:
     """
     Return the poles of alpha and beta; scale: 2 P lambda1.
@@ -322,8 +316,8 @@ def _poles(sides: tuple[_Side, ...], roots: Roots, scale: Decimal,
             _Pole(True, below1, below2, beta_zero))
 
 
-def _nearest_quarter(roots: Roots, complement: Decimal, falling: bool,
-                     imaginary: bool) -> tuple[int, int, Decimal]:
+def _nearest_quarter(roots: Roots, complement: mpfr, falling: bool,
+                     imaginary: bool) -> tuple[int, int, mpfr]:
     """
     Return N at t = 0, the sign of y, and sn^2 or sn^2/cn^2 of the distance of chi from N K.
 
@@ -340,24 +334,24 @@ def _nearest_quarter(roots: Roots, complement: Decimal, falling: bool,
         low * roots.gap32 if imaginary else roots.gap21 * roots.y3))
 
 
-def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rate: Decimal,
-              y_rate: Decimal, quarters: int, y: Decimal,
-              point: tuple[Decimal, Decimal, Decimal]) -> Factor:
+def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: mpfr, x_rate: mpfr,
+              y_rate: mpfr, quarters: int, y: mpfr,
+              point: tuple[mpfr, mpfr, mpfr]) -> Factor:
     """
     Return alpha or beta as a quotient of theta functions.
 
     x_rate, y_rate : of x and y, the arguments of the imaginary and of the real form [rad/s]
     quarters, y, point : N, y and the arguments of `Series.at` at t = 0
     """
-    sense, drift, rate = int(side.momentum.compare(ZERO)), ZERO, side.spin / 2
+    sense, drift, rate = sign(side.momentum), ZERO, side.spin / 2
     farthest, real, imag = max(pole.x1, pole.x2), ONE, ZERO
-    scale = root(farthest / 2)
+    scale = sqrt(farthest / 2)
     starts_in_first = quarters % 2 == pole.is_beta       # the theta1 of step 3
     if pole.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
     elif not sense:
-        sign = -1 if pole.is_beta else 1
-        first = Series(SIN_ODD, [sign * x for x in form.theta1.weights]), NOTHING
+        slope = -1 if pole.is_beta else 1
+        first = Series(SIN_ODD, [slope * x for x in form.theta1.weights]), NOTHING
         second = form.theta2, NOTHING
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
         # vanish they leave 0 with the slope.
@@ -368,9 +362,9 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rat
     else:
         amplitude = form.mean.amplitude(pole.zero, -1 if form.imaginary else 1)
         first, second = form.shifted(amplitude, sense)
-        drift = Decimal(-sense)
+        drift = -sense * ONE
         if form.imaginary:
-            drift += sense * 2 / pi() * atan2(amplitude, root(1 - amplitude * amplitude))
+            drift += sense * 2 / const_pi() * atan2(amplitude, sqrt(1 - amplitude * amplitude))
         rate += (side.momentum / (2 * lambda1 * farthest) - drift * y_rate
                  - second[1].leading / second[0].leading * x_rate)
         real, imag = (part.at(*point) for part in (first if starts_in_first else second))
@@ -380,5 +374,5 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: Decimal, x_rat
                      else ((first, second), (scale, scale)))
     c, s = side.direction
     argument = drift * y + atan2(imag * c - real * s, real * c + imag * s)
-    return Factor(rate, side.turns - argument / (2 * pi()), drift, parts, scales,
+    return Factor(rate, side.turns - argument / (2 * const_pi()), drift, parts, scales,
                   sense, argument)

@@ -14,16 +14,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from decimal import Decimal
 from functools import cached_property
 from itertools import chain
 from operator import sub
 
 import numpy as np
+from gmpy2 import const_pi, mpfr, rint
 from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.solvers.decimal_math import DIGITS, double_double, pi, precision
+from spinning_top_sim.solvers.multiprecision import BITS, double_double, precision
 from spinning_top_sim.solvers.theta_series import SIN_ODD
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import UNITS, Times, halves, products
@@ -37,7 +37,7 @@ QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
 SIGNS = np.array((1.0, -1.0))   # of an even and of an odd number of half turns
 HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the three phases' units
 # Smaller amplitudes leave no room for their squares in doubles, larger numbers none for halves.
-LEAST_AMPLITUDE, LARGEST_NUMBER = Decimal('1e-145'), Decimal('1e290')
+LEAST_AMPLITUDE, LARGEST_NUMBER = 1e-145, 1e290
 
 
 class Constants:
@@ -46,7 +46,7 @@ class Constants:
 
     Raises ValueError if doubles cannot hold an amplitude or a rate.
 
-    rates : of the three phases [1/s], in long decimals
+    rates : of the three phases [1/s], in multiprecision
     start_whole, offsets : at t = 0 a phase is their sum; the latter are two doubles each
     drifts : kappa/2 of alpha and beta
     stretch : K/K' times a quarter turn, 0 in the real form
@@ -59,9 +59,9 @@ class Constants:
 
     def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
-        self.rates = [motion.quarter_rate, *(x.rate / pi() for x in factors)]
+        self.rates = [motion.quarter_rate, *(x.rate / const_pi() for x in factors)]
         turns = [2 * x.phase_turns for x in factors]
-        self.start_whole = [motion.quarter0, *map(round, turns)]
+        self.start_whole = [motion.quarter0, *(int(rint(x)) for x in turns)]
         self.offsets = [*map(double_double, (
             motion.offset0, *map(sub, turns, self.start_whole[1:])))]
         self.drifts = [0.5 * float(factor.drift) for factor in factors]
@@ -145,9 +145,9 @@ class ThetaFunctions:
     def turned(self, times: Times) -> tuple[Matrix, Matrix]:
         """Return what the three phases have grown by (3, n), as two doubles each."""
         if times.unit not in self._rates:
-            with precision(DIGITS):
+            with precision(BITS):
                 rate, rest = map(self.columns, np.array([
-                    [double_double(x * UNITS[times.unit]) for x in one.rates]
+                    [double_double(x / UNITS[times.unit]) for x in one.rates]
                     for one in self._motions]).transpose(2, 0, 1))
             self._rates[times.unit] = rate, *halves(rate), rest
         return products(self._rates[times.unit], times)
@@ -352,7 +352,7 @@ class ThetaValues:
                          sin[0] * cos[1] - cos[0] * sin[1]))
 
 
-def in_range(name: str, value: Decimal) -> float:
+def in_range(name: str, value: mpfr) -> float:
     """Return a number as a double.  Raises ValueError where its products would overflow."""
     if abs(value) > LARGEST_NUMBER:
         raise ValueError(f'{name} is {value:.3e}: must be at most {LARGEST_NUMBER} for doubles to '

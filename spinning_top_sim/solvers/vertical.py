@@ -4,7 +4,7 @@ The exact motion of a top while its pivot accelerates uniformly, and how it is h
 
 In the frame of a pivot with the acceleration a, gravity is g - a: the top is the same top about
 another vertical.  A change of a leaves attitude and angular velocity as they are.  They are handed
-over in long decimals: in doubles every change would move the constants of the motion by a
+over in multiprecision: in doubles every change would move the constants of the motion by a
 rounding, and the phase would drift by that much times the angle that follows.
 """
 
@@ -13,31 +13,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from decimal import Decimal
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from gmpy2 import const_pi, mpfr, rint, sin_cos, sinh, sqrt
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.pivot import Exact
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.decimal_math import (
-    DIGITS,
+from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
+from spinning_top_sim.solvers.multiprecision import (
+    BITS,
     ONE,
     ZERO,
     Complex,
     exact,
-    pi,
     precision,
-    root,
-    sin_cos,
 )
-from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
 from spinning_top_sim.solvers.theta_series import SIN_ODD
 from spinning_top_sim.solvers.theta_setup import (
-    DIGITS_TO_TRY,
     Factor,
     HalfAngles,
     Posture,
@@ -47,13 +43,12 @@ from spinning_top_sim.solvers.theta_setup import (
 from spinning_top_sim.solvers.theta_values import ThetaFunctions
 from spinning_top_sim.solvers.times import Times
 
-MOST_DIGITS = DIGITS_TO_TRY[0]
 # An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
 # as this has zeros.
-POLE = Decimal('1e-30')
+POLE = 1e-30
 # If the distance by which a motion misses a pole is less than this share of the largest possible,
 # it passes exactly: the set-up squares the share, and has 40 digits.
-THROUGH = Decimal('1e-19')
+THROUGH = 1e-19
 
 
 class Vertical(NamedTuple):
@@ -70,7 +65,7 @@ class Vertical(NamedTuple):
     rows : the same rotation, q(world <- frame), in doubles
     """
 
-    gravity: Decimal
+    gravity: mpfr
     top: Top
     alpha: Complex
     beta: Complex
@@ -81,10 +76,10 @@ class Vertical(NamedTuple):
         top, (a, b), (c, d) = self.top, self.alpha, self.beta
         alpha, beta = _product(((a, -b), (-c, -d)), (posture.alpha, posture.beta))
         cosine2, sine2 = _square(alpha), _square(beta)
-        size2, l3, (o1, o2) = cosine2 + sine2, Decimal(posture.l3), posture.across
-        cosine, sine = root(cosine2 / size2), root(sine2 / size2)
+        size2, l3, (o1, o2) = cosine2 + sine2, mpfr(posture.l3), posture.across
+        cosine, sine = sqrt(cosine2 / size2), sqrt(sine2 / size2)
         if 2 * sine < POLE:         # all the motion of the axis is nutation: psi from omega
-            theta_dot = root(_square(posture.across))
+            theta_dot = sqrt(_square(posture.across))
             beta = _times(alpha, (o2, -o1)) if theta_dot else alpha
             return HalfAngles(ZERO, ONE, theta_dot, alpha, beta, +l3, +l3)
         # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
@@ -141,9 +136,9 @@ class AcceleratedMotion(ClosedForm):
         """
         if not ns:                  # perhaps at a pole, where the axis does not tell its rates
             return self._posture
-        with precision(DIGITS + 2):
+        with precision(BITS):
             vertical = self.vertical
-            alpha, beta, u_dot = _cayley_klein(self._motion, Decimal(ns).scaleb(-9))
+            alpha, beta, u_dot = _cayley_klein(self._motion, mpfr(ns) / 10 ** 9)
             across = _across(exact(self.top.lambda1), *self.halves[-2:], alpha, beta, u_dot)
             alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
             return Posture(alpha, beta, across, self._posture.l3)
@@ -179,16 +174,16 @@ class AcceleratedStates(ThetaStates):
 
 @lru_cache(64)
 def _verticals(top: Top, acceleration: Exact,
-               ) -> tuple[tuple[Decimal, Decimal, Decimal], Vertical, Vertical]:
+               ) -> tuple[tuple[mpfr, mpfr, mpfr], Vertical, Vertical]:
     """Return the upward line of effective gravity, and the verticals along and against it."""
-    x, y, z = (Decimal(a.numerator) / Decimal(a.denominator) for a in acceleration)
-    z += Decimal(top.gravity)
-    size = root(x * x + y * y + z * z)
+    x, y, z = (mpfr(a.numerator) / a.denominator for a in acceleration)
+    z += mpfr(top.gravity)
+    size = sqrt(x * x + y * y + z * z)
     x, y, z = line = (x / size, y / size, z / size) if size else (ZERO, ZERO, ONE)
     return line, _upright(top, size, x, y, z), _upright(top, -size, -x, -y, -z)
 
 
-def _upright(top: Top, gravity: Decimal, x: Decimal, y: Decimal, z: Decimal) -> Vertical:
+def _upright(top: Top, gravity: mpfr, x: mpfr, y: mpfr, z: mpfr) -> Vertical:
     alpha, beta = _least_rotation(x, y, z)
     qx, qy, qz, qw = (np.array([float(part)]) for part in (-beta[1], beta[0], alpha[1], alpha[0]))
     return Vertical(gravity, replace(top, gravity=float(gravity)), alpha, beta, (qx, qy, qz, qw))
@@ -197,7 +192,7 @@ def _upright(top: Top, gravity: Decimal, x: Decimal, y: Decimal, z: Decimal) -> 
 def about_vertical(top: Top, posture: Posture, acceleration: Exact,
                    ) -> tuple[Vertical, HalfAngles]:
     """Return the vertical while the pivot accelerates so, and the state there."""
-    with precision(MOST_DIGITS):
+    with precision(BITS):
         (x, y, z), up, down = _verticals(top, acceleration)
         (w0, z0), (y0, minus_x0) = alpha, beta = posture[:2]
         side = (2 * (x * (w0 * y0 - z0 * minus_x0) + y * (y0 * z0 + w0 * minus_x0))
@@ -218,12 +213,12 @@ def rounded(start: HalfAngles) -> State:
 
 def posture_of(top: Top, state: State) -> Posture:
     """Return the posture of a state about the vertical of the world."""
-    with precision(MOST_DIGITS):
-        sine, cosine = sin_cos(Decimal(state.theta) / 2)
-        phi, psi = +Decimal(state.phi), +Decimal(state.psi)
+    with precision(BITS):
+        sine, cosine = sin_cos(mpfr(state.theta) / 2)
+        phi, psi = mpfr(state.phi), mpfr(state.psi)
         (s_sum, c_sum), (s_difference, c_difference), (s_psi, c_psi) = (
-            sin_cos(_reduced(angle)) for angle in ((phi + psi) / 2, (phi - psi) / 2, psi))
-        l3, lz, two_lambda1 = Decimal(state.l3), Decimal(state.lz), 2 * exact(top.lambda1)
+            sin_cos(angle) for angle in ((phi + psi) / 2, (phi - psi) / 2, psi))
+        l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * exact(top.lambda1)
         swing = ZERO                # phi' sin(theta)
         if lz + l3:
             swing += (lz + l3) / two_lambda1 * sine / cosine
@@ -231,58 +226,52 @@ def posture_of(top: Top, state: State) -> Posture:
             swing += (lz - l3) / two_lambda1 * cosine / sine
         return Posture((cosine * c_sum, cosine * s_sum),
                        (sine * c_difference, sine * s_difference),
-                       _times((-swing, Decimal(state.theta_dot)), (c_psi, -s_psi)), state.l3)
+                       _times((-swing, mpfr(state.theta_dot)), (c_psi, -s_psi)), state.l3)
 
 
 def posture_at(states: States) -> Posture:
     """Return the posture of states (n = 1) in the world, as far as doubles know it."""
-    x, y, z, w, o1, o2 = (Decimal(float(part[0])) for part in (
+    x, y, z, w, o1, o2 = (mpfr(float(part[0])) for part in (
         *states.rows_quaternion, *states.transverse_velocity))
     return Posture((w, z), (y, -x), (o1, o2), states.start.l3)
 
 
-def _reduced(angle: Decimal) -> Decimal:
-    """Return an angle less whole turns [rad]."""
-    with precision(MOST_DIGITS + max(0, angle.adjusted())):
-        return angle.remainder_near(2 * pi())
-
-
-def _cayley_klein(motion: ThetaMotion, t: Decimal) -> tuple[Complex, Complex, Decimal]:
+def _cayley_klein(motion: ThetaMotion, t: mpfr) -> tuple[Complex, Complex, mpfr]:
     """Return alpha, beta and cos(theta)' at t [s] in the frame of a motion."""
     quarters = motion.quarter0 + motion.offset0 + motion.quarter_rate * t
-    whole = int(quarters.to_integral_value())
+    whole = int(rint(quarters))
     rest = (motion.quarter0 - whole) + motion.quarter_rate * t + motion.offset0
-    y = pi() / 2 * rest
+    y = const_pi() / 2 * rest
     if motion.stretch:
-        sine = _sinh(motion.stretch * y)
+        sine = sinh(motion.stretch * y)
         xi = -sine * sine
     else:
         sine, _ = sin_cos(y)
         xi = sine * sine
-    cosine = root(1 - xi)
+    cosine = sqrt(1 - xi)
     point = sine, cosine, xi
     alpha, beta = (_value(factor, whole, y, t, point) for factor in (motion.alpha, motion.beta))
     size2 = _square(alpha) + _square(beta)
     slope = motion.u_dot_series.at(2 * sine * cosine, 1 - 2 * xi, 4 * xi * (1 - xi))
     u_dot = motion.u_dot[whole % 2] * slope / (size2 * size2)
-    scale = 1 / root(size2)
+    scale = 1 / sqrt(size2)
     return _scaled(scale, alpha), _scaled(scale, beta), u_dot
 
 
-def _value(factor: Factor, whole: int, y: Decimal, t: Decimal,
-           point: tuple[Decimal, Decimal, Decimal]) -> Complex:
+def _value(factor: Factor, whole: int, y: mpfr, t: mpfr,
+           point: tuple[mpfr, mpfr, mpfr]) -> Complex:
     """Return alpha D or beta D; `whole`, y, `point`: N, y and the arguments of `Series.at`."""
     parts, scale = factor.parts[whole % 2], factor.scales[whole % 2]
     real, imag = (scale * part.at(*point) for part in parts)
     if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
         real = -real                # it passes a pole
-    turn = factor.rate * t + 2 * pi() * factor.phase_turns + factor.drift * y
+    turn = factor.rate * t + 2 * const_pi() * factor.phase_turns + factor.drift * y
     sine, cosine = sin_cos(turn)
     return _times((real, imag), (cosine, sine))
 
 
-def _across(lambda1: Decimal, l3: Decimal, lz: Decimal, alpha: Complex, beta: Complex,
-            u_dot: Decimal) -> Complex:
+def _across(lambda1: mpfr, l3: mpfr, lz: mpfr, alpha: Complex, beta: Complex,
+            u_dot: mpfr) -> Complex:
     """Return omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta))."""
     cosine2, sine2 = _square(alpha), _square(beta)
     if not (cosine2 and sine2):
@@ -295,27 +284,16 @@ def _across(lambda1: Decimal, l3: Decimal, lz: Decimal, alpha: Complex, beta: Co
     return _times((momentum / lambda1, u_dot), inverse)
 
 
-def _sinh(x: Decimal) -> Decimal:
-    """Return sinh, to an absolute accuracy, and relative to itself where x is small."""
-    if abs(x) < Decimal('1e-3'):
-        square, term, total = x * x, x, x
-        for n in range(2, 22, 2):
-            term *= square / (n * (n + 1))
-            total += term
-        return total
-    return (x.exp() - (-x).exp()) / 2
-
-
-def _least_rotation(x: Decimal, y: Decimal, z: Decimal) -> tuple[Complex, Complex]:
+def _least_rotation(x: mpfr, y: mpfr, z: mpfr) -> tuple[Complex, Complex]:
     """Return the Cayley-Klein parameters of the least rotation of (0, 0, 1) to a unit vector."""
-    across = root(x * x + y * y)
+    across = sqrt(x * x + y * y)
     if not across:                  # perhaps a half turn, about the x axis
         return ((ONE, ZERO), (ZERO, ZERO)) if z > 0 else ((ZERO, ZERO), (ZERO, -ONE))
     if z > 0:
-        cosine = root((1 + z) / 2)
+        cosine = sqrt((1 + z) / 2)
         sine = across / (2 * cosine)
     else:
-        sine = root((1 - z) / 2)
+        sine = sqrt((1 - z) / 2)
         cosine = across / (2 * sine)
     return (cosine, ZERO), (sine * x / across, sine * y / across)
 
@@ -333,9 +311,9 @@ def _times(a: Complex, b: Complex) -> Complex:
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
-def _scaled(factor: Decimal, a: Complex) -> Complex:
+def _scaled(factor: mpfr, a: Complex) -> Complex:
     return factor * a[0], factor * a[1]
 
 
-def _square(a: Complex) -> Decimal:
+def _square(a: Complex) -> mpfr:
     return a[0] * a[0] + a[1] * a[1]

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Multiprecision numbers: `mpfr` of gmpy2, whose results are rounded in the current context.
+
+L. Fousse et al., "MPFR: A multiple-precision binary floating-point library with correct rounding",
+ACM Trans. Math. Softw. 33 (2007), 13.
+"""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+
+import gmpy2
+from gmpy2 import mpfr
+
+# Three words of 64 bits, or 57 decimal digits.
+BITS = 192
+# An infinity or a NaN raises ArithmeticError.
+TRAPS = {f'trap_{name}': True for name in ('divzero', 'invalid', 'overflow')}
+ZERO, ONE = mpfr(0), mpfr(1)
+Complex = tuple[mpfr, mpfr]
+
+
+@lru_cache(64)
+def exact(x: float) -> mpfr:
+    """Return a double as it is, in any context."""
+    return mpfr(x, 53)
+
+
+@contextmanager
+def precision(bits: int) -> Iterator[None]:
+    """Set the bits of results for a while, in this thread."""
+    before = gmpy2.get_context()
+    gmpy2.set_context(gmpy2.context(precision=bits, **TRAPS))
+    try:
+        yield
+    finally:
+        gmpy2.set_context(before)       # which `with` of gmpy2 2.1 does not, where it is nested
+
+
+def atan2(y: mpfr, x: mpfr) -> mpfr:
+    """
+    Return the argument of x + iy, to some 240 bits; 0 at the origin.
+
+    MPFR's own takes several times as long.
+    """
+    size = max(abs(x), abs(y))
+    if not size:
+        return ZERO
+    # Turned back by the argument in doubles (+ 0.0: not -pi on the negative real axis), the
+    # point is next to the positive one.
+    near = math.atan2(float(y / size) + 0.0, float(x / size))
+    sine, cosine = gmpy2.sin_cos(near)
+    tangent = (y * cosine - x * sine) / (x * cosine + y * sine)
+    return near + (tangent - tangent * tangent * tangent / 3)
+
+
+def half_turns(radians: float) -> mpfr:
+    """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
+    sine, cosine = gmpy2.sin_cos(mpfr(radians) / 2)
+    return atan2(sine, cosine) / (2 * gmpy2.const_pi())
+
+
+def double_double(x: mpfr) -> tuple[float, float]:
+    """Return the nearest double, and the nearest double to what it leaves out."""
+    high = float(x)
+    return high, float(x - high)
