@@ -25,7 +25,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
-from spinning_top_sim.tools.ensemble_spec import Specification
+from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
 from spinning_top_sim.tools.recorded_run import field_names, reason_of
 from spinning_top_sim.tools.simulate import write_log
 
@@ -39,7 +39,6 @@ EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
 DATA = 'data'                   # folder of the files of a dataset
 # Key of the metadata of a Parquet file: the reasons of the runs that failed, by run.
 FAILED = b'failed'
-ROWS_IN_A_GROUP = 40_000        # of a Parquet file
 # Names of the numbers in the fields of a topic, where they are not x, y, z and w.
 PLACE = ('latitude', 'longitude', 'altitude')
 LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING,
@@ -171,7 +170,7 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
         constant = ['run', *specification.drawn(0)]
         written = path.with_name(f'.{path.name}.{uuid4()}')     # readers of Parquet skip it
         parquet.write_table(
-            rows, written, compression='lz4', row_group_size=ROWS_IN_A_GROUP,
+            rows, written, compression='lz4', row_group_size=ROWS_IN_A_PART,
             use_dictionary=constant, write_statistics=constant, use_byte_stream_split=[
                 name for name in rows.column_names if name not in constant])
         written.replace(path)

@@ -20,8 +20,8 @@ DEFAULTS = {parameter.name: parameter.default for parameter in parameters.TABLE}
 # Streams that a table can have; only a log has the others.
 STREAMS = tuple(row[0] for row in parameters.STREAM_DEFAULTS if row[0] not in ('clock', 'markers'))
 # By default a part has at most this many rows, or one run, and a large ensemble at least this
-# many parts.
-ROWS_IN_A_PART, LEAST_PARTS = 200_000, 50
+# many parts.  Larger parts take more memory, and are no faster.
+ROWS_IN_A_PART, LEAST_PARTS = 50_000, 50
 VALUES, PARAMS = 'values', 'params'
 _entry = partial(parameters.Parameter, text='', effect=parameters.Effect.START)
 ENTRIES = (
