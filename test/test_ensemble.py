@@ -243,14 +243,6 @@ def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(
     assert abs(np.corrcoef(columns['spin.l3'], columns['spin.lz'])[0, 1]) < 5.0 / np.sqrt(2000)
 
 
-@pytest.mark.parametrize(('runs', 'duration', 'together'), [
-    (10 ** 6, 10.0, 25), (1000, 10.0, 20), (10 ** 6, 1e5, 1)])
-def test_a_part_has_so_many_runs_by_default(runs, duration, together):
-    """At most 50 000 rows of 200 Hz, and at least 50 parts."""
-    given = {'runs': runs, 'duration': duration}
-    assert ensemble_spec.parse(given, 'test').runs_per_part == together
-
-
 @pytest.mark.parametrize(('content', 'counts'), [
     # A magnetometer in one of two IMUs; a value that is unset in some runs.
     ({'runs': 4, 'sample': {'params': {'values': [

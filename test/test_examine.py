@@ -148,7 +148,7 @@ def test_a_filter_without_faults_passes(report):
     explained = {name for name in MEANINGS if not name.startswith(('data_', 'field_'))}
     assert {*explained, 'nees_low', 'nees_high', 'nees_attitude_low', 'nees_attitude_high'} == {
         *marks}, 'each measure is explained'
-    assert 'fault from 1\n' in str(found)
+    assert 'fault from 1.5\n' in str(found)
 
 
 def test_vqf_passes_with_and_without_magnetometer(report):
@@ -194,6 +194,17 @@ def test_a_filter_that_goes_on_from_run_to_run_gets_the_same_verdict_but_for_its
     found = report('too sure', restart=False)
     assert found.passed and found.measures['nees'] > 1.5, found
     assert found.measures['heading_rms_deg'] < 1.0
+    assert report('reference', restart=False).passed
+
+
+def test_an_error_that_only_noise_shows_is_inaccurate():
+    class Nervous(Vqf):
+        def update(self, gyroscope, accelerometer, *others):
+            noisy = abs(np.linalg.norm(accelerometer) - scenarios.GRAVITY) > 1e-6
+            return (Rotation.from_rotvec((0.02 * noisy, 0.0, 0.0)) * Rotation.from_quat(
+                super().update(gyroscope, accelerometer, *others))).as_quat()
+
+    assert examine(Nervous, seeds=1, isolated=False).faults == ['inaccurate']
 
 
 class Bad:

@@ -38,9 +38,10 @@ def test_a_disturbed_field_changes_neither_tilt_nor_heading():
     assert np.degrees(np.max(np.abs(errors.heading[800:]))) < 2.0
 
 
-def test_an_uncalibrated_device_is_calibrated_and_the_covariance_says_how_well():
+@pytest.mark.parametrize('name', ['bmi088', 'icm_42688_p'])
+def test_an_uncalibrated_device_is_calibrated_and_the_covariance_says_how_well(name):
     """The accelerometer alone would be 1 degree off, and the covariance knows no data sheet."""
-    imu = read_scene(ROOT / 'config/imu/bmi088.yaml')
+    imu = read_scene(ROOT / f'config/imu/{name}.yaml')
     outcomes = [follow(ReferenceFilter, scenarios.record(SLOW, imu, seed)) for seed in range(4)]
     tilts = [np.degrees(rms(outcome.last().errors.tilt)) for outcome in outcomes]
     assert max(tilts) < 0.05
@@ -48,6 +49,7 @@ def test_an_uncalibrated_device_is_calibrated_and_the_covariance_says_how_well()
     for what in ('tilt', 'attitude'):
         low, high = nees[what].band
         assert low < nees[what].ratio < high, what
+    assert 0.7 < nees['tilt'].ratio < 1.4
 
 
 def test_the_covariance_of_the_tilt_is_not_below_the_bound_of_white_noise():

@@ -15,7 +15,7 @@ pytest.importorskip('rclpy')
 
 import rclpy
 from helpers.node_harness import wait_for
-from helpers.standard_node import KINDS, StandardNode, finished
+from helpers.standard_node import finished, standard_node  # noqa: F401, a fixture
 
 from spinning_top_sim.nodes.simulation_handlers import FEATURES
 from spinning_top_sim.tools import inspect
@@ -23,12 +23,6 @@ from spinning_top_sim.tools import inspect
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 STOPPED, PLAYING, PAUSED, QUITTING, NO_WORLD = range(5)
 ALREADY, TRANSITION_ERROR, INCORRECT_TRANSITION = 101, 102, 103
-
-
-@pytest.fixture(scope='module', params=KINDS)
-def node(request, tmp_path_factory):
-    with StandardNode(tmp_path_factory.mktemp('node'), request.param) as node:
-        yield node
 
 
 @pytest.fixture

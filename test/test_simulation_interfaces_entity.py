@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from helpers.node_logs import log_of, xyz, xyzw
-from helpers.standard_node import KINDS, StandardNode
+from helpers.standard_node import standard_node  # noqa: F401, a fixture
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
@@ -17,12 +17,6 @@ from scipy.spatial.transform import Rotation
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 PAUSED, INVALID_POSE = 2, 101
 NAME = 'spinning_top'
-
-
-@pytest.fixture(scope='module', params=KINDS)
-def node(request, tmp_path_factory):
-    with StandardNode(tmp_path_factory.mktemp('node'), request.param) as node:
-        yield node
 
 
 @pytest.fixture

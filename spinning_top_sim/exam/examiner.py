@@ -169,7 +169,7 @@ class _Exam:
             self._do(self._judge_lever_arm)
             if identified:
                 self._do(self._response.judge_bias)
-        self._judge_noisy_runs()
+        self._do(self._judge_noisy_runs)
         self._do(lambda: self.findings.measures.update(self._subject.convergence()))
 
     def _do(self, part: Callable[[], object]) -> bool:
@@ -199,7 +199,12 @@ class _Exam:
         findings.measures |= diagnosis.quality(self.outcomes, imu, self._absolute)
         findings.measures['stamp_offset_s'] = diagnosis.stamp_fault(
             first.last(), self._absolute)[0].seconds
-        large = diagnosis.inaccuracy(first, self._absolute)
+        limit = (diagnosis.largest_error(first.run, self._absolute)
+                 if imu.keys() <= scenarios.CALIBRATED.keys() else diagnosis.DIVERGED)
+        large = diagnosis.inaccuracy(first, self._absolute, limit)
+        if large:       # unless it corrects before its step, which is no fault
+            large = diagnosis.inaccuracy(self._response.respond((), first.run), self._absolute,
+                                         limit)
         if large and not findings.faults and from_identity(early) > SLIGHT:
             large = Fault('gyroscope_wiring', f'{words(early)}; {large.evidence}')
         if large and (large.name == 'diverges' or not findings.faults):

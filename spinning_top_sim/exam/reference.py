@@ -50,7 +50,7 @@ class _Variance:
     """A mean square over the last seconds."""
 
     def __init__(self, guess: float) -> None:
-        self.value, self._seconds = guess, 0.5
+        self.value, self._seconds = guess, 0.1
 
     def add(self, square: float, dt: float) -> float:
         """Return the mean with this square, at least a quarter of the square itself."""
@@ -127,7 +127,8 @@ class ReferenceFilter:
         band = self._slow - self._slower
         square = float(band @ band) / 3.0
         self._moving_s -= dt
-        if square > LARGEST ** 2 + np.trace(self._p[6:, 6:]) / 3.0:
+        bias_variance = np.trace(self._p[6:, 6:]) / 3.0
+        if square > LARGEST ** 2 + bias_variance:
             self._moving_s = MOVING_S
         h = np.zeros((3, 9))
         h[0, 1], h[1, 0] = -GRAVITY, GRAVITY
@@ -135,11 +136,13 @@ class ReferenceFilter:
             self._correct(h, residual, MOVING_FORCE ** 2 / dt, NO_FORCE_BIAS)
             return
         h[:, 6:] = self._to_world
+        turns, noise = gyroscope @ gyroscope > TURNING ** 2, self._force_noise
+        # Turning takes a bias that is not known yet through the band.
+        variance = (max(noise.value, square) if turns and bias_variance > 4.0 * noise.value
+                    else noise.add(square, dt))
         # Samples of a white density N leave 2 N^2 BAND_S^2 / (2 BAND_S + dt)^3 in the band.
-        density = max((2.0 * BAND_S + dt) ** 3 / (2.0 * BAND_S ** 2)
-                      * self._force_noise.add(square, dt), LEAST[1] ** 2)
-        self._correct(h, residual, density / dt,
-                      1.0 if gyroscope @ gyroscope > TURNING ** 2 else NO_FORCE_BIAS)
+        density = max((2.0 * BAND_S + dt) ** 3 / (2.0 * BAND_S ** 2) * variance, LEAST[1] ** 2)
+        self._correct(h, residual, density / dt, 1.0 if turns else NO_FORCE_BIAS)
 
     def _correct_at_rest(self, rates: Reals, dt: float) -> None:
         self._mean_rate += dt / (0.5 + dt) * (rates - self._mean_rate)

@@ -87,7 +87,7 @@ class Response:
 
         Raises InvalidOutputError if the filter fails.
         """
-        self._outcome = self._respond()
+        self._outcome = self.respond()
         for _ in range(4):
             best = self._cause()
             if best is None:
@@ -124,7 +124,8 @@ class Response:
     def _whole(self, outcome: Outcome, *places: Any) -> float:
         return float(np.linalg.norm(self._clean(outcome, *places)))
 
-    def _respond(self, more: Sequence[Hypothesis] = (), run: Run | None = None) -> Outcome:
+    def respond(self, more: Sequence[Hypothesis] = (), run: Run | None = None) -> Outcome:
+        """Return the outcome of a run, by default of the excitation; all found is undone."""
         return self._subject.follow(run or self._excited,
                                     [*more, *self._harmless, *self.undone])
 
@@ -135,12 +136,12 @@ class Response:
                 if one.given is None:
                     yield one, replace(self._outcome, estimates=one.read(self._outcome.estimates))
                 elif not (screened and self._subject.restarts and self._in_vain(one)):
-                    yield one, self._respond((one,))
+                    yield one, self.respond((one,))
 
     def _in_vain(self, one: Hypothesis) -> bool:
         """Return whether a short run has the error of early rests still: a long one would, too."""
         rests = self._rests[EARLY_RESTS]
-        short = self._respond((one,), self._excited.part(slice(rests[-1] + 1)))
+        short = self.respond((one,), self._excited.part(slice(rests[-1] + 1)))
         before, after = (self._whole(outcome, rests) for outcome in (self._outcome, short))
         return before > HEADING and after > LESS * before
 
@@ -291,7 +292,7 @@ class Response:
             # Within turns too, the readings are those of a rest in the same attitude.
             starts = np.concatenate((self._rests, self._given.turns + 15, self._given.turns + 30))
             still = np.full((START, 3), excitation.NEVER_ZERO)
-            found.insert(0, (Rotation.from_quat([self._respond(more, replace(
+            found.insert(0, (Rotation.from_quat([self.respond(more, replace(
                 self._excited.part(np.full(START, row)), gyroscope=still)).estimates[-1]
                 for row in starts]), starts))
         return found
@@ -337,7 +338,7 @@ class Response:
             return [Fault('lag', f'turns are followed {late} samples late; {left}')]
         found = self._not_corrected(self._excited.truth)
         if found and wrong:     # a run without kicks has the same error
-            without = self._respond((), self._given.still).estimates
+            without = self.respond((), self._given.still).estimates
             error = measures.errors_of(without, self._excited.truth).attitude(True)
             # Far from the truth no filter is linear.
             found = self._not_corrected(without) if error[self._given.kicks[0]] < NEAR else []
@@ -373,7 +374,7 @@ class Response:
         """
         motion, size = self._given.motion, float(np.linalg.norm(BIAS))
         run = self._excited.part(slice(motion.stop))
-        outcome = self._respond((), replace(run, gyroscope=run.gyroscope + BIAS))
+        outcome = self.respond((), replace(run, gyroscope=run.gyroscope + BIAS))
         apart = measures.errors_of(
             outcome.estimates, self._outcome.estimates[:motion.stop]).known(self._absolute)
         estimates = outcome.biases - self._outcome.biases[:motion.stop]
@@ -385,7 +386,8 @@ class Response:
         first, again = apart[self._rests[[0, -2]]].tolist()
         self._findings.measures |= {'bias_error_s': late, 'bias_found': share}
         left, shares = late > diagnosis.BIAS_LEFT_S, (found / BIAS).tolist()
-        right = (-BIAS_FOUND < share < 1.0 / BIAS_OFF if left else
+        # A filter that has gone on for minutes is sure of its bias, and learns another one slowly.
+        right = (-BIAS_FOUND < share < 1.0 / BIAS_OFF if left or not self._subject.restarts else
                  np.linalg.norm(found - BIAS) < BIAS_OFF * size)
         learns = again < LEARNED * first or (
             again < LEARNING * first and share > max(BIAS_FOUND, 1.2 * before))

@@ -4,6 +4,8 @@
 import importlib
 import importlib.util
 
+import pytest
+
 from helpers import standard_types
 from helpers.own_node import OwnNode
 from spinning_top_sim.nodes.simulation_handlers import SimulationHandlers
@@ -79,6 +81,12 @@ class StandardNode(OwnNode):
         """Return a goal of SimulateSteps, and the coroutine that executes it."""
         goal = Goal(self.actions.SimulateSteps.Goal(steps=count))
         return goal, self.handlers.simulate_steps(goal)
+
+
+@pytest.fixture(scope='module', params=KINDS, name='node')
+def standard_node(request, tmp_path_factory):
+    with StandardNode(tmp_path_factory.mktemp('node'), request.param) as node:
+        yield node
 
 
 class Goal:
