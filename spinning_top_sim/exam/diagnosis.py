@@ -123,12 +123,13 @@ def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
 
 def largest_error(run: Run, absolute: bool) -> float:
     """
-    Return the largest rms error [rad] of a right filter that knows its biases.
+    Return the largest rms error [rad], in the last quarter, of a right filter without a bias.
 
     It is that without noise, or that of the attitudes of single samples where this is larger.
     """
+    last = run.part(slice(-len(run.t) // 4, None))
     single = measures.errors_of(np.array([from_two_vectors(*pair) for pair in zip(
-        run.accelerometer, run.magnetometer, strict=True)]), run.truth)
+        last.accelerometer, last.magnetometer, strict=True)]), last.truth)
     return max(math.hypot(TILT, absolute * HEADING), rms(single.known(absolute)))
 
 

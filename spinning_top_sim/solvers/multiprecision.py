@@ -36,7 +36,7 @@ def precision(bits: int) -> Iterator[None]:
     try:
         yield
     finally:
-        gmpy2.set_context(before)       # which `with` of gmpy2 2.1 does not, where it is nested
+        gmpy2.set_context(before)       # which `with gmpy2.context` of gmpy2 2.1 does not
 
 
 def atan2(y: mpfr, x: mpfr) -> mpfr:
