@@ -62,11 +62,16 @@ class Subject:
 
 
 class LastingSubject(Subject):
-    """A filter that is made once, and turned to where each run begins."""
+    """
+    A filter that is made once, and turned to where each run begins.
+
+    Its sensor has no turn-on bias, which would jump from run to run.
+    """
 
     restarts = False
 
     def __init__(self, make_filter: MakeFilter, imu: Mapping[str, Any], seed: int) -> None:
+        imu = {name: value for name, value in imu.items() if not name.endswith('_turn_on_bias')}
         super().__init__(cache(make_filter), feed, imu, seed)
         self._attitude = Rotation.identity()        # the true one
 
