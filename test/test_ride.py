@@ -90,7 +90,7 @@ def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
             found.append(min(abs(value - true), abs(value + true)) / max(1, abs(true)))
     assert l3 == case['start']['l3']
     # Half of the thirtieth digit, unless the motion is chaotic.
-    assert max(found) <= float('1e-26' if len(case['pieces']) == 1000 else '5e-30'), found
+    assert max(found) <= (1e-26 if len(case['pieces']) == 1000 else 5e-30), found
 
 
 @pytest.mark.parametrize('acceleration', [

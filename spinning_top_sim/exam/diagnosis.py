@@ -121,20 +121,24 @@ def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
     return None
 
 
-def largest_error(run: Run, absolute: bool) -> float:
+def noisy_limit(run: Run, absolute: bool) -> float:
     """
-    Return the largest rms error [rad], in the last quarter, of a right filter without a bias.
+    Return the rms error [rad] in the last quarter above which a filter is wrong.
 
-    It is that without noise, or that of the attitudes of single samples where this is larger.
+    It is the limit without noise, or the error of attitudes from single samples if that is larger.
     """
     last = run.part(slice(-len(run.t) // 4, None))
     single = measures.errors_of(np.array([from_two_vectors(*pair) for pair in zip(
         last.accelerometer, last.magnetometer, strict=True)]), last.truth)
-    return max(math.hypot(TILT, absolute * HEADING), rms(single.known(absolute)))
+    return min(DIVERGED, max(math.hypot(TILT, absolute * HEADING), rms(single.known(absolute))))
 
 
 def inaccuracy(outcome: Outcome, absolute: bool, limit: float = DIVERGED) -> Fault | None:
-    """Judge the error in the last quarter, and whether it grows from quarter to quarter."""
+    """
+    Judge the error in the last quarter, and whether it grows from quarter to quarter.
+
+    limit : of that error [rad], at most DIVERGED
+    """
     quarters = [rms(part) for part in np.array_split(outcome.errors.known(absolute), 4)]
     if quarters[-1] < limit:
         return None
@@ -143,7 +147,7 @@ def inaccuracy(outcome: Outcome, absolute: bool, limit: float = DIVERGED) -> Fau
         return Fault('diverges', f'{outcome.run.name}: the error grows from quarter to quarter: '
                      f'{", ".join(map(degrees, quarters))}')
     return Fault('inaccurate', f'{outcome.run.name}: the error in the last quarter is '
-                 f'{degrees(quarters[-1])}, for no reason that is known')
+                 f'{degrees(quarters[-1])}, above {degrees(limit)}, for no reason that is known')
 
 
 def degrees(angle: float) -> str:

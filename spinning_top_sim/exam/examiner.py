@@ -199,8 +199,9 @@ class _Exam:
         findings.measures |= diagnosis.quality(self.outcomes, imu, self._absolute)
         findings.measures['stamp_offset_s'] = diagnosis.stamp_fault(
             first.last(), self._absolute)[0].seconds
-        limit = (diagnosis.largest_error(first.run, self._absolute)
-                 if imu.keys() <= scenarios.CALIBRATED.keys() else diagnosis.DIVERGED)
+        limit = (diagnosis.noisy_limit(first.run, self._absolute)
+                 if imu.keys() <= {*scenarios.CALIBRATED, 'mag.field', 'imu.rpy'}
+                 else diagnosis.DIVERGED)       # it may still be learning biases
         large = diagnosis.inaccuracy(first, self._absolute, limit)
         if large:       # unless it corrects before its step, which is no fault
             large = diagnosis.inaccuracy(self._response.respond((), first.run), self._absolute,

@@ -50,7 +50,7 @@ class _Variance:
     """A mean square over the last seconds."""
 
     def __init__(self, guess: float) -> None:
-        self.value, self._seconds = guess, 0.1
+        self.value, self._seconds = guess, 0.1      # the weight of the guess
 
     def add(self, square: float, dt: float) -> float:
         """Return the mean with this square, at least a quarter of the square itself."""
@@ -137,7 +137,7 @@ class ReferenceFilter:
             return
         h[:, 6:] = self._to_world
         turns, noise = gyroscope @ gyroscope > TURNING ** 2, self._force_noise
-        # Turning takes a bias that is not known yet through the band.
+        # In turns, a bias that is not known yet shows in the band as well: it is no noise.
         variance = (max(noise.value, square) if turns and bias_variance > 4.0 * noise.value
                     else noise.add(square, dt))
         # Samples of a white density N leave 2 N^2 BAND_S^2 / (2 BAND_S + dt)^3 in the band.

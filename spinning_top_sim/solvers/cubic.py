@@ -41,7 +41,7 @@ def cubic_roots(f0: mpfr, f1: mpfr, f2: mpfr, f3: mpfr) -> Roots:
         low, high, gap = _quadratic_roots(-a2, a1)
         return (Roots(ZERO, low, high, low, gap) if low > 0
                 else Roots(low, ZERO, high, -low, high))
-    y, side = _isolated_sqrt(a2, a1, a0)
+    y, side = _isolated_root(a2, a1, a0)
     product = -a0 / y
     # The sum of the other two.  Next to a pole one of them is small, and -a2 - y cancels.
     total = -a2 - y if 2 * abs(y) < abs(a2) else (a1 - product) / y
@@ -60,7 +60,7 @@ def _quadratic_roots(total: mpfr, product: mpfr) -> tuple[mpfr, mpfr, mpfr]:
     return min(large, small), max(large, small), gap
 
 
-def _isolated_sqrt(a2: mpfr, a1: mpfr, a0: mpfr) -> tuple[mpfr, int]:
+def _isolated_root(a2: mpfr, a1: mpfr, a0: mpfr) -> tuple[mpfr, int]:
     """
     Return the root of y^3 + a2 y^2 + a1 y + a0 that lies alone on its side of -a2/3, and the side.
 

@@ -19,7 +19,7 @@ from spinning_top_sim.solvers.multiprecision import ONE, ZERO
 # Coefficients of lambda, lambda^5, lambda^9 ... in the nome [DLMF 19.5.6; A002103 of oeis.org].
 # The first one that is left out contributes less than 1e-44 for k^2 <= 1/2.
 NOME_COEFFICIENTS = 1, 2, 15, 150, 1707, 20910, 268616, 3567400, 48555069, 673458874
-NEGLIGIBLE = mpfr(1e-21)          # c/a, the square of which does not count
+NEGLIGIBLE = 1e-21      # a ratio whose square does not count
 
 
 class GaussMean:

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Multiprecision numbers: `mpfr` of gmpy2, whose results are rounded in the current context.
+Multiprecision numbers: `mpfr` of gmpy2.  Results have the precision that `precision` sets.
 
 L. Fousse et al., "MPFR: A multiple-precision binary floating-point library with correct rounding",
 ACM Trans. Math. Softw. 33 (2007), 13.
 """
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -22,12 +21,6 @@ ZERO, ONE = mpfr(0), mpfr(1)
 Complex = tuple[mpfr, mpfr]
 
 
-@lru_cache(64)
-def exact(x: float) -> mpfr:
-    """Return a double as it is, in any context."""
-    return mpfr(x, 53)
-
-
 @contextmanager
 def precision(bits: int) -> Iterator[None]:
     """Set the bits of results for a while, in this thread."""
@@ -39,21 +32,16 @@ def precision(bits: int) -> Iterator[None]:
         gmpy2.set_context(before)       # which `with gmpy2.context` of gmpy2 2.1 does not
 
 
-def atan2(y: mpfr, x: mpfr) -> mpfr:
-    """
-    Return the argument of x + iy, to some 240 bits; 0 at the origin.
+@lru_cache(64)
+def exact(x: float) -> mpfr:
+    """Return a double as it is, in any context."""
+    with precision(53):
+        return mpfr(x)
 
-    MPFR's own takes several times as long.
-    """
-    size = max(abs(x), abs(y))
-    if not size:
-        return ZERO
-    # Turned back by the argument in doubles (+ 0.0: not -pi on the negative real axis), the
-    # point is next to the positive one.
-    near = math.atan2(float(y / size) + 0.0, float(x / size))
-    sine, cosine = gmpy2.sin_cos(near)
-    tangent = (y * cosine - x * sine) / (x * cosine + y * sine)
-    return near + (tangent - tangent * tangent * tangent / 3)
+
+def atan2(y: mpfr, x: mpfr) -> mpfr:
+    """Return the argument of x + iy in (-pi, pi]; 0 at the origin, whatever the signs of zeros."""
+    return gmpy2.atan2(y + ZERO, x + ZERO)
 
 
 def half_turns(radians: float) -> mpfr:

@@ -45,7 +45,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from gmpy2 import asinh, const_pi, mpfr, sign, sin_cos, sqrt
+from gmpy2 import asinh, const_pi, mpfr, sin_cos, sqrt
+from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
@@ -72,7 +73,8 @@ from spinning_top_sim.solvers.theta_series import (
 )
 
 BITS_TO_TRY = BITS, 2 * BITS, 4 * BITS, 8 * BITS
-NO_GRAVITY = mpfr('1e-1000')        # so small that u3 is infinite to all bits
+with precision(BITS):
+    NO_GRAVITY = mpfr('1e-1000')    # so small that u3 is infinite to all bits
 
 
 class Factor(NamedTuple):
@@ -343,15 +345,15 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: mpfr, x_rate: 
     x_rate, y_rate : of x and y, the arguments of the imaginary and of the real form [rad/s]
     quarters, y, point : N, y and the arguments of `Series.at` at t = 0
     """
-    sense, drift, rate = sign(side.momentum), ZERO, side.spin / 2
+    sense, drift, rate = sign_of(side.momentum), ZERO, side.spin / 2
     farthest, real, imag = max(pole.x1, pole.x2), ONE, ZERO
     scale = sqrt(farthest / 2)
     starts_in_first = quarters % 2 == pole.is_beta       # the theta1 of step 3
     if pole.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
     elif not sense:
-        slope = -1 if pole.is_beta else 1
-        first = Series(SIN_ODD, [slope * x for x in form.theta1.weights]), NOTHING
+        sign = -1 if pole.is_beta else 1
+        first = Series(SIN_ODD, [sign * x for x in form.theta1.weights]), NOTHING
         second = form.theta2, NOTHING
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
         # vanish they leave 0 with the slope.

@@ -47,7 +47,7 @@ from spinning_top_sim.solvers.times import Times
 # as this has zeros.
 POLE = 1e-30
 # If the distance by which a motion misses a pole is less than this share of the largest possible,
-# it passes exactly: the set-up squares the share, and has 40 digits.
+# it passes exactly: the set-up squares the share, and keeps some 40 digits.
 THROUGH = 1e-19
 
 
@@ -56,7 +56,7 @@ class Vertical(NamedTuple):
     The line of effective gravity, and a frame with its z axis along it.
 
     Of the two directions z is the one on the side of the axis, and gravity has a sign: the axis
-    can only meet the pole theta = 0, where doubles and decimals are dense.  Without effective
+    can only meet the pole theta = 0, where floating-point numbers are dense.  Without effective
     gravity z stays the line of the world's vertical.
 
     gravity : downwards along z positive [m/s^2]
@@ -81,7 +81,7 @@ class Vertical(NamedTuple):
         if 2 * sine < POLE:         # all the motion of the axis is nutation: psi from omega
             theta_dot = sqrt(_square(posture.across))
             beta = _times(alpha, (o2, -o1)) if theta_dot else alpha
-            return HalfAngles(ZERO, ONE, theta_dot, alpha, beta, +l3, +l3)
+            return HalfAngles(ZERO, ONE, theta_dot, alpha, beta, l3, l3)
         # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
         # + i theta') exp(-i psi)
         minus_across, theta_dot = _times(posture.across, _times(alpha, (beta[0], -beta[1])))
@@ -93,8 +93,8 @@ class Vertical(NamedTuple):
             + abs(self.gravity * exact(top.mass) * exact(top.com_distance))))
         for pole in (l3, -l3):
             if (lz - pole) ** 2 <= most2:
-                lz = +pole
-        return HalfAngles(sine, cosine, theta_dot / unit, alpha, beta, +l3, lz)
+                lz = pole or ZERO
+        return HalfAngles(sine, cosine, theta_dot / unit, alpha, beta, l3, lz)
 
 
 class AcceleratedMotion(ClosedForm):
@@ -215,25 +215,26 @@ def posture_of(top: Top, state: State) -> Posture:
     """Return the posture of a state about the vertical of the world."""
     with precision(BITS):
         sine, cosine = sin_cos(mpfr(state.theta) / 2)
-        phi, psi = mpfr(state.phi), mpfr(state.psi)
-        (s_sum, c_sum), (s_difference, c_difference), (s_psi, c_psi) = (
-            sin_cos(angle) for angle in ((phi + psi) / 2, (phi - psi) / 2, psi))
+        (s_phi, c_phi), (s_psi, c_psi) = (
+            sin_cos(mpfr(angle) / 2) for angle in (state.phi, state.psi))
+        half_phi, half_psi, back = (c_phi, s_phi), (c_psi, s_psi), (c_psi, -s_psi)
         l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * exact(top.lambda1)
         swing = ZERO                # phi' sin(theta)
         if lz + l3:
             swing += (lz + l3) / two_lambda1 * sine / cosine
         if lz - l3:
             swing += (lz - l3) / two_lambda1 * cosine / sine
-        return Posture((cosine * c_sum, cosine * s_sum),
-                       (sine * c_difference, sine * s_difference),
-                       _times((-swing, mpfr(state.theta_dot)), (c_psi, -s_psi)), state.l3)
+        return Posture(_scaled(cosine, _times(half_phi, half_psi)),
+                       _scaled(sine, _times(half_phi, back)),
+                       _times((-swing, mpfr(state.theta_dot)), _times(back, back)), state.l3)
 
 
 def posture_at(states: States) -> Posture:
     """Return the posture of states (n = 1) in the world, as far as doubles know it."""
-    x, y, z, w, o1, o2 = (mpfr(float(part[0])) for part in (
-        *states.rows_quaternion, *states.transverse_velocity))
-    return Posture((w, z), (y, -x), (o1, o2), states.start.l3)
+    with precision(BITS):
+        x, y, z, w, o1, o2 = (mpfr(float(part[0])) for part in (
+            *states.rows_quaternion, *states.transverse_velocity))
+        return Posture((w, z), (y, -x), (o1, o2), states.start.l3)
 
 
 def _cayley_klein(motion: ThetaMotion, t: mpfr) -> tuple[Complex, Complex, mpfr]:
