@@ -61,7 +61,7 @@ class Constants:
         factors = motion.alpha, motion.beta
         self.rates = [motion.quarter_rate, *(x.rate / const_pi() for x in factors)]
         turns = [2 * x.phase_turns for x in factors]
-        self.start_whole = [motion.quarter0, *(int(rint(x)) for x in turns)]
+        self.start_whole = [motion.quarter0, *map(int, map(rint, turns))]
         self.offsets = [*map(double_double, (
             motion.offset0, *map(sub, turns, self.start_whole[1:])))]
         self.drifts = [0.5 * float(factor.drift) for factor in factors]
