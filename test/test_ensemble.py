@@ -243,6 +243,11 @@ def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(
     assert abs(np.corrcoef(columns['spin.l3'], columns['spin.lz'])[0, 1]) < 5.0 / np.sqrt(2000)
 
 
+def test_a_part_has_at_most_50_000_rows_and_an_ensemble_at_least_50_parts_by_default():
+    assert [ensemble_spec.parse({'runs': runs, 'duration': duration}, 'test').runs_per_part
+            for runs, duration in ((10 ** 6, 10.0), (1000, 10.0), (10 ** 6, 1e5))] == [25, 20, 1]
+
+
 @pytest.mark.parametrize(('content', 'counts'), [
     # A magnetometer in one of two IMUs; a value that is unset in some runs.
     ({'runs': 4, 'sample': {'params': {'values': [

@@ -125,7 +125,8 @@ def noisy_limit(run: Run, absolute: bool) -> float:
     """
     Return the rms error [rad] in the last quarter above which a filter is wrong.
 
-    It is the limit without noise, or the error of attitudes from single samples if that is larger.
+    It is the limit without noise, or the error of attitudes from single samples if that is larger;
+    at most DIVERGED.
     """
     last = run.part(slice(-len(run.t) // 4, None))
     single = measures.errors_of(np.array([from_two_vectors(*pair) for pair in zip(

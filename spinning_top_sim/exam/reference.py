@@ -50,7 +50,7 @@ class _Variance:
     """A mean square over the last seconds."""
 
     def __init__(self, guess: float) -> None:
-        self.value, self._seconds = guess, 0.1      # the weight of the guess
+        self.value, self._seconds = guess, 0.1      # weight of the guess [s]
 
     def add(self, square: float, dt: float) -> float:
         """Return the mean with this square, at least a quarter of the square itself."""

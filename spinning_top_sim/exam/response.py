@@ -125,7 +125,7 @@ class Response:
         return float(np.linalg.norm(self._clean(outcome, *places)))
 
     def respond(self, more: Sequence[Hypothesis] = (), run: Run | None = None) -> Outcome:
-        """Return the outcome of a run, by default of the excitation; all found is undone."""
+        """Return the outcome of a run, by default the excitation; causes found are undone."""
         return self._subject.follow(run or self._excited,
                                     [*more, *self._harmless, *self.undone])
 

@@ -52,7 +52,7 @@ def cubic_roots(f0: mpfr, f1: mpfr, f2: mpfr, f3: mpfr) -> Roots:
 def _quadratic_roots(total: mpfr, product: mpfr) -> tuple[mpfr, mpfr, mpfr]:
     """Return the roots x1 <= x2 of x^2 - total x + product, and x2 - x1."""
     discriminant = total * total - 4 * product
-    if discriminant < total * total * ONE / 2 ** (get_context().precision - KEPT_BITS):
+    if discriminant < total * total / 2 ** (get_context().precision - KEPT_BITS):
         raise RootsTooCloseError
     gap = sqrt(discriminant)
     large = (total + gap) / 2 if total > 0 else (total - gap) / 2

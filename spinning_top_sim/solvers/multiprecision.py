@@ -23,7 +23,7 @@ Complex = tuple[mpfr, mpfr]
 
 @contextmanager
 def precision(bits: int) -> Iterator[None]:
-    """Set the bits of results for a while, in this thread."""
+    """Set the precision of results [bits] within a `with` statement, in this thread."""
     before = gmpy2.get_context()
     gmpy2.set_context(gmpy2.context(precision=bits, **TRAPS))
     try:
@@ -34,7 +34,7 @@ def precision(bits: int) -> Iterator[None]:
 
 @lru_cache(64)
 def exact(x: float) -> mpfr:
-    """Return a double as it is, in any context."""
+    """Return a double without rounding, whatever the precision that is set."""
     with precision(53):
         return mpfr(x)
 

@@ -3,6 +3,7 @@
 
 import importlib
 import importlib.util
+from functools import partial
 
 import pytest
 
@@ -95,18 +96,11 @@ class Goal:
     def __init__(self, request):
         self.request, self.feedback, self.end = request, [], None
         self.is_cancel_requested = False
+        self.succeed, self.abort, self.canceled = (
+            partial(setattr, self, 'end', end) for end in ('succeeded', 'aborted', 'canceled'))
 
     def publish_feedback(self, feedback):
         self.feedback.append((feedback.completed_steps, feedback.remaining_steps))
-
-    def succeed(self):
-        self.end = 'succeeded'
-
-    def abort(self):
-        self.end = 'aborted'
-
-    def canceled(self):
-        self.end = 'canceled'
 
 
 def finished(coroutine, turns=10_000):
