@@ -57,8 +57,7 @@ def report():
 
 @pytest.fixture(scope='module')
 def slow():
-    """A second of the slow motion."""
-    return scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))
+    return scenarios.record(scenarios.SLOW, {}, 1).part(slice(100))     # a second
 
 
 def test_the_gyroscope_reads_the_mean_over_its_step_and_a_delay_is_measured():
@@ -107,8 +106,7 @@ def test_covariances_may_be_about_the_axes_of_sensor_or_world(report, factor, fa
 def test_a_misreading_is_named_with_its_evidence(report, name):
     found = report('vqf', name)
     assert found.faults == [name] and not found.passed, found
-    if name not in ('stamp_offset', 'time_step', 'diverges',
-                    'invalid_output'):      # it is undone
+    if name not in ('stamp_offset', 'time_step', 'diverges', 'invalid_output'):   # it is undone
         assert found.measures['tilt_rms_deg'] < 0.1 and found.measures['convergence_s'] < 1.0
         assert found.outcomes[0].errors.tilt[-1] < 0.01
     assert name in str(found) and found.found[0].evidence in str(found)

@@ -250,6 +250,14 @@ class _Exam:
                 self.findings.faults.append(Fault(
                     'first_order_integration', 'integration is first order: correcting it reduces '
                     f'the error on the fast motion from {degrees(before)} to {degrees(after)}'))
+                return
+        if before > diagnosis.FAST:     # with the field as well?
+            error = diagnosis.error_of(self._run(runs[0]).last(), self._absolute)
+            if error > diagnosis.FAST:
+                self.findings.faults.append(Fault(
+                    'inaccurate', 'on the fast motion, of '
+                    f'{np.linalg.norm(runs[0].rates[0]):.3g} rad/s, the error is '
+                    f'{degrees(error)}: no cause explains it'))
 
     def _judge_steps(self, outcomes: Sequence[Outcome], finer: Sequence[float]) -> None:
         """Judge whether the filter uses the step, or turns by the number of samples."""

@@ -26,7 +26,9 @@ FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
 WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
-KICK_S, KICK = 0.1, np.radians((0.7, 0.0, 0.7))     # of the gyroscope only; axes of the world
+# Of the gyroscope only, about axes of the world.  Of two kicks with opposite headings the mean
+# tells the tilt, and half the difference the heading.
+KICK_S, KICK, OTHER_KICK = 0.1, np.radians((0.7, 0.0, 0.7)), np.array((1.0, 1.0, -1.0))
 
 
 class Excitation(NamedTuple):
@@ -38,7 +40,7 @@ class Excitation(NamedTuple):
     rests : index of the last sample of each rest (n,); the first and the last but one are equal
     turns : index of the first sample of each turn (n,)
     motion : where the slow motion is judged
-    kicks : index of the first sample of each kick; the second one is opposite
+    kicks : index of the first sample of each kick
     """
 
     run: Run
@@ -71,9 +73,10 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
         motion.preceded_by(lead)), name='excitation')
     still.gyroscope[:] += NEVER_ZERO
     run = replace(still, gyroscope=still.gyroscope.copy())
-    kick = Rotation.from_quat(last[0]).inv().apply(KICK) / KICK_S
-    for number, first in enumerate(kicks := (end + answer, end + 2 * answer)):
-        run.gyroscope[first:first + round(KICK_S * rate)] += (-1.0) ** number * kick
+    kicks = end + answer, end + 2 * answer
+    for first, kick in zip(kicks, Rotation.from_quat(last[0]).inv().apply(
+            (KICK, OTHER_KICK * KICK)), strict=True):
+        run.gyroscope[first:first + round(KICK_S * rate)] += kick / KICK_S
     return Excitation(run, still, ends - 1, ends[:len(TURNS)],
                       slice(end - len(motion.t) // 2, end), kicks)
 

@@ -45,6 +45,7 @@ CLEAN = np.array((TILT, HEADING, TILT, HEADING))
 GAIN, GROSS_GAIN = 0.003, 0.25
 START = 50                      # samples after which a filter that starts has an attitude
 SURE = 0.2                      # share of the limit of an explanation: nothing else is tried
+SMOOTHED = 0.1                  # share that is left where a delay or a low pass is the cause
 WORST = 30.0                    # condition of a matrix that can be inverted
 EARLY_RESTS = slice(2, 5)       # rests of a short run, when the error of the start is over
 STAYS = 0.98                    # share of a kick that a filter without correction leaves
@@ -163,11 +164,12 @@ class Response:
                 or self._best(self._of_sensor('accelerometer', 2, (0, 1), hypotheses.GRAVITY_SIGN,
                                               *hypotheses.UNITS))
                 or self._best(self._of_sensor('magnetometer', 1, (0,), hypotheses.LEVEL))
-                or self._best(self._of_smoothing()))
+                or self._best(self._of_smoothing(), SMOOTHED))
 
-    def _best(self, tried: Iterator[Tried], mends_turns: bool = False) -> Tried | None:
+    def _best(self, tried: Iterator[Tried], share: float = diagnosis.EXPLAINED,
+              mends_turns: bool = False) -> Tried | None:
         """Return the one that leaves least, if it explains the error or mends wrong turns."""
-        limit, least, best = diagnosis.EXPLAINED * self._whole(self._outcome), math.inf, None
+        limit, least, best = share * self._whole(self._outcome), math.inf, None
         for one, outcome in tried:
             error = self._whole(outcome)
             if error < least and (error <= limit or (
@@ -337,7 +339,7 @@ class Response:
         if wrong and late > 1:
             return [Fault('lag', f'turns are followed {late} samples late; {left}')]
         found = self._not_corrected(self._excited.truth)
-        if found and wrong:     # a run without kicks has the same error
+        if found:               # a run without kicks has the same error
             without = self.respond((), self._given.still).estimates
             error = measures.errors_of(without, self._excited.truth).attitude(True)
             # Far from the truth no filter is linear.
@@ -351,9 +353,9 @@ class Response:
         n = round(excitation.ANSWER_S * scenarios.SLOW.rate)
         error = (Rotation.from_quat(self._outcome.estimates)
                  * Rotation.from_quat(without).inv()).as_rotvec()
-        up, down = (error[[first + excitation.LATEST, first + n - 1]] - error[first - 1]
-                    for first in self._given.kicks)
-        begin, end = 0.5 * (up - down)
+        one, other = (error[[first + excitation.LATEST, first + n - 1]] - error[first - 1]
+                      for first in self._given.kicks)
+        begin, end = 0.5 * (one + excitation.OTHER_KICK * other)
         # Some filters correct most of it before the longest delay is over.
         return [Fault(
             f'{name}_wiring', f'{left:.0%} of an error of the {what} are left after '

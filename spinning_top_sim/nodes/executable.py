@@ -15,7 +15,7 @@ from itertools import pairwise
 from os import _exit
 from typing import TYPE_CHECKING, Protocol, cast
 
-from spinning_top_sim.installation import remedy
+from spinning_top_sim.installation import needed, remedy
 from spinning_top_sim.recording.errors import text_of
 from spinning_top_sim.tools.cli import printable
 
@@ -52,7 +52,8 @@ def run(name: str, argv: Sequence[str] | None,
     _handle(signal.SIGINT, lambda *_: _exit(130))
     _open_standard_streams()
     try:
-        argv, make_node = prepare(argv)
+        with needed('it'):
+            argv, make_node = prepare(argv)
         interrupts = _initialize_ros([name, *argv])
     except Exception as error:
         return _cannot_start(name, error)
@@ -132,7 +133,7 @@ def without_ros_arguments(argv: Iterable[str]) -> list[str]:
 
 def _cannot_start(name: str, error: Exception) -> int:
     kind = type(error).__name__
-    if isinstance(error, ModuleNotFoundError) and not find_spec('rclpy'):
+    if isinstance(error, ImportError) and not find_spec('rclpy'):
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
                              f'{remedy("ros")}' + name.endswith('view') * (
                                  '; `view LOG` works without'))

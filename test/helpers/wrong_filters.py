@@ -127,11 +127,12 @@ class Complementary(Part):
 class Ekf(Part):
     """The reference filter of the exam."""
 
-    def start(self, **settings):
+    def start(self, fields=10 ** 9, **settings):
         self._filter, self._bias = ReferenceFilter(**settings), np.zeros(3)
+        self._fields = iter(range(fields))
 
     def turn(self, w, a, m, dt):
-        q = self._filter.update(w, a, m, dt)
+        q = self._filter.update(w, a, None if next(self._fields, None) is None else m, dt)
         self._bias = self._filter.bias
         return q
 
@@ -167,6 +168,7 @@ CHANGES = {
     'rates x 1.05': ({'gyroscope': scaled(1.05, 1.0, 1.0)}, GYROSCOPE),
     'rates in deg': ({'gyroscope': np.degrees}, UNITS),
     'rates twice in rad': ({'gyroscope': np.radians}, UNITS),
+    'rates clipped': ({'gyroscope': lambda v: np.clip(v, -8.0, 8.0)}, OFF),
     'rates late': ({'late': (5, 0, 0, 0)}, LAG),
     'rates smoothed': ({'smooth': (0.05, 0.0, 0.0)}, LAG),
     'force y x z': ({'accelerometer': axes(2, 1, 3)}, GRAVITY),
@@ -207,6 +209,7 @@ OWN = {     # and these
     'ekf': {
         # It takes the lag for motion of the device, and follows such forces little.
         'force smoothed': ({'smooth': (0.0, 0.1, 0.0)}, f'{LAG} {OFF}'),
+        'field at its start': ({'fields': 50}, FIELD),
         'bias negated': ({'report': np.negative}, 'bias_report')}}
 KINDS = {'mahony': Mahony, 'complementary': Complementary, 'ekf': Ekf}
 TABLE = {f'{kind}, {name}': (partial(make, **change), set(causes.split()))
