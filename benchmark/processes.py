@@ -35,9 +35,9 @@ def ros_arguments(namespace: str, parameters: Mapping[str, Any]) -> list[str]:
                 '-p', f'{name}:={value if isinstance(value, str) else json.dumps(value)}'))]
 
 
-# -P: of this checkout, by PYTHONPATH, and not of whatever lies in the working directory.
-SIM_NODE = ('-P', '-c', 'import sys; from spinning_top_sim.nodes.sim_node import main; '
-            'sys.exit(main())')
+# What `ros2 run` runs, of the checkout in PYTHONPATH.
+SIM_NODE = ('-P', '-c', 'import os, runpy; runpy.run_path(os.environ["PYTHONPATH"].split('
+            'os.pathsep)[0] + "/scripts/sim_node", run_name="__main__")')
 
 
 def sim_node(namespace: str, parameters: Mapping[str, Any]) -> list[str]:

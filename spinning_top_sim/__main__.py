@@ -39,6 +39,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
     try:
         name = _parser().parse_args(argv[:1]).command
+        if name != 'examine':       # where filters of the user run
+            # OpenBLAS starts no threads: nothing here multiplies large matrices.
+            os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
         with needed('it'):
             command: Callable[[Sequence[str]], int] = _module(name).main
     except ImportError as error:

@@ -120,9 +120,7 @@ class ChunkBuilder:
 
     def _compressed(self) -> bytes:
         if self._compression == 'zstd':
-            # The one-call interface would allocate as much memory as the chunk has.
-            stream = self._zstd.compressobj(size=self.size)
-            return stream.compress(self.data) + stream.flush()
+            return self._zstd.compress(self.data)
         return lz4.frame.compress(self.data) if self._compression == 'lz4' else bytes(self.data)
 
     def _enlarge(self, size: int) -> None:
