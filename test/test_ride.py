@@ -155,7 +155,7 @@ def test_a_repeated_path_closes_exactly(waypoints):
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.integers(1, 10 ** 11), st.tuples(*3 * [st.floats(-50, 50)])),
+@given(st.lists(st.tuples(st.integers(10 ** 6, 10 ** 11), st.tuples(*3 * [st.floats(-50, 50)])),
                 min_size=1, max_size=6), st.booleans())
 def test_position_and_velocity_are_those_of_exact_arithmetic(pieces, there_and_back):
     if there_and_back:

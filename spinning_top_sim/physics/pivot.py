@@ -25,6 +25,8 @@ NEVER_NS = 2 ** 63 - 1
 Exact = tuple[Fraction, Fraction, Fraction]
 Given = Sequence[float | Fraction]
 ZERO: Exact = (Fraction(0), Fraction(0), Fraction(0))
+SHORTEST_S = 1e-3               # mean time of the pieces of a path that is repeated
+ROUNDING = 1e-12                # of velocities, relative
 
 
 class Kinematics(NamedTuple):
@@ -80,7 +82,8 @@ class PivotPath:
     pieces : sequence of (duration [ns], acceleration (3,) [m/s^2])
         A duration is an integer > 0.
     repeat : bool, default False
-        Whether they are repeated for ever; then they must leave the velocity as it was.
+        Whether they are repeated for ever.  Then they must leave the velocity as it was, but for
+        rounding, which the last acceleration takes; and last SHORTEST_S each on average.
     position, velocity : (3,) sequence
         At the start, in the world [m], [m/s].
     start_ns : int, default 0
@@ -94,11 +97,10 @@ class PivotPath:
         self.start_ns = start_ns
         self._starts, self._accelerations = [0], []
         places, velocities = [_exact('position', position)], [_exact('velocity', velocity)]
-        for duration_ns, given in pieces:
-            if isinstance(duration_ns, bool) or not (
-                    isinstance(duration_ns, int) and duration_ns > 0):
-                raise ValueError(f'duration = {shown(duration_ns)} ns: must be an integer > 0')
-            acceleration, t = _exact('acceleration', given), Fraction(duration_ns, NANOSECONDS)
+        steps = [(_checked(duration_ns), _exact('acceleration', given))
+                 for duration_ns, given in pieces]
+        for duration_ns, acceleration in _closed(steps) if repeat else steps:
+            t = Fraction(duration_ns, NANOSECONDS)
             v = velocities[-1]
             places.append(_sum((1, places[-1]), (t, v), (t * t / 2, acceleration)))
             velocities.append(_sum((1, v), (t, acceleration)))
@@ -111,6 +113,10 @@ class PivotPath:
                 raise ValueError(f'a repeated path changes the velocity by {change} m/s: it must '
                                  'end with the velocity that it starts with')
             self._cycle_ns = self._starts.pop()
+            if self._cycle_ns < len(self._starts) * SHORTEST_S * NANOSECONDS:
+                raise ValueError(f'a repeated path has {len(self._starts)} pieces in '
+                                 f'{self._cycle_ns / NANOSECONDS!r} s: must last at least '
+                                 f'{SHORTEST_S:g} s for each')
             self._per_cycle[:3] = _doubles([_sum((1, places.pop()), (-1, places[0]))])
             velocities.pop()
         else:
@@ -204,6 +210,24 @@ class PivotPath:
         return piece
 
 
+def _checked(duration_ns: int) -> int:
+    if isinstance(duration_ns, bool) or not (isinstance(duration_ns, int) and duration_ns > 0):
+        raise ValueError(f'duration = {shown(duration_ns)} ns: must be an integer > 0')
+    return duration_ns
+
+
+def _closed(steps: Sequence[tuple[int, Exact]]) -> Sequence[tuple[int, Exact]]:
+    """Return steps that leave the velocity as it was, if these change it by rounding only."""
+    changes = [_sum((Fraction(duration_ns, NANOSECONDS), a)) for duration_ns, a in steps]
+    change = _sum(*((1, one) for one in changes))
+    if not any(change) or _length(change) > ROUNDING * max(map(_length, changes)):
+        return steps
+    last = max(k for k, one in enumerate(changes) if any(one))
+    duration_ns, a = steps[last]
+    return [*steps[:last], (duration_ns, _sum((1, a), (Fraction(-NANOSECONDS, duration_ns),
+                                                       change))), *steps[last + 1:]]
+
+
 def _ramp(begin: Exact, end: Exact, most_acceleration: float) -> Iterator[tuple[int, Exact]]:
     """Yield the piece that leads from one velocity to another, none if they are equal."""
     change = _sum((1, end), (-1, begin))
@@ -217,7 +241,8 @@ def _leg(way: Exact, speed: float, acceleration: float) -> list[tuple[int, Given
     length = _length(way)
     ramp = min(speed / acceleration, math.sqrt(length / acceleration))
     ramp_ns = _whole_ns(ramp)
-    cruise_ns = math.ceil(max(length / speed - ramp, 0.0) * 1e9)
+    cruise = length / speed - ramp
+    cruise_ns = _whole_ns(cruise) if cruise > 0.0 else 0
     # The distance is acceleration * ramp * (ramp + cruise).
     scale = Fraction(NANOSECONDS ** 2, ramp_ns * (ramp_ns + cruise_ns))
     pieces: list[tuple[int, Given]] = [(ramp_ns, _sum((scale, way)))]
@@ -229,7 +254,7 @@ def _leg(way: Exact, speed: float, acceleration: float) -> list[tuple[int, Given
 def _whole_ns(seconds: float) -> int:
     """Return a duration in nanoseconds, rounded up to 1 or more; at most the range of int64."""
     if not seconds < 9e9:
-        raise ValueError(f'the acceleration lasts {seconds!r} s: must be less than 9e9 s')
+        raise ValueError(f'a piece of the path lasts {seconds!r} s: must be less than 9e9 s')
     return max(1, math.ceil(seconds * 1e9))
 
 

@@ -17,7 +17,7 @@ from itertools import pairwise
 from typing import Any
 
 from spinning_top_sim.installation import remedy
-from spinning_top_sim.physics.pivot import PivotPath
+from spinning_top_sim.physics.pivot import SHORTEST_S, PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
 
@@ -142,7 +142,7 @@ HIGHEST_RATE = 10_000.0
 LOWEST_RATE_OF_INTERVALS = 1.0      # of increments and means: the motion is kept for a second
 LARGEST = 1e30                      # of a quantity: its squares and products are doubles
 LONGEST = 1e8                       # time [s], three years
-FASTEST, SHORTEST_PIECE = 1e4, 1e-3     # of the pivot: speed [m/s], time of an acceleration [s]
+FASTEST = 1e4                       # speed of the pivot [m/s]
 
 _at_once = partial(Parameter, effect=Effect.NOW)
 _at_reset = partial(Parameter, effect=Effect.RESET)
@@ -250,7 +250,8 @@ TABLE: tuple[Parameter, ...] = (
               'velocity', 'rad/s', -1e6, 1e6),
     *(_at_reset(f'imu.vibration.{kind}_psd', (0.0, 0.0), f'Vibration of the {text} of each axis: '
                 f'ascending frequencies [Hz], each with its one-sided spectral density [{unit}]; '
-                'zeros: none', '', 0.0, 1e6, is_repeated=True) for kind, text, unit in (
+                'zeros: none', '', 0.0, 1e6, smallest=1e-100, is_repeated=True)
+      for kind, text, unit in (
           ('force', 'specific force', '(m/s^2)^2/Hz'),
           ('rate', 'angular velocity', '(rad/s)^2/Hz'))),
     *_axes('gyroscope', 'rad/s', 'rad/s^2/sqrt(Hz)'),
@@ -397,9 +398,9 @@ def pivot_path(values: Mapping[str, Any]) -> PivotPath | None:
     if path and points:
         raise ValueError(f'pivot.waypoints = {points!r}: must be zeros with pivot.path')
     for duration, *_ in path:
-        if not duration >= SHORTEST_PIECE:
+        if not duration >= SHORTEST_S:
             raise ValueError(f'pivot.path: the duration {duration!r} s: must be >= '
-                             f'{SHORTEST_PIECE:g} s')
+                             f'{SHORTEST_S:g} s')
     repeat = values['pivot.repeat']
     try:
         if path:
