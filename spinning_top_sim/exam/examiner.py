@@ -169,6 +169,8 @@ class _Exam:
             self._do(self._judge_lever_arm)
             if identified:
                 self._do(self._response.judge_bias)
+                if 'frame_ned' in [fault.name for fault in self.findings.faults]:
+                    self.findings.drop('bias_report')       # it has the same axes
         self._do(self._judge_noisy_runs)
         self._do(lambda: self.findings.measures.update(self._subject.convergence()))
 
@@ -195,7 +197,7 @@ class _Exam:
 
     def _judge_noisy_runs(self) -> None:
         first = self.outcomes[0]
-        imu, findings, early = self._subject.imu, self.findings, self._response.early
+        imu, findings = self._subject.imu, self.findings
         findings.measures |= diagnosis.quality(self.outcomes, imu, self._absolute)
         findings.measures['stamp_offset_s'] = diagnosis.stamp_fault(
             first.last(), self._absolute)[0].seconds
@@ -206,10 +208,8 @@ class _Exam:
         if large:       # unless it corrects before its step, which is no fault
             large = diagnosis.inaccuracy(self._response.respond((), first.run), self._absolute,
                                          limit)
-        if large and not findings.faults and from_identity(early) > SLIGHT:
-            large = Fault('gyroscope_wiring', f'{words(early)}; {large.evidence}')
         if large and (large.name == 'diverges' or not findings.faults):
-            findings.faults.append(large)
+            findings.faults.append(self._of_gyroscope(large))
         if any(fault.name not in SHOW_ELSEWHERE for fault in findings.faults):
             findings.drop('inaccurate')
         consistency = diagnosis.consistency(self.outcomes, self._absolute)
@@ -251,13 +251,21 @@ class _Exam:
                     'first_order_integration', 'integration is first order: correcting it reduces '
                     f'the error on the fast motion from {degrees(before)} to {degrees(after)}'))
                 return
-        if before > diagnosis.FAST:     # with the field as well?
-            error = diagnosis.error_of(self._run(runs[0]).last(), self._absolute)
-            if error > diagnosis.FAST:
-                self.findings.faults.append(Fault(
-                    'inaccurate', 'on the fast motion, of '
-                    f'{np.linalg.norm(runs[0].rates[0]):.3g} rad/s, the error is '
-                    f'{degrees(error)}: no cause explains it'))
+        for run, outcome in zip(runs, outcomes, strict=True):
+            if diagnosis.error_of(outcome, absolute) > diagnosis.FAST:
+                error = diagnosis.error_of(self._run(run).last(), self._absolute)
+                if error > diagnosis.FAST:      # with the field as well
+                    self.findings.faults.append(self._of_gyroscope(Fault(
+                        'inaccurate', f'{run.name}, without noise: the error is '
+                        f'{degrees(error)}, above {degrees(diagnosis.FAST)}, for no reason that '
+                        'is known')))
+
+    def _of_gyroscope(self, error: Fault) -> Fault:
+        """Return an error as that of the gyroscope where the response to that is slightly off."""
+        early, others = self._response.early, {
+            fault.name for fault in self.findings.faults} - {'gyroscope_wiring'}
+        return error if others or from_identity(early) <= SLIGHT else Fault(
+            'gyroscope_wiring', f'{words(early)}; {error.evidence}')
 
     def _judge_steps(self, outcomes: Sequence[Outcome], finer: Sequence[float]) -> None:
         """Judge whether the filter uses the step, or turns by the number of samples."""
@@ -266,14 +274,15 @@ class _Exam:
             steps, right = map(increments, (outcome.estimates, outcome.run.truth))
             gains.append(float(np.sum(steps * right) / np.sum(right * right)))
         apart = abs(gains[-1] - gains[0]) / max(abs(gains[0]), STEP)
-        if apart > STEP and abs(gains[-1] / finer[-1] - gains[0]) < 0.25 * abs(gains[0]):
+        by_samples = abs(gains[-1] / finer[-1] - gains[0]) < 0.25 * abs(gains[0])
+        if apart > STEP and (by_samples or abs(gains[0] - 1.0) < STEP):
             # A wrong step turns up as a wrong scale at one rate.
             if 'time_step' in [fault.name for fault in self.findings.faults]:
                 self.findings.drop('gyroscope_wiring')
             self.findings.faults.append(Fault(
                 'time_step', f'at {" and ".join(one.run.name for one in outcomes)} turns move it '
                 f'{" and ".join(f"{gain:.3g}" for gain in gains)} times as far as the sensor: the '
-                'step is not used'))
+                'length of a step is misused'))
 
     def _judge_lever_arm(self) -> None:
         """Compare the attitudes with and without a lever arm."""

@@ -17,6 +17,7 @@ from spinning_top_sim.exam.hypotheses import AXES
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.exam.trial import Outcome
+from spinning_top_sim.tools.verdict import Fault
 
 # Turns about an axis of the sensor [deg], each followed by a rest; the last one leads back.
 TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0),
@@ -24,8 +25,12 @@ TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), 
 TURN_RATE = 2.6                 # [rad/s]
 FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
 WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
+# Shares of a kick that a filter without correction leaves, and from where on it grows.
+STAYS, GROWN = 0.98, 1.2
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
+EXPLAINED = 0.5                 # share that a delay leaves of what the response without one does
+DOWN = 70.0, 20.0, 140.0        # yaw, pitch and roll of the last rest [deg]
 # Of the gyroscope only, about axes of the world.  Of two kicks with opposite headings the mean
 # tells the tilt, and half the difference the heading.
 KICK_S, KICK, OTHER_KICK = 0.1, np.radians((0.7, 0.0, 0.7)), np.array((1.0, 1.0, -1.0))
@@ -33,14 +38,14 @@ KICK_S, KICK, OTHER_KICK = 0.1, np.radians((0.7, 0.0, 0.7)), np.array((1.0, 1.0,
 
 class Excitation(NamedTuple):
     """
-    Rests between turns, the slow motion, and two kicks of the gyroscope alone at rest.
+    Rests between turns, the slow motion, and kicks of the gyroscope alone at two rests.
 
     run : with the kicks
     still : without them
     rests : index of the last sample of each rest (n,); the first and the last but one are equal
     turns : index of the first sample of each turn (n,)
     motion : where the slow motion is judged
-    kicks : index of the first sample of each kick
+    kicks : index of the first sample of each kick, two at each rest
     """
 
     run: Run
@@ -48,7 +53,7 @@ class Excitation(NamedTuple):
     rests: NDArray[np.intp]
     turns: NDArray[np.intp]
     motion: slice
-    kicks: tuple[int, int]
+    kicks: list[tuple[int, int]]
 
 
 def excite(imu: Mapping[str, Any]) -> Excitation:
@@ -68,15 +73,19 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
     path = Slerp(np.ravel((begins, ends), 'F'), stops[np.repeat(np.arange(len(stops)), 2)])
     lead = scenarios.along(path(np.arange(ends[-1] + 1)), imu)
     end = len(lead.t) + len(motion.t)
-    last = np.tile(motion.truth[-1], (3 * answer + 1, 1))
-    still = replace(scenarios.along(Rotation.from_quat(last), imu).preceded_by(
-        motion.preceded_by(lead)), name='excitation')
+    last = Rotation.concatenate((Rotation.from_quat(motion.truth[-1]), Rotation.from_euler(
+        'ZYX', DOWN, degrees=True)))
+    way = round((last[0].inv() * last[1]).magnitude() / TURN_RATE * rate)
+    rests = np.array((0, 3 * answer, 3 * answer + way, 6 * answer + way))
+    still = replace(scenarios.along(Slerp(rests, last[[0, 0, 1, 1]])(np.arange(rests[-1] + 1)), imu
+                                    ).preceded_by(motion.preceded_by(lead)), name='excitation')
     still.gyroscope[:] += NEVER_ZERO
     run = replace(still, gyroscope=still.gyroscope.copy())
-    kicks = end + answer, end + 2 * answer
-    for first, kick in zip(kicks, Rotation.from_quat(last[0]).inv().apply(
-            (KICK, OTHER_KICK * KICK)), strict=True):
-        run.gyroscope[first:first + round(KICK_S * rate)] += kick / KICK_S
+    kicks = [(end + begin + answer, end + begin + 2 * answer) for begin in rests[::2].tolist()]
+    for attitude, pair in zip(last, kicks, strict=True):
+        for first, kick in zip(pair, (KICK, OTHER_KICK * KICK), strict=True):
+            run.gyroscope[first:first + round(KICK_S * rate)] += (
+                attitude.inv().apply(kick) / KICK_S)
     return Excitation(run, still, ends - 1, ends[:len(TURNS)],
                       slice(end - len(motion.t) // 2, end), kicks)
 
@@ -86,7 +95,7 @@ def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Real
     Fit the response to the gyroscope: increments of the attitude over those of the sensor.
 
     Returns two matrices (3, 3) from whole turns and from their begins, the identity for a right
-    filter, and the delay in samples that leaves least of whole turns.
+    filter, and the delay in samples that leaves least of whole turns; 0 if it leaves much.
     """
     estimated, true = increments(outcome.estimates), increments(outcome.run.truth)
 
@@ -98,7 +107,37 @@ def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Real
 
     fits = [fit(WHOLE, late) for late in range(LATEST + 1)]
     late = int(np.argmin([left for _, left in fits]))
+    if fits[late][1] > EXPLAINED * fits[0][1]:
+        late = 0
     return fits[late][0], fit(EARLY, 0)[0], late
+
+
+def not_corrected(estimates: Reals, without: Reals, given: Excitation,
+                  absolute: bool) -> list[Fault]:
+    """
+    Name the sensors that do not correct a kick.
+
+    estimates, without : attitudes (n, 4) with kicks and without
+    absolute : whether the heading is judged
+    """
+    n = round(ANSWER_S * scenarios.SLOW.rate)
+    error = (Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()).as_rotvec()
+    lefts = []
+    for pair in given.kicks:
+        one, other = (error[[first + LATEST, first + n - 1]] - error[first - 1] for first in pair)
+        begin, end = 0.5 * (one + OTHER_KICK * other)
+        # Some filters correct most of it before the longest delay is over.
+        lefts.append([rms(end[part]) / max(rms(begin[part]), 0.5 * rms(KICK[part]))
+                      for part in (slice(2), slice(2, 3))])
+    sensors = ('accelerometer', 'tilt'), ('magnetometer', 'heading')
+    found = [(*one, left) for one, left in zip(
+        sensors[:1 + absolute], np.max(lefts, axis=0).tolist(), strict=False) if left > STAYS]
+    grown = [f'of the {what} grows to {left:.0%}' for _, what, left in found if left > GROWN]
+    if grown:       # by which sensor, and whether by the bias, is not known
+        return [Fault('inaccurate', f'an error {" and ".join(grown)} in {ANSWER_S:g} s at rest')]
+    return [Fault(f'{name}_wiring', f'{left:.0%} of an error of the {what} are left after '
+                  f'{ANSWER_S:g} s: the {name} does not correct it')
+            for name, what, left in found]
 
 
 def from_identity(*matrices: Reals) -> float:

@@ -85,10 +85,10 @@ def permuted(name: str, fit: Callable[[Reals], Any]) -> list[Hypothesis]:
             for one in sorted(SIGNED, key=fit, reverse=True)[:LIKELY]]
 
 
-def delayed(names: Sequence[str], samples: int) -> Hypothesis:
-    """Return the hypothesis that sensors are so many samples late."""
-    return Hypothesis(('lag',), f'with the {" and ".join(names)} {samples} samples earlier',
-                      given=changed(names, lambda rows: moved(rows, samples)))
+def delayed(names: Sequence[str], samples: float) -> Hypothesis:
+    """Return the hypothesis that sensors are so many samples late, rounded."""
+    return Hypothesis(('lag',), f'with the {" and ".join(names)} {round(samples)} samples earlier',
+                      given=changed(names, lambda rows: moved(rows, round(samples))))
 
 
 def sharpened(names: Sequence[str], samples: float) -> Hypothesis:

@@ -7,6 +7,7 @@ is a hypothesis: its inverse is applied to the readings or the attitudes, and th
 """
 
 import contextlib
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -43,17 +44,17 @@ CLEAN = np.array((TILT, HEADING, TILT, HEADING))
 # The largest entry of the gyroscope's matrix less the identity: what is looked into, and what is
 # too much for any other error to be judged.
 GAIN, GROSS_GAIN = 0.003, 0.25
+GROSS_REST = np.radians(10.0)   # rms error of filters that start at rest: the same
 START = 50                      # samples after which a filter that starts has an attitude
 SURE = 0.2                      # share of the limit of an explanation: nothing else is tried
 SMOOTHED = 0.1                  # share that is left where a delay or a low pass is the cause
 WORST = 30.0                    # condition of a matrix that can be inverted
 EARLY_RESTS = slice(2, 5)       # rests of a short run, when the error of the start is over
-STAYS = 0.98                    # share of a kick that a filter without correction leaves
 NEAR = 0.5                      # largest error without a kick with which a kick is judged [rad]
 STUCK = np.radians(1.0)         # attitudes that differ less are always the same
-# The search for the affine change of a sensor.
+# The search for the affine change of a sensor, or for its delay.
 FITS = 0.1                      # share of the error at rest that a good fit leaves
-STEPS = 4
+STEPS, LITTLE = 4, 0.05         # the last step changes it by less than this share
 LESS = 0.7                      # a step that leaves more of the whole error is the last one
 # A bias counts as learned if at most LEARNED of its first effect is left in the same attitude
 # later; LEARNING suffices if the estimate that the filter reports grows.
@@ -269,22 +270,32 @@ class Response:
         yield from self._affine(name, f'{name}_wiring', level, 0)
 
     def _of_smoothing(self) -> Iterator[Tried]:
-        """Try delays and low passes of the sensors."""
+        """Try delays and low passes of the sensors, each in several steps."""
         error = self._apart(self._excited.truth)
-        for names in (('gyroscope',), ('accelerometer',), ('magnetometer',),
-                      ('accelerometer', 'magnetometer')):
-            for _, outcome in self._tried(sharpened(names, 1.0), screened=False):
-                change = self._apart(outcome.estimates)
-                by = float(change @ error) / max(float(change @ change), 1e-12)
-                if by > 0.5:
-                    yield from self._tried(delayed(names, round(by)), sharpened(names, by))
+        for names, change in itertools.product(
+                (('gyroscope',), ('accelerometer',), ('magnetometer',),
+                 ('accelerometer', 'magnetometer')), (delayed, sharpened)):
+            samples, before = 1.0, self._whole(self._outcome)
+            for _ in range(STEPS):
+                tried = [*self._tried(change(names, samples), screened=False)]
+                yield from tried
+                if not tried or self._whole(tried[0][1]) > before:
+                    break
+                before = self._whole(tried[0][1])
+                turned = self._apart(tried[0][1].estimates)
+                more = float(turned @ error) / max(float(turned @ turned), 1e-12)
+                if more * samples < 0.5 or abs(more - 1.0) < LITTLE:
+                    break
+                samples = more * samples
 
     def _apart(self, others: Reals) -> Reals:
-        """Return the turns to other attitudes, at rest and in motion."""
+        """Return how far the axes of the world move to other attitudes, at rest and in motion."""
         judged = [*self._rests, *range(*self._given.motion.indices(len(others)))[::10]]
-        one, other = (Rotation.from_quat(rows[judged])
+        one, other = (Rotation.from_quat(rows[judged]).inv()
                       for rows in (self._outcome.estimates, others))
-        return (other * one.inv()).as_rotvec().ravel()
+        # Without a heading, the vertical alone.
+        return np.concatenate([(other.apply(axis) - one.apply(axis)).ravel()
+                               for axis in np.eye(3)[0 if self._absolute else 2:]])
 
     def _at_rest(self, outcome: Outcome, more: Sequence[Hypothesis] = (),
                  ) -> list[tuple[Rotation, NDArray[np.intp]]]:
@@ -335,35 +346,29 @@ class Response:
         if np.max((turns * turns[0].inv()).magnitude()) < STUCK:
             return [Fault('inaccurate', 'the attitude hardly changes')]
         if from_identity(whole, early) > GROSS_GAIN:
+            if self._subject.restarts:      # what is wrong without turns is not the gyroscope's
+                turns, rows = self._at_rest(self._outcome)[0]
+                start = measures.errors_of(turns.as_quat(), self._excited.truth[rows])
+                if rms(start.known(self._absolute)) > GROSS_REST:
+                    return [Fault('inaccurate', f'{left}: no cause explains it')]
             return [Fault('gyroscope_wiring', words(early))]
         if wrong and late > 1:
             return [Fault('lag', f'turns are followed {late} samples late; {left}')]
-        found = self._not_corrected(self._excited.truth)
+        not_corrected = partial(excitation.not_corrected, given=self._given,
+                                absolute=self._absolute)
+        found = not_corrected(self._outcome.estimates, self._excited.truth)
         if found:               # a run without kicks has the same error
             without = self.respond((), self._given.still).estimates
             error = measures.errors_of(without, self._excited.truth).attitude(True)
             # Far from the truth no filter is linear.
-            found = self._not_corrected(without) if error[self._given.kicks[0]] < NEAR else []
+            found = (not_corrected(self._outcome.estimates, without)
+                     if error[self._given.kicks[0][0]] < NEAR else [])
+        for one, outcome in self._tried(*hypotheses.UNITS, screened=False) if found else ():
+            if not not_corrected(outcome.estimates, self._excited.truth):
+                return [Fault(one.faults[0], f'{found[0].evidence}, but {one.text} it is')]
         if not found and wrong:
             return [Fault('inaccurate', f'{left}: no cause explains it')]
         return found
-
-    def _not_corrected(self, without: Reals) -> list[Fault]:
-        """Name the sensors that leave a kick, compared with attitudes without it."""
-        n = round(excitation.ANSWER_S * scenarios.SLOW.rate)
-        error = (Rotation.from_quat(self._outcome.estimates)
-                 * Rotation.from_quat(without).inv()).as_rotvec()
-        one, other = (error[[first + excitation.LATEST, first + n - 1]] - error[first - 1]
-                      for first in self._given.kicks)
-        begin, end = 0.5 * (one + excitation.OTHER_KICK * other)
-        # Some filters correct most of it before the longest delay is over.
-        return [Fault(
-            f'{name}_wiring', f'{left:.0%} of an error of the {what} are left after '
-            f'{excitation.ANSWER_S:g} s: the {name} does not correct it')
-            for name, what, part in (('accelerometer', 'tilt', slice(2)),
-                                     ('magnetometer', 'heading', slice(2, 3)))
-            if (left := rms(end[part]) / max(rms(begin[part]), 0.5 * rms(excitation.KICK[part])))
-            > STAYS and (self._absolute or what == 'tilt')]
 
     def judge_bias(self) -> None:
         """

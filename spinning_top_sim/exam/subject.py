@@ -14,7 +14,7 @@ from spinning_top_sim.exam.hypotheses import Hypothesis
 from spinning_top_sim.exam.scenarios import Run, Scenario
 from spinning_top_sim.exam.trial import Feed, MakeFilter, Outcome, feed, follow
 
-FIELD_ASKED = 200, 1000     # updates after which a filter has shown whether it uses the field
+FIELD_ASKED = 200, 3000     # updates after which a filter has shown whether it uses the field
 # A filter that goes on is first turned to the attitude at which a run begins [s].
 TURN_S = 30.0
 # A filter uses the field if its heading follows at least a tenth of this alternating turn of the

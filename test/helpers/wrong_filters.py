@@ -78,8 +78,9 @@ class Mahony(Part):
     """A filter of Mahony (2008) with exact steps."""
 
     def start(self, up=0.3, north=0.3, learns=0.15, most=np.inf, advance=body, triad=True,
-              level=True, declination=0.0):
+              level=True, declination=0.0, about=None):
         self._gains, self._most, self._advance = (up, north, learns), most, advance
+        self._about = about
         self._triad, self._level, self._declination = triad, level, declination
         self._q, self._bias = None, np.zeros(3)
 
@@ -96,7 +97,7 @@ class Mahony(Part):
                 yaw = Rotation.from_quat(self._q).as_euler('ZYX')[0]
                 h = Rotation.from_euler('z', yaw).apply(m)
             angle = math.atan2(h[0], h[1]) + self._declination
-            e = e + north * angle * r[2]
+            e = e + north * angle * (r[2] if self._about is None else self._about)
         self._bias = np.minimum(np.maximum(self._bias - learns * e * dt, -self._most), self._most)
         self._q = body(self._q, e * dt)
         return self._q.copy()
@@ -184,6 +185,7 @@ CHANGES = {
     'conjugated': ({'said': lambda q: q * (-1.0, -1.0, -1.0, 1.0)}, 'conjugated'),
     'w first': ({'said': lambda q: q[[3, 0, 1, 2]]}, 'component_order'),
     'vector longer': ({'said': longer}, OFF),
+    'vector positive': ({'said': np.abs}, OFF),
     'attitude late': ({'late': (0, 0, 0, 5)}, 'stamp_offset'),
     'twice dt': ({'step': lambda dt: 2.0 * dt}, f'{GYROSCOPE} {STEP}'),
     'dt of 100 Hz': ({'step': lambda dt: 0.01}, STEP)}
@@ -195,8 +197,10 @@ OWN = {     # and these
         'gain < 0': ({'up': -0.3}, f'gravity_sign {GRAVITY} diverges'),
         'no gravity': ({'up': 0.0}, GRAVITY), 'no field': ({'north': 0.0}, FIELD),
         'field of a level sensor': ({'level': False}, FIELD),
+        'heading about z': ({'about': np.array((0.0, 0.0, 1.0))}, f'{FIELD} {OFF}'),
+        'dt cut': ({'step': lambda dt: int(100.0 * dt) / 100.0}, STEP),
         'declination': ({'declination': np.radians(5.0)}, 'heading_offset'),
-        'bias gain < 0': ({'learns': -0.15}, 'no_bias_estimate diverges'),
+        'bias gain < 0': ({'learns': -0.15}, f'no_bias_estimate diverges {OFF}'),
         'no bias': ({'learns': 0.0}, 'no_bias_estimate'),
         'bias about z': ({'learns': np.array((0.0, 0.0, 0.15))}, 'no_bias_estimate'),
         'bias in deg/s': ({'report': np.degrees}, 'bias_report'),
