@@ -35,7 +35,6 @@ SPEC = {
 
 
 def written(folder, **changes):
-    """Write a specification; return its path."""
     path = folder / 'spec.yaml'
     path.write_text(yaml.safe_dump({**SPEC, **changes}, sort_keys=False))
     return path
@@ -170,13 +169,12 @@ def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
 
 
 def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_scheduler(
-        whole, tmp_path, ensemble, monkeypatch, capsys):
+        whole, tmp_path, ensemble, cluster, monkeypatch, capsys):
     """A part that is there is not computed again; a torn one is."""
-    from distributed.client import Future
-    from distributed.comm import CommClosedError
+    from distributed import Future, comm
 
     (data, path), folder, ordinary = whole, tmp_path / 'other', Future.result
-    for error, code, said in ((CommClosedError('gone'), 1, 'the scheduler is lost'),
+    for error, code, said in ((comm.CommClosedError('gone'), 1, 'the scheduler is lost'),
                               (KeyboardInterrupt(), 130, 'interrupted')):
         results = []
 
@@ -191,6 +189,8 @@ def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_sched
             assert ensemble(path, '-o', folder) == code
         assert capsys.readouterr().err == f'spinning-top ensemble: {said}\n'
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
+    cluster.gather([cluster.submit(os.getpid, workers=[one], pure=False)    # behind what is left
+                    for one in cluster.scheduler_info()['workers']])
     torn, *kept = sorted((folder / 'data').iterdir())
     assert len(kept) >= 2
     then = [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept]
