@@ -38,14 +38,14 @@ def share() -> Path:
 @contextlib.contextmanager
 def needed(what: str, wanted: str = '') -> Iterator[None]:
     """
-    Import what not every user has: an ImportError then says how to install it.
+    Import what not every user has.  Where it is missing, an ImportError says how to install it.
 
     what : what needs it
     wanted : as in `remedy`; by default the library that is missing
     """
     try:
         yield
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         library, *_ = str(error.name).split('.')
         raise ImportError(f'{what} needs {library}, which is not installed: '
                           f'{remedy(wanted or library)}') from error

@@ -189,7 +189,7 @@ def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_sched
             assert ensemble(path, '-o', folder) == code
         assert capsys.readouterr().err == f'spinning-top ensemble: {said}\n'
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
-    cluster.gather([cluster.submit(os.getpid, workers=[one], pure=False)    # behind what is left
+    cluster.gather([cluster.submit(os.getpid, workers=[one], pure=False)    # after running tasks
                     for one in cluster.scheduler_info()['workers']])
     torn, *kept = sorted((folder / 'data').iterdir())
     assert len(kept) >= 2

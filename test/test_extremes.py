@@ -81,7 +81,9 @@ HUGE, TINY = 1e300, 1e-300
 OUT_OF_RANGE = [
     ('status_period', TINY), ('pose.rate', 1e5), ('imu.gyroscope_M', (*8 * (0.0,), HUGE)),
     ('imu.clock_drift', -HUGE), ('imu.bias_instability_band', (0.0, 1.0)), ('top.mass', HUGE),
-    ('step.count', 0), ('record.min_free_bytes', 2 ** 63), ('seed', 10 ** 400)]
+    ('step.count', 0), ('record.min_free_bytes', 2 ** 63), ('seed', 10 ** 400),
+    ('imu.vibration.rate_psd', (20.0, 0.1, 30.0)), ('pivot.waypoints', (1.0, 1.0, 0.0, 2.0)),
+    ('pivot.waypoints', (1.0, math.nan, 0.0)), ('imu.bandwidth_order', 3)]
 
 
 @pytest.mark.parametrize(('name', 'value'), OUT_OF_RANGE)
@@ -119,9 +121,7 @@ SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.repeat': Tr
 def test_what_makes_no_sense_is_refused_in_words(values, words):
     with pytest.raises(ValueError, match=words):
         parameters.checked(values)
-    for right in ({'imu.rate': 0.5}, {'pivot.repeat': True, 'pivot.path': (
-            1.5, 1.0, 0.0, 0.0, 4.5, -1.0 / 3.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)}):
-        parameters.checked(right)
+    parameters.checked({'imu.rate': 0.5})
 
 
 @pytest.mark.parametrize(('given', 'named'), [

@@ -152,13 +152,14 @@ def test_a_repeated_path_closes_exactly(waypoints):
     corners = kinematics(path, np.array([0, *ends]))
     assert abs(corners.position - [*waypoints, waypoints[0]]).max() <= 4e-16
     assert not corners.velocity.any()
+    PivotPath([(S, (1.0, 0.0, 0.0)), (3 * S, (-1.0 / 3.0, 0.0, 0.0))], repeat=True)     # rounded
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.integers(10 ** 6, 10 ** 11), st.tuples(*3 * [st.floats(-50, 50)])),
+@given(st.lists(st.tuples(st.integers(1, 10 ** 11), st.tuples(*3 * [st.floats(-50, 50)])),
                 min_size=1, max_size=6), st.booleans())
 def test_position_and_velocity_are_those_of_exact_arithmetic(pieces, there_and_back):
-    if there_and_back:
+    if there_and_back := there_and_back and min(pieces)[0] >= 10 ** 6:
         pieces = [*pieces, *((length, tuple(-x for x in a)) for length, a in pieces)]
     path = PivotPath(pieces, repeat=there_and_back)
     cycle = sum(length for length, _ in pieces)

@@ -169,7 +169,7 @@ class _Exam:
             self._do(self._judge_lever_arm)
             if identified:
                 self._do(self._response.judge_bias)
-                if 'frame_ned' in [fault.name for fault in self.findings.faults]:
+                if 'frame_ned' in self.findings.names:
                     self.findings.drop('bias_report')       # it has the same axes
         self._do(self._judge_noisy_runs)
         self._do(lambda: self.findings.measures.update(self._subject.convergence()))
@@ -210,7 +210,7 @@ class _Exam:
                                          limit)
         if large and (large.name == 'diverges' or not findings.faults):
             findings.faults.append(self._of_gyroscope(large))
-        if any(fault.name not in SHOW_ELSEWHERE for fault in findings.faults):
+        if findings.names.difference(SHOW_ELSEWHERE):
             findings.drop('inaccurate')
         consistency = diagnosis.consistency(self.outcomes, self._absolute)
         findings.measures |= diagnosis.nees_marks(consistency)
@@ -259,13 +259,14 @@ class _Exam:
                         'inaccurate', f'{run.name}, without noise: the error is '
                         f'{degrees(error)}, above {degrees(diagnosis.FAST)}, for no reason that '
                         'is known')))
+                    break
 
     def _of_gyroscope(self, error: Fault) -> Fault:
-        """Return an error as that of the gyroscope where the response to that is slightly off."""
-        early, others = self._response.early, {
-            fault.name for fault in self.findings.faults} - {'gyroscope_wiring'}
-        return error if others or from_identity(early) <= SLIGHT else Fault(
-            'gyroscope_wiring', f'{words(early)}; {error.evidence}')
+        """Blame the gyroscope for an error if nothing else is wrong but the response to it."""
+        early = self._response.early
+        if self.findings.names - {'gyroscope_wiring'} or from_identity(early) <= SLIGHT:
+            return error
+        return Fault('gyroscope_wiring', f'{words(early)}; {error.evidence}')
 
     def _judge_steps(self, outcomes: Sequence[Outcome], finer: Sequence[float]) -> None:
         """Judge whether the filter uses the step, or turns by the number of samples."""
@@ -277,7 +278,7 @@ class _Exam:
         by_samples = abs(gains[-1] / finer[-1] - gains[0]) < 0.25 * abs(gains[0])
         if apart > STEP and (by_samples or abs(gains[0] - 1.0) < STEP):
             # A wrong step turns up as a wrong scale at one rate.
-            if 'time_step' in [fault.name for fault in self.findings.faults]:
+            if 'time_step' in self.findings.names:
                 self.findings.drop('gyroscope_wiring')
             self.findings.faults.append(Fault(
                 'time_step', f'at {" and ".join(one.run.name for one in outcomes)} turns move it '

@@ -29,7 +29,7 @@ WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; th
 STAYS, GROWN = 0.98, 1.2
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
-EXPLAINED = 0.5                 # share that a delay leaves of what the response without one does
+DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
 DOWN = 70.0, 20.0, 140.0        # yaw, pitch and roll of the last rest [deg]
 # Of the gyroscope only, about axes of the world.  Of two kicks with opposite headings the mean
 # tells the tilt, and half the difference the heading.
@@ -95,7 +95,7 @@ def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Real
     Fit the response to the gyroscope: increments of the attitude over those of the sensor.
 
     Returns two matrices (3, 3) from whole turns and from their begins, the identity for a right
-    filter, and the delay in samples that leaves least of whole turns; 0 if it leaves much.
+    filter, and the delay of whole turns in samples; 0 if none explains the response.
     """
     estimated, true = increments(outcome.estimates), increments(outcome.run.truth)
 
@@ -107,7 +107,7 @@ def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Real
 
     fits = [fit(WHOLE, late) for late in range(LATEST + 1)]
     late = int(np.argmin([left for _, left in fits]))
-    if fits[late][1] > EXPLAINED * fits[0][1]:
+    if fits[late][1] > DELAY_LEAVES * fits[0][1]:
         late = 0
     return fits[late][0], fit(EARLY, 0)[0], late
 

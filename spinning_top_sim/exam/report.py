@@ -91,6 +91,11 @@ class Findings:
     faults: list[Fault] = field(default_factory=list)
     measures: dict[str, float] = field(default_factory=dict)
 
+    @property
+    def names(self) -> set[str]:
+        """Names of the faults."""
+        return {fault.name for fault in self.faults}
+
     def drop(self, name: str) -> None:
         """Remove the faults of this name."""
         self.faults = [fault for fault in self.faults if fault.name != name]

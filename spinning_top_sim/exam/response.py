@@ -47,7 +47,7 @@ GAIN, GROSS_GAIN = 0.003, 0.25
 GROSS_REST = np.radians(10.0)   # rms error of filters that start at rest: the same
 START = 50                      # samples after which a filter that starts has an attitude
 SURE = 0.2                      # share of the limit of an explanation: nothing else is tried
-SMOOTHED = 0.1                  # share that is left where a delay or a low pass is the cause
+LAG_LEAVES = 0.1                # most of the error, after a delay or a low pass is undone
 WORST = 30.0                    # condition of a matrix that can be inverted
 EARLY_RESTS = slice(2, 5)       # rests of a short run, when the error of the start is over
 NEAR = 0.5                      # largest error without a kick with which a kick is judged [rad]
@@ -165,7 +165,7 @@ class Response:
                 or self._best(self._of_sensor('accelerometer', 2, (0, 1), hypotheses.GRAVITY_SIGN,
                                               *hypotheses.UNITS))
                 or self._best(self._of_sensor('magnetometer', 1, (0,), hypotheses.LEVEL))
-                or self._best(self._of_smoothing(), SMOOTHED))
+                or self._best(self._of_smoothing(), LAG_LEAVES))
 
     def _best(self, tried: Iterator[Tried], share: float = diagnosis.EXPLAINED,
               mends_turns: bool = False) -> Tried | None:
@@ -279,17 +279,16 @@ class Response:
             for _ in range(STEPS):
                 tried = [*self._tried(change(names, samples), screened=False)]
                 yield from tried
-                if not tried or self._whole(tried[0][1]) > before:
+                if not tried or (left := self._whole(tried[0][1])) > before:
                     break
-                before = self._whole(tried[0][1])
-                turned = self._apart(tried[0][1].estimates)
+                before, turned = left, self._apart(tried[0][1].estimates)
                 more = float(turned @ error) / max(float(turned @ turned), 1e-12)
                 if more * samples < 0.5 or abs(more - 1.0) < LITTLE:
                     break
                 samples = more * samples
 
     def _apart(self, others: Reals) -> Reals:
-        """Return how far the axes of the world move to other attitudes, at rest and in motion."""
+        """Return the change of the axes of the world, in the sensor, to other attitudes."""
         judged = [*self._rests, *range(*self._given.motion.indices(len(others)))[::10]]
         one, other = (Rotation.from_quat(rows[judged]).inv()
                       for rows in (self._outcome.estimates, others))

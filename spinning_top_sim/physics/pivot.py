@@ -217,7 +217,7 @@ def _checked(duration_ns: int) -> int:
 
 
 def _closed(steps: Sequence[tuple[int, Exact]]) -> Sequence[tuple[int, Exact]]:
-    """Return steps that leave the velocity as it was, if these change it by rounding only."""
+    """Return the steps; the last one cancels a change of the velocity by rounding errors."""
     changes = [_sum((Fraction(duration_ns, NANOSECONDS), a)) for duration_ns, a in steps]
     change = _sum(*((1, one) for one in changes))
     if not any(change) or _length(change) > ROUNDING * max(map(_length, changes)):

@@ -80,8 +80,7 @@ class Mahony(Part):
     def start(self, up=0.3, north=0.3, learns=0.15, most=np.inf, advance=body, triad=True,
               level=True, declination=0.0, about=None):
         self._gains, self._most, self._advance = (up, north, learns), most, advance
-        self._about = about
-        self._triad, self._level, self._declination = triad, level, declination
+        self._triad, self._level, self._declination, self._about = triad, level, declination, about
         self._q, self._bias = None, np.zeros(3)
 
     def turn(self, w, a, m, dt):
