@@ -10,8 +10,9 @@ Each node publishes pose, joint_states and imu/data_raw at one rate to 1 and to 
 `sim_node` runs with its default of 200 ticks per second and with one tick per sample.  It is
 compared with `straightforward_node.py` (a timer, SciPy's RK45, message objects), under the
 executor of `rclpy.spin` and under rclpy's EventsExecutor, and with `bare_node.py`, the floor:
-constant bytes, one tick per sample, by a thread or by a timer.  All take turns in every round;
-nodes of a pair run at once.  The tables have medians of rounds, and of ratios within a round.
+constant bytes, one tick per sample, by a thread or by a timer.  With a pivot that goes to and fro,
+and beside it with one at rest, it publishes all default streams at their rates and records them.
+All take turns in every round; nodes of a pair run at once.  The tables have medians of rounds, and of ratios within a round.
 Processor time is that of the whole process, relative to the elapsed time.  An arrival is the
 reception by the middleware of a subscriber.  Jitter is the difference between the period and the
 time between two arrivals on a topic.
@@ -50,6 +51,8 @@ TICKS_RECORDING = 'sim_node, 200 ticks, recording'
 STRAIGHT, EVENTS = 'straightforward', 'straightforward, EventsExecutor'
 FLOOR, TIMER = 'floor, thread', 'floor, timer'
 KINDS = (TICKS_RECORDING, 'sim_node, 200 ticks', SIM_RECORDING, SIM, STRAIGHT, EVENTS, FLOOR)
+SHUTTLE = {'pivot.waypoints': [0.0, 0.0, 0.0, 10.0, 0.0, 0.0], 'pivot.speed': 4.0,
+           'pivot.acceleration': 2.0, 'pivot.repeat': True}
 PAIRS = ((TICKS_RECORDING, EVENTS), (SIM_RECORDING, FLOOR), (SIM, FLOOR), (FLOOR, TIMER))
 
 
@@ -179,7 +182,7 @@ def in_pairs(programs: Mapping[str, Callable[[str], list[str]]], rounds: int, se
 
 
 def all_pairs(rounds: int, seconds: float) -> str:
-    """Return the table of pairs at 1 kHz, and of streams without subscribers."""
+    """Return the table of pairs at 1 kHz, of a moving pivot, and without subscribers."""
     def idle(enabled: bool) -> Callable[[str], list[str]]:
         return lambda namespace: sim_node(namespace, {
             'tick_rate': 1000.0, 'status_period': 0.0, **{
@@ -189,6 +192,13 @@ def all_pairs(rounds: int, seconds: float) -> str:
         def node(kind: str) -> Callable[[str], list[str]]:
             return lambda namespace: program(kind, 1000, namespace, Path(folder))
         rows = [in_pairs({kind: node(kind) for kind in pair}, rounds, seconds) for pair in PAIRS]
+
+        def exact(pivot: Mapping[str, object]) -> Callable[[str], list[str]]:
+            return lambda namespace: sim_node(namespace, {
+                'solver.method': 'exact', 'record.enabled': True, 'record.uri': f'{folder}/',
+                **pivot})
+        rows.append(in_pairs({'pivot to and fro, exact, recording': exact(SHUTTLE),
+                              'pivot at rest': exact({})}, 2 * rounds, 2.0 * seconds))
     rows.append(in_pairs({'no subscriber, all streams enabled': idle(True),
                           'none enabled': idle(False)}, rounds, seconds, subscribers=0))
     return table(('node', 'other', 'node', 'other', 'ratio', 'smallest', 'largest'), rows)
@@ -209,7 +219,7 @@ def main() -> None:
     text = '\n'.join((
         f'{options.rounds} rounds of {options.seconds:g} s, twice as many of pairs; load average '
         f'at the start {at_first:.1f}.\n',
-        '## Pairs at 1 kHz\n', pairs, '## All nodes\n', in_turns(options)))
+        '## Pairs, at 1 kHz or default rates\n', pairs, '## All nodes\n', in_turns(options)))
     print(text)
     if not options.no_report:
         write_section('node_cpu', head, __doc__, text)
