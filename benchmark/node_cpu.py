@@ -12,10 +12,10 @@ compared with `straightforward_node.py` (a timer, SciPy's RK45, message objects)
 executor of `rclpy.spin` and under rclpy's EventsExecutor, and with `bare_node.py`, the floor:
 constant bytes, one tick per sample, by a thread or by a timer.  With a pivot that goes to and fro,
 and beside it with one at rest, it publishes all default streams at their rates and records them.
-All take turns in every round; nodes of a pair run at once.  The tables have medians of rounds, and of ratios within a round.
-Processor time is that of the whole process, relative to the elapsed time.  An arrival is the
-reception by the middleware of a subscriber.  Jitter is the difference between the period and the
-time between two arrivals on a topic.
+All take turns in every round; nodes of a pair run at once.  The tables have medians of rounds, and
+of ratios within a round.  Processor time is that of the whole process, relative to the elapsed
+time.  An arrival is the reception by the middleware of a subscriber.  Jitter is the difference
+between the period and the time between two arrivals on a topic.
 """
 
 from __future__ import annotations

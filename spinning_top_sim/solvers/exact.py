@@ -316,7 +316,7 @@ class _ExactStates(ThetaStates):
         return theta_dot
 
     def _across(self) -> Column:
-        # `_AcceleratedStates` chooses between two formulas.  Here there is only the first, because
+        # `AcceleratedStates` chooses between two formulas.  Here there is only the first, because
         # a choice would change the last bits of earlier logs.
         cosine, sine = self._rows('half_theta')
         return axis_rate(self._solution.bottom_rate, self._solution.top_rate, cosine, sine)

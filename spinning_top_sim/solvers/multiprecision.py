@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Multiprecision numbers: `mpfr` of gmpy2.  Results have the precision that `precision` sets.
+Multiprecision numbers: `mpfr` and `mpc` of gmpy2.  `precision` sets the precision of results.
 
 L. Fousse et al., "MPFR: A multiple-precision binary floating-point library with correct rounding",
 ACM Trans. Math. Softw. 33 (2007), 13.
@@ -11,14 +11,13 @@ from contextlib import contextmanager
 from functools import lru_cache
 
 import gmpy2
-from gmpy2 import mpfr
+from gmpy2 import mpc, mpfr
 
 # Three words of 64 bits, or 57 decimal digits.
 BITS = 192
 # An infinity or a NaN raises ArithmeticError.
 TRAPS = {f'trap_{name}': True for name in ('divzero', 'invalid', 'overflow')}
-ZERO, ONE = mpfr(0), mpfr(1)
-Complex = tuple[mpfr, mpfr]
+ZERO, ONE, IMAGINARY = mpfr(0), mpfr(1), mpc(1j)
 
 
 @contextmanager

@@ -45,7 +45,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from gmpy2 import asinh, const_pi, mpfr, sin_cos, sqrt
+from gmpy2 import asinh, const_pi, mpc, mpfr, sin_cos, sqrt
 from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
@@ -56,7 +56,6 @@ from spinning_top_sim.solvers.multiprecision import (
     BITS,
     ONE,
     ZERO,
-    Complex,
     atan2,
     exact,
     half_turns,
@@ -136,9 +135,9 @@ class Posture(NamedTuple):
     l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
     """
 
-    alpha: Complex
-    beta: Complex
-    across: Complex
+    alpha: mpc
+    beta: mpc
+    across: mpc
     l3: float
 
 
@@ -154,8 +153,8 @@ class HalfAngles(NamedTuple):
     sin_half: mpfr
     cos_half: mpfr
     theta_dot: mpfr
-    alpha: Complex
-    beta: Complex
+    alpha: mpc
+    beta: mpc
     l3: mpfr
     lz: mpfr
 
@@ -196,7 +195,7 @@ class _Side(NamedTuple):
     momentum: mpfr
     spin: mpfr
     turns: mpfr
-    direction: Complex
+    direction: mpc
     modulus: mpfr
     slope: mpfr
 
@@ -204,7 +203,7 @@ class _Side(NamedTuple):
 def _set_up(top: Top, gravity: mpfr, start: State | HalfAngles) -> ThetaMotion:
     torque = exact(top.mass) * gravity * exact(top.com_distance)
     lambda1, lambda3 = exact(top.lambda1), exact(top.lambda3)
-    alpha_turns, beta_turns, alpha, beta = ZERO, ZERO, (ONE, ZERO), (ONE, ZERO)
+    alpha_turns, beta_turns, alpha, beta = ZERO, ZERO, mpc(1), mpc(1)
     if isinstance(start, HalfAngles):
         sin_half, cos_half, theta_dot, alpha, beta, l3, lz = start
     else:
@@ -231,7 +230,7 @@ def _resting(side: _Side, lambda1: mpfr) -> Factor:
     if side.momentum:
         rate += side.momentum / (4 * lambda1 * side.modulus ** 2)
     parts = Series(COS_EVEN, (ONE,)), NOTHING
-    argument = -atan2(side.direction[1], side.direction[0])
+    argument = -atan2(side.direction.imag, side.direction.real)
     return Factor(rate, side.turns - argument / (2 * const_pi()), ZERO, (parts, parts),
                   (side.modulus, side.modulus), 0, argument)
 
@@ -374,7 +373,7 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: mpfr, x_rate: 
     scale *= (form.middle4 if pole.is_beta else form.middle3) / second[0].leading
     parts, scales = (((second, first), (scale, scale * form.odd_over_even)) if pole.is_beta
                      else ((first, second), (scale, scale)))
-    c, s = side.direction
+    c, s = side.direction.real, side.direction.imag
     argument = drift * y + atan2(imag * c - real * s, real * c + imag * s)
     return Factor(rate, side.turns - argument / (2 * const_pi()), drift, parts, scales,
                   sense, argument)

@@ -17,7 +17,7 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from gmpy2 import const_pi, mpfr, rint, sin_cos, sinh, sqrt
+from gmpy2 import const_pi, mpc, mpfr, norm, rint, sin_cos, sinh, sqrt
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.pivot import Exact
@@ -26,9 +26,9 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
 from spinning_top_sim.solvers.multiprecision import (
     BITS,
+    IMAGINARY,
     ONE,
     ZERO,
-    Complex,
     exact,
     precision,
 )
@@ -67,34 +67,34 @@ class Vertical(NamedTuple):
 
     gravity: mpfr
     top: Top
-    alpha: Complex
-    beta: Complex
+    alpha: mpc
+    beta: mpc
     rows: Quaternion
 
     def start(self, posture: Posture) -> HalfAngles:
         """Return a posture as a state in this frame."""
-        top, (a, b), (c, d) = self.top, self.alpha, self.beta
-        alpha, beta = _product(((a, -b), (-c, -d)), (posture.alpha, posture.beta))
-        cosine2, sine2 = _square(alpha), _square(beta)
-        size2, l3, (o1, o2) = cosine2 + sine2, mpfr(posture.l3), posture.across
+        top, across = self.top, posture.across
+        alpha, beta = _product(self.alpha.conjugate(), -self.beta, posture.alpha, posture.beta)
+        cosine2, sine2 = norm(alpha), norm(beta)
+        size2, l3 = cosine2 + sine2, mpfr(posture.l3)
         cosine, sine = sqrt(cosine2 / size2), sqrt(sine2 / size2)
         if 2 * sine < POLE:         # all the motion of the axis is nutation: psi from omega
-            theta_dot = sqrt(_square(posture.across))
-            beta = _times(alpha, (o2, -o1)) if theta_dot else alpha
+            theta_dot = abs(across)
+            beta = alpha * (-IMAGINARY * across) if theta_dot else alpha
             return HalfAngles(ZERO, ONE, theta_dot, alpha, beta, l3, l3)
         # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
         # + i theta') exp(-i psi)
-        minus_across, theta_dot = _times(posture.across, _times(alpha, (beta[0], -beta[1])))
+        rates = across * (alpha * beta.conjugate())
         half_tilt = cosine * sine
         tilt, unit, lambda1 = 2 * half_tilt, half_tilt * size2, exact(top.lambda1)
-        lz = (1 - 2 * sine * sine) * l3 - lambda1 * minus_across / unit * tilt
+        lz = (1 - 2 * sine * sine) * l3 - lambda1 * rates.real / unit * tilt
         most2 = THROUGH ** 2 * tilt * tilt * (l3 * l3 * tilt * tilt + lambda1 * (
-            lambda1 * _square(posture.across)
+            lambda1 * norm(across)
             + abs(self.gravity * exact(top.mass) * exact(top.com_distance))))
         for pole in (l3, -l3):
             if (lz - pole) ** 2 <= most2:
                 lz = pole or ZERO
-        return HalfAngles(sine, cosine, theta_dot / unit, alpha, beta, l3, lz)
+        return HalfAngles(sine, cosine, rates.imag / unit, alpha, beta, l3, lz)
 
 
 class AcceleratedMotion(ClosedForm):
@@ -140,7 +140,7 @@ class AcceleratedMotion(ClosedForm):
             vertical = self.vertical
             alpha, beta, u_dot = _cayley_klein(self._motion, mpfr(ns) / 10 ** 9)
             across = _across(exact(self.top.lambda1), *self.halves[-2:], alpha, beta, u_dot)
-            alpha, beta = _product((vertical.alpha, vertical.beta), (alpha, beta))
+            alpha, beta = _product(vertical.alpha, vertical.beta, alpha, beta)
             return Posture(alpha, beta, across, self._posture.l3)
 
 
@@ -185,7 +185,8 @@ def _verticals(top: Top, acceleration: Exact,
 
 def _upright(top: Top, gravity: mpfr, x: mpfr, y: mpfr, z: mpfr) -> Vertical:
     alpha, beta = _least_rotation(x, y, z)
-    qx, qy, qz, qw = (np.array([float(part)]) for part in (-beta[1], beta[0], alpha[1], alpha[0]))
+    qx, qy, qz, qw = (np.array([float(part)]) for part in (
+        -beta.imag, beta.real, alpha.imag, alpha.real))
     return Vertical(gravity, replace(top, gravity=float(gravity)), alpha, beta, (qx, qy, qz, qw))
 
 
@@ -194,16 +195,16 @@ def about_vertical(top: Top, posture: Posture, acceleration: Exact,
     """Return the vertical while the pivot accelerates so, and the state there."""
     with precision(BITS):
         (x, y, z), up, down = _verticals(top, acceleration)
-        (w0, z0), (y0, minus_x0) = alpha, beta = posture[:2]
-        side = (2 * (x * (w0 * y0 - z0 * minus_x0) + y * (y0 * z0 + w0 * minus_x0))
-                + z * (_square(alpha) - _square(beta)))
-        vertical = up if side >= 0 else down
+        # The axis is (2 alpha beta, |alpha|^2 - |beta|^2).
+        across = 2 * posture.alpha * posture.beta
+        height = norm(posture.alpha) - norm(posture.beta)
+        vertical = up if x * across.real + y * across.imag + z * height >= 0 else down
         return vertical, vertical.start(posture)
 
 
 def rounded(start: HalfAngles) -> State:
     """Return a state in doubles."""
-    alpha, beta = (math.atan2(float(y), float(x)) for x, y in (start.alpha, start.beta))
+    alpha, beta = (math.atan2(float(x.imag), float(x.real)) for x in (start.alpha, start.beta))
     l3 = float(start.l3)
     return State(
         theta=min(2.0 * math.asin(float(start.sin_half)), 0.5 * math.pi),
@@ -215,29 +216,26 @@ def posture_of(top: Top, state: State) -> Posture:
     """Return the posture of a state about the vertical of the world."""
     with precision(BITS):
         sine, cosine = sin_cos(mpfr(state.theta) / 2)
-        (s_phi, c_phi), (s_psi, c_psi) = (
-            sin_cos(mpfr(angle) / 2) for angle in (state.phi, state.psi))
-        half_phi, half_psi, back = (c_phi, s_phi), (c_psi, s_psi), (c_psi, -s_psi)
+        half_phi, half_psi = (_phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
+        back = half_psi.conjugate()
         l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * exact(top.lambda1)
         swing = ZERO                # phi' sin(theta)
         if lz + l3:
             swing += (lz + l3) / two_lambda1 * sine / cosine
         if lz - l3:
             swing += (lz - l3) / two_lambda1 * cosine / sine
-        return Posture(_scaled(cosine, _times(half_phi, half_psi)),
-                       _scaled(sine, _times(half_phi, back)),
-                       _times((-swing, mpfr(state.theta_dot)), _times(back, back)), state.l3)
+        return Posture(cosine * (half_phi * half_psi), sine * (half_phi * back),
+                       (IMAGINARY * mpfr(state.theta_dot) - swing) * (back * back), state.l3)
 
 
 def posture_at(states: States) -> Posture:
     """Return the posture of states (n = 1) in the world, as far as doubles know it."""
-    with precision(BITS):
-        x, y, z, w, o1, o2 = (mpfr(float(part[0])) for part in (
-            *states.rows_quaternion, *states.transverse_velocity))
-        return Posture((w, z), (y, -x), (o1, o2), states.start.l3)
+    x, y, z, w, o1, o2 = (float(part[0]) for part in (
+        *states.rows_quaternion, *states.transverse_velocity))
+    return Posture(mpc(complex(w, z)), mpc(complex(y, -x)), mpc(complex(o1, o2)), states.start.l3)
 
 
-def _cayley_klein(motion: ThetaMotion, t: mpfr) -> tuple[Complex, Complex, mpfr]:
+def _cayley_klein(motion: ThetaMotion, t: mpfr) -> tuple[mpc, mpc, mpfr]:
     """Return alpha, beta and cos(theta)' at t [s] in the frame of a motion."""
     quarters = motion.quarter0 + motion.offset0 + motion.quarter_rate * t
     whole = int(rint(quarters))
@@ -252,69 +250,54 @@ def _cayley_klein(motion: ThetaMotion, t: mpfr) -> tuple[Complex, Complex, mpfr]
     cosine = sqrt(1 - xi)
     point = sine, cosine, xi
     alpha, beta = (_value(factor, whole, y, t, point) for factor in (motion.alpha, motion.beta))
-    size2 = _square(alpha) + _square(beta)
+    size2 = norm(alpha) + norm(beta)
     slope = motion.u_dot_series.at(2 * sine * cosine, 1 - 2 * xi, 4 * xi * (1 - xi))
     u_dot = motion.u_dot[whole % 2] * slope / (size2 * size2)
     scale = 1 / sqrt(size2)
-    return _scaled(scale, alpha), _scaled(scale, beta), u_dot
+    return scale * alpha, scale * beta, u_dot
 
 
 def _value(factor: Factor, whole: int, y: mpfr, t: mpfr,
-           point: tuple[mpfr, mpfr, mpfr]) -> Complex:
+           point: tuple[mpfr, mpfr, mpfr]) -> mpc:
     """Return alpha D or beta D; `whole`, y, `point`: N, y and the arguments of `Series.at`."""
     parts, scale = factor.parts[whole % 2], factor.scales[whole % 2]
     real, imag = (scale * part.at(*point) for part in parts)
     if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
         real = -real                # it passes a pole
     turn = factor.rate * t + 2 * const_pi() * factor.phase_turns + factor.drift * y
-    sine, cosine = sin_cos(turn)
-    return _times((real, imag), (cosine, sine))
+    return (real + IMAGINARY * imag) * _phase(turn)
 
 
-def _across(lambda1: mpfr, l3: mpfr, lz: mpfr, alpha: Complex, beta: Complex,
-            u_dot: mpfr) -> Complex:
+def _across(lambda1: mpfr, l3: mpfr, lz: mpfr, alpha: mpc, beta: mpc, u_dot: mpfr) -> mpc:
     """Return omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta))."""
-    cosine2, sine2 = _square(alpha), _square(beta)
+    cosine2, sine2 = norm(alpha), norm(beta)
     if not (cosine2 and sine2):
-        return ZERO, ZERO           # it rests at a pole
+        return mpc(0)               # it rests at a pole
     # Lz - L3 u, without cancellation at either pole
     momentum = ((lz - l3) + 2 * l3 * sine2 if sine2 < cosine2
                 else (lz + l3) - 2 * l3 * cosine2)
-    # 1/(alpha conj(beta)) = conj(alpha) beta/|alpha beta|^2
-    inverse = _scaled(-1 / (2 * cosine2 * sine2), _times((alpha[0], -alpha[1]), beta))
-    return _times((momentum / lambda1, u_dot), inverse)
+    return -(momentum / lambda1 + IMAGINARY * u_dot) / (2 * alpha * beta.conjugate())
 
 
-def _least_rotation(x: mpfr, y: mpfr, z: mpfr) -> tuple[Complex, Complex]:
+def _least_rotation(x: mpfr, y: mpfr, z: mpfr) -> tuple[mpc, mpc]:
     """Return the Cayley-Klein parameters of the least rotation of (0, 0, 1) to a unit vector."""
     across = sqrt(x * x + y * y)
     if not across:                  # perhaps a half turn, about the x axis
-        return ((ONE, ZERO), (ZERO, ZERO)) if z > 0 else ((ZERO, ZERO), (ZERO, -ONE))
+        return (mpc(1), mpc(0)) if z > 0 else (mpc(0), -IMAGINARY)
     if z > 0:
         cosine = sqrt((1 + z) / 2)
         sine = across / (2 * cosine)
     else:
         sine = sqrt((1 - z) / 2)
         cosine = across / (2 * sine)
-    return (cosine, ZERO), (sine * x / across, sine * y / across)
+    return mpc(cosine), sine / across * (x + IMAGINARY * y)
 
 
-def _product(p: Sequence[Complex], q: Sequence[Complex]) -> tuple[Complex, Complex]:
-    """Return the Cayley-Klein parameters of p q: first the rotation q, then p."""
-    (a, b), (c, d) = p, q
-    conj_c, conj_d = (c[0], -c[1]), (d[0], -d[1])
-    (r1, i1), (r2, i2) = _times(a, c), _times(b, conj_d)
-    (r3, i3), (r4, i4) = _times(a, d), _times(b, conj_c)
-    return (r1 - r2, i1 - i2), (r3 + r4, i3 + i4)
+def _product(a: mpc, b: mpc, c: mpc, d: mpc) -> tuple[mpc, mpc]:
+    """Return the Cayley-Klein parameters of two rotations: first that of c and d, then of a, b."""
+    return a * c - b * d.conjugate(), a * d + b * c.conjugate()
 
 
-def _times(a: Complex, b: Complex) -> Complex:
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
-def _scaled(factor: mpfr, a: Complex) -> Complex:
-    return factor * a[0], factor * a[1]
-
-
-def _square(a: Complex) -> mpfr:
-    return a[0] * a[0] + a[1] * a[1]
+def _phase(angle: mpfr) -> mpc:
+    sine, cosine = sin_cos(angle)
+    return cosine + IMAGINARY * sine

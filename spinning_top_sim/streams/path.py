@@ -86,7 +86,7 @@ class Segment:
         posture, top, start = self.motion.posture(0), self.motion.top, self.start
         if posture is None:
             return float(self._first.energy[0])
-        o1, o2 = map(float, posture.across)     # without an evaluation of states
+        o1, o2 = float(posture.across.real), float(posture.across.imag)  # evaluates no states
         return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
                 + top.gravity_torque * math.cos(start.theta))
 
