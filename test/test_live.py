@@ -43,7 +43,7 @@ def test_a_log_gets_an_instant_in_one_call_before_anybody_else():
     expected = record(undisturbed)
     undisturbed.advance(SECOND)
     simulation, calls = simulate(), []
-    simulation.log_to(lambda entries, size: calls.append(entries), simulation.streams)
+    simulation.log_to(calls.append, simulation.streams)
 
     def fail(data):
         if simulation.now_ns >= SECOND // 3:
@@ -96,7 +96,7 @@ def test_ticks_leave_nothing_behind():
     simulation = simulate(solver__method='exact')
     for one in simulation.outputs:
         one.publish = len
-    simulation.log_to(lambda entries, size: None, simulation.streams)
+    simulation.log_to(lambda entries: None, simulation.streams)
 
     def run(ticks):
         for _ in range(ticks):
@@ -148,7 +148,7 @@ CHANGES = {
     'command': lambda one, taken: one.command(2.0, 1.5),
     'subscriber': lambda one, taken: setattr(output(one, 'imu/data_raw'), 'publish', taken.append),
     'recorder': lambda one, taken: one.log_to(
-        lambda entries, _: taken.extend(entries), [output(one, 'imu/data_raw').stream]),
+        taken.extend, [output(one, 'imu/data_raw').stream]),
     'epoch': lambda one, taken: setattr(one, 'epoch_ns', one.epoch_ns + 1),
     'late': lambda one, taken: one.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)}
 

@@ -154,7 +154,7 @@ def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, 
         topics = [RecordedTopic('/a', {ARRAY!r})]
         recorder = McapRecorder(sys.argv[1], topics, {{}}, min_free_bytes=0, max_loss=60.0)
         for number in range(100):
-            recorder.write_all([(0, number, bytes(8))], 8)
+            recorder.write_all([(0, number, bytes(8))])
         {ending}
         """
     subprocess.run([sys.executable, '-c', textwrap.dedent(code), tmp_path / 'run.mcap'],

@@ -55,7 +55,7 @@ class Run:
         return next(one for one in self.simulation.outputs if one.stream.topic == topic)
 
     def record(self):
-        self.simulation.log_to(lambda entries, size: self.stamps.extend(
+        self.simulation.log_to(lambda entries: self.stamps.extend(
             stamp_ns for _, stamp_ns, _ in entries), [self.pose.stream])
         return self
 

@@ -40,7 +40,7 @@ class RecordingSession:
         self.error: str | None = None       # why the last recording stopped early or did not start
         self._simulation, self._lock, self._topics = simulation, lock, topics
         self._recorder: McapRecorder | None = None
-        self._pending: list[tuple[Sequence[Entry], int]] = []   # while a log is being opened
+        self._pending: list[Sequence[Entry]] = []       # while a log is being opened
         self._write: Write | None = None        # writes into the recorder, or into `_pending`
         # Streams, their topics and the run, of a log that is to be opened
         self._begun: tuple[Sequence[Stream], Sequence[Topic], Mapping[str, Any]] = (), (), {}
@@ -59,7 +59,7 @@ class RecordingSession:
                    'begun_ns': simulation.now_ns, 'history': tuple(simulation.history),
                    'values_at_recording': values}
             self._journal_index = len(streams)
-            self._feed(lambda *messages: self._pending.append(messages), streams)
+            self._feed(self._pending.append, streams)
             self.write_event('start')
             self._begun = streams, topics, run
 
@@ -80,15 +80,16 @@ class RecordingSession:
                     self._feed(None)
                 raise RecordingError(str(error)) from error
             with self._lock:
-                for messages in self._pending:
-                    recorder.write_all(*messages)
+                for entries in self._pending:
+                    recorder.write_all(entries)
                 self._recorder, self.error = recorder, None
                 self._feed(recorder.write_all, streams)
         return f'recording to {recorder.path}'
 
     def _feed(self, write: Write | None, streams: Sequence[Stream] = ()) -> None:
         """Record these streams, commands and events with `write` from now on."""
-        self._pending, self._write = [], write
+        self._pending.clear()
+        self._write = write
         self._simulation.log_to(write, streams)
 
     def stop(self, error: str | None = None) -> str | None:
@@ -127,7 +128,7 @@ class RecordingSession:
         if self._write is not None:
             index = self._journal_index + [name for name, _ in journal.TOPICS].index(topic)
             stamp_ns = self._simulation.epoch_ns + max(self._simulation.now_ns, 0)
-            self._write([(index, stamp_ns, data)], len(data))
+            self._write([(index, stamp_ns, data)])
 
     def has_room(self) -> bool:
         if self._recorder is not None:

@@ -126,18 +126,16 @@ class McapRecorder:
             queued=missing if running else 0, lost=0 if running else missing,
             error=self.error)
 
-    def write_all(self, entries: Sequence[Entry], size: int) -> None:
+    def write_all(self, entries: Sequence[Entry]) -> None:
         """
         Hand over messages, from one thread at a time; they keep their order.
-
-        size : of their data together [bytes]
 
         Never waits for the disk, never raises for its sake.  After the recording stopped the
         messages are only counted, as lost.
         """
         self._offered += len(entries)
         if self._accepting:
-            size += _ENTRY_BYTES * len(entries)
+            size = sum(_ENTRY_BYTES + len(data) for _, _, data in entries)
             self._queue.append((entries, size))
             self._bytes_in += size
             if self._bytes_in - self._bytes_out >= QUEUE_BYTES // 2 and not self._wake.is_set():

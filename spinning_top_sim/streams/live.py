@@ -29,24 +29,8 @@ LONGEST_AHEAD_NS = 300_000_000                  # from the last sample that is s
 
 # A message for a log: number of the stream in the log, stamp [ns], CDR.
 Entry = tuple[int, int, bytes]
-# Takes messages of one stamp for a log, and their size together [bytes].
-Write = Callable[[Sequence[Entry], int], object]
-
-
-class Instant:
-    """
-    The messages of one time.
-
-    entries, size : for the log, and their size together [bytes]
-    publications : of outputs with subscribers
-    """
-
-    __slots__ = ('entries', 'publications', 'size')
-
-    def __init__(self) -> None:
-        self.entries: list[Entry] = []
-        self.publications: list[tuple[Output, bytes]] = []
-        self.size = 0
+# Takes messages of one stamp for a log.
+Write = Callable[[Sequence[Entry]], object]
 
 
 @dataclass(eq=False)
@@ -71,6 +55,10 @@ class Output:
         return self.publish is not None or self.log_index is not None
 
 
+# The messages of one time: for the log, and of outputs with subscribers.
+Instant = tuple[list[Entry], list[tuple[Output, bytes]]]
+
+
 class LiveSimulation(Simulation):
     """
     A simulation with an output for each stream.
@@ -85,7 +73,7 @@ class LiveSimulation(Simulation):
         super().__init__(values, epoch_ns)
         self.outputs = [Output(stream) for stream in self.streams]
         self.computed_ns = -1
-        self._write: Write = lambda entries, size: None
+        self._write: Write = lambda entries: None
         self._queue: deque[tuple[int, Instant]] = deque()       # by time [ns]
         self._used: list[Output] = []               # those whose samples are in the queue
         # The queue is right as long as these are as they were when it was computed: `version`,
@@ -185,11 +173,12 @@ class LiveSimulation(Simulation):
 
     def _send(self, t_ns: int, instant: Instant, publish_from_ns: int) -> None:
         """Send the messages of one time, to the log before others."""
-        if instant.entries:
-            self._write(instant.entries, instant.size)
+        entries, publications = instant
+        if entries:
+            self._write(entries)
         self.now_ns = t_ns
         if t_ns >= publish_from_ns:
-            for output, message in instant.publications:
+            for output, message in publications:
                 assert output.publish is not None       # `_refresh` sees when it is not
                 output.publish(message)
                 output.sent += 1
@@ -235,16 +224,15 @@ class LiveSimulation(Simulation):
 
     def _append(self, block: Block) -> None:
         """Put the messages of a block into the queue; what is done here is not done by a tick."""
-        instants: defaultdict[int, Instant] = defaultdict(Instant)
+        instants: defaultdict[int, Instant] = defaultdict(lambda: ([], []))
         for stream, times_ns, rows in block.messages:
             output = next(one for one in self.outputs if one.stream is stream)
             data, size = rows.tobytes(), stream.size
             for t_ns, begin in zip(times_ns.tolist(), range(0, len(data), size), strict=True):
-                instant, message = instants[t_ns], data[begin:begin + size]
+                (entries, publications), message = instants[t_ns], data[begin:begin + size]
                 if output.log_index is not None:
-                    instant.entries.append((output.log_index, self.epoch_ns + t_ns, message))
-                    instant.size += size
+                    entries.append((output.log_index, self.epoch_ns + t_ns, message))
                 if output.publish is not None:
-                    instant.publications.append((output, message))
-        self._queue.extend(sorted(instants.items()))
+                    publications.append((output, message))
+        self._queue.extend((t_ns, instants[t_ns]) for t_ns in sorted(instants))
         self.computed_ns = block.until_ns

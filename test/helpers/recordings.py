@@ -52,7 +52,7 @@ def write_rows(path, topics, rows, per_chunk=None):
 
 
 def write(recorder, topic_index, log_time_ns, data):
-    recorder.write_all([(topic_index, log_time_ns, data)], len(data))
+    recorder.write_all([(topic_index, log_time_ns, data)])
 
 
 def some_messages(count: int) -> list[tuple[int, int, bytes]]:
