@@ -259,7 +259,7 @@ def _sum(*terms: tuple[int | Fraction, Exact]) -> Exact:
 
 
 def _exact(given: Given) -> Exact:
-    x, y, z = map(Fraction, given)
+    x, y, z = (Fraction(value) for value in given)
     return x, y, z
 
 
