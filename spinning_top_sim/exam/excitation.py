@@ -22,18 +22,19 @@ from spinning_top_sim.tools.verdict import Fault
 # Turns about an axis of the sensor [deg], each followed by a rest; the last one leads back.
 TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0),
          (1, 110.0), (2, -120.0))
-TURN_RATE = 2.6                 # [rad/s]
+# Of these, and of the last one, which a filter must not take for a bias [rad/s].
+TURN_RATE, SLOW_RATE = 2.6, 0.3
 FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
 WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
-# Shares of a kick that a filter without correction leaves, and from where on it grows.
-STAYS, GROWN = 0.98, 1.2
+# Share of a kick that a filter without correction leaves, and that of the least before it grows.
+STAYS, GROWN = 0.98, 1.1
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
 DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
 DOWN = 70.0, 20.0, 140.0        # yaw, pitch and roll of the last rest [deg]
-# Of the gyroscope only, about axes of the world.  Of two kicks with opposite headings the mean
-# tells the tilt, and half the difference the heading.
-KICK_S, KICK, OTHER_KICK = 0.1, np.radians((0.7, 0.0, 0.7)), np.array((1.0, 1.0, -1.0))
+# Of the gyroscope only, about axes of the world: of the heading, and of the tilt, whose correction
+# may change the heading for a while.
+KICK_S, KICKS, PARTS = 0.1, np.radians(((0.0, 0.0, 0.7), (0.7, 0.0, 0.0))), (slice(2, 3), slice(2))
 
 
 class Excitation(NamedTuple):
@@ -60,13 +61,15 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
     """Return the run for the IMU's place and field, sampled at the rate of the slow motion."""
     rate = scenarios.SLOW.rate
     motion = scenarios.record(replace(scenarios.PIVOT, duration=MOTION_S), imu, 0)
+    level = Rotation.identity()         # some filters begin with it
     goals = list(itertools.accumulate((Rotation.from_rotvec(
         math.radians(angle) * np.eye(3)[axis]) for axis, angle in TURNS), operator.mul))
-    level = Rotation.identity()
     stops = Rotation.concatenate((level, *goals, level, motion.start))
     ways = (stops[:-1].inv() * stops[1:]).magnitude()
+    ways[:-1] /= TURN_RATE
+    ways[-1] /= SLOW_RATE
     lengths, rest, answer = (np.rint(seconds * rate).astype(int) for seconds in (
-        ways / TURN_RATE, REST_S, ANSWER_S))
+        ways, REST_S, ANSWER_S))
     # Begin and end of each rest.
     ends = np.cumsum([FIRST_S * rate, *(lengths + 1 + rest)]).astype(int)
     begins = np.append(0, ends[1:] - rest)
@@ -83,7 +86,7 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
     run = replace(still, gyroscope=still.gyroscope.copy())
     kicks = [(end + begin + answer, end + begin + 2 * answer) for begin in rests[::2].tolist()]
     for attitude, pair in zip(last, kicks, strict=True):
-        for first, kick in zip(pair, (KICK, OTHER_KICK * KICK), strict=True):
+        for first, kick in zip(pair, KICKS, strict=True):
             run.gyroscope[first:first + round(KICK_S * rate)] += (
                 attitude.inv().apply(kick) / KICK_S)
     return Excitation(run, still, ends - 1, ends[:len(TURNS)],
@@ -122,22 +125,24 @@ def not_corrected(estimates: Reals, without: Reals, given: Excitation,
     """
     n = round(ANSWER_S * scenarios.SLOW.rate)
     error = (Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()).as_rotvec()
-    lefts = []
+    lefts: dict[str, list[tuple[float, float]]] = {'heading': [], 'tilt': []}   # in the end, least
     for pair in given.kicks:
-        one, other = (error[[first + LATEST, first + n - 1]] - error[first - 1] for first in pair)
-        begin, end = 0.5 * (one + OTHER_KICK * other)
-        # Some filters correct most of it before the longest delay is over.
-        lefts.append([rms(end[part]) / max(rms(begin[part]), 0.5 * rms(KICK[part]))
-                      for part in (slice(2), slice(2, 3))])
+        for what, first, kick, part in zip(lefts, pair, KICKS, PARTS, strict=True):
+            sizes = np.linalg.norm(error[first + LATEST:first + n, part] - error[first - 1, part],
+                                   axis=1)
+            # Some filters correct most of it before the longest delay is over.
+            whole = max(sizes[0], 0.5 * np.linalg.norm(kick))
+            lefts[what].append((sizes[-1] / whole, np.min(sizes) / whole))
     sensors = ('accelerometer', 'tilt'), ('magnetometer', 'heading')
-    found = [(*one, left) for one, left in zip(
-        sensors[:1 + absolute], np.max(lefts, axis=0).tolist(), strict=False) if left > STAYS]
-    grown = [f'of the {what} grows to {left:.0%}' for _, what, left in found if left > GROWN]
+    found = [(*one, *max(lefts[one[1]])) for one in sensors[:1 + absolute]
+             if max(lefts[one[1]])[0] > STAYS]
+    grown = [f'of the {what} grows to {left:.0%}' for _, what, left, least in found
+             if left > GROWN * least]
     if grown:       # by which sensor, and whether by the bias, is not known
         return [Fault('inaccurate', f'an error {" and ".join(grown)} in {ANSWER_S:g} s at rest')]
     return [Fault(f'{name}_wiring', f'{left:.0%} of an error of the {what} are left after '
                   f'{ANSWER_S:g} s: the {name} does not correct it')
-            for name, what, left in found]
+            for name, what, left, _ in found]
 
 
 def from_identity(*matrices: Reals) -> float:
@@ -170,7 +175,7 @@ def affine_of(readings: Reals, estimated: Rotation, level: Sequence[int],
     return change, rms(matrix @ entries - wanted) / max(rms(wanted), 1e-6)
 
 
-def words(matrix: Reals) -> str:
+def words(matrix: NDArray[np.floating[Any]]) -> str:
     """Return in words how a matrix (3, 3) of the gyroscope differs from the identity."""
     large = 0.5 * np.max(np.abs(matrix - np.eye(3)))
     return '; '.join(

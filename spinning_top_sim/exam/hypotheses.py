@@ -99,6 +99,8 @@ def sharpened(names: Sequence[str], samples: float) -> Hypothesis:
                               rows, axis=0, prepend=rows[:1])))
 
 
+# Inverted, it lets a filter correct before it takes the step, which is no fault.
+EARLY = delayed(('accelerometer', 'magnetometer'), -1)._replace(faults=())
 WITHOUT_FIELD = changed(('magnetometer',), lambda rows: np.full_like(rows, np.nan))
 _HALF = 0.5 ** 0.5
 _CONJUGATE, _W_LAST = np.array((-1.0, -1.0, -1.0, 1.0)), [1, 2, 3, 0]

@@ -9,7 +9,7 @@ is a hypothesis: its inverse is applied to the readings or the attitudes, and th
 import contextlib
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -209,7 +209,7 @@ class Response:
         offset = measures.time_offset(part.estimates, part.run.truth, part.run.rates,
                                       self._absolute).seconds * scenarios.SLOW.rate
         yield from self._tried(         # the filter corrects before it takes the step
-            delayed(('accelerometer', 'magnetometer'), -1)._replace(faults=()),
+            hypotheses.EARLY,
             Hypothesis((), 'a step ahead', read=lambda q: moved(q, -1)))
         if not diagnosis.AHEAD <= offset <= diagnosis.DELAYED:
             yield from self._tried(Hypothesis(
@@ -230,18 +230,28 @@ class Response:
                             ('pi/180', math.radians(1.0)), ('180/pi', math.degrees(1.0)))),
                 Hypothesis(('gyroscope_wiring',), 'with rates about axes of the world (a product '
                            'on the wrong side)', given=hypotheses.of_world), screened=False)
-        for matrix in (early, whole):
+        for kind, matrix in (1, early), (0, whole):
             scale = float(np.trace(matrix)) / 3.0
-            uniform = np.max(np.abs(matrix - scale * np.eye(3))) < 0.3 * abs(scale - 1.0)
-            if uniform and scale > 1.0 / WORST:
-                yield from self._tried(Hypothesis(
-                    ('gyroscope_wiring', 'time_step'), f'with steps {1.0 / scale:.4g} times as '
-                    'long (scales of rates and steps cannot be told apart)',
-                    given=changed(('dt',), partial(np.multiply, 1.0 / scale))), screened=False)
-            if np.linalg.cond(matrix) < WORST:
-                yield from self._tried(wired(
-                    'gyroscope', f'{words(matrix)}: with the inverse of that',
-                    np.linalg.inv(matrix)), screened=False)
+            if (scale > 1.0 / WORST and np.max(np.abs(matrix - scale * np.eye(3)))
+                    < 0.3 * abs(scale - 1.0)):
+                yield from self._inverses(kind, scale * np.eye(3), lambda fed: Hypothesis(
+                    ('gyroscope_wiring', 'time_step'), f'with steps {np.trace(fed) / 3.0:.4g} '
+                    'times as long (scales of rates and steps cannot be told apart)',
+                    given=changed(('dt',), partial(np.multiply, np.trace(fed) / 3.0))))
+            yield from self._inverses(kind, matrix, lambda fed: wired(
+                'gyroscope', f'{words(np.linalg.inv(fed))}: with the inverse of that', fed))
+
+    def _inverses(self, kind: int, matrix: Reals,
+                  make: Callable[[Reals], Hypothesis]) -> Iterator[Tried]:
+        """Try the inverse of the response in two steps: at first the filter is far off."""
+        fed = np.eye(3)
+        for _ in range(2):
+            if np.linalg.cond(matrix) > WORST:
+                return
+            fed = fed @ np.linalg.inv(matrix)
+            for one, outcome in self._tried(make(fed), screened=False):
+                yield one, outcome
+                matrix = gyroscope_of(outcome, self._given.turns)[:2][kind]
 
     def _of_sensor(self, name: str, axis: int, level: Sequence[int],
                    *more: Hypothesis) -> Iterator[Tried]:
@@ -362,9 +372,10 @@ class Response:
             # Far from the truth no filter is linear.
             found = (not_corrected(self._outcome.estimates, without)
                      if error[self._given.kicks[0][0]] < NEAR else [])
-        for one, outcome in self._tried(*hypotheses.UNITS, screened=False) if found else ():
-            if not not_corrected(outcome.estimates, self._excited.truth):
-                return [Fault(one.faults[0], f'{found[0].evidence}, but {one.text} it is')]
+        if 'accelerometer_wiring' in [fault.name for fault in found]:
+            for one, outcome in self._tried(*hypotheses.UNITS, screened=False):
+                if not not_corrected(outcome.estimates, self._excited.truth):
+                    return [Fault(one.faults[0], f'{found[0].evidence}, but {one.text} it is')]
         if not found and wrong:
             return [Fault('inaccurate', f'{left}: no cause explains it')]
         return found
@@ -375,8 +386,8 @@ class Response:
 
         `left` is whether the attitude is off in the end, relative to the bias.  That is no fault
         if the filter learns: the effect in the attitude of the first rest is smaller `again`,
-        much smaller or with an estimate that grows, and no axis is left out while another is
-        learned (`partly`).  Otherwise the estimate, if there is one, must be `right`.
+        much smaller or with an estimate that grows or is `close`, and no axis is left out while
+        another is learned (`partly`).  Otherwise the estimate, if any, must be `right`.
         """
         motion, size = self._given.motion, float(np.linalg.norm(BIAS))
         run = self._excited.part(slice(motion.stop))
@@ -393,10 +404,11 @@ class Response:
         self._findings.measures |= {'bias_error_s': late, 'bias_found': share}
         left, shares = late > diagnosis.BIAS_LEFT_S, (found / BIAS).tolist()
         # A filter that has gone on for minutes is sure of its bias, and learns another one slowly.
+        close = bool(np.linalg.norm(found - BIAS) < BIAS_OFF * size)
         right = (-BIAS_FOUND < share < 1.0 / BIAS_OFF if left or not self._subject.restarts else
-                 np.linalg.norm(found - BIAS) < BIAS_OFF * size)
+                 close)
         learns = again < LEARNED * first or (
-            again < LEARNING * first and share > max(BIAS_FOUND, 1.2 * before))
+            again < LEARNING * first and (close or share > max(BIAS_FOUND, 1.2 * before)))
         partly = self._absolute and min(shares) < BIAS_FOUND and max(shares) > LEARNED
         if left and (partly or not learns):
             self._findings.faults.append(Fault(

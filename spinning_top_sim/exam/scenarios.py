@@ -7,7 +7,7 @@ Each motion shows a fault that the others hide.  A seed decides the noise, and v
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -94,6 +94,15 @@ class Run:
     def part(self, rows: slice | NDArray[np.int64]) -> 'Run':
         """Return the run at these times only."""
         return Run(self.name, *(getattr(self, one.name)[rows] for one in fields(self)[1:]))
+
+    def merged(self, counts: Sequence[int]) -> 'Run':
+        """Return the run with steps that last so many samples in turn: their mean rates."""
+        begins = np.cumsum([0, *np.resize(counts, len(self.t) // min(counts))])
+        begins = begins[begins < len(self.t)]
+        dt = np.add.reduceat(self.dt, begins)
+        turns = np.add.reduceat(self.dt[:, np.newaxis] * self.gyroscope, begins)
+        return replace(self.part(np.append(begins[1:], len(self.t)) - 1), dt=dt,
+                       name=f'{self.name}, uneven', gyroscope=turns / dt[:, np.newaxis])
 
     @property
     def start(self) -> Rotation:

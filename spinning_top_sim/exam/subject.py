@@ -78,8 +78,9 @@ class LastingSubject(Subject):
     def follow(self, run: Run, undone: Sequence[Hypothesis] = ()) -> Outcome:
         """Return the outcome of a run.  Raises InvalidOutputError."""
         lead = scenarios.turning(self.imu, self._attitude, run.start, TURN_S)
+        outcome = super().follow(run.preceded_by(lead), undone)
         self._attitude = Rotation.from_quat(run.truth[-1])
-        return super().follow(run.preceded_by(lead), undone).part(slice(len(lead.t), None))
+        return outcome.part(slice(len(lead.t), None))
 
     def uses_field(self) -> bool:
         """Turn the field to and fro; return whether the attitude follows."""

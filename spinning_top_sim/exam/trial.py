@@ -159,7 +159,7 @@ def invalid(quaternions: Reals, covariances: Reals) -> Iterator[tuple[int, str]]
     wrong = ~finite & ~np.any(np.isnan(covariances), axis=(1, 2))
     eigenvalues = np.linalg.eigvalsh(
         0.5 * covariances[finite] + 0.5 * np.swapaxes(covariances[finite], 1, 2))
-    wrong[finite] = eigenvalues[:, 0] < -1e-9 * np.abs(eigenvalues).max(axis=1)
+    wrong[finite] = eigenvalues[:, 0] < -1e-5 * np.abs(eigenvalues).max(axis=1)
     for k in np.flatnonzero(wrong)[:1].tolist():
         yield k, f'the covariance is {covariances[k].tolist()}: must have no negative eigenvalue'
 

@@ -16,8 +16,6 @@ from spinning_top_sim.exam.reference import (
     product,
 )
 
-G, Z = 9.80665, np.array((0.0, 0.0, 1.0))
-
 
 class Part:
     """The part of a filter that can be wrong: what it takes, and what it says."""
@@ -198,6 +196,8 @@ OWN = {     # and these
         'field of a level sensor': ({'level': False}, FIELD),
         'heading about z': ({'about': np.array((0.0, 0.0, 1.0))}, f'{FIELD} {OFF}'),
         'dt cut': ({'step': lambda dt: int(100.0 * dt) / 100.0}, STEP),
+        'dt rounded': ({'step': lambda dt: round(dt, 3)}, STEP),
+        'slow heading': ({'north': 0.01, 'learns': 0.02}, 'no_bias_estimate'),
         'declination': ({'declination': np.radians(5.0)}, 'heading_offset'),
         'bias gain < 0': ({'learns': -0.15}, f'no_bias_estimate diverges {OFF}'),
         'no bias': ({'learns': 0.0}, 'no_bias_estimate'),
@@ -208,7 +208,8 @@ OWN = {     # and these
     'complementary': {
         'wrong side': ({'advance': world}, GYROSCOPE),
         'Euler angles': ({'advance': euler}, GYROSCOPE),
-        'never corrects': ({'share': 0.0}, f'{GRAVITY} {FIELD}')},
+        'never corrects': ({'share': 0.0, 'learns': 0.0}, f'{GRAVITY} {FIELD}'),
+        'corrects by the bias': ({'share': 0.0}, OFF)},
     'ekf': {
         # It takes the lag for motion of the device, and follows such forces little.
         'force smoothed': ({'smooth': (0.0, 0.1, 0.0)}, f'{LAG} {OFF}'),
