@@ -27,7 +27,7 @@ TURN_RATE, SLOW_RATE = 2.6, 0.3
 FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
 WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
 # Share of a kick that a filter without correction leaves, and that of the least before it grows.
-STAYS, GROWN = 0.98, 1.1
+STAYS, GROWN = 0.995, 1.1
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
 DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
@@ -140,7 +140,7 @@ def not_corrected(estimates: Reals, without: Reals, given: Excitation,
              if left > GROWN * least]
     if grown:       # by which sensor, and whether by the bias, is not known
         return [Fault('inaccurate', f'an error {" and ".join(grown)} in {ANSWER_S:g} s at rest')]
-    return [Fault(f'{name}_wiring', f'{left:.0%} of an error of the {what} are left after '
+    return [Fault(f'{name}_wiring', f'{left:.1%} of an error of the {what} are left after '
                   f'{ANSWER_S:g} s: the {name} does not correct it')
             for name, what, left, _ in found]
 

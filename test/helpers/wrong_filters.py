@@ -209,7 +209,7 @@ OWN = {     # and these
         'wrong side': ({'advance': world}, GYROSCOPE),
         'Euler angles': ({'advance': euler}, GYROSCOPE),
         'never corrects': ({'share': 0.0, 'learns': 0.0}, f'{GRAVITY} {FIELD}'),
-        'corrects by the bias': ({'share': 0.0}, OFF)},
+        'corrects by the bias': ({'share': 0.0}, f'{OFF} no_bias_estimate')},
     'ekf': {
         # It takes the lag for motion of the device, and follows such forces little.
         'force smoothed': ({'smooth': (0.0, 0.1, 0.0)}, f'{LAG} {OFF}'),
