@@ -210,9 +210,10 @@ class _Exam:
         large = diagnosis.inaccuracy(first, self._absolute, limit)
         if large and all(diagnosis.inaccuracy(self._response.respond(more, first.run),
                                               self._absolute, limit) for more in HARMLESS):
+            large = self._of_gyroscope(large)
             if large.name == 'diverges':        # of which a growing kick is a part
                 findings.drop('inaccurate')
-            findings.faults.append(self._of_gyroscope(large))
+            findings.faults.append(large)
         if findings.names.difference(SHOW_ELSEWHERE):   # a cause, of which something may be left
             findings.drop('inaccurate')
             findings.drop('diverges')
