@@ -125,13 +125,14 @@ def noisy_limit(run: Run, absolute: bool) -> float:
     """
     Return the rms error [rad] in the last quarter above which a filter is wrong.
 
-    It is the limit without noise, or the error of attitudes from single samples if that is larger;
-    at most DIVERGED.
+    It is the limit without noise, or three standard deviations of attitudes from single samples,
+    where a slow filter starts, if that is larger; at most DIVERGED.
     """
     last = run.part(slice(-len(run.t) // 4, None))
     single = measures.errors_of(np.array([from_two_vectors(*pair) for pair in zip(
         last.accelerometer, last.magnetometer, strict=True)]), last.truth)
-    return min(DIVERGED, max(math.hypot(TILT, absolute * HEADING), rms(single.known(absolute))))
+    return min(DIVERGED, max(math.hypot(TILT, absolute * HEADING),
+                             3.0 * rms(single.known(absolute))))
 
 
 def inaccuracy(outcome: Outcome, absolute: bool, limit: float = DIVERGED) -> Fault | None:
