@@ -38,14 +38,22 @@ class Times:
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
-        """Return the times of integer nanoseconds (n,)."""
+        """Return the times of integer nanoseconds (n,); raise ValueError for anything else."""
         if isinstance(ns, range):
             first, last = (ns[0], ns[-1]) if ns else (0, 0)
+            if not -2 ** 63 <= min(first, last, ns.step) <= max(first, last, ns.step) < 2 ** 63:
+                raise ValueError(f'times_ns = {ns!r}: must be within int64')
             # `numpy.arange` takes its length from doubles.
             count = first + ns.step * np.arange(len(ns), dtype=np.int64)
         else:
-            count = ns
-            first, last = (int(ns.min()), int(ns.max())) if ns.size else (0, 0)
+            count = np.asarray(ns)
+            if count.ndim != 1 or (count.size and count.dtype.kind not in 'iu'):
+                raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must '
+                                 'be (n,) integer nanoseconds')
+            first, last = (int(count.min()), int(count.max())) if count.size else (0, 0)
+            if last >= 2 ** 63:
+                raise ValueError(f'times_ns = {last}: must be within int64')
+            count = count.astype(np.int64)
         latest = float(max(abs(first), abs(last)))
         if latest <= 2.0 ** 53:
             return cls('ns', count.astype(np.float64), 0.0, latest)
