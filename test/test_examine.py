@@ -199,7 +199,7 @@ def test_an_error_that_only_noise_shows_is_inaccurate():
     class Nervous(Vqf):
         def update(self, gyroscope, accelerometer, *others):
             noisy = abs(np.linalg.norm(accelerometer) - scenarios.GRAVITY) > 1e-6
-            return (Rotation.from_rotvec((0.035 * noisy, 0.0, 0.0)) * Rotation.from_quat(
+            return (Rotation.from_rotvec((0.0, 0.0, 0.035 * noisy)) * Rotation.from_quat(
                 super().update(gyroscope, accelerometer, *others))).as_quat()
 
     assert examine(Nervous, seeds=1, isolated=False).faults == ['inaccurate']
