@@ -45,7 +45,7 @@ SHOW_ELSEWHERE = ('inaccurate', 'diverges', 'lever_arm', 'no_bias_estimate', 'bi
 # When the lever arm comes, and until when its effect is measured [s].  Later the estimate of a
 # bias would have adapted to the force.
 ARM_S = 13.33, 14.33, 19.33
-HARMLESS: tuple[tuple[Hypothesis, ...], ...] = (), (EARLY,)     # undone before an error counts
+HARMLESS: tuple[tuple[Hypothesis, ...], ...] = (), (EARLY,)     # undone on the fast motion
 SLIGHT = 0.01                   # by which the gyroscope's matrix differs where an error grows
 STEP = 0.05                     # by which the response to a rate depends on the step, relative
 
@@ -208,8 +208,10 @@ class _Exam:
                  if imu.keys() <= {*scenarios.CALIBRATED, 'mag.field', 'imu.rpy'}
                  else diagnosis.DIVERGED)       # it may still be learning biases
         large = diagnosis.inaccuracy(first, self._absolute, limit)
-        if large and all(diagnosis.inaccuracy(self._response.respond(more, first.run),
-                                              self._absolute, limit) for more in HARMLESS):
+        if large:       # unless it corrects before its step, which is no fault
+            large = diagnosis.inaccuracy(self._response.respond((), first.run), self._absolute,
+                                         limit)
+        if large:
             large = self._of_gyroscope(large)
             if large.name == 'diverges':        # of which a growing kick is a part
                 findings.drop('inaccurate')
