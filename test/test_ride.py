@@ -117,8 +117,7 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
     for t, (alpha, beta, across, _) in (0, posture), (S, whole):
         states = motion.states(range(t, t + 1))
         q = np.ravel(attitude.product(motion.vertical.rows, states.rows_quaternion))
-        known = np.array([-beta.imag, beta.real, alpha.imag, alpha.real], float)
-        assert abs(q - known).max() < 2e-15
+        assert abs(q - [-beta.imag, beta.real, alpha.imag, alpha.real]).max() < 2e-15
         rates = np.array([across.real, across.imag], float)
         assert abs(states.angular_velocity[0, :2] - rates).max() < 5e-15 * max(1.0, *abs(rates))
     assert back.l3 == start.l3 == motion.start.l3

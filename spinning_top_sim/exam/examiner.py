@@ -16,7 +16,12 @@ from spinning_top_sim.exam import diagnosis, measures, scenarios
 from spinning_top_sim.exam.diagnosis import degrees
 from spinning_top_sim.exam.excitation import from_identity, words
 from spinning_top_sim.exam.field import examine_field
-from spinning_top_sim.exam.hypotheses import EARLY, WITHOUT_FIELD, ChangeReadings, Hypothesis
+from spinning_top_sim.exam.hypotheses import (
+    CORRECTS_FIRST,
+    WITHOUT_FIELD,
+    ChangeReadings,
+    Hypothesis,
+)
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.report import Findings, Report
@@ -45,7 +50,7 @@ SHOW_ELSEWHERE = ('inaccurate', 'diverges', 'lever_arm', 'no_bias_estimate', 'bi
 # When the lever arm comes, and until when its effect is measured [s].  Later the estimate of a
 # bias would have adapted to the force.
 ARM_S = 13.33, 14.33, 19.33
-HARMLESS: tuple[tuple[Hypothesis, ...], ...] = (), (EARLY,)     # undone on the fast motion
+HARMLESS: tuple[tuple[Hypothesis, ...], ...] = (), (CORRECTS_FIRST,)      # on the fast motion
 SLIGHT = 0.01                   # by which the gyroscope's matrix differs where an error grows
 STEP = 0.05                     # by which the response to a rate depends on the step, relative
 

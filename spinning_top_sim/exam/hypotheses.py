@@ -100,7 +100,7 @@ def sharpened(names: Sequence[str], samples: float) -> Hypothesis:
 
 
 # Inverted, it lets a filter correct before it takes the step, which is no fault.
-EARLY = delayed(('accelerometer', 'magnetometer'), -1)._replace(faults=())
+CORRECTS_FIRST = delayed(('accelerometer', 'magnetometer'), -1)._replace(faults=())
 WITHOUT_FIELD = changed(('magnetometer',), lambda rows: np.full_like(rows, np.nan))
 _HALF = 0.5 ** 0.5
 _CONJUGATE, _W_LAST = np.array((-1.0, -1.0, -1.0, 1.0)), [1, 2, 3, 0]

@@ -209,7 +209,7 @@ class Response:
         offset = measures.time_offset(part.estimates, part.run.truth, part.run.rates,
                                       self._absolute).seconds * scenarios.SLOW.rate
         yield from self._tried(         # the filter corrects before it takes the step
-            hypotheses.EARLY,
+            hypotheses.CORRECTS_FIRST,
             Hypothesis((), 'a step ahead', read=lambda q: moved(q, -1)))
         if not diagnosis.AHEAD <= offset <= diagnosis.DELAYED:
             yield from self._tried(Hypothesis(
@@ -232,8 +232,7 @@ class Response:
                            'on the wrong side)', given=hypotheses.of_world), screened=False)
         for kind, matrix in (1, early), (0, whole):
             scale = float(np.trace(matrix)) / 3.0
-            if (scale > 1.0 / WORST and np.max(np.abs(matrix - scale * np.eye(3)))
-                    < 0.3 * abs(scale - 1.0)):
+            if scale > 1.0 / WORST and from_identity(matrix / scale) < 0.3 * abs(1 - 1 / scale):
                 yield from self._inverses(kind, scale * np.eye(3), lambda fed: Hypothesis(
                     ('gyroscope_wiring', 'time_step'), f'with steps {np.trace(fed) / 3.0:.4g} '
                     'times as long (scales of rates and steps cannot be told apart)',
