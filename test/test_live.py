@@ -147,8 +147,7 @@ def test_each_sample_is_computed_once_for_all_its_sinks_and_few_in_vain():
 CHANGES = {
     'command': lambda one, taken: one.command(2.0, 1.5),
     'subscriber': lambda one, taken: setattr(output(one, 'imu/data_raw'), 'publish', taken.append),
-    'recorder': lambda one, taken: one.log_to(
-        taken.extend, [output(one, 'imu/data_raw').stream]),
+    'recorder': lambda one, taken: one.log_to(taken.extend, [output(one, 'imu/data_raw').stream]),
     'epoch': lambda one, taken: setattr(one, 'epoch_ns', one.epoch_ns + 1),
     'late': lambda one, taken: one.advance(15 * MILLISECOND, publish_from_ns=10 * MILLISECOND)}
 

@@ -13,6 +13,7 @@ import os
 import numpy as np
 import pytest
 from helpers.reference import scene_parameters
+from helpers.wrong_filters import TABLE
 from stress.tops import blocks, check_block
 
 from spinning_top_sim.physics.top import ContinuedState
@@ -76,8 +77,8 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
         now += 200_000_000
 
 
-@pytest.mark.parametrize(('part', 'seed'), [
-    ('logs', 4), ('nodes', 0), ('wrong', 36), ('wrong', 37)])
+@pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0), *(
+    ('wrong', list(TABLE).index(f'mahony, {name}')) for name in ('dt rounded', 'slow heading'))])
 def test_a_seed_of_a_part_of_make_stress(tmp_path, monkeypatch, request, part, seed):
     pytest.importorskip('rclpy')
     module = importlib.import_module(f'stress.{part}')

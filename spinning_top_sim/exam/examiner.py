@@ -42,7 +42,7 @@ from spinning_top_sim.tools.verdict import Fault
 # Seeds of the noisy runs.
 SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
 # Sampling rates for the order of convergence, as multiples of the rate of the fast motion; and the
-# finest one, of which a step has so many samples in turn.
+# rate at which samples are merged into steps of UNEVEN samples in turn.
 FINER, FINEST, UNEVEN = (1.0, 2.0), 4.0, (1, 2)
 # These faults do not show in runs without noise, bias and lever arm.
 SHOW_ELSEWHERE = ('inaccurate', 'diverges', 'lever_arm', 'no_bias_estimate', 'bias_report',
@@ -50,7 +50,8 @@ SHOW_ELSEWHERE = ('inaccurate', 'diverges', 'lever_arm', 'no_bias_estimate', 'bi
 # When the lever arm comes, and until when its effect is measured [s].  Later the estimate of a
 # bias would have adapted to the force.
 ARM_S = 13.33, 14.33, 19.33
-HARMLESS: tuple[tuple[Hypothesis, ...], ...] = (), (CORRECTS_FIRST,)      # on the fast motion
+# On the fast motion the least error counts after these are inverted.
+HARMLESS: tuple[tuple[Hypothesis, ...], ...] = (), (CORRECTS_FIRST,)
 SLIGHT = 0.01                   # by which the gyroscope's matrix differs where an error grows
 STEP = 0.05                     # by which the response to a rate depends on the step, relative
 

@@ -26,15 +26,27 @@ TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), 
 TURN_RATE, SLOW_RATE = 2.6, 0.3
 FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
 WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
-# Share of a kick that a filter without correction leaves, and that of the least before it grows.
+# A kick is not corrected if more than STAYS is left, and grows if GROWN times its least is left.
 STAYS, GROWN = 0.995, 1.1
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
 DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
 DOWN = 70.0, 20.0, 140.0        # yaw, pitch and roll of the last rest [deg]
-# Of the gyroscope only, about axes of the world: of the heading, and of the tilt, whose correction
-# may change the heading for a while.
-KICK_S, KICKS, PARTS = 0.1, np.radians(((0.0, 0.0, 0.7), (0.7, 0.0, 0.0))), (slice(2, 3), slice(2))
+
+
+class Kick(NamedTuple):
+    """A turn of the gyroscope only, about an axis of the world, and what must correct it."""
+
+    sensor: str
+    what: str
+    turn: Reals         # (3,) [rad]
+    part: slice         # of an error (3,) that is judged
+
+
+# The tilt comes last: its correction may change the heading for a while.
+KICK_S, KICKS = 0.1, (
+    Kick('magnetometer', 'heading', np.radians((0.0, 0.0, 0.7)), slice(2, 3)),
+    Kick('accelerometer', 'tilt', np.radians((0.7, 0.0, 0.0)), slice(2)))
 
 
 class Excitation(NamedTuple):
@@ -88,7 +100,7 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
     for attitude, pair in zip(last, kicks, strict=True):
         for first, kick in zip(pair, KICKS, strict=True):
             run.gyroscope[first:first + round(KICK_S * rate)] += (
-                attitude.inv().apply(kick) / KICK_S)
+                attitude.inv().apply(kick.turn) / KICK_S)
     return Excitation(run, still, ends - 1, ends[:len(TURNS)],
                       slice(end - len(motion.t) // 2, end), kicks)
 
@@ -125,24 +137,25 @@ def not_corrected(estimates: Reals, without: Reals, given: Excitation,
     """
     n = round(ANSWER_S * scenarios.SLOW.rate)
     error = (Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()).as_rotvec()
-    lefts: dict[str, list[tuple[float, float]]] = {'heading': [], 'tilt': []}   # in the end, least
-    for pair in given.kicks:
-        for what, first, kick, part in zip(lefts, pair, KICKS, PARTS, strict=True):
-            sizes = np.linalg.norm(error[first + LATEST:first + n, part] - error[first - 1, part],
-                                   axis=1)
-            # Some filters correct most of it before the longest delay is over.
-            whole = max(sizes[0], 0.5 * np.linalg.norm(kick))
-            lefts[what].append((sizes[-1] / whole, np.min(sizes) / whole))
-    sensors = ('accelerometer', 'tilt'), ('magnetometer', 'heading')
-    found = [(*one, *max(lefts[one[1]])) for one in sensors[:1 + absolute]
-             if max(lefts[one[1]])[0] > STAYS]
-    grown = [f'of the {what} grows to {left:.0%}' for _, what, left, least in found
+
+    def shares(first: int, kick: Kick) -> tuple[float, float]:
+        """Return what is left of a kick in the end, and the least of it."""
+        sizes = np.linalg.norm((error[first + LATEST:first + n] - error[first - 1])[:, kick.part],
+                               axis=1)
+        # Some filters correct most of it before the longest delay is over.
+        whole = max(sizes[0], 0.5 * np.linalg.norm(kick.turn))
+        return sizes[-1] / whole, np.min(sizes) / whole
+
+    heading, tilt = ((kick, *max(shares(first, kick) for first in starts))
+                     for kick, starts in zip(KICKS, zip(*given.kicks, strict=True), strict=True))
+    found = [one for one in (tilt, heading)[:1 + absolute] if one[1] > STAYS]
+    grown = [f'of the {kick.what} grows to {left:.0%}' for kick, left, least in found
              if left > GROWN * least]
     if grown:       # by which sensor, and whether by the bias, is not known
         return [Fault('inaccurate', f'an error {" and ".join(grown)} in {ANSWER_S:g} s at rest')]
-    return [Fault(f'{name}_wiring', f'{left:.1%} of an error of the {what} are left after '
-                  f'{ANSWER_S:g} s: the {name} does not correct it')
-            for name, what, left, _ in found]
+    return [Fault(f'{kick.sensor}_wiring', f'{left:.1%} of an error of the {kick.what} are left '
+                  f'after {ANSWER_S:g} s: the {kick.sensor} does not correct it')
+            for kick, left, _ in found]
 
 
 def from_identity(*matrices: Reals) -> float:

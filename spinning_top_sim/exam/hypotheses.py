@@ -99,7 +99,7 @@ def sharpened(names: Sequence[str], samples: float) -> Hypothesis:
                               rows, axis=0, prepend=rows[:1])))
 
 
-# Inverted, it lets a filter correct before it takes the step, which is no fault.
+# For filters that correct before they take the step: readings of the step before.  It is no fault.
 CORRECTS_FIRST = delayed(('accelerometer', 'magnetometer'), -1)._replace(faults=())
 WITHOUT_FIELD = changed(('magnetometer',), lambda rows: np.full_like(rows, np.nan))
 _HALF = 0.5 ** 0.5

@@ -242,7 +242,7 @@ class Response:
 
     def _inverses(self, kind: int, matrix: Reals,
                   make: Callable[[Reals], Hypothesis]) -> Iterator[Tried]:
-        """Try the inverse of the response in two steps: at first the filter is far off."""
+        """Try the inverse of matrix `kind` of `gyroscope_of`, and improve it when it is undone."""
         fed = np.eye(3)
         for _ in range(2):
             if np.linalg.cond(matrix) > WORST:

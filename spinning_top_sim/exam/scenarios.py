@@ -96,7 +96,7 @@ class Run:
         return Run(self.name, *(getattr(self, one.name)[rows] for one in fields(self)[1:]))
 
     def merged(self, counts: Sequence[int]) -> 'Run':
-        """Return the run with steps that last so many samples in turn: their mean rates."""
+        """Return the run in steps of so many samples, in turn; rates are means over the steps."""
         begins = np.cumsum([0, *np.resize(counts, len(self.t) // min(counts))])
         begins = begins[begins < len(self.t)]
         dt = np.add.reduceat(self.dt, begins)

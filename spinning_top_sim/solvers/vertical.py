@@ -294,7 +294,7 @@ def _least_rotation(x: mpfr, y: mpfr, z: mpfr) -> tuple[mpc, mpc]:
 
 
 def _product(a: mpc, b: mpc, c: mpc, d: mpc) -> tuple[mpc, mpc]:
-    """Return the Cayley-Klein parameters of two rotations: first that of c and d, then of a, b."""
+    """Return the Cayley-Klein parameters of two rotations: (a, b) after (c, d)."""
     return a * c - b * d.conjugate(), a * d + b * c.conjugate()
 
 

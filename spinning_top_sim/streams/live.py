@@ -234,5 +234,5 @@ class LiveSimulation(Simulation):
                     entries.append((output.log_index, self.epoch_ns + t_ns, message))
                 if output.publish is not None:
                     publications.append((output, message))
-        self._queue.extend((t_ns, instants[t_ns]) for t_ns in sorted(instants))
+        self._queue.extend(sorted(instants.items()))
         self.computed_ns = block.until_ns
