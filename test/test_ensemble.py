@@ -261,16 +261,14 @@ def test_a_part_has_at_most_50_000_rows_and_an_ensemble_at_least_50_parts_by_def
         {'mag.enabled': False}, {'mag.enabled': True}]}}}, [0, 6])])
 def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
         tmp_path, content, counts):
-    specification = ensemble_spec.parse(
-        {'duration': 0.05, 'runs_per_part': 4, **content}, 'test')
+    specification = ensemble_spec.parse({'duration': 0.05, 'runs_per_part': 4, **content}, 'test')
     assert parts_of(specification, tmp_path) == {}
     runs = [table_of(specification, run) for run in range(specification.runs)]
     assert parquet.read_table(tmp_path / 'data').equals(pa.concat_tables(runs).combine_chunks())
     mag = [one['imu/mag.magnetic_field.x'] for one in runs]
     assert [len(column) - column.null_count for column in mag] == counts
     if 'spin.lz' in content['sample']:
-        assert [set(one['spin.lz'].to_pylist()) for one in runs] == [
-            {None}, {None}, {1.4}, {1.4}]
+        assert [set(one['spin.lz'].to_pylist()) for one in runs] == [{None}, {None}, {1.4}, {1.4}]
 
 
 @pytest.mark.parametrize(('changes', 'said'), [

@@ -23,9 +23,10 @@ from helpers.reference import CASES, ROOT, start_of, top_of
 from stress import tops
 
 from spinning_top_sim import State, Top, solve
+from spinning_top_sim.physics.states import TIMES_TOGETHER
 from spinning_top_sim.solvers import propagator
 from spinning_top_sim.solvers.cubic import RootsTooCloseError, cubic_roots
-from spinning_top_sim.solvers.exact import TIMES_TOGETHER, ExactSolution
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.multiprecision import BITS, exact, precision
 
 BOUND = 5e-15

@@ -45,8 +45,7 @@ def test_readings_are_the_derivatives_of_the_exact_pose(scene):
         assert rates == pytest.approx(expected_rates, abs=1e-7 * scale)
         positions = turned.apply(lever_arm)
         acceleration = TWICE @ positions / step ** 2
-        expected_force = middle.inv().apply(
-            acceleration + np.array((0.0, 0.0, top.gravity)))
+        expected_force = middle.inv().apply(acceleration + np.array((0.0, 0.0, top.gravity)))
         scale = 1.0 + np.linalg.norm(expected_force)
         assert force == pytest.approx(expected_force, abs=1e-7 * scale)
         sensor = Rotation.from_quat(np.ravel(imu.orientation(states)))

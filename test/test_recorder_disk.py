@@ -263,10 +263,12 @@ def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
 
 @pytest.fixture
 def disk(monkeypatch):
-    """A disk on which a file has at most `disk.size` bytes."""
-    disk, pwrite = SimpleNamespace(size=1 << 30), os.pwrite
+    """A disk on which a file has at most `disk.size` bytes: `disk.room` after a second chunk."""
+    disk, pwrite, chunks = SimpleNamespace(size=1 << 30, room=1 << 30), os.pwrite, []
 
     def write(descriptor, data, offset):
+        chunks.extend([offset] * (len(data) > 500_000))
+        disk.size = min([disk.size, *(begin + disk.room for begin in chunks[1:2])])
         if offset >= disk.size:
             raise OSError(28, os.strerror(28))
         return pwrite(descriptor, data[:disk.size - offset], offset)
@@ -283,19 +285,19 @@ def test_a_full_disk_stops_the_recording_and_costs_what_is_not_written(
     path, rng = tmp_path / 'run.mcap', random.Random(3)
     at_end = max_loss < 1.0
     recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0, max_loss=max_loss)
-    for number in range(2000):      # many times half of the queue: chunks of 1 MB
+    disk.room = disk.size if at_end else room
+    for number in range(5000):      # many times half of the queue: chunks of 1 MB
         write(recorder, 0, number, rng.randbytes(1000))
-    eventually(lambda: recorder.counters.messages > (1999 if at_end else 1000))
-    disk.size = recorder.counters.bytes + room
-    for number in range(2000, 2000 if at_end else 5000):
-        write(recorder, 0, number, rng.randbytes(1000))
+    if at_end:
+        eventually(lambda: recorder.counters.messages == 5000)
+        disk.size = recorder.counters.bytes + room
     summary = recorder.close()
     write(recorder, 0, 0, b'after the end')
     kept = summary.messages
     assert recorder.error == f'recording to {path} stopped: No space left on device'
     assert recorder.state == 'failed' and summary.error == recorder.error and recorder.room
-    assert kept == 2000 if at_end else kept > 1000
-    assert recorder.counters.lost == (2001 if at_end else 5001) - kept
+    assert kept == 5000 if at_end else 500 < kept < 4000
+    assert recorder.counters.lost == 5001 - kept
     assert is_indexed(path) != at_end
     assert numbers_in(path) == list(range(kept)) and summary.bytes == path.stat().st_size
 

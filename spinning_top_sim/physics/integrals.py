@@ -9,7 +9,7 @@ the interval.  Means are integrals, too, by a Gauss-Legendre rule at whole nanos
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import lru_cache
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
-from spinning_top_sim.physics.states import Point, States
+from spinning_top_sim.physics.states import TIMES_TOGETHER, Point, States
 from spinning_top_sim.physics.top import Top
 
 # Increments over panels of a larger angle are differences: the rounding is below 1e-13 of them.
@@ -85,8 +85,8 @@ def panels(rate: float, length_ns: int) -> int:
     return max(1, math.ceil(min(rate * length_ns * 1e-9 / LONGEST_PANEL, MOST_PANELS)))
 
 
-def increments(states: Callable[[range], States], begins: range, length_ns: int, point: Point,
-               rate: float) -> Increments:
+def increments(states: Callable[[NDArray[np.int64]], States], begins: range, length_ns: int,
+               point: Point, rate: float) -> Increments:
     """
     Return the increments over panels of one length that begin at these times [ns].
 
@@ -94,41 +94,78 @@ def increments(states: Callable[[range], States], begins: range, length_ns: int,
     point : of which the specific force is taken, in the body [m]
     rate : `fastest_rate` of the motion
     """
-    first = states(begins)
-    x, y, z, w = first.rows_quaternion
-    inverse = -x, -y, -z, w
+    angle = rate * length_ns * 1e-9
+    rule = _rule(length_ns, _nodes(angle))
+    offsets_ns = np.array([0, *(offset_ns for offset_ns, _ in rule), length_ns])
+    # All times of a panel together: each call takes the time of many states.
+    together = max(1, TIMES_TOGETHER // len(offsets_ns))
+    return joined([_panels(states, np.array(begins[first:first + together])[:, np.newaxis]
+                           + offsets_ns, [weight for _, weight in rule], point, angle)
+                   for first in range(0, len(begins), together)])
+
+
+def _panels(states: Callable[[NDArray[np.int64]], States], times_ns: NDArray[np.int64],
+            weights: list[float], point: Point, angle: float) -> Increments:
+    """
+    Return the increments over panels with these times, (n, nodes and both ends) [ns].
+
+    angle : by which the motion turns in a panel at most [rad]
+    """
+    now = states(times_ns.ravel())
+
+    def rows_of(vector: Sequence[Column | float]) -> Rows:
+        """Return components of the states, (components, nodes and ends, n)."""
+        rows = np.empty((len(vector), times_ns.size))
+        for row, component in zip(rows, vector, strict=True):
+            row[:] = component      # perhaps one number for all
+        return rows.reshape(-1, *times_ns.shape).swapaxes(1, 2)
+
+    quaternions, rates, forces = map(rows_of, (
+        now.rows_quaternion, now.rows_angular_velocity, now.specific_force(point)))
+    (x, y, z, w), nodes = quaternions[:, :1], slice(1, -1)
+    (a, b, c, d), (w1, w2, w3), (f1, f2, f3) = (
+        rows[:, nodes] for rows in (quaternions, rates, forces))
+    x, y, z, w = rotation = attitude.product((-x, -y, -z, w), (a, b, c, d))
+    # The derivative of the rotation is half of its product with the angular velocity.
+    derivatives = np.concatenate([
+        attitude.product(rotation, (0.5 * w1, 0.5 * w2, 0.5 * w3, 0.0 * w3)),
+        attitude.rotated_back((-x, -y, -z, w), (f1, f2, f3)), (w1, w2, w3), (f1, f2, f3)])
     # Rotation less the identity, velocity, angles and forces: 4, 3, 3 and 3 rows.
-    sums = np.zeros((13, len(begins)))
-    for offset_ns, weight in _rule(length_ns, _nodes(rate * length_ns * 1e-9)):
-        now = states(range(begins.start + offset_ns, begins.stop + offset_ns, begins.step))
-        rates, force = now.rows_angular_velocity, now.specific_force(point)
-        w1, w2, w3 = np.broadcast_arrays(*rates)
-        x, y, z, w = rotation = attitude.product(inverse, now.rows_quaternion)
-        # The derivative of the rotation is half of its product with the angular velocity.
-        derivatives = (
-            *attitude.product(rotation, (0.5 * w1, 0.5 * w2, 0.5 * w3, 0.0 * w3)),
-            *attitude.rotated_back((-x, -y, -z, w), force), *rates, *force)
-        for row, derivative in enumerate(derivatives):
-            sums[row] += weight * derivative
+    sums = np.zeros((13, len(times_ns)))
+    for node, weight in enumerate(weights):
+        sums += weight * derivatives[:, node]
     sums[3] += 1.0              # w of the identity
-    if rate * length_ns * 1e-9 >= LEAST_ANGLE:
-        last = states(range(begins.start + length_ns, begins.stop + length_ns, begins.step))
-        sums[:7] = _differences(first, last, length_ns * 1e-9, point)
+    if angle >= LEAST_ANGLE:
+        seconds = 1e-9 * float(times_ns[0, -1] - times_ns[0, 0])
+        sums[:7] = _differences(quaternions[:, [0, -1]], rows_of(now.velocity(point))[:, [0, -1]],
+                                now.top.gravity * seconds)
     return Increments(sums[:4], sums[4:7], sums[7:10], sums[10:])
 
 
-def _differences(first: States, last: States, seconds: float, point: Point) -> Rows:
-    """Return rotation and velocity (7, n) of `Increments` from the states at both ends."""
-    x, y, z, w = now = first.rows_quaternion
-    a, b, c, d = last.rows_quaternion
+def joined(parts: Sequence[Increments]) -> Increments:
+    """Return the increments over these intervals together."""
+    return parts[0] if len(parts) == 1 else Increments(*(
+        np.concatenate(rows, axis=1) for rows in zip(*parts, strict=True)))
+
+
+def _differences(quaternions: Rows, velocities: Rows, fall: float) -> Rows:
+    """
+    Return rotation and velocity (7, n) of `Increments` from the states at both ends.
+
+    quaternions, velocities : (components, 2, n); velocities in the body [m/s]
+    fall : what gravity adds to a velocity meanwhile [m/s]
+    """
+    now, last = ((x, y, z, w) for x, y, z, w in quaternions.swapaxes(0, 1))
+    (x, y, z, w), (a, b, c, d) = now, last
     # conj(q) p = 1 + conj(q) (p - q) rounds less than the product.
     *axis, shrunk = attitude.product((-x, -y, -z, w), (a - x, b - y, c - z, d - w))
     # The lengths of q and p, rounded like their components, would scale all the small angles.
-    too_long, longer = _excess(now), _excess(last.rows_quaternion)
+    too_long, longer = _excess(now), _excess(last)
     scale = 1.0 - 0.5 * (too_long + longer)
-    v1, v2, v3 = attitude.rotated(now, first.velocity(point))
-    u1, u2, u3 = attitude.rotated(last.rows_quaternion, last.velocity(point))
-    change = u1 - v1, u2 - v2, u3 - v3 + first.top.gravity * seconds
+    (v1, v2, v3), (u1, u2, u3) = (
+        attitude.rotated(turn, (x, y, z)) for turn, (x, y, z) in zip(
+            (now, last), velocities.swapaxes(0, 1), strict=True))
+    change = u1 - v1, u2 - v2, u3 - v3 + fall
     return np.stack((*(scale * part for part in axis), 1.0 + (shrunk + 0.5 * (too_long - longer)),
                      *attitude.rotated_back(now, change)))
 

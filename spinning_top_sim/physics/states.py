@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Point = tuple[float, float, float]
+# Times that are evaluated together: the temporaries of more do not fit into the cache.
+TIMES_TOGETHER = 8192
 _LARGEST = np.finfo(float).max
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.states import TIMES_TOGETHER, States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.multiprecision import BITS, exact, precision
 from spinning_top_sim.solvers.theta_setup import Posture, ThetaMotion, set_up
@@ -32,8 +32,6 @@ from spinning_top_sim.solvers.times import LARGEST_NS, Times
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
-# Times that are evaluated together: the temporaries of more do not fit into the cache.
-TIMES_TOGETHER = 8192
 
 
 class ClosedForm:

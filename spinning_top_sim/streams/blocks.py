@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.states import TIMES_TOGETHER
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.exact import TIMES_TOGETHER
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.path import Path, Segment
 from spinning_top_sim.streams.stream import Rows, Samples, Stream

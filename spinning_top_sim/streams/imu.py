@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import States
@@ -175,17 +175,16 @@ class Imu:
         path, point = samples.path, self._lever_arm
         found: list[Increments] = []
         for segment, times in samples.shares:
-            # Those that may be shorter, or contain a command, are computed one by one.
-            since_ns = max(self._since_ns, segment.start_ns)
-            single = len(range(times.start, since_ns + self.length_ns + 1, times.step))
+            # Those that may be shorter, reach back or contain a jump are computed one by one.
+            since_ns = max(self._since_ns + 1, segment.start_ns + segment.jumps)
+            single = len(range(times.start, since_ns + self.length_ns, times.step))
             found += [path.increments(self._begin_ns(end_ns), end_ns, point)
                       for end_ns in times[:single]]
             if single < len(times):
                 first_ns = times[single]
                 found.append(path.increments(self._begin_ns(first_ns), first_ns, point,
                                              len(times) - single, times.step))
-        return found[0] if len(found) == 1 else Increments(*(
-            np.concatenate(rows, axis=1) for rows in zip(*found, strict=True)))
+        return integrals.joined(found)
 
     def motion(self, samples: Samples) -> tuple[Vector, Quaternion, Vector]:
         """Return position [m] and orientation in the world, velocity in the IMU's frame [m/s]."""

@@ -54,14 +54,16 @@ class Segment:
     moves, `motion`, `exact`, `start` and the constants are about the effective vertical.
 
     ride : what the pivot does; None while it rests at the origin
+    jumps : whether the angular velocity jumps at its start, as by a command
     reached_ns : time up to which the motion needs no further steps
     start, energy, l3, lz : at its start
     chains : whether it can be evaluated together with others
     filter_state : of the low pass of the IMU at the start; None without one, or from t = 0 on
     """
 
-    def __init__(self, motion: Motion, start_ns: int, ride: Ride | None = None) -> None:
-        self.motion, self.start_ns, self.ride = motion, start_ns, ride
+    def __init__(self, motion: Motion, start_ns: int, ride: Ride | None = None, *,
+                 jumps: bool) -> None:
+        self.motion, self.start_ns, self.ride, self.jumps = motion, start_ns, ride, jumps
         self.chains, self.reached_ns = motion.chains, start_ns + motion.reached_ns
         self.filter_state: NDArray[np.float64] | None = None
 
@@ -271,15 +273,15 @@ class Path:
         Return the increments of a point of the body over intervals of one length.
 
         The first interval is [begin_ns, end_ns), the next one begins `step_ns` later.  They may
-        contain the start of a segment only if `count` is 1.  The impulsive torque of a command
-        lets the velocity of the point jump; the jump counts toward the interval [begin, end) that
-        contains it.
+        contain a jump, or reach into another segment, only if `count` is 1.  The impulsive torque
+        of a command lets the velocity of the point jump; the jump counts toward the interval
+        [begin, end) that contains it.
         """
         pieces: list[Increments] = []
         for before, segment, after in zip([None, *self._segments], self._segments,
                                           [*self._segments[1:], None], strict=False):
             start_ns = segment.start_ns
-            if before is not None and begin_ns <= start_ns < end_ns:
+            if before is not None and segment.jumps and begin_ns <= start_ns < end_ns:
                 moment = range(start_ns, start_ns + 1)
                 (u1, u2, u3), (v1, v2, v3) = (
                     one.own_states(moment).velocity(point) for one in (before, segment))

@@ -349,7 +349,7 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
                    atol=values['solver.atol'])
     if pivot is None:
         assert isinstance(start, State)
-        return Segment(step(top, start), start_ns)
+        return Segment(step(top, start), start_ns, jumps=True)
     posture, piece = start, pivot.lasting(start_ns)
     if isinstance(posture, State):
         posture = posture_of(top, posture)
@@ -360,4 +360,4 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
     else:
         vertical, halves = about_vertical(top, posture, piece.acceleration)
         motion = step(vertical.top, rounded(halves))
-    return Segment(motion, start_ns, Ride(top, vertical, piece))
+    return Segment(motion, start_ns, Ride(top, vertical, piece), jumps=isinstance(start, State))
