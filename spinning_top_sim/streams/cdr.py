@@ -11,7 +11,7 @@ elements, then the elements.  Padding is zero, so that equal messages have equal
 import struct
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,24 +102,15 @@ class Template:
         return self.encode_runs(stamps_ns, ((len(stamps_ns), values),))
 
     def encode_runs(self, stamps_ns: NDArray[np.int64],
-                    runs: Iterable[tuple[int, Sequence[Field]]]) -> NDArray[np.uint8]:
+                    runs: Iterable[tuple[int, Sequence[Field]]]) -> NDArray[Any]:
         """Return the same; `runs` has the fields of so many messages after the other."""
-        count, begin = len(stamps_ns), 0
+        count = len(stamps_ns)
         if len(self._rows) < count:
             self._rows = np.frombuffer(count * self._buffer, self._row_type)
         rows = self._rows[:count]
         for at in self._stamps_at:
             rows[f'sec{at}'], rows[f'nanosec{at}'] = np.divmod(stamps_ns, NANOSECONDS)
-        for size, values in runs:
-            run = rows[begin:begin + size]
-            begin += size
-            for i, value in zip(range(len(self._fields)), values, strict=True):
-                field = run[f'field{i}']
-                if isinstance(value, np.ndarray):
-                    field[:] = value
-                else:
-                    for column, numbers in zip(field.T, value, strict=True):
-                        column[:] = numbers
+        fill([rows[f'field{i}'] for i in range(len(self._fields))], runs)
         return rows.view(np.uint8).reshape(count, len(self))
 
     def encode_one(self, stamp_ns: int, *values: Field) -> bytes:
@@ -150,3 +141,18 @@ class Template:
             if 0 <= at - begin < 8 * count:
                 return field, (at - begin) // 8, at - (at - begin) % 8
         return None
+
+
+def fill(fields: Sequence[NDArray[np.float64]],
+         runs: Iterable[tuple[int, Sequence[Field]]]) -> None:
+    """Fill fields (n, count); `runs` has the values of so many messages after the other."""
+    begin = 0
+    for size, values in runs:
+        for field, value in zip(fields, values, strict=True):
+            rows = field[begin:begin + size]
+            if isinstance(value, np.ndarray):
+                rows[:] = value
+            else:
+                for column, numbers in zip(rows.T, value, strict=True):
+                    column[:] = numbers
+        begin += size

@@ -232,8 +232,7 @@ class Sensor:
         self.rate_variance, self.force_variance = variances[0], variances[3]
         turn_on_bias = np.array(_six(values, 'turn_on_bias'))[:, np.newaxis]
         if turn_on_bias.any():
-            turn_on_bias *= noise.white(
-                values['seed'], noise.Purpose.TURN_ON, np.zeros(1, np.int64), 6)
+            turn_on_bias *= noise.constants(values['seed'], noise.Purpose.TURN_ON, 6)
         self._noise = noise.SensorNoise(
             values['seed'], noise.Purpose.WHITE, period_ns, white[:, np.newaxis], turn_on_bias,
             _bias_paths(values))

@@ -42,12 +42,6 @@ def stamped(frame_id: str, *counts: int) -> Template:
 
 
 @lru_cache(64)
-def numbers(*counts: int) -> Template:
-    """Fields alone, for those who need no message around them."""
-    return Template(CdrWriter().field(*counts))
-
-
-@lru_cache(64)
 def joint_state(names: tuple[str, ...]) -> Template:
     """sensor_msgs/JointState without effort; fields: positions, velocities."""
     count = len(names)

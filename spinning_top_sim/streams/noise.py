@@ -36,6 +36,11 @@ def white(seed: int, purpose: Purpose, numbers: NDArray[np.int64], columns: int,
     return _gathered(partial(_normal, seed, purpose, columns=columns), numbers)
 
 
+def constants(seed: int, purpose: Purpose, columns: int) -> NDArray[np.float64]:
+    """Return standard normal numbers (columns, 1): those of `white` for the sample 0."""
+    return _normal(seed, purpose, 0, columns, 1).T
+
+
 @dataclass(frozen=True)
 class RandomPath:
     """

@@ -9,8 +9,7 @@ import contextlib
 import itertools
 import json
 import platform
-from collections.abc import Iterator, Mapping, Sequence
-from copy import copy
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
-from spinning_top_sim.streams import journal, messages
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams import journal
+from spinning_top_sim.streams.cdr import NANOSECONDS, CdrWriter, Field, Template, fill
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
@@ -63,6 +62,19 @@ def _column_names(stream: Stream) -> Sequence[str]:
     return names
 
 
+class _Columns(Template):
+    """The fields of messages alone, as the rows of a table, (n, numbers)."""
+
+    def __init__(self, counts: Sequence[int]) -> None:
+        super().__init__(CdrWriter().field(*counts))
+
+    def encode_runs(self, stamps_ns: NDArray[np.int64],
+                    runs: Iterable[tuple[int, Sequence[Field]]]) -> NDArray[Any]:
+        columns = np.empty((sum(self.counts), len(stamps_ns)))
+        fill([field.T for field in np.split(columns, np.cumsum(self.counts)[:-1])], runs)
+        return columns.T
+
+
 def samples(specification: Specification, simulation: Simulation) -> Samples:
     """
     Play a run; return its columns: t [s], and the numbers of the streams that are kept.
@@ -73,22 +85,21 @@ def samples(specification: Specification, simulation: Simulation) -> Samples:
     values = simulation.values
     names = {stream: _column_names(stream) for stream in simulation.streams
              if stream.parameter in specification.kept}
-    # Times and numbers of the samples; empty arrays first, for a stream without any.
-    times = {stream: [np.empty(0, np.int64)] for stream in names}
-    numbers = {stream: [np.empty((len(labels), 0))] for stream, labels in names.items()}
+    times: dict[Stream, list[NDArray[np.int64]]] = {stream: [] for stream in names}
+    numbers: dict[Stream, list[NDArray[np.float64]]] = {stream: [] for stream in names}
     for stream in names:
-        stream.template = copy(messages.numbers(*stream.template.counts))
+        stream.template = _Columns(stream.template.counts)
     recorded = journal.recorded_streams(list(names), values)
     for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
         for stream, times_ns, rows in block.messages:
             times[stream].append(times_ns)
-            numbers[stream].append(np.vstack([
-                field.T for field in stream.template.decode(rows)]))
-    every_ns = np.sort(np.concatenate([*itertools.chain(*times.values())]), kind='stable')
+            numbers[stream].append(rows.T)
+    every_ns = np.sort(_joined([*itertools.chain(*times.values())], 0, np.int64), kind='stable')
     rows_ns = every_ns[np.diff(every_ns, prepend=-1) > 0]
     columns = {'t': (rows_ns / NANOSECONDS, np.zeros(len(rows_ns), bool))}
     for stream, labels in names.items():
-        times_ns, cells = np.concatenate(times[stream]), np.hstack(numbers[stream])
+        times_ns = _joined(times[stream], 0, np.int64)
+        cells = _joined(numbers[stream], (len(labels), 0))
         absent = np.zeros(len(rows_ns), bool)
         if not np.array_equal(times_ns, rows_ns):
             # A faulty sensor sends some samples twice; they share a row.
@@ -100,6 +111,12 @@ def samples(specification: Specification, simulation: Simulation) -> Samples:
         columns.update((f'{stream.topic}.{name}', (column, absent))
                        for name, column in zip(labels, cells, strict=True) if name)
     return columns
+
+
+def _joined(parts: Sequence[NDArray[Any]], none: int | tuple[int, int],
+            kind: type = float) -> NDArray[Any]:
+    """Return arrays one after the other in their last axis; of the shape `none` without any."""
+    return parts[0] if len(parts) == 1 else np.concatenate([np.empty(none, kind), *parts], axis=-1)
 
 
 def table(specification: Specification, found: Mapping[int, Samples]) -> 'pyarrow.Table':
