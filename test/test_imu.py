@@ -73,8 +73,7 @@ def test_one_imu_has_one_noise_and_one_bias_at_all_rates(rate, other):
     values = {'imu.rate': rate, 'imu_data.rate': other}
     _, found = run({**NOISY, **values}, SECOND, 'imu/data_raw', 'imu/data',
                    'ground_truth/imu_bias')
-    raw, data, bias = (
-        dict(zip(times_ns.tolist(), np.hstack((rates, force)), strict=True))
+    raw, data, bias = (dict(zip(times_ns.tolist(), np.hstack((rates, force)), strict=True))
         for times_ns, _, _, rates, force in found.values())
     common = raw.keys() & data.keys()
     assert len(common) >= 4 and len(data) == 1 + other

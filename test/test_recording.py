@@ -202,8 +202,7 @@ def test_the_definitions_of_all_streams_are_those_of_jazzy():
     assert json.loads(FILE.read_bytes()) == {name: definition(name) for name in TYPES}
 
 
-@pytest.mark.parametrize('type_name', [
-    'geometry_msgs/msg/NoSuchType', 'no_such_msgs/msg/Type'])
+@pytest.mark.parametrize('type_name', ['geometry_msgs/msg/NoSuchType', 'no_such_msgs/msg/Type'])
 def test_a_missing_definition_is_named(tmp_path, type_name):
     with pytest.raises(RecordingError) as caught:
         McapRecorder(
