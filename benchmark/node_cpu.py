@@ -44,6 +44,8 @@ from processes import (
 )
 from report import number, preamble, table, write_section
 
+from spinning_top_sim.tools.scene_file import read_scene
+
 STREAMS = ('pose', 'joint_states', 'imu')
 OTHERS = ('ground_truth_imu', 'ground_truth_odom', 'invariants')
 SIM, SIM_RECORDING = 'sim_node', 'sim_node, recording'
@@ -51,8 +53,8 @@ TICKS_RECORDING = 'sim_node, 200 ticks, recording'
 STRAIGHT, EVENTS = 'straightforward', 'straightforward, EventsExecutor'
 FLOOR, TIMER = 'floor, thread', 'floor, timer'
 KINDS = (TICKS_RECORDING, 'sim_node, 200 ticks', SIM_RECORDING, SIM, STRAIGHT, EVENTS, FLOOR)
-SHUTTLE = {'pivot.waypoints': [0.0, 0.0, 0.0, 10.0, 0.0, 0.0], 'pivot.speed': 4.0,
-           'pivot.acceleration': 2.0, 'pivot.repeat': True}
+SHUTTLE = {name: value for name, value in read_scene(ROOT / 'config/shuttle.yaml').items()
+           if name.startswith('pivot.')}
 PAIRS = ((TICKS_RECORDING, EVENTS), (SIM_RECORDING, FLOOR), (SIM, FLOOR), (FLOOR, TIMER))
 
 
