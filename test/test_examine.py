@@ -130,7 +130,7 @@ def test_another_filter_has_its_own_faults_and_this_one(report, name):
 def test_a_filter_that_corrects_in_a_quarter_of_a_second_corrects(report):
     """And then goes to and fro about the truth."""
     pytest.importorskip('ahrs')
-    assert report('madgwick-6d').faults == ['first_order_integration', 'lever_arm']
+    assert report('madgwick-6d').faults == ['first_order_integration']
 
 
 def test_a_filter_without_faults_passes(report):

@@ -205,8 +205,7 @@ def test_the_definitions_of_all_streams_are_those_of_jazzy():
 @pytest.mark.parametrize('type_name', ['geometry_msgs/msg/NoSuchType', 'no_such_msgs/msg/Type'])
 def test_a_missing_definition_is_named(tmp_path, type_name):
     with pytest.raises(RecordingError) as caught:
-        McapRecorder(
-            tmp_path / 'run.mcap', [RecordedTopic('/a', type_name)], {}, min_free_bytes=0)
+        McapRecorder(tmp_path / 'run.mcap', [RecordedTopic('/a', type_name)], {}, min_free_bytes=0)
     assert type_name in str(caught.value)
     assert not list(tmp_path.iterdir())
 

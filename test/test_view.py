@@ -111,16 +111,14 @@ def test_arrows_are_the_vectors_in_the_world(shown, name):
         assert drawn @ [math.sin(exact.phi[0]), -math.cos(exact.phi[0]), 0.0] == pytest.approx(
             -np.linalg.norm(drawn))
     if name == 'angular momentum':      # Lz is conserved, and L3 the usual length
-        assert drawn[2] / shapes.reach(shown) == pytest.approx(
-            exact.lz[0] / exact.l3[0], abs=1e-8)
+        assert drawn[2] / shapes.reach(shown) == pytest.approx(exact.lz[0] / exact.l3[0], abs=1e-8)
 
 
 def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     stamp_ns = shown.epoch_ns + 2_000_000_000
     lines = shapes.trace(shown, stamp_ns)
     exact = truth(shown, stamp_ns)
-    assert lines[-1, 1] == pytest.approx(
-        shapes.reach(shown) * np.ravel(exact.rows_axis), abs=1e-6)
+    assert lines[-1, 1] == pytest.approx(shapes.reach(shown) * np.ravel(exact.rows_axis), abs=1e-6)
     assert len(lines) == 200            # 2 s at 100 Hz
     track = Track('', parameters.checked({}))
     half = math.sqrt(0.5)

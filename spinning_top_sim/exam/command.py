@@ -91,23 +91,23 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _report(arguments: argparse.Namespace) -> Report:
     if ([arguments.log, arguments.node, arguments.filter].count(None) < 2
-            or arguments.filter is arguments.topic is None
-            or arguments.filter is None is not arguments.data):
+            or (arguments.filter is None
+                and (arguments.topic is None or arguments.data is not None))):
         log = f'{arguments.log}: ' if arguments.log else ''
         raise ValueError(f'{log}give either a log and --topic, --node and --topic, --topic '
                          'alone, --filter, or --filter and --data')
-    subject = ('a log' if arguments.log is not None else
-               '--data' if arguments.data is not None else
-               '--filter' if arguments.filter is not None else 'a node')
+    kind = ('a log' if arguments.log is not None else
+            '--data' if arguments.data is not None else
+            '--filter' if arguments.filter is not None else 'a node')
     options = {name: value for names in OPTIONS.values() for name in names
                if (value := getattr(arguments, name)) is not None}
-    for name in options.keys() - OPTIONS[subject]:
-        raise ValueError(f'--{name}: {subject} takes --{", --".join(OPTIONS[subject])} only')
+    for name in options.keys() - OPTIONS[kind]:
+        raise ValueError(f'--{name}: {kind} takes --{", --".join(OPTIONS[kind])} only')
     if arguments.imu is not None:
         (options['imu'],) = scene_file.chosen_files(argparse.Namespace(imu=arguments.imu))
-    if subject == 'a log':
+    if kind == 'a log':
         return _of_log(arguments.log, options)
-    if subject == 'a node':
+    if kind == 'a node':
         return _of_node(arguments.node, options)
     return _of_filter(arguments.filter, options)
 

@@ -21,9 +21,9 @@ FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component
           'stamp_offset', 'no_bias_estimate', 'bias_report', 'covariance_small',
           'covariance_large', 'inaccurate', 'diverges', 'invalid_output')
 
-# Thresholds; docs/exam.md compares them with the values of filters.  Errors are in rad.
+# Thresholds; docs/exam.md says what they are for.  Errors are in rad.
 TILT, HEADING = np.radians((0.3, 0.8)).tolist()         # rms of a right filter, no noise
-DIVERGED, GROWS = np.radians(10.0), 1.2     # from one quarter to the next
+DIVERGED, GROWS = np.radians(10.0), 1.2     # rms; factor from one quarter to the next
 EXPLAINED = 0.25                # of the error is left at most when its cause is undone
 FIRST_ORDER, FAST = np.radians((0.2, 1.0)).tolist()     # on the fast motion, no noise
 FIRST_ORDER_LEFT = 0.5          # of that error, with rates for which first-order steps are right
@@ -40,7 +40,7 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
         'tilt_rms_deg': math.degrees(rms(np.concatenate([one.tilt for one in errors]))),
         'tilt_max_deg': math.degrees(max(float(np.max(one.tilt)) for one in errors)),
         'heading_rms_deg': math.degrees(rms(np.concatenate(
-            [one.turned(absolute) for one in errors]))),
+            [one.heading_varying(absolute) for one in errors]))),
         'convergence_s': max(measures.convergence_time(outcome.run.t, outcome.errors.tilt)
                              for outcome in outcomes),
         'heading_drift_deg_per_s': math.degrees(float(np.mean([
@@ -53,8 +53,8 @@ def quality(outcomes: Sequence[Outcome], imu: Mapping[str, Any],
     """
     Return ratios of errors to the least that white noise allows, and to those without a filter.
 
-    A Kalman filter of a random walk of density q, read with noise of density r, has the variance
-    sqrt(q r) (Bar-Shalom et al. 2001, 4.5).
+    A Kalman filter of a random walk of density N, read with noise of density R, has the variance
+    N R (Bar-Shalom et al. 2001, 4.5).
     """
     rate, force, field = (imu.get(f'{name}noise_density', 0.0)
                           for name in ('imu.gyroscope_', 'imu.accelerometer_', 'mag.'))
@@ -79,15 +79,19 @@ def error_of(outcome: Outcome, absolute: bool) -> float:
     return rms(outcome.errors.attitude(absolute))
 
 
-def stamp_fault(outcome: Outcome, absolute: bool) -> tuple[measures.Offset, Fault | None]:
-    """Return the time offset of a settled filter, and the fault if it explains the error."""
+def offset_of(outcome: Outcome, absolute: bool) -> measures.Offset:
+    """Return the time offset of a settled filter."""
     run = outcome.run
-    offset = measures.time_offset(outcome.estimates, run.truth, run.rates, absolute)
-    steps = offset.seconds / float(np.median(run.dt))
+    return measures.time_offset(outcome.estimates, run.truth, run.rates, absolute)
+
+
+def stamp_fault(offset: measures.Offset, step: float) -> Fault | None:
+    """Return the fault if a time offset explains the error; step : of the samples [s]."""
+    steps = offset.seconds / step
     if AHEAD <= steps <= DELAYED or offset.after > EXPLAINED * offset.before:
-        return offset, None
+        return None
     side = 'behind' if steps > 0.0 else 'ahead of'
-    return offset, Fault(
+    return Fault(
         'stamp_offset', f'the attitude is {abs(1e3 * offset.seconds):.3g} ms {side} its stamp: '
         f'shifted by that, the error falls from {degrees(offset.before)} to '
         f'{degrees(offset.after)}')
@@ -132,7 +136,7 @@ def noisy_limit(run: Run, absolute: bool) -> float:
     single = measures.errors_of(np.array([from_two_vectors(*pair) for pair in zip(
         last.accelerometer, last.magnetometer, strict=True)]), last.truth)
     return min(DIVERGED, max(math.hypot(TILT, absolute * HEADING),
-                             3.0 * rms(single.known(absolute))))
+                             3.0 * rms(single.judged(absolute))))
 
 
 def inaccuracy(outcome: Outcome, absolute: bool, limit: float = DIVERGED) -> Fault | None:
@@ -141,7 +145,7 @@ def inaccuracy(outcome: Outcome, absolute: bool, limit: float = DIVERGED) -> Fau
 
     limit : of that error [rad], at most DIVERGED
     """
-    quarters = [rms(part) for part in np.array_split(outcome.errors.known(absolute), 4)]
+    quarters = [rms(part) for part in np.array_split(outcome.errors.judged(absolute), 4)]
     if quarters[-1] < limit:
         return None
     grows = all(later >= GROWS * one for one, later in itertools.pairwise(quarters[1:]))

@@ -19,11 +19,12 @@ from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.exam.trial import Outcome
 from spinning_top_sim.tools.verdict import Fault
 
-# Turns about an axis of the sensor [deg], each followed by a rest; the last one leads back.
+# Turns about an axis of the sensor [deg], each followed by a rest; then one leads back, and a slow
+# one to the motion.
 TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0),
          (1, 110.0), (2, -120.0))
-# Of these, and of the last one, which a filter must not take for a bias [rad/s].
-TURN_RATE, SLOW_RATE = 2.6, 0.3
+# Of these, and of the slow one, which a filter must neither drop nor take for a bias [rad/s].
+TURN_RATE, SLOW_RATE = 2.6, 0.15
 FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
 WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
 # A kick is not corrected if more than STAYS is left, and grows if GROWN times its least is left.
@@ -31,7 +32,10 @@ STAYS, GROWN = 0.995, 1.1
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
 DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
-DOWN = 70.0, 20.0, 140.0        # yaw, pitch and roll of the last rest [deg]
+# The last rest: yaw, pitch and roll [deg].  There the heading is turned as far as that takes it
+# across south and, counted from the east, across west.
+DOWN, ASTRAY, ASTRAY_S = (160.0, 20.0, 140.0), np.radians(120.0), 0.5
+GROWS = 1.03                    # of the error that this leaves
 
 
 class Kick(NamedTuple):
@@ -55,10 +59,12 @@ class Excitation(NamedTuple):
 
     run : with the kicks
     still : without them
-    rests : index of the last sample of each rest (n,); the first and the last but one are equal
+    rests : index of the last sample of each rest (n,); at the first and the last but one the
+        attitude is the same
     turns : index of the first sample of each turn (n,)
     motion : where the slow motion is judged
     kicks : index of the first sample of each kick, two at each rest
+    astray : where the heading has been turned far off, up to the end
     """
 
     run: Run
@@ -67,10 +73,15 @@ class Excitation(NamedTuple):
     turns: NDArray[np.intp]
     motion: slice
     kicks: list[tuple[int, int]]
+    astray: slice
 
 
-def excite(imu: Mapping[str, Any]) -> Excitation:
-    """Return the run for the IMU's place and field, sampled at the rate of the slow motion."""
+def excite(imu: Mapping[str, Any], goes_astray: bool) -> Excitation:
+    """
+    Return the run for the IMU's place and field, sampled at the rate of the slow motion.
+
+    goes_astray : whether the heading is turned far off at last; the next run would begin with that
+    """
     rate = scenarios.SLOW.rate
     motion = scenarios.record(replace(scenarios.PIVOT, duration=MOTION_S), imu, 0)
     level = Rotation.identity()         # some filters begin with it
@@ -91,18 +102,20 @@ def excite(imu: Mapping[str, Any]) -> Excitation:
     last = Rotation.concatenate((Rotation.from_quat(motion.truth[-1]), Rotation.from_euler(
         'ZYX', DOWN, degrees=True)))
     way = round((last[0].inv() * last[1]).magnitude() / TURN_RATE * rate)
-    rests = np.array((0, 3 * answer, 3 * answer + way, 6 * answer + way))
-    still = replace(scenarios.along(Slerp(rests, last[[0, 0, 1, 1]])(np.arange(rests[-1] + 1)), imu
+    knots = np.array((0, 3 * answer, 3 * answer + way, 7 * answer + way))
+    still = replace(scenarios.along(Slerp(knots, last[[0, 0, 1, 1]])(np.arange(knots[-1] + 1)), imu
                                     ).preceded_by(motion.preceded_by(lead)), name='excitation')
     still.gyroscope[:] += NEVER_ZERO
     run = replace(still, gyroscope=still.gyroscope.copy())
-    kicks = [(end + begin + answer, end + begin + 2 * answer) for begin in rests[::2].tolist()]
+    kicks = [(end + begin + answer, end + begin + 2 * answer) for begin in knots[::2].tolist()]
     for attitude, pair in zip(last, kicks, strict=True):
         for first, kick in zip(pair, KICKS, strict=True):
             run.gyroscope[first:first + round(KICK_S * rate)] += (
                 attitude.inv().apply(kick.turn) / KICK_S)
+    far = slice(kicks[-1][-1] + answer, kicks[-1][-1] + answer + round(ASTRAY_S * rate))
+    run.gyroscope[far] += goes_astray * last[1].inv().apply((0.0, 0.0, ASTRAY / ASTRAY_S))
     return Excitation(run, still, ends - 1, ends[:len(TURNS)],
-                      slice(end - len(motion.t) // 2, end), kicks)
+                      slice(end - len(motion.t) // 2, end), kicks, slice(far.stop, None))
 
 
 def gyroscope_of(outcome: Outcome, turns: NDArray[np.intp]) -> tuple[Reals, Reals, int]:
@@ -158,6 +171,15 @@ def not_corrected(estimates: Reals, without: Reals, given: Excitation,
             for kick, left, _ in found]
 
 
+def astray(outcome: Outcome, given: Excitation, absolute: bool) -> list[Fault]:
+    """Return the fault of a filter that, turned far off north, turns farther."""
+    errors = np.abs(outcome.part(given.astray).errors.heading)
+    if not absolute or np.max(errors) < max(ASTRAY, GROWS * errors[0]):
+        return []
+    return [Fault('inaccurate', f'turned off north by {np.degrees(errors[0]):.0f} deg, it turns '
+                  f'to {np.degrees(np.max(errors)):.0f} deg')]
+
+
 def from_identity(*matrices: Reals) -> float:
     """Return how far the nearest of some matrices is from the identity."""
     return float(min(np.max(np.abs(matrix - np.eye(3))) for matrix in matrices))
@@ -186,6 +208,14 @@ def affine_of(readings: Reals, estimated: Rotation, level: Sequence[int],
     change[:3] += np.hstack((entries[:9].reshape(3, 3), entries[9:, np.newaxis]))
     change[:3] /= np.median(np.diag(change)[:3])    # most axes are right
     return change, rms(matrix @ entries - wanted) / max(rms(wanted), 1e-6)
+
+
+def apart(estimates: Reals, others: Reals, absolute: bool) -> Reals:
+    """Return the change of the axes of the world, in the sensor, from attitudes to others."""
+    one, other = (Rotation.from_quat(rows).inv() for rows in (estimates, others))
+    # Without a heading, the vertical alone.
+    return np.concatenate([(other.apply(axis) - one.apply(axis)).ravel()
+                           for axis in np.eye(3)[0 if absolute else 2:]])
 
 
 def words(matrix: NDArray[np.floating[Any]]) -> str:

@@ -51,20 +51,20 @@ class Scene:
     """
     A motion of a hand, and what disturbs its sensor.
 
-    rates, turns : root mean squares of the rates of yaw, pitch and roll [rad/s], their frequency
-    force, strokes : those of the acceleration of the arm, east, north, up [m/s^2], its frequency
+    rates, rates_hz : root mean squares of the rates of yaw, pitch and roll [rad/s], frequency
+    acceleration, acceleration_hz : those of the pivot of the arm, east, north, up [m/s^2]
     arm, pitch : length of the arm [m], level at first, and pitch of the sensor on it [rad]
     taps : taps on the sensor a second
     magnet : standard deviation of the fields of what it passes [T]
     motions : begin and end of each [s]
-    values : parameters of the vibration, and of a magnet on the sensor
+    values : parameters of the vibration and of a magnet on the sensor; they override `imu`
     """
 
     name: str
     rates: tuple[float, float, float]
-    turns: float
-    force: tuple[float, float, float]
-    strokes: float
+    rates_hz: float
+    acceleration: tuple[float, float, float]
+    acceleration_hz: float
     arm: float
     pitch: float = 0.0
     taps: float = 0.0
@@ -116,11 +116,12 @@ def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> Trial:
     t = HALF * np.arange(n, dtype=np.float64)
     moves = np.sum([_step((t - begin) / RAMP) * _step((end - t) / RAMP)
                     for begin, end in scene.motions], axis=0)
-    yaw, pitch, roll = moves * _waves(random, n, scene.turns, 1, scene.rates)
+    yaw, pitch, roll = moves * _waves(random, n, scene.rates_hz, 1, scene.rates)
     turns = Rotation.from_euler('ZYX', np.stack((
         yaw + random.uniform(-np.pi, np.pi), pitch - scene.pitch, roll), axis=1))
     arm = scene.arm * np.array((math.cos(scene.pitch), 0.0, -math.sin(scene.pitch)))
-    place = (moves * _waves(random, n, scene.strokes, 2, scene.force)).T + turns.apply(arm)
+    strokes = moves * _waves(random, n, scene.acceleration_hz, 2, scene.acceleration)
+    place = strokes.T + turns.apply(arm)
     acceleration = np.diff(place, 2, axis=0) / HALF ** 2
     # A blow, and the one back that leaves the sensor where it was.
     taps = round(scene.taps * HALF * float(np.sum(moves)))

@@ -26,7 +26,14 @@ SIGNED = [sign * one for one in Rotation.create_group('O').as_matrix().round()
 
 
 class Hypothesis(NamedTuple):
-    """A possible cause of errors, and its inverse: other readings, or other attitudes."""
+    """
+    A possible cause of errors, and its inverse.
+
+    faults : names; none if it is no fault
+    text : what its inverse is
+    given : changes the readings that are fed; None: nothing is fed again
+    read : changes the attitudes that are returned
+    """
 
     faults: tuple[str, ...]
     text: str
@@ -35,7 +42,7 @@ class Hypothesis(NamedTuple):
 
 
 def changed(names: Sequence[str], change: ChangeRows) -> ChangeReadings:
-    """Return what changes the readings (n, 3) of these sensors."""
+    """Return what changes these columns of a run, such as the readings (n, 3) of a sensor."""
     def with_changes(run: Run) -> Run:
         readings: Any = {name: change(getattr(run, name)) for name in names}
         return replace(run, **readings)
@@ -57,7 +64,7 @@ def wired(name: str, text: str, matrix: Any, offset: Any = 0.0,
 
 
 def moved(rows: Reals, samples: int) -> Reals:
-    """Return the rows so many samples later; the first or the last is repeated."""
+    """Return rows whose k-th is the one at k + samples; the first or the last is repeated."""
     return rows[np.clip(np.arange(len(rows)) + samples, 0, len(rows) - 1)]
 
 
@@ -101,18 +108,18 @@ def sharpened(names: Sequence[str], samples: float) -> Hypothesis:
 
 # For filters that correct before they take the step: readings of the step before.  It is no fault.
 CORRECTS_FIRST = delayed(('accelerometer', 'magnetometer'), -1)._replace(faults=())
-WITHOUT_FIELD = changed(('magnetometer',), lambda rows: np.full_like(rows, np.nan))
+WITHOUT_FIELD = Hypothesis((), '', given=changed(
+    ('magnetometer',), lambda rows: np.full_like(rows, np.nan)))
 _HALF = 0.5 ** 0.5
 _CONJUGATE, _W_LAST = np.array((-1.0, -1.0, -1.0, 1.0)), [1, 2, 3, 0]
-NED_WORLD = Hypothesis(('frame_ned',), 'read as attitude in a world north-east-down',
-                       read=_turned((_HALF, _HALF, 0.0, 0.0)))
 GRAVITY_SIGN = Hypothesis(('gravity_sign',), 'with the sign of the accelerometer changed',
                           given=changed(('accelerometer',), np.negative))
 # Of attitudes; nothing is fed again.
 MISREADINGS = (
     Hypothesis(('component_order',), 'read as w, x, y, z', read=lambda q: q[:, _W_LAST]),
     Hypothesis(('conjugated',), 'conjugated', read=lambda q: q * _CONJUGATE),
-    NED_WORLD,
+    Hypothesis(('frame_ned',), 'read as attitude in a world north-east-down',
+               read=_turned((_HALF, _HALF, 0.0, 0.0))),
     Hypothesis(('frame_ned',), 'read as attitude of axes forward-right-down in a world '
                'north-east-down', read=_turned((_HALF, _HALF, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))),
     Hypothesis(('frame_ned',), 'read as attitude in a world north-west-up',
@@ -127,7 +134,7 @@ LEVEL = Hypothesis(('magnetometer_wiring',), 'with the field of a level sensor',
 
 def ambiguous(one: Hypothesis, absolute: bool) -> Hypothesis:
     """Return a hypothesis that has both names where two cannot be told apart."""
-    if absolute or one.faults not in (('gravity_sign',), NED_WORLD.faults):
+    if absolute or one.faults not in (('gravity_sign',), ('frame_ned',)):
         return one
     return one._replace(faults=('frame_ned', 'gravity_sign'),
                         text=f'{one.text}; the two cannot be told apart without a heading')

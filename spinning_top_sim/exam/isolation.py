@@ -20,7 +20,7 @@ def feed_apart(make_filter: MakeFilter, run: Run) -> Output:
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_serve, args=(make_filter, run, sender))
     with warnings.catch_warnings():
-        # A fork has no other threads; this one needs none, as it only runs the filter.
+        # The fork runs the filter only, and needs no other thread.
         warnings.simplefilter('ignore', DeprecationWarning)
         process.start()
     sender.close()

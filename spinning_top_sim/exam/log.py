@@ -170,25 +170,24 @@ def _beside(name: str, said: Attitudes, true_ns: NDArray[np.int64], turns: Rotat
                    np.full((len(t), 3), np.nan))
 
 
-def _judge(subject: str, outcome: Outcome, heading: bool) -> Report:
+def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
     settled, found = outcome.last(), None
-    before = diagnosis.error_of(settled, heading)
+    before = diagnosis.error_of(settled, absolute)
     after, best = min(((diagnosis.error_of(replace(
-        settled, estimates=one.read(settled.estimates)), heading), one)
+        settled, estimates=one.read(settled.estimates)), absolute), one)
         for one in hypotheses.MISREADINGS), key=lambda pair: pair[0])
     if before > GROSS and after < diagnosis.EXPLAINED * before:
         found = hypotheses.ambiguous(best._replace(
             text=f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
-            'measures are those after this correction'), heading)
+            'measures are those after this correction'), absolute)
     corrected = outcome if found is None else replace(
         outcome, estimates=found.read(outcome.estimates))
-    offset, late = diagnosis.stamp_fault(corrected.last(), heading)
-    consistency = diagnosis.consistency([corrected], heading)
-    # The first of these that applies, besides a misreading and a wrong stamp.
-    faults = [*([Fault(name, found.text) for name in found.faults] if found else ()),
-              *([late] if late else ())] or [fault for fault in (
-                  diagnosis.inaccuracy(outcome, heading),
-                  diagnosis.covariance_fault(consistency)) if fault][:1]
-    measured = {**diagnosis.marks([corrected], heading), 'stamp_offset_s': offset.seconds,
+    offset = diagnosis.offset_of(corrected.last(), absolute)
+    consistency = diagnosis.consistency([corrected], absolute)
+    faults = [Fault(name, found.text) for name in found.faults] if found else []
+    faults += filter(None, [diagnosis.stamp_fault(offset, float(outcome.run.dt[0]))])
+    faults = faults or [*filter(None, (diagnosis.inaccuracy(outcome, absolute),
+                                       diagnosis.covariance_fault(consistency)))][:1]
+    measured = {**diagnosis.marks([corrected], absolute), 'stamp_offset_s': offset.seconds,
                 **diagnosis.nees_marks(consistency)}
     return Report(subject, faults, measured, [corrected])

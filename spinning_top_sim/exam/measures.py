@@ -18,20 +18,24 @@ WINDOW = 3.0                    # autocorrelation times over which correlations 
 
 
 class Errors(NamedTuple):
-    """Attitude errors [rad]: tilt (n,) >= 0, and heading (n,) in [-pi, pi]."""
+    """
+    Attitude errors [rad]: tilt (n,) >= 0, and heading (n,) in [-pi, pi].
+
+    The methods take `absolute`: whether the heading is judged against north.
+    """
 
     tilt: Reals
     heading: Reals
 
     def attitude(self, absolute: bool) -> Reals:
-        """Return tilt and heading error combined (n,); see `turned`."""
-        return np.hypot(self.tilt, self.turned(absolute))
+        """Return tilt and heading error combined (n,); see `heading_varying`."""
+        return np.hypot(self.tilt, self.heading_varying(absolute))
 
-    def known(self, absolute: bool) -> Reals:
+    def judged(self, absolute: bool) -> Reals:
         """Return tilt and heading error combined (n,), the tilt alone unless `absolute`."""
         return np.hypot(self.tilt, absolute * self.heading)
 
-    def turned(self, absolute: bool) -> Reals:
+    def heading_varying(self, absolute: bool) -> Reals:
         """Return the heading error in [-pi, pi] (n,), relative to its mean unless `absolute`."""
         phase = np.exp(1j * self.heading)
         return self.heading if absolute else np.angle(phase * np.conj(np.mean(phase)))
@@ -64,7 +68,7 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
 
 
 def unaided(run: Run, rows: slice | NDArray[np.intp]) -> Rmse:
-    """Return the errors, if small, of the gyroscope integrated from the truth without a filter."""
+    """Return the errors, to first order, of the gyroscope integrated from the truth."""
     apart = run.dt[:, np.newaxis] * run.gyroscope - increments(run.truth)
     error = np.cumsum(Rotation.from_quat(run.truth[1:]).apply(apart[1:]), axis=0)
     error = np.concatenate((np.zeros((1, 3)), error))[rows]

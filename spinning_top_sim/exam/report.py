@@ -101,7 +101,7 @@ class Findings:
         self.faults = [fault for fault in self.faults if fault.name != name]
 
     def report(self, subject: str, outcomes: Sequence[Outcome]) -> Report:
-        """Return the report, with the first fault of each name: a misreading hides others."""
+        """Return the report, with the first fault of each name: later ones are its effects."""
         first: dict[str, Fault] = {}
         for fault in self.faults:
             first.setdefault(fault.name, fault)

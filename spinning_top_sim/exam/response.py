@@ -42,9 +42,8 @@ BIAS = np.array((0.01, -0.01, 0.02))    # of the gyroscope [rad/s]; its norm is 
 # Errors of a right filter: tilt and heading at rest, then in motion, rms [rad].
 CLEAN = np.array((TILT, HEADING, TILT, HEADING))
 # The largest entry of the gyroscope's matrix less the identity: what is looked into, and what is
-# too much for any other error to be judged.
-GAIN, GROSS_GAIN = 0.003, 0.25
-GROSS_REST = np.radians(10.0)   # rms error of filters that start at rest: the same
+# too much for any other error to be judged; unless filters that start at rest have this error.
+GAIN, GROSS_GAIN, GROSS_REST = 0.003, 0.25, np.radians(10.0)
 START = 50                      # samples after which a filter that starts has an attitude
 SURE = 0.2                      # share of the limit of an explanation: nothing else is tried
 LAG_LEAVES = 0.1                # most of the error, after a delay or a low pass is undone
@@ -61,6 +60,7 @@ LESS = 0.7                      # a step that leaves more of the whole error is 
 LEARNED, LEARNING = 0.5, 0.9
 BIAS_FOUND = 0.05               # share of the bias in the estimate that is more than none
 BIAS_OFF = 0.5                  # relative error of an estimate that is wrong
+UNDONE = '; all measures but those of the field are those after this correction'
 
 Tried = tuple[Hypothesis, Outcome]
 
@@ -71,6 +71,7 @@ class Response:
 
     absolute : whether the heading is judged
     undone : inverses of the causes that were found, for other runs
+    shifts : those of time, such as of a filter that corrects before its step
     early : response to the begin of turns (3, 3), the identity for a right filter
     unclear : whether an error is left that would be taken for that by a lever arm or a bias
     """
@@ -78,10 +79,10 @@ class Response:
     def __init__(self, subject: Subject, absolute: bool, findings: Findings) -> None:
         self._subject, self._absolute, self._findings = subject, absolute, findings
         self.undone: list[Hypothesis] = []
-        self._harmless: list[Hypothesis] = []
+        self.shifts: list[Hypothesis] = []
         self.early, self.unclear = np.eye(3), False
-        self._given = excitation.excite(subject.imu)
-        self._excited, self._rests = self._given.run, self._given.rests
+        self._excitation = excitation.excite(subject.imu, subject.restarts)
+        self._run, self._rests = self._excitation.run, self._excitation.rests
 
     def identify(self) -> None:
         """
@@ -94,44 +95,44 @@ class Response:
             best = self._cause()
             if best is None:
                 break
-            before = self._whole(self._outcome)
+            before = self._error(self._outcome)
             one, self._outcome = best
+            is_shift = {*one.faults} <= {'stamp_offset'}
             self._findings.faults += [
                 Fault(name, f'{one.text}, the error falls from {degrees(before)} to '
-                      f'{degrees(self._whole(self._outcome))}; all measures but those of the '
-                      'field are those after this correction') for name in one.faults]
-            (self.undone if {*one.faults} - {'stamp_offset'} else self._harmless).insert(0, one)
+                      f'{degrees(self._error(self._outcome))}{"" if is_shift else UNDONE}')
+                for name in one.faults]
+            (self.shifts if is_shift else self.undone).insert(0, one)
             self.unclear |= one.given is hypotheses.of_world
-        clean = np.degrees(self._clean(self._outcome))
+        clean = np.degrees(self._errors(self._outcome))
         self._findings.measures |= {'tilt_clean_deg': float(max(clean[::2])),
                                  'heading_clean_deg': float(max(clean[1::2]))}
-        rest = self._rest()
+        others = self._unexplained()
         # A heading that nothing corrects is any.
-        if 'magnetometer_wiring' in [fault.name for fault in rest]:
+        if 'magnetometer_wiring' in [fault.name for fault in others]:
             self._findings.drop('heading_offset')
-        faults = self._findings.faults
-        faults += rest
-        self.unclear |= bool(rest)
+        faults = self._findings.faults = [*self._findings.faults, *others]
+        self.unclear |= bool(others)
         if self.unclear:
             faults[-1] = faults[-1]._replace(
                 evidence=f'{faults[-1].evidence}; no lever arm and no bias is judged')
 
-    def _clean(self, outcome: Outcome, *places: Any) -> Reals:
+    def _errors(self, outcome: Outcome, *places: Any) -> Reals:
         """Return errors of tilt and heading, by default at rest, then in motion, rms [rad]."""
         errors = outcome.errors
         heading = self._absolute * errors.heading
-        return np.array([rms(error[rows]) for rows in places or (self._rests, self._given.motion)
+        return np.array([rms(error[rows])
+                         for rows in places or (self._rests, self._excitation.motion)
                          for error in (errors.tilt, heading)])
 
-    def _whole(self, outcome: Outcome, *places: Any) -> float:
-        return float(np.linalg.norm(self._clean(outcome, *places)))
+    def _error(self, outcome: Outcome, *places: Any) -> float:
+        return float(np.linalg.norm(self._errors(outcome, *places)))
 
     def respond(self, more: Sequence[Hypothesis] = (), run: Run | None = None) -> Outcome:
-        """Return the outcome of a run, by default the excitation; causes found are undone."""
-        return self._subject.follow(run or self._excited,
-                                    [*more, *self._harmless, *self.undone])
+        """Return the outcome of a run, by default the excitation; all that is found is undone."""
+        return self._subject.follow(run or self._run, [*more, *self.shifts, *self.undone])
 
-    def _tried(self, *hypotheses: Hypothesis, screened: bool = True) -> Iterator[Tried]:
+    def _try(self, *hypotheses: Hypothesis, screened: bool = True) -> Iterator[Tried]:
         """Yield the hypotheses with their outcomes; `screened` leaves out what is in vain."""
         for one in hypotheses:
             with contextlib.suppress(InvalidOutputError):       # the filter rejects the readings
@@ -143,12 +144,12 @@ class Response:
     def _in_vain(self, one: Hypothesis) -> bool:
         """Return whether a short run has the error of early rests still: a long one would, too."""
         rests = self._rests[EARLY_RESTS]
-        short = self.respond((one,), self._excited.part(slice(rests[-1] + 1)))
-        before, after = (self._whole(outcome, rests) for outcome in (self._outcome, short))
+        short = self.respond((one,), self._run.part(slice(rests[-1] + 1)))
+        before, after = (self._error(outcome, rests) for outcome in (self._outcome, short))
         return before > HEADING and after > LESS * before
 
     def _turns_wrong(self, outcome: Outcome) -> bool:
-        return from_identity(*gyroscope_of(outcome, self._given.turns)[:2]) > GROSS_GAIN
+        return from_identity(*gyroscope_of(outcome, self._excitation.turns)[:2]) > GROSS_GAIN
 
     def _cause(self) -> Tried | None:
         """
@@ -157,22 +158,21 @@ class Response:
         What would look like another cause is tried before that one.
         """
         gross = self._turns_wrong(self._outcome)
-        if not (gross or np.any(self._clean(self._outcome) > CLEAN)):
+        if not (gross or np.any(self._errors(self._outcome) > CLEAN)):
             return None
-        whole, early, late = gyroscope_of(self._outcome, self._given.turns)
+        whole, early, late = gyroscope_of(self._outcome, self._excitation.turns)
         return (self._best(self._of_attitudes()) or self._best(self._of_delays(late))
                 or self._best(self._of_gyroscope(whole, early), mends_turns=gross)
-                or self._best(self._of_sensor('accelerometer', 2, (0, 1), hypotheses.GRAVITY_SIGN,
-                                              *hypotheses.UNITS))
+                or self._best(self._of_sensor('accelerometer', 2, (0, 1), hypotheses.GRAVITY_SIGN))
                 or self._best(self._of_sensor('magnetometer', 1, (0,), hypotheses.LEVEL))
                 or self._best(self._of_smoothing(), LAG_LEAVES))
 
     def _best(self, tried: Iterator[Tried], share: float = diagnosis.EXPLAINED,
               mends_turns: bool = False) -> Tried | None:
         """Return the one that leaves least, if it explains the error or mends wrong turns."""
-        limit, least, best = share * self._whole(self._outcome), math.inf, None
+        limit, least, best = share * self._error(self._outcome), math.inf, None
         for one, outcome in tried:
-            error = self._whole(outcome)
+            error = self._error(outcome)
             if error < least and (error <= limit or (
                     mends_turns and not self._turns_wrong(outcome))):
                 least, best = error, (hypotheses.ambiguous(one, self._absolute), outcome)
@@ -183,7 +183,7 @@ class Response:
     def _of_attitudes(self) -> Iterator[Tried]:
         """Try misreadings of the attitudes, and what the attitudes at rest suggest."""
         estimated, true = (Rotation.from_quat(rows[self._rests])
-                           for rows in (self._outcome.estimates, self._excited.truth))
+                           for rows in (self._outcome.estimates, self._run.truth))
         in_sensor, in_world = (true.inv() * estimated).mean(), (estimated * true.inv()).mean()
         heading = 2.0 * math.atan2(*in_world.as_quat(canonical=True)[2:])
         back = Rotation.from_rotvec((0.0, 0.0, -heading))
@@ -191,7 +191,7 @@ class Response:
         square = group[int(np.argmin((group.inv() * in_sensor).magnitude()))]
         tangents = [np.tan(0.5 * turns.magnitude()) for turns in (estimated, true)]
         scale = max(float(np.median(tangents[0] / np.maximum(tangents[1], 1e-9))), 1e-3)
-        return self._tried(
+        return self._try(
             *hypotheses.MISREADINGS,
             Hypothesis(('frame_ned',), 'read as attitude of axes '
                        f'{axes(square.as_matrix())} of the sensor',
@@ -205,25 +205,24 @@ class Response:
 
     def _of_delays(self, late: int) -> Iterator[Tried]:
         """Try delays of the attitudes and the gyroscope, and what is no fault."""
-        part = self._outcome.part(slice(self._given.motion.start, None))
-        offset = measures.time_offset(part.estimates, part.run.truth, part.run.rates,
-                                      self._absolute).seconds * scenarios.SLOW.rate
-        yield from self._tried(         # the filter corrects before it takes the step
+        offset = scenarios.SLOW.rate * diagnosis.offset_of(
+            self._outcome.part(self._excitation.motion), self._absolute).seconds
+        yield from self._try(         # the filter corrects before it takes the step
             hypotheses.CORRECTS_FIRST,
             Hypothesis((), 'a step ahead', read=lambda q: moved(q, -1)))
         if not diagnosis.AHEAD <= offset <= diagnosis.DELAYED:
-            yield from self._tried(Hypothesis(
+            yield from self._try(Hypothesis(
                 ('stamp_offset',), f'with the attitude {round(offset)} samples earlier',
                 read=lambda q: moved(q, round(offset))))
         if late > 0:
-            yield from self._tried(delayed(('gyroscope',), late))
+            yield from self._try(delayed(('gyroscope',), late))
 
     def _of_gyroscope(self, whole: Reals, early: Reals) -> Iterator[Tried]:
         """Try the inverse of the matrix that the gyroscope has."""
         if from_identity(whole, early) < GAIN:
             return
         if from_identity(whole, early) > GROSS_GAIN:
-            yield from self._tried(         # judged by the turns
+            yield from self._try(         # judged by the turns
                 *permuted('gyroscope', lambda one: -np.sum((one - early) ** 2)),
                 *(wired('gyroscope', f'with the gyroscope multiplied by {text}', by * np.eye(3),
                         fault='gyroscope_units') for text, by in (
@@ -248,9 +247,9 @@ class Response:
             if np.linalg.cond(matrix) > WORST:
                 return
             fed = fed @ np.linalg.inv(matrix)
-            for one, outcome in self._tried(make(fed), screened=False):
+            for one, outcome in self._try(make(fed), screened=False):
                 yield one, outcome
-                matrix = gyroscope_of(outcome, self._given.turns)[:2][kind]
+                matrix = gyroscope_of(outcome, self._excitation.turns)[:2][kind]
 
     def _of_sensor(self, name: str, axis: int, level: Sequence[int],
                    *more: Hypothesis) -> Iterator[Tried]:
@@ -261,11 +260,14 @@ class Response:
             and zero: up and the horizontal ones for the accelerometer, north and east for the
             magnetometer.  `fit` is largest where readings, turned by the attitudes, are so.
         """
-        tilt, heading, *_ = self._clean(self._outcome)
-        if (max(tilt, heading) < HEADING or not self._absolute if name == 'magnetometer' else
-                tilt < TILT):
+        tilt, heading, *_ = self._errors(self._outcome)
+        shows = {'accelerometer': tilt >= TILT,
+                 'magnetometer': self._absolute and max(tilt, heading) >= HEADING}
+        if not shows[name]:
             return
-        readings = getattr(self._excited, name)
+        if name == 'accelerometer' and self._kicks() != []:     # another unit corrects nothing
+            more = *more, *hypotheses.UNITS
+        readings = getattr(self._run, name)
         found = self._at_rest(self._outcome)
 
         def fit(one: Reals) -> float:
@@ -273,22 +275,22 @@ class Response:
             return float(np.sum(there[:, axis]
                                 / np.linalg.norm(there[:, [axis, *level]], axis=1)))
 
-        yield from self._tried(*more, *permuted(name, fit))
+        yield from self._try(*more, *permuted(name, fit))
         if name == 'magnetometer':
             yield from self._affine(name, 'hard_iron', level, 9)
         yield from self._affine(name, f'{name}_wiring', level, 0)
 
     def _of_smoothing(self) -> Iterator[Tried]:
         """Try delays and low passes of the sensors, each in several steps."""
-        error = self._apart(self._excited.truth)
+        error = self._apart(self._run.truth)
         for names, change in itertools.product(
                 (('gyroscope',), ('accelerometer',), ('magnetometer',),
                  ('accelerometer', 'magnetometer')), (delayed, sharpened)):
-            samples, before = 1.0, self._whole(self._outcome)
+            samples, before = 1.0, self._error(self._outcome)
             for _ in range(STEPS):
-                tried = [*self._tried(change(names, samples), screened=False)]
+                tried = [*self._try(change(names, samples), screened=False)]
                 yield from tried
-                if not tried or (left := self._whole(tried[0][1])) > before:
+                if not tried or (left := self._error(tried[0][1])) > before:
                     break
                 before, turned = left, self._apart(tried[0][1].estimates)
                 more = float(turned @ error) / max(float(turned @ turned), 1e-12)
@@ -297,13 +299,8 @@ class Response:
                 samples = more * samples
 
     def _apart(self, others: Reals) -> Reals:
-        """Return the change of the axes of the world, in the sensor, to other attitudes."""
-        judged = [*self._rests, *range(*self._given.motion.indices(len(others)))[::10]]
-        one, other = (Rotation.from_quat(rows[judged]).inv()
-                      for rows in (self._outcome.estimates, others))
-        # Without a heading, the vertical alone.
-        return np.concatenate([(other.apply(axis) - one.apply(axis)).ravel()
-                               for axis in np.eye(3)[0 if self._absolute else 2:]])
+        judged = [*self._rests, *range(*self._excitation.motion.indices(len(others)))[::10]]
+        return excitation.apart(self._outcome.estimates[judged], others[judged], self._absolute)
 
     def _at_rest(self, outcome: Outcome, more: Sequence[Hypothesis] = (),
                  ) -> list[tuple[Rotation, NDArray[np.intp]]]:
@@ -311,24 +308,25 @@ class Response:
         found = [(Rotation.from_quat(outcome.estimates[self._rests]), self._rests)]
         if self._subject.restarts:
             # Within turns too, the readings are those of a rest in the same attitude.
-            starts = np.concatenate((self._rests, self._given.turns + 15, self._given.turns + 30))
+            turns = self._excitation.turns
+            starts = np.concatenate((self._rests, turns + 15, turns + 30))
             still = np.full((START, 3), excitation.NEVER_ZERO)
             found.insert(0, (Rotation.from_quat([self.respond(more, replace(
-                self._excited.part(np.full(START, row)), gyroscope=still)).estimates[-1]
+                self._run.part(np.full(START, row)), gyroscope=still)).estimates[-1]
                 for row in starts]), starts))
         return found
 
     def _affine(self, name: str, fault: str, level: Sequence[int],
                 first: int) -> Iterator[Tried]:
         """Try the affine change of a sensor that attitudes at rest show, in several steps."""
-        readings = getattr(self._excited, name)
+        readings = getattr(self._run, name)
         size = float(np.linalg.norm(readings[0]))
         fed, outcome, before = np.eye(4), self._outcome, math.inf
         tried: tuple[Hypothesis, ...] = ()
         for _ in range(STEPS):
-            if self._whole(outcome) > LESS * before:
+            if self._error(outcome) > LESS * before:
                 return
-            before = self._whole(outcome)
+            before = self._error(outcome)
             for turns, rows in self._at_rest(outcome, tried):
                 change, left = excitation.affine_of(readings[rows] / size, turns, level, first)
                 if left < FITS:
@@ -339,16 +337,27 @@ class Response:
             one = wired(name, f'with the {name} multiplied by [matrix, offset] = '
                         f'{fed[:3].round(4).tolist()}', fed[:3, :3], size * fed[:3, 3], fault)
             tried = one,
-            for _, outcome in self._tried(one):
+            for _, outcome in self._try(one):
                 yield one, outcome
 
-    def _rest(self) -> list[Fault]:
-        """Name what no hypothesis explains by where it shows."""
-        clean = self._clean(self._outcome)
+    def _kicks(self) -> list[Fault] | None:
+        """Name the sensors that do not correct a kick; None: it is too far off to tell."""
+        not_corrected = partial(excitation.not_corrected, self._outcome.estimates,
+                                given=self._excitation, absolute=self._absolute)
+        if not not_corrected(self._run.truth):
+            return []
+        without = self.respond((), self._excitation.still).estimates    # has the same error
+        error = measures.errors_of(without, self._run.truth).attitude(True)
+        # Far from the truth no filter is linear.
+        return not_corrected(without) if error[self._excitation.kicks[0][0]] < NEAR else None
+
+    def _unexplained(self) -> list[Fault]:
+        """Name what no hypothesis explains by where it shows; set `early`."""
+        clean = self._errors(self._outcome)
         left = ('without noise the error at rest is {} of tilt and {} of heading, '
                 'in motion {} and {}').format(*map(degrees, clean))
         wrong = bool(np.any(clean > CLEAN))
-        whole, early, late = gyroscope_of(self._outcome, self._given.turns)
+        whole, early, late = gyroscope_of(self._outcome, self._excitation.turns)
         self.early = early
         turns = Rotation.from_quat(self._outcome.estimates)
         if np.max((turns * turns[0].inv()).magnitude()) < STUCK:
@@ -356,64 +365,55 @@ class Response:
         if from_identity(whole, early) > GROSS_GAIN:
             if self._subject.restarts:      # what is wrong without turns is not the gyroscope's
                 turns, rows = self._at_rest(self._outcome)[0]
-                start = measures.errors_of(turns.as_quat(), self._excited.truth[rows])
-                if rms(start.known(self._absolute)) > GROSS_REST:
+                start = measures.errors_of(turns.as_quat(), self._run.truth[rows])
+                if rms(start.judged(self._absolute)) > GROSS_REST:
                     return [Fault('inaccurate', f'{left}: no cause explains it')]
             return [Fault('gyroscope_wiring', words(early))]
         if wrong and late > 1:
             return [Fault('lag', f'turns are followed {late} samples late; {left}')]
-        not_corrected = partial(excitation.not_corrected, given=self._given,
-                                absolute=self._absolute)
-        found = not_corrected(self._outcome.estimates, self._excited.truth)
-        if found:               # a run without kicks has the same error
-            without = self.respond((), self._given.still).estimates
-            error = measures.errors_of(without, self._excited.truth).attitude(True)
-            # Far from the truth no filter is linear.
-            found = (not_corrected(self._outcome.estimates, without)
-                     if error[self._given.kicks[0][0]] < NEAR else [])
+        found = self._kicks() or []
         if 'accelerometer_wiring' in [fault.name for fault in found]:
-            for one, outcome in self._tried(*hypotheses.UNITS, screened=False):
-                if not not_corrected(outcome.estimates, self._excited.truth):
+            for one, outcome in self._try(*hypotheses.UNITS, screened=False):
+                if not excitation.not_corrected(outcome.estimates, self._run.truth,
+                                                self._excitation, self._absolute):
                     return [Fault(one.faults[0], f'{found[0].evidence}, but {one.text} it is')]
         if not found and wrong:
             return [Fault('inaccurate', f'{left}: no cause explains it')]
-        return found
+        return found or excitation.astray(self._outcome, self._excitation, self._absolute)
 
     def judge_bias(self) -> None:
         """
         Compare runs with and without a gyroscope bias, after `identify`.
 
-        `left` is whether the attitude is off in the end, relative to the bias.  That is no fault
-        if the filter learns: the effect in the attitude of the first rest is smaller `again`,
-        much smaller or with an estimate that grows or is `close`, and no axis is left out while
-        another is learned (`partly`).  Otherwise the estimate, if any, must be `right`.
+        See `no_bias_estimate` and `bias_report` in docs/exam.md.
         """
-        motion, size = self._given.motion, float(np.linalg.norm(BIAS))
-        run = self._excited.part(slice(motion.stop))
+        motion, size = self._excitation.motion, float(np.linalg.norm(BIAS))
+        run = self._run.part(slice(motion.stop))
         outcome = self.respond((), replace(run, gyroscope=run.gyroscope + BIAS))
         apart = measures.errors_of(
-            outcome.estimates, self._outcome.estimates[:motion.stop]).known(self._absolute)
+            outcome.estimates, self._outcome.estimates[:motion.stop]).judged(self._absolute)
         estimates = outcome.biases - self._outcome.biases[:motion.stop]
         estimates = estimates[np.isfinite(estimates[:, 0])]
         if not len(estimates):
             estimates = np.full((1, 3), math.nan)
-        found, late = estimates[-1], rms(apart[motion]) / size
+        found, left_s = estimates[-1], rms(apart[motion]) / size
         share, before = (estimates[[-1, len(estimates) // 4]] @ BIAS / size ** 2).tolist()
         first, again = apart[self._rests[[0, -2]]].tolist()
-        self._findings.measures |= {'bias_error_s': late, 'bias_found': share}
-        left, shares = late > diagnosis.BIAS_LEFT_S, (found / BIAS).tolist()
+        self._findings.measures |= {'bias_error_s': left_s, 'bias_found': share}
+        left, shares = left_s > diagnosis.BIAS_LEFT_S, (found / BIAS).tolist()
         # A filter that has gone on for minutes is sure of its bias, and learns another one slowly.
-        close = bool(np.linalg.norm(found - BIAS) < BIAS_OFF * size)
-        right = (-BIAS_FOUND < share < 1.0 / BIAS_OFF if left or not self._subject.restarts else
-                 close)
+        close = bool(np.median(np.linalg.norm(
+            estimates[-len(estimates) // 8:] - BIAS, axis=1)) < BIAS_OFF * size)
+        right = -BIAS_FOUND < share < 2.0 if left or not self._subject.restarts else close
         learns = again < LEARNED * first or (
             again < LEARNING * first and (close or share > max(BIAS_FOUND, 1.2 * before)))
         partly = self._absolute and min(shares) < BIAS_FOUND and max(shares) > LEARNED
         if left and (partly or not learns):
             self._findings.faults.append(Fault(
                 'no_bias_estimate', 'with a gyroscope bias of 1 deg/s the '
-                f'{"attitude" if self._absolute else "tilt"} is {late:.3g} deg off in the end: '
-                f'the bias is not learned{" about each axis" * partly}'))
+                f'{"attitude" if self._absolute else "tilt"} is {left_s:.3g} deg off in the end: '
+                f'the bias is not learned{" about each axis" * partly} in '
+                f'{motion.stop / scenarios.SLOW.rate:.0f} s'))
         elif not right and not math.isnan(share):
             self._findings.faults.append(Fault(
                 'bias_report', f'a gyroscope bias of {np.degrees(BIAS).round(2).tolist()} deg/s '

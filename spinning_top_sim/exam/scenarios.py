@@ -111,7 +111,7 @@ class Run:
             -self.gyroscope[0] * self.dt[0])
 
     def preceded_by(self, lead: 'Run') -> 'Run':
-        """Return this run with another one before it, of the same name; there t <= 0."""
+        """Return this run with another one before it, of the same name; `t` is that of each."""
         return Run(self.name, *(np.concatenate((getattr(lead, one.name), getattr(self, one.name)))
                                 for one in fields(self)[1:]))
 

@@ -57,7 +57,7 @@ class Subject:
         return False
 
     def convergence(self) -> Mapping[str, float]:
-        """Return the convergence time, if runs do not begin with it."""
+        """Return the convergence time; {} where the noisy runs show it."""
         return {}
 
 

@@ -61,7 +61,7 @@ class InvalidOutputError(Exception):
 
 
 class NodeError(RuntimeError):
-    """A node cannot be examined; the text says why, and what to check."""
+    """A node cannot be examined: this ends the exam, any other error is a fault of the node."""
 
 
 # Attitudes, covariances and biases as in `Outcome`.

@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade import problem as unknowns
-from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Readings, turned
+from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Samples, turned
 from spinning_top_sim.grade.scenes import Reals, Start
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -137,7 +137,7 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     if not np.any(np.ptp(attitudes, axis=0)):
         raise ValueError('the attitude never changes: there is no motion to fit')
     turns = Rotation.from_quat(np.roll(attitudes, -1, axis=1))
-    one = Readings('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
+    one = Samples('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
     told = parts.get('rates', parts.get('gyroscope'))
     spin, sure = unknowns.spin_rate(one.times, one.values,
                                     told and float(np.median(told[1][:, 2])))
@@ -184,7 +184,7 @@ def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) 
         f'at its begin the attitude is up to {math.degrees(np.max(apart)):.3g} deg off')
 
 
-def _fit_from(one: Readings, x: Reals, size: int, gravity: float) -> _Trial:
+def _fit_from(one: Samples, x: Reals, size: int, gravity: float) -> _Trial:
     """Fit longer and longer parts from `size` attitudes on; with 0, L3 and P in the last only."""
     problem = Problem([one], one.values[:, 0], gravity)
     done, growth, level, last = (size or FIRST) / GROWTH, GROWTH, math.inf, len(one.times)
@@ -219,7 +219,7 @@ def _judged(problem: Problem, x: Reals, converged: bool, frozen: Sequence[int] =
 
 
 def _descend(problem: Problem, x: Reals, free: Sequence[int], evaluations: int = 30,
-            tolerance: float = 1e-8) -> tuple[Reals, bool]:
+             tolerance: float = 1e-8) -> tuple[Reals, bool]:
     """Return the unknowns at the least sum of squares, and whether it was reached."""
     chosen = [*free]
 
@@ -251,8 +251,8 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]]) -> _Trial
     for name, kind in (('gyroscope', 'rates'), ('accelerations', 'force')):
         if name not in parts:
             raise ValueError(f'the file has no {name}: the place of the IMU cannot be fitted')
-        streams.append(Readings(kind, parts[name][0] - parts['attitudes'][0][0],
-                                np.ascontiguousarray(parts[name][1].T)))
+        streams.append(Samples(kind, parts[name][0] - parts['attitudes'][0][0],
+                               np.ascontiguousarray(parts[name][1].T)))
         streams[-1].sigma = float(np.std(streams[-1].values)) or 1.0
     (one,), problem.readings = problem.readings, streams
     _, model = problem.motion(x, streams[0])

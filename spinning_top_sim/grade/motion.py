@@ -160,8 +160,8 @@ class Motion:
             self.truth.angular_velocity[MARGIN:-MARGIN])
 
     @property
-    def accelerations(self) -> Reals:
-        """Angular accelerations (n - 12, 3)."""
+    def angular_accelerations(self) -> Reals:
+        """In the body (n - 12, 3) [rad/s^2]."""
         inner = slice(MARGIN, -MARGIN)
         total = correlate1d(self.rates - self.truth.angular_velocity[inner], _WEIGHTS, axis=0)
         return (total / self.trajectory.step + self.truth.angular_acceleration[inner])[inner]

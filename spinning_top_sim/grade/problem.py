@@ -36,9 +36,9 @@ CHANGE = 1e-5               # of the readings by a step of finite differences [r
 
 
 @dataclass(eq=False)
-class Readings:
+class Samples:
     """
-    Readings at times.
+    Samples at times.
 
     kind : 'attitude', q(world <- body) as x, y, z, w; 'rates' or 'force' of an IMU
     times : (n,), ascending [s]
@@ -59,7 +59,7 @@ class Problem:
     reference, mounting : q(world <- body) at t = 0 and q(body <- IMU) before the unknown turns
     """
 
-    def __init__(self, readings: Sequence[Readings], reference: Reals, gravity: float) -> None:
+    def __init__(self, readings: Sequence[Samples], reference: Reals, gravity: float) -> None:
         self.readings, self.reference, self.gravity = readings, reference, gravity
         self.mounting: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
         self._steps = np.full(UNKNOWNS, 1e-6)
@@ -95,7 +95,7 @@ class Problem:
             self._steps[k] = min(max(CHANGE / max(largest, 1e-300), 1e-12), 1e-4)
         return np.stack(columns, axis=1)
 
-    def residual(self, x: Reals, one: Readings) -> Reals:
+    def residual(self, x: Reals, one: Samples) -> Reals:
         """Return readings - model (3, n)."""
         q, w = self.motion(x, one)
         if one.kind == 'attitude':
@@ -105,12 +105,12 @@ class Problem:
         model = w if one.kind == 'rates' else self._force(x, q, w)
         return one.values - turned(self.mounting, x[MOUNTING]).inv().apply(model.T).T
 
-    def motion(self, x: Reals, one: Readings) -> tuple[Reals, Reals]:
+    def motion(self, x: Reals, one: Samples) -> tuple[Reals, Reals]:
         """Return attitudes (4, n), and for an IMU rates in the body (3, n), at its times."""
         late = 0.0 if one.kind == 'attitude' else float(x[LATE])
         return self._motion(one, *x[:8].tolist(), late=late)
 
-    def _motion_of(self, one: Readings, *unknowns: float, late: float) -> tuple[Reals, Reals]:
+    def _motion_of(self, one: Samples, *unknowns: float, late: float) -> tuple[Reals, Reals]:
         x, t = np.array(unknowns), one.times - late
         states = ExactSolution(*self.start(x)).states_at_seconds(t)
         angle, zero = (x[SPIN] - x[L3]) * t, np.zeros(1)

@@ -43,7 +43,7 @@ _DEGREES, _G = (180.0 / math.pi, math.pi / 180.0), (1.0 / 9.80665,)
 UNITS = {'gyroscope': _DEGREES, 'rates': _DEGREES, 'rotations': _DEGREES, 'accelerations': _G,
          'velocities': _G, 'magnetometer': (1e4, 1e6, 1e9)}
 FORCES = ('accelerations', 'velocities')
-_rate = partial(np.gradient, axis=0)        # change per step of values (m, 3)
+_per_step = partial(np.gradient, axis=0)        # change per step of values (m, 3)
 
 
 class Readings(NamedTuple):
@@ -60,8 +60,8 @@ class Readings(NamedTuple):
     terms: Sequence[str]
     size: float
 
-    def late(self, lag: int, names: Sequence[str] = ()) -> tuple[Reals, dict[str, Reals]]:
-        """Return what is wrong `lag` samples after the effects, and the effects there."""
+    def apart(self, lag: int, names: Sequence[str] = ()) -> tuple[Reals, dict[str, Reals]]:
+        """Return reading less total, and the effects, for a reading that is `lag` samples late."""
         total, begin = self.effects['total'], self.first + lag
         end = min(begin + len(total), len(self.reading))
         skip = max(0, -begin)
@@ -88,7 +88,7 @@ def _readings_of(kind: str, motion: Motion) -> Readings | None:
         reading, first = reading[:, :3] / said.step, first + 1
         terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
     else:
-        first, a, w = 2 * MARGIN, motion.accelerations, w[inner]
+        first, a, w = 2 * MARGIN, motion.angular_accelerations, w[inner]
         axes = np.eye(3)[:, np.newaxis]
         tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
         arms = tangential + centripetal
@@ -102,13 +102,13 @@ def _readings_of(kind: str, motion: Motion) -> Readings | None:
     effects = {name: mounting.inv().apply(term) for name, term in terms.items()}
     effects['total'] = total = sum(effects.values(), np.zeros(1))
     turn = said.rotation[first:first + len(total)] * mounting
-    effects |= {'step': _rate(total), 'world': (world := turn.apply(total)),
+    effects |= {'step': _per_step(total), 'world': (world := turn.apply(total)),
                 'reversed': turn.apply(world)}
     if kind in FORCES:
         back, kinematic = turn.inv().apply, total - effects['gravity']
-        effects |= {'kinematic': kinematic, 'difference': back(_rate(turn.apply(kinematic))),
-                    'turned': back(_rate(world)) - effects['step'],
-                    'tangential step': _rate(effects['tangential']),
+        effects |= {'kinematic': kinematic, 'difference': back(_per_step(turn.apply(kinematic))),
+                    'turned': back(_per_step(world)) - effects['step'],
+                    'tangential step': _per_step(effects['tangential']),
                     **{f'fixed {k}': 0.0 * total + axis for k, axis in enumerate(np.eye(3))},
                     **{f'arm {k}': mounting.inv().apply(arm) for k, arm in enumerate(arms)}}
     size = rms(reading) or 1.0
@@ -117,15 +117,15 @@ def _readings_of(kind: str, motion: Motion) -> Readings | None:
 
 
 def faults_of_rates(motions: Sequence[Motion]) -> list[Fault]:
-    """Compare the rates that a simulator tells with its attitudes; mark those that are right."""
+    """Compare the rates told with the attitudes; unless unusable, they become `Motion.rates`."""
     faults, _ = judge('rates', motions)
-    first = faults[0].name if faults else 'rates_scale'
+    name = faults[0].name if faults else ''
     for motion in motions:
         said = motion.trajectory
-        if said.rates is not None and first in ('rates_scale', 'rates_in_world'):
-            motion.derived, motion.rates = False, (
-                said.rates if first == 'rates_scale' else
-                said.rotation.inv().apply(said.rates))[MARGIN:-MARGIN]
+        if said.rates is not None and name in ('', 'rates_scale', 'rates_in_world'):
+            rates = (said.rotation.inv().apply(said.rates) if name == 'rates_in_world' else
+                     said.rates)
+            motion.derived, motion.rates = False, rates[MARGIN:-MARGIN]
     return faults
 
 
@@ -133,7 +133,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     """
     Return faults and measures of the readings of one of KINDS, or of the rates told.
 
-    Of all that follows, `noise` of each motion and `floor` of all are the rms of white noise in
+    Throughout, `noise` of each motion and `floor` of all are the rms of white noise in
     the discrepancy, by differences; `doubt` is the relative error of that, and `most` what the
     noise may be at most.
     """
@@ -142,7 +142,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
         return [], {}
     # Velocities are means over a step.
     lag, late = (0, 0.0) if kind == 'velocities' else _lag(runs)
-    wrong, effects = zip(*(run.late(lag) for run in runs), strict=True)
+    wrong, effects = zip(*(run.apart(lag) for run in runs), strict=True)
     target, sizes = np.concatenate(wrong), np.array([run.size for run in runs])
     noise, floor = np.array([*map(_white, wrong)]), _white(*wrong)
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
@@ -153,7 +153,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     if abs(late) > LATE:
         faults.append(Fault('imu_one_step_late', 'readings belong to the motion of '
                             f'{abs(late):.3g} steps {"before" if late > 0.0 else "after"}', late))
-    found, residual, explained = _explained(
+    found, residual, explained = _find_causes(
         kind, motions, *pooled(zip(wrong, effects, strict=True)), floor, most)
     faults += found
     if explained and kind in DENSITIES and not any(
@@ -167,7 +167,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     return [fault._replace(evidence=f'{kind}: {fault.evidence}') for fault in faults], marks
 
 
-def _explained(kind: str, motions: Sequence[Motion], target: Reals, effects: Mapping[str, Reals],
+def _find_causes(kind: str, motions: Sequence[Motion], target: Reals, effects: Mapping[str, Reals],
                floor: float, most: float) -> tuple[list[Fault], Reals, bool]:
     """Return the causes of a discrepancy, what they leave of it, and whether that is noise."""
     before, strange = beyond(target, most), STRANGE.get(kind, STRANGE_OTHERS)
@@ -230,16 +230,16 @@ def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residua
 def _lag(runs: Sequence[Readings]) -> tuple[int, float]:
     """Return by how many samples readings are late, with any size of their terms, and by what."""
     def left(lag: int) -> float:
-        target, effects = pooled(run.late(lag, (*run.terms, 'step')) for run in runs)
+        target, effects = pooled(run.apart(lag, (*run.terms, 'step')) for run in runs)
         return rms(fitted(target, [*effects.values()])[1])
 
-    floor, now, best = _white(*(run.late(0)[0] for run in runs)), left(0), 0
+    floor, now, best = _white(*(run.apart(0)[0] for run in runs)), left(0), 0
     if now ** 2 >= 1.1 * floor ** 2 + CONSISTENT ** 2:
         most = len(runs[0].effects['total']) // 4
         found = {lag: left(lag) for lag in LAGS if lag < most}
         best = min(found, key=lambda lag: found[lag])
         best = best if found[best] < 0.5 * now else 0
-    target, effects = pooled(run.late(best) for run in runs)
+    target, effects = pooled(run.apart(best) for run in runs)
     # The acceleration of a step may be that of its begin, without a lag of the reading.
     steps, rest = fitted(target, [effects[name] for name in (
         'step', 'tangential step') if name in effects])

@@ -15,7 +15,7 @@ class Fault(NamedTuple):
     Parameters
     ----------
     name : str
-        One of FAULTS.
+        As in docs/exam.md or docs/grade.md.
     evidence : str
         Why it is reported.
     number : float

@@ -43,8 +43,7 @@ ALL_KEPT, FAILED, SOME_LOST = 0, 1, 3
 def cdr(number: int) -> tuple[int, bytes]:
     """Return a topic and a message for it."""
     if number % 3:
-        return 0, bytes(JAZZY.serialize_cdr(
-            JAZZY.types[POINT](float(number), -2.0, 1 / 3), POINT))
+        return 0, bytes(JAZZY.serialize_cdr(JAZZY.types[POINT](float(number), -2.0, 1 / 3), POINT))
     return 1, bytes(JAZZY.serialize_cdr(JAZZY.types[NUMBER](float(number)), NUMBER))
 
 

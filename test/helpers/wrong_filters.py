@@ -76,9 +76,10 @@ class Mahony(Part):
     """A filter of Mahony (2008) with exact steps."""
 
     def start(self, up=0.3, north=0.3, learns=0.15, most=np.inf, advance=body, triad=True,
-              level=True, declination=0.0, about=None):
+              level=True, declination=0.0, about=None, angle=math.atan2):
         self._gains, self._most, self._advance = (up, north, learns), most, advance
         self._triad, self._level, self._declination, self._about = triad, level, declination, about
+        self._angle = angle
         self._q, self._bias = None, np.zeros(3)
 
     def turn(self, w, a, m, dt):
@@ -93,7 +94,7 @@ class Mahony(Part):
             if not self._level:
                 yaw = Rotation.from_quat(self._q).as_euler('ZYX')[0]
                 h = Rotation.from_euler('z', yaw).apply(m)
-            angle = math.atan2(h[0], h[1]) + self._declination
+            angle = self._angle(h[0], h[1]) + self._declination
             e = e + north * angle * (r[2] if self._about is None else self._about)
         self._bias = np.minimum(np.maximum(self._bias - learns * e * dt, -self._most), self._most)
         self._q = body(self._q, e * dt)
@@ -194,7 +195,10 @@ OWN = {     # and these
         'gain < 0': ({'up': -0.3}, f'gravity_sign {GRAVITY} diverges'),
         'no gravity': ({'up': 0.0}, GRAVITY), 'no field': ({'north': 0.0}, FIELD),
         'field of a level sensor': ({'level': False}, FIELD),
+        'heading by atan': ({'angle': lambda x, y: math.atan(x / y)}, OFF),
         'heading about z': ({'about': np.array((0.0, 0.0, 1.0))}, f'{FIELD} {OFF}'),
+        'slow turns dropped': ({'gyroscope': lambda v: v * (v @ v > 0.04)}, OFF),
+        'dt at most 10 ms': ({'step': lambda dt: min(dt, 0.01)}, STEP),
         'dt cut': ({'step': lambda dt: int(100.0 * dt) / 100.0}, STEP),
         'dt rounded': ({'step': lambda dt: round(dt, 3)}, STEP),
         'slow heading': ({'north': 0.01, 'learns': 0.02}, 'no_bias_estimate'),
