@@ -121,7 +121,9 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
                  LastingSubject(make_filter, values, numbers[0]), numbers)
     exam.sit()
     if level == 'full' and restart and exam.outcomes:
-        exam.findings.measures |= in_field(numbers[:1]).measures
+        scenes = in_field(numbers[:1])
+        exam.findings.measures |= scenes.measures
+        exam.findings.faults += scenes.found
     return exam.findings.report(subject, exam.outcomes)
 
 
