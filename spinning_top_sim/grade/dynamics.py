@@ -117,7 +117,7 @@ def _inertia(body: Body, found: Reals) -> Fault | None:
     if np.any(shares <= 0.0):
         return None
     first, second = body.lambda1 / shares
-    # (I2 - I3)/I1, (I3 - I1)/I2 are told by the first two.
+    # The others are changes of (I2 - I3)/I1 and (I3 - I1)/I2; each of them tells I3.
     right = (body.lambda1 - body.lambda3) / body.lambda1
     third = 0.5 * (second - first * (right + found[2]) + first + second * (found[3] - right))
     return Fault('inertia', 'the motion is that of moments of inertia '

@@ -185,7 +185,7 @@ def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) 
 
 
 def _fit_from(one: Samples, x: Reals, size: int, gravity: float) -> _Trial:
-    """Fit longer and longer parts from `size` attitudes on; with 0, L3 and P in the last only."""
+    """Fit longer parts from `size` attitudes on; 0: from FIRST, L3 and P in the last only."""
     problem = Problem([one], one.values[:, 0], gravity)
     done, growth, level, last = (size or FIRST) / GROWTH, GROWTH, math.inf, len(one.times)
     converged = False
@@ -326,8 +326,9 @@ def _not_told(names: Sequence[str], values: Reals, deviations: Reals,
 def _without_unseen_nutation(problem: Problem, x: Reals,
                              residual: float) -> tuple[Reals, tuple[int, ...]]:
     """
-    Return the steady or sleeping motion with lambda3 = lambda1 next to one whose nutation may be
-    noise, and the unknowns that it does not tell; the unknowns as they are and () if it is none.
+    Return x and (), or where the nutation may be noise, the nearest motion without it.
+
+    That is steady or sleeping, with lambda3 = lambda1; the unknowns that it does not tell follow.
     """
     motion = ExactSolution(*problem.start(x))
     low, high = motion.theta_min, motion.theta_max

@@ -35,7 +35,7 @@ FAR = 1e9
 CHANGE = 1e-5               # of the readings by a step of finite differences [rad], [rad/s], ..
 
 
-@dataclass(eq=False)
+@dataclass(eq=False)        # hashed by identity
 class Samples:
     """
     Samples at times.

@@ -25,7 +25,7 @@ Judge = Callable[[Reals], Fault | None]     # of the coefficients of a cause; No
 
 
 class Cause(NamedTuple):
-    """A possible cause of a discrepancy: names of its effects, and what names its fault."""
+    """Names of the effects of a possible cause, and what names its fault; None: it is no fault."""
 
     effects: Sequence[str]
     judge: Judge | None = None
@@ -74,6 +74,7 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
 
 def _named(causes: Sequence[Cause], found: Reals) -> list[Fault]:
     """Return the faults that causes with these coefficients are."""
+    # Without causes `split` gives one part.
     ends = np.cumsum([len(one.effects) for one in causes], dtype=int)[:-1]
     return [fault for one, part in zip(causes, np.split(found, ends), strict=False)
             if one.judge and (fault := one.judge(part))]

@@ -103,7 +103,7 @@ class Start:
                    tuple(first.angular_velocity[0].tolist()), state)
 
     def state_of(self, top: Top) -> State:
-        """Return the start as a state of `top`."""
+        """Return `state`, or else the start as a state of `top`."""
         if self.state is not None:
             return self.state
         turn = Rotation.from_quat(np.roll(self.attitude, -1))
