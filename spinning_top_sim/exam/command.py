@@ -89,16 +89,21 @@ def _run(arguments: argparse.Namespace) -> int:
     return cli.OK if report.passed else cli.FAILED
 
 
-def _report(arguments: argparse.Namespace) -> Report:
+def _kind(arguments: argparse.Namespace) -> str:
+    """Return what is examined, a key of OPTIONS.  Raises ValueError where that is not clear."""
     if ([arguments.log, arguments.node, arguments.filter].count(None) < 2
             or (arguments.filter is None
                 and (arguments.topic is None or arguments.data is not None))):
         log = f'{arguments.log}: ' if arguments.log else ''
         raise ValueError(f'{log}give either a log and --topic, --node and --topic, --topic '
                          'alone, --filter, or --filter and --data')
-    kind = ('a log' if arguments.log is not None else
+    return ('a log' if arguments.log is not None else
             '--data' if arguments.data is not None else
             '--filter' if arguments.filter is not None else 'a node')
+
+
+def _report(arguments: argparse.Namespace) -> Report:
+    kind = _kind(arguments)
     options = {name: value for names in OPTIONS.values() for name in names
                if (value := getattr(arguments, name)) is not None}
     for name in options.keys() - OPTIONS[kind]:
