@@ -77,8 +77,8 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
         now += 200_000_000
 
 
-@pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0), *(('wrong', list(
-    TABLE).index(f'mahony, {name}')) for name in ('dt rounded', 'heading by atan'))])
+@pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0), *(('wrong', [*TABLE]
+    .index(f'mahony, {one}')) for one in ('dt rounded', 'slow heading', 'heading by atan'))])
 def test_a_seed_of_a_part_of_make_stress(tmp_path, monkeypatch, request, part, seed):
     pytest.importorskip('rclpy')
     module = importlib.import_module(f'stress.{part}')

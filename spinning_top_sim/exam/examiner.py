@@ -17,11 +17,7 @@ from spinning_top_sim.exam import diagnosis, measures, scenarios
 from spinning_top_sim.exam.diagnosis import degrees
 from spinning_top_sim.exam.excitation import from_identity, words
 from spinning_top_sim.exam.field import examine_field
-from spinning_top_sim.exam.hypotheses import (
-    CORRECTS_FIRST,
-    WITHOUT_FIELD,
-    Hypothesis,
-)
+from spinning_top_sim.exam.hypotheses import CORRECTS_FIRST, WITHOUT_FIELD, Hypothesis
 from spinning_top_sim.exam.isolation import feed_apart
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.report import Findings, Report

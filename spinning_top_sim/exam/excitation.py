@@ -32,10 +32,10 @@ STAYS, GROWN = 0.995, 1.1
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
 DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
-# The last rest: yaw, pitch and roll [deg].  There the heading is turned as far as that takes it
-# across south and, counted from the east, across west.
+# Yaw, pitch and roll of the last rest [deg], and a turn of the heading there.  The yaw passes 180
+# degrees in this turn, whether it counts from the east or from the north.
 DOWN, ASTRAY, ASTRAY_S = (160.0, 20.0, 140.0), np.radians(120.0), 0.5
-GROWS = 1.03                    # of the error that this leaves
+FARTHER = 1.03                  # of the error after this turn is no right filter's
 
 
 class Kick(NamedTuple):
@@ -80,7 +80,8 @@ def excite(imu: Mapping[str, Any], goes_astray: bool) -> Excitation:
     """
     Return the run for the IMU's place and field, sampled at the rate of the slow motion.
 
-    goes_astray : whether the heading is turned far off at last; the next run would begin with that
+    goes_astray : whether the heading is turned far off at the end; a filter that goes on would
+        begin its next run there
     """
     rate = scenarios.SLOW.rate
     motion = scenarios.record(replace(scenarios.PIVOT, duration=MOTION_S), imu, 0)
@@ -113,7 +114,8 @@ def excite(imu: Mapping[str, Any], goes_astray: bool) -> Excitation:
             run.gyroscope[first:first + round(KICK_S * rate)] += (
                 attitude.inv().apply(kick.turn) / KICK_S)
     far = slice(kicks[-1][-1] + answer, kicks[-1][-1] + answer + round(ASTRAY_S * rate))
-    run.gyroscope[far] += goes_astray * last[1].inv().apply((0.0, 0.0, ASTRAY / ASTRAY_S))
+    if goes_astray:
+        run.gyroscope[far] += last[1].inv().apply((0.0, 0.0, ASTRAY / ASTRAY_S))
     return Excitation(run, still, ends - 1, ends[:len(TURNS)],
                       slice(end - len(motion.t) // 2, end), kicks, slice(far.stop, None))
 
@@ -174,7 +176,7 @@ def not_corrected(estimates: Reals, without: Reals, given: Excitation,
 def astray(outcome: Outcome, given: Excitation, absolute: bool) -> list[Fault]:
     """Return the fault of a filter that, turned far off north, turns farther."""
     errors = np.abs(outcome.part(given.astray).errors.heading)
-    if not absolute or np.max(errors) < max(ASTRAY, GROWS * errors[0]):
+    if not absolute or np.max(errors) < max(ASTRAY, FARTHER * errors[0]):
         return []
     return [Fault('inaccurate', f'turned off north by {np.degrees(errors[0]):.0f} deg, it turns '
                   f'to {np.degrees(np.max(errors)):.0f} deg')]
