@@ -23,6 +23,7 @@ from spinning_top_sim.exam import broad, field
 from spinning_top_sim.exam.adapters import Ahrs, Imufusion, Vqf
 from spinning_top_sim.exam.measures import Rmse, rmse
 from spinning_top_sim.exam.reference import ReferenceFilter
+from spinning_top_sim.exam.scored import ScoredRun
 from spinning_top_sim.exam.trial import InvalidOutputError, feed
 from spinning_top_sim.tools.cli import progress
 
@@ -44,7 +45,7 @@ DRAWS = 2000
 
 
 @cache
-def trial_of(what: Path | tuple[int, int]) -> broad.Trial:
+def trial_of(what: Path | tuple[int, int]) -> ScoredRun:
     """Return a trial of a file, or of a scene and a seed."""
     if isinstance(what, Path):
         return broad.read_trial(what)

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top
 from spinning_top_sim.grade import Body, Start, grade, grade_trajectory
-from spinning_top_sim.grade.motion import InvalidTrajectoryError, errors_of
+from spinning_top_sim.grade.motion import InvalidTrajectoryError, errors_by_angle
 from spinning_top_sim.grade.pytest_plugin import pass_grade  # noqa: F401, a fixture
 from spinning_top_sim.grade.scenes import SCENES, WHEEL
 
@@ -51,11 +51,11 @@ def test_errors_are_split_into_precession_nutation_and_spin():
     for name, angles, size in (('precession', (phi + 1e-3, theta, psi), math.sin(theta)),
                                ('nutation', (phi, theta + 1e-3, psi), 1.0),
                                ('spin', (phi, theta, psi + 1e-3), 1.0)):
-        errors = errors_of(Rotation.from_euler('ZYZ', [angles]), truth)
+        errors = errors_by_angle(Rotation.from_euler('ZYZ', [angles]), truth)
         assert errors[name] == pytest.approx(1e-3 * size, rel=1e-3)
         others = {'precession', 'nutation'} - {name}
         assert all(abs(errors[other]) < 1e-9 for other in others)
-    turned = errors_of(Rotation.from_euler('ZYZ', [(phi + 1e-3, theta, psi)]), truth)
+    turned = errors_by_angle(Rotation.from_euler('ZYZ', [(phi + 1e-3, theta, psi)]), truth)
     assert turned['spin'] == pytest.approx(1e-3 * math.cos(theta), rel=1e-3)
 
 

@@ -32,7 +32,7 @@ AHEAD, DELAYED = -1.5, 0.75     # steps; a filter that corrects before its step 
 BIAS_LEFT_S = 0.05              # error relative to the bias that causes it [rad/(rad/s)]
 
 
-def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
+def error_measures(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
     """Return the measures of the errors in several runs, as defined in docs/exam.md."""
     settled = [outcome.last() for outcome in outcomes]
     errors = [outcome.errors for outcome in settled]
@@ -40,7 +40,7 @@ def marks(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, float]:
         'tilt_rms_deg': math.degrees(rms(np.concatenate([one.tilt for one in errors]))),
         'tilt_max_deg': math.degrees(max(float(np.max(one.tilt)) for one in errors)),
         'heading_rms_deg': math.degrees(rms(np.concatenate(
-            [one.heading_varying(absolute) for one in errors]))),
+            [one.varying_heading(absolute) for one in errors]))),
         'convergence_s': max(measures.convergence_time(outcome.run.t, outcome.errors.tilt)
                              for outcome in outcomes),
         'heading_drift_deg_per_s': math.degrees(float(np.mean([
@@ -76,7 +76,7 @@ def quality(outcomes: Sequence[Outcome], imu: Mapping[str, Any],
 
 def error_of(outcome: Outcome, absolute: bool) -> float:
     """Return the rms attitude error [rad]."""
-    return rms(outcome.errors.attitude(absolute))
+    return rms(outcome.errors.with_varying_heading(absolute))
 
 
 def offset_of(outcome: Outcome, absolute: bool) -> measures.Offset:
@@ -106,7 +106,7 @@ def consistency(outcomes: Sequence[Outcome], absolute: bool) -> dict[str, measur
             if runs and (nees := measures.nees_of(runs, whole)) is not None}
 
 
-def nees_marks(found: Mapping[str, measures.Nees]) -> dict[str, float]:
+def nees_measures(found: Mapping[str, measures.Nees]) -> dict[str, float]:
     """Return the result of `consistency` as measures."""
     names = {'tilt': 'nees', 'attitude': 'nees_attitude'}
     return {f'{names[what]}{end}': value for what, nees in found.items()
@@ -125,13 +125,15 @@ def covariance_fault(found: Mapping[str, measures.Nees]) -> Fault | None:
     return None
 
 
-def noisy_limit(run: Run, absolute: bool) -> float:
+def noisy_limit(run: Run, absolute: bool, imu: Mapping[str, Any]) -> float:
     """
     Return the rms error [rad] in the last quarter above which a filter is wrong.
 
     It is the limit without noise, or three standard deviations of attitudes from single samples,
     where a slow filter starts, if that is larger; at most DIVERGED.
     """
+    if not imu.keys() <= {*scenarios.CALIBRATED, 'mag.field', 'imu.rpy'}:
+        return DIVERGED             # the filter may still be learning biases
     last = run.part(slice(-len(run.t) // 4, None))
     single = measures.errors_of(np.array([from_two_vectors(*pair) for pair in zip(
         last.accelerometer, last.magnetometer, strict=True)]), last.truth)

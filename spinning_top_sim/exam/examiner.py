@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exam of a filter in Python: the runs that it consists of, and the report on them."""
 
-import itertools
 import math
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,43 +10,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import diagnosis, measures, scenarios
+from spinning_top_sim.exam.bias import judge_bias
 from spinning_top_sim.exam.diagnosis import degrees
-from spinning_top_sim.exam.excitation import from_identity, words
 from spinning_top_sim.exam.field import examine_field
-from spinning_top_sim.exam.hypotheses import CORRECTS_FIRST, WITHOUT_FIELD, Hypothesis
+from spinning_top_sim.exam.integration import judge_integration
 from spinning_top_sim.exam.isolation import feed_apart
-from spinning_top_sim.exam.measures import increments, rms
+from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.report import Findings, Report
 from spinning_top_sim.exam.response import Response
-from spinning_top_sim.exam.scenarios import Run
 from spinning_top_sim.exam.subject import LastingSubject, Subject
-from spinning_top_sim.exam.trial import (
-    InvalidOutputError,
-    MakeFilter,
-    Outcome,
-    feed,
-    one_line,
-)
+from spinning_top_sim.exam.trial import InvalidOutputError, MakeFilter, Outcome, feed, one_line
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.tools.verdict import Fault
 
 # Seeds of the noisy runs.
 SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
-# Sampling rates for the order of convergence, as multiples of the rate of the fast motion; and the
-# rate at which samples are merged into steps of UNEVEN samples in turn, of 2.5 to 15 ms.
-FACTORS, FINEST, UNEVEN = (1.0, 2.0), 4.0, (1, 2, 6, 1, 5, 2, 1, 3)
-# What is no cause of an error with noise.
-NO_CAUSE = ('inaccurate', 'diverges', 'lever_arm', 'no_bias_estimate', 'bias_report',
-            'invalid_output')
 # When the lever arm comes, and from when until when its effect is measured [s].  Later the
 # estimate of a bias would have adapted to the force.
 ARM_S = 13.33, 14.33, 19.33
-SLIGHT = 0.01                   # by which the gyroscope's matrix differs where an error grows
-STEP = 0.05                     # by which the response to a rate depends on the step, relative
 
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
@@ -168,14 +151,12 @@ class _Exam:
         if not self.outcomes:
             return
         self.findings.measures = (
-            diagnosis.marks(self.outcomes, self._absolute) | self.findings.measures)
-        self._do(self._judge_integration)
+            diagnosis.error_measures(self.outcomes, self._absolute) | self.findings.measures)
+        self._do(partial(judge_integration, self._response))
         if not self._response.unclear:
             self._do(self._judge_lever_arm)
             if identified:
-                self._do(self._response.judge_bias)
-                if 'frame_ned' in self.findings.names:
-                    self.findings.drop('bias_report')       # it has the same axes
+                self._do(partial(judge_bias, self._response))
         self._do(self._judge_noisy_runs)
         self._do(lambda: self.findings.measures.update(self._subject.convergence()))
 
@@ -192,106 +173,36 @@ class _Exam:
         self._absolute = self._subject.uses_field()
         self._response = Response(self._subject, self._absolute, self.findings)
 
-    def _run(self, run: Run, *more: Hypothesis) -> Outcome:
-        """Return the outcome of a run; causes found are undone, shifts of time are not."""
-        return self._subject.follow(run, [*more, *self._response.undone])
-
     def _do_noisy_run(self, seed: int) -> None:
-        self.outcomes.append(self._run(self._subject.record(scenarios.SLOW, seed)))
+        self.outcomes.append(self._response.respond(
+            self._subject.record(scenarios.SLOW, seed), shifted=False))
 
     def _judge_noisy_runs(self) -> None:
-        first, imu, findings = self.outcomes[0], self._subject.imu, self.findings
-        findings.measures |= diagnosis.quality(self.outcomes, imu, self._absolute)
-        findings.measures['stamp_offset_s'] = diagnosis.offset_of(
-            first.last(), self._absolute).seconds
-        limit = (diagnosis.noisy_limit(first.run, self._absolute)
-                 if imu.keys() <= {*scenarios.CALIBRATED, 'mag.field', 'imu.rpy'}
-                 else diagnosis.DIVERGED)       # it may still be learning biases
-        outcomes = [self._response.respond((), one.run) for one in self.outcomes
+        measured = self.findings.measures
+        measured |= diagnosis.quality(self.outcomes, self._subject.imu, self._absolute)
+        measured['stamp_offset_s'] = diagnosis.offset_of(
+            self.outcomes[0].last(), self._absolute).seconds
+        outcomes = [self._response.respond(one.run) for one in self.outcomes
                     ] if self._response.shifts else self.outcomes
-        fault = next(filter(None, (diagnosis.inaccuracy(one, self._absolute, limit)
-                                   for one in outcomes)), None)
-        if fault:
-            fault = self._blamed(fault)
-            if fault.name == 'diverges':        # of which a growing kick is a part
-                findings.drop('inaccurate')
-            findings.faults.append(fault)
-        if findings.names.difference(NO_CAUSE):     # a cause, of which something may be left
-            findings.drop('inaccurate')
-            findings.drop('diverges')
+        self._judge_errors(outcomes)
+        self._judge_covariance(outcomes)
+
+    def _judge_errors(self, outcomes: Sequence[Outcome]) -> None:
+        limit = diagnosis.noisy_limit(outcomes[0].run, self._absolute, self._subject.imu)
+        for outcome in outcomes:
+            if fault := diagnosis.inaccuracy(outcome, self._absolute, limit):
+                self.findings.faults.append(self._response.blamed(fault))
+                return
+
+    def _judge_covariance(self, outcomes: Sequence[Outcome]) -> None:
         consistency = diagnosis.consistency(outcomes, self._absolute)
-        findings.measures |= diagnosis.nees_marks(consistency)
+        self.findings.measures |= diagnosis.nees_measures(consistency)
         # Faults are another reason for errors; without noise there is nothing random to judge by.
         # After minutes of learning the bias, a filter that goes on is too sure of it.
-        if self._subject.restarts and not findings.faults and any(
-                imu.get(f'imu.{sensor}_noise_density')
+        if self._subject.restarts and not self.findings.faults and any(
+                self._subject.imu.get(f'imu.{sensor}_noise_density')
                 for sensor in ('gyroscope', 'accelerometer')):
-            findings.faults += filter(None, [diagnosis.covariance_fault(consistency)])
-
-    def _judge_integration(self) -> None:
-        """Compare sampling rates on the fast motion, if possible without the magnetometer."""
-        # A filter that goes on has the one rate of its IMU.
-        factors = FACTORS if self._subject.restarts else FACTORS[:1]
-        runs = [self._fast(factor) for factor in factors]
-        aiding: tuple[Hypothesis, ...] = (WITHOUT_FIELD,)
-        try:
-            self._run(runs[0].part(slice(10)), *aiding)
-        except InvalidOutputError:
-            aiding = ()
-        outcomes = [self._run(run, *aiding).last() for run in runs]
-        moved = []
-        for outcome in outcomes:
-            one, true = map(Rotation.from_quat, (outcome.estimates, outcome.run.truth))
-            moved.append(rms(((true[0] * one[0].inv()) * one * true.inv()).magnitude()))
-        self.findings.measures['order'] = measures.convergence_order(factors, moved)
-        self.findings.measures['integration_error_deg'] = math.degrees(moved[0])
-        if self._subject.restarts:
-            self._judge_steps([*outcomes, self._response.respond(
-                aiding, self._fast(FINEST).merged(UNEVEN)).last()])
-        absolute = self._absolute and not aiding
-        before = diagnosis.error_of(outcomes[0], absolute)
-        # An error of the scale does not fall with the rate.
-        if before > diagnosis.FIRST_ORDER and not self.findings.measures['order'] < 1.0:
-            after = diagnosis.error_of(self._run(runs[0], FIRST_ORDER, *aiding).last(), absolute)
-            if after < diagnosis.FIRST_ORDER_LEFT * before:
-                self.findings.faults.append(Fault(
-                    'first_order_integration', 'integration is first order: correcting it reduces '
-                    f'the error on the fast motion from {degrees(before)} to {degrees(after)}'))
-                return
-        for run, outcome in zip(runs, outcomes, strict=True):
-            if diagnosis.error_of(outcome, absolute) > diagnosis.FAST:
-                error = min(diagnosis.error_of(self._response.respond(more, run).last(),
-                                               self._absolute) for more in ((), (CORRECTS_FIRST,)))
-                if error > diagnosis.FAST:      # with the field as well
-                    self.findings.faults.append(self._blamed(Fault(
-                        'inaccurate', f'{run.name}, without noise: the error is '
-                        f'{degrees(error)}, above {degrees(diagnosis.FAST)}, for no reason that '
-                        'is known')))
-                    break
-
-    def _fast(self, factor: float) -> Run:
-        return self._subject.record(replace(scenarios.FAST, rate=factor * scenarios.FAST.rate))
-
-    def _blamed(self, error: Fault) -> Fault:
-        """Blame the gyroscope for an error if nothing else is wrong but the response to it."""
-        early = self._response.early
-        if self.findings.names - {'gyroscope_wiring'} or from_identity(early) <= SLIGHT:
-            return error
-        return Fault('gyroscope_wiring', f'{words(early)}; {error.evidence}')
-
-    def _judge_steps(self, outcomes: Sequence[Outcome]) -> None:
-        """Judge whether the filter uses the step, or turns by the number of samples."""
-        lengths, gains = zip(*itertools.chain(*map(gains_of, outcomes)), strict=True)
-        apart = np.max(np.abs(np.subtract(gains, gains[0]))) / max(abs(gains[0]), STEP)
-        by_samples = abs(gains[1] / FACTORS[1] - gains[0]) < 0.25 * abs(gains[0])
-        if apart > STEP and (by_samples or abs(gains[0] - 1.0) < STEP):
-            # A wrong step turns up as a wrong scale at one rate.
-            if 'time_step' in self.findings.names:
-                self.findings.drop('gyroscope_wiring')
-            self.findings.faults.append(Fault(
-                'time_step', f'in steps of {", ".join(f"{1e3 * one:g}" for one in lengths)} ms '
-                f'turns move it {", ".join(f"{one:.3g}" for one in gains)} times as far as the '
-                'sensor: the length of a step is misused'))
+            self.findings.faults += filter(None, [diagnosis.covariance_fault(consistency)])
 
     def _judge_lever_arm(self) -> None:
         """Compare the attitudes with and without a lever arm."""
@@ -300,7 +211,7 @@ class _Exam:
         begin, first, end = (round(t * scenarios.SLOW.rate) for t in ARM_S)
         with_arm = replace(still, accelerometer=np.concatenate(
             (still.accelerometer[:begin], moving.accelerometer[begin:])))
-        arm, pivot = (self._response.respond((), run).estimates[first:end]
+        arm, pivot = (self._response.respond(run).estimates[first:end]
                       for run in (with_arm, still))
         effect, before = (rms(measures.errors_of(one, other).tilt) for one, other in (
             (arm, pivot), (pivot, still.truth[first:end])))
@@ -309,25 +220,3 @@ class _Exam:
             self.findings.faults.append(Fault(
                 'lever_arm', f'10 cm off the axis adds {degrees(effect)}: motion is mistaken for '
                 'gravity'))
-
-
-def gains_of(outcome: Outcome) -> list[tuple[float, float]]:
-    """Return each length of a step [s], and the share by which turns move a filter in those."""
-    steps, right = (increments(one)[1:] for one in (outcome.estimates, outcome.run.truth))
-    lengths, inner = outcome.run.dt[2:-1].round(6), slice(1, -1)
-    found = []
-    for shift in (0, -1, 1):        # a filter may be a step behind or ahead
-        share = np.sum(np.roll(steps, shift, axis=0) * right, 1) / np.sum(right * right, 1)
-        found.append([(float(one), float(np.median(share[inner][lengths == one])))
-                      for one in np.unique(lengths)])
-    return min(found, key=lambda pairs: np.ptp([gain for _, gain in pairs]))
-
-
-def for_first_order(run: Run) -> Run:
-    """Return the rates for which the normalised first-order step q + q w dt/2 is exact."""
-    half = 0.5 * run.dt[:, np.newaxis] * np.linalg.norm(run.gyroscope, axis=1, keepdims=True)
-    longer = np.tan(np.minimum(half, 1.5)) / np.where(half > 0.0, half, 1.0)
-    return replace(run, gyroscope=longer * run.gyroscope)
-
-
-FIRST_ORDER = Hypothesis((), '', given=for_first_order)

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam.broad import Trial, judge
+from spinning_top_sim.exam.measures import unaided
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import GRAVITY, Reals, Run
+from spinning_top_sim.exam.scored import ScoredRun, report_of
 from spinning_top_sim.exam.trial import Feed, MakeFilter
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
@@ -89,12 +90,12 @@ SCENES = (
 
 def examine_field(make_filter: MakeFilter, subject: str, seeds: Iterable[int],
                   imu: Mapping[str, Any], feed: Feed) -> Report:
-    """Examine a filter with the scenes; the arguments are those of `record` and `judge`."""
-    return judge(make_filter, (record(scene, seed, imu) for seed in seeds for scene in SCENES),
-                 'field', subject, feed)
+    """Examine a filter with the scenes; the arguments are those of `record` and `report_of`."""
+    return report_of(make_filter, (record(scene, seed, imu) for seed in seeds
+                                   for scene in SCENES), 'field', subject, feed)
 
 
-def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> Trial:
+def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> ScoredRun:
     """
     Return a scene as an IMU reads it.  Raises ValueError for parameters not allowed.
 
@@ -102,15 +103,34 @@ def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> Trial:
     differ from those of DEVICE.
     """
     random = np.random.default_rng((seed, *scene.name.encode()))
+    values = _device(random, scene, imu)
+    turns, rates, acceleration, moves = _motion(random, scene)
+    bias = random.standard_normal(3)
+    readings = _readings(values, turns, rates + BIAS * bias / np.linalg.norm(bias),
+                         turns.inv().apply(acceleration + UP))
+    step = np.full(len(moves) // 2, 1e-9 * PERIOD_NS)
+    run = Run(scene.name, np.cumsum(step), step, turns[1::2].as_quat(), rates[1::2], *readings)
+    counts = np.flatnonzero(moves[1::2] > 0.5)
+    return ScoredRun(run, counts, unaided(run, counts).total)
+
+
+def _device(random: np.random.Generator, scene: Scene,
+            imu: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the parameters of the sensor, and of what it passes."""
     begins = np.arange(0.0, scene.motions[-1][1], PASSING)[:, np.newaxis]
     events = np.hstack((begins, begins + PASSING, scene.magnet * random.standard_normal(
         (len(begins), 3))))
     left = {name: (np.array(parameters.BY_NAME[name].default) + deviation
                    * random.standard_normal(len(parameters.BY_NAME[name].default))).tolist()
             for name, deviation in LEFT.items()}
-    values = parameters.checked({
+    return parameters.checked({
         **DEVICE, **left, 'mag.disturbance.world': events.ravel().tolist(),
         'seed': int(random.integers(2 ** 31)), **imu, **scene.values})
+
+
+def _motion(random: np.random.Generator,
+            scene: Scene) -> tuple[Rotation, Reals, Reals, Reals]:
+    """Return attitudes, rates, accelerations and share of the motion at all half steps."""
     # The first and the last half step are for differences only.
     n = 2 * round(1e9 * (scene.motions[-1][1] + RAMP) / PERIOD_NS) + 2
     t = HALF * np.arange(n, dtype=np.float64)
@@ -130,12 +150,7 @@ def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> Trial:
         acceleration[k] += blow
         acceleration[k + 1] -= blow
     rates = (turns[:-2].inv() * turns[2:]).as_rotvec() / (2.0 * HALF)
-    turns, moves, bias = turns[1:-1], moves[1:-1], random.standard_normal(3)
-    readings = _readings(values, turns, rates + BIAS * bias / np.linalg.norm(bias),
-                         turns.inv().apply(acceleration + UP))
-    step = np.full(len(moves) // 2, 1e-9 * PERIOD_NS)
-    return Trial(Run(scene.name, np.cumsum(step), step, turns[1::2].as_quat(), rates[1::2],
-                     *readings), np.flatnonzero(moves[1::2] > 0.5))
+    return turns[1:-1], rates, acceleration, moves[1:-1]
 
 
 def _step(x: Reals) -> Reals:

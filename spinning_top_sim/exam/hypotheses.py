@@ -33,12 +33,14 @@ class Hypothesis(NamedTuple):
     text : what its inverse is
     given : changes the readings that are fed; None: nothing is fed again
     read : changes the attitudes that are returned
+    shift : whether it shifts the time: sampling rates are compared without its inverse
     """
 
     faults: tuple[str, ...]
     text: str
     given: ChangeReadings | None = None
     read: ChangeRows = lambda estimates: estimates
+    shift: bool = False
 
 
 def changed(names: Sequence[str], change: ChangeRows) -> ChangeReadings:
@@ -107,9 +109,7 @@ def sharpened(names: Sequence[str], samples: float) -> Hypothesis:
 
 
 # For filters that correct before they take the step: readings of the step before.  It is no fault.
-CORRECTS_FIRST = delayed(('accelerometer', 'magnetometer'), -1)._replace(faults=())
-WITHOUT_FIELD = Hypothesis((), '', given=changed(
-    ('magnetometer',), lambda rows: np.full_like(rows, np.nan)))
+CORRECTS_FIRST = delayed(('accelerometer', 'magnetometer'), -1)._replace(faults=(), shift=True)
 _HALF = 0.5 ** 0.5
 _CONJUGATE, _W_LAST = np.array((-1.0, -1.0, -1.0, 1.0)), [1, 2, 3, 0]
 GRAVITY_SIGN = Hypothesis(('gravity_sign',), 'with the sign of the accelerometer changed',

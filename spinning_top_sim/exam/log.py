@@ -37,7 +37,7 @@ GROSS = np.radians(3.0)         # a smaller error is no misreading
 FEWEST = 100                    # attitudes in a log that can be judged
 
 
-class Attitudes(NamedTuple):
+class Stamped(NamedTuple):
     """Stamps (n,) [ns], quaternions (n, 4) and covariances (n, 3, 3), NaN where unknown."""
 
     stamps_ns: NDArray[np.int64]
@@ -105,7 +105,7 @@ def _first_truth(reader: LogReader, examined: LogTopic) -> LogTopic:
                      'one by --truth')
 
 
-def _read(reader: LogReader, topic: LogTopic) -> Attitudes:
+def _read(reader: LogReader, topic: LogTopic) -> Stamped:
     """Return the attitudes of a topic by ascending stamps, the first of each stamp."""
     try:
         rows = [decode(message.data, topic.type_name)
@@ -115,7 +115,7 @@ def _read(reader: LogReader, topic: LogTopic) -> Attitudes:
     if len(rows) < FEWEST:
         raise ValueError(f'{topic.name} has {len(rows)} messages: must have {FEWEST} at least')
     stamps, first = np.unique([row.stamp_ns for row in rows], return_index=True)
-    return Attitudes(stamps, np.array([rows[k].quaternion for k in first]),
+    return Stamped(stamps, np.array([rows[k].quaternion for k in first]),
                      np.array([rows[k].covariance for k in first]))
 
 
@@ -130,7 +130,7 @@ def _parameters(reader: LogReader) -> dict[str, Any]:
                          f'{type(error).__name__}: {error}') from error
 
 
-def _of_sensor(topic: LogTopic, true: Attitudes, values: dict[str, Any],
+def _of_sensor(topic: LogTopic, true: Stamped, values: dict[str, Any],
                north: str | None) -> Rotation:
     """Return the true attitudes of the sensor, in a world with this north.  Raises ValueError."""
     for k, why in invalid(true.quaternions, np.empty((0, 3, 3))):
@@ -146,7 +146,7 @@ def _of_sensor(topic: LogTopic, true: Attitudes, values: dict[str, Any],
     return turns
 
 
-def _beside(name: str, said: Attitudes, true_ns: NDArray[np.int64], turns: Rotation) -> Outcome:
+def _beside(name: str, said: Stamped, true_ns: NDArray[np.int64], turns: Rotation) -> Outcome:
     """Return the estimates with the truth at their stamps, interpolated if few are the same."""
     chosen = np.isin(said.stamps_ns, true_ns)
     if np.count_nonzero(chosen) < FEWEST:
@@ -188,6 +188,6 @@ def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
     faults += filter(None, [diagnosis.stamp_fault(offset, float(outcome.run.dt[0]))])
     faults = faults or [*filter(None, (diagnosis.inaccuracy(outcome, absolute),
                                        diagnosis.covariance_fault(consistency)))][:1]
-    measured = {**diagnosis.marks([corrected], absolute), 'stamp_offset_s': offset.seconds,
-                **diagnosis.nees_marks(consistency)}
+    measured = {**diagnosis.error_measures([corrected], absolute),
+                'stamp_offset_s': offset.seconds, **diagnosis.nees_measures(consistency)}
     return Report(subject, faults, measured, [corrected])

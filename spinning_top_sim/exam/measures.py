@@ -27,15 +27,15 @@ class Errors(NamedTuple):
     tilt: Reals
     heading: Reals
 
-    def attitude(self, absolute: bool) -> Reals:
-        """Return tilt and heading error combined (n,); see `heading_varying`."""
-        return np.hypot(self.tilt, self.heading_varying(absolute))
+    def with_varying_heading(self, absolute: bool) -> Reals:
+        """Return tilt and heading error combined (n,); see `varying_heading`."""
+        return np.hypot(self.tilt, self.varying_heading(absolute))
 
     def judged(self, absolute: bool) -> Reals:
         """Return tilt and heading error combined (n,), the tilt alone unless `absolute`."""
         return np.hypot(self.tilt, absolute * self.heading)
 
-    def heading_varying(self, absolute: bool) -> Reals:
+    def varying_heading(self, absolute: bool) -> Reals:
         """Return the heading error in [-pi, pi] (n,), relative to its mean unless `absolute`."""
         phase = np.exp(1j * self.heading)
         return self.heading if absolute else np.angle(phase * np.conj(np.mean(phase)))
@@ -134,7 +134,7 @@ class Nees(NamedTuple):
     """
     Mean of the NEES divided by its expectation, and its degrees of freedom.
 
-    known : degrees of freedom of the variance from which the former are estimated
+    known : degrees of freedom with which the variance of the mean itself is known; inf: exactly
     """
 
     ratio: float

@@ -115,6 +115,7 @@ class ReferenceFilter:
         effect = -dt * self._to_world
         self._p[:3] += effect @ self._p[3:6]
         self._p[:, :3] += self._p[:, 3:6] @ effect.T
+        # The diagonal: attitude, gyroscope bias, accelerometer bias.
         self._p.flat[:30:10] += density * dt
         self._p.flat[30:60:10] += GYROSCOPE_WALK ** 2 * dt
         self._p.flat[60::10] += ACCELEROMETER_WALK ** 2 * dt

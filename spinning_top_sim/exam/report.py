@@ -36,6 +36,13 @@ MEANINGS = {
     'data_rms_deg': 'of real readings in motion, mean over the trials',
     'data_heading_rms_deg': 'heading alone', 'data_tilt_rms_deg': 'tilt alone'}
 
+# What is no cause of an error with noise.
+NO_CAUSE = {'inaccurate', 'diverges', 'lever_arm', 'no_bias_estimate', 'bias_report',
+            'invalid_output'}
+# Any of these faults hides those: it has such effects itself.
+HIDES = (({*FAULTS} - NO_CAUSE, {'inaccurate', 'diverges'}), ({'diverges'}, {'inaccurate'}),
+         ({'frame_ned'}, {'bias_report'}))
+
 
 @dataclass(frozen=True)
 class Report(Verdict):
@@ -102,7 +109,9 @@ class Findings:
 
     def report(self, subject: str, outcomes: Sequence[Outcome]) -> Report:
         """Return the report, with the first fault of each name: later ones are its effects."""
+        hidden = set().union(*(effects for causes, effects in HIDES if causes & self.names))
         first: dict[str, Fault] = {}
         for fault in self.faults:
-            first.setdefault(fault.name, fault)
+            if fault.name not in hidden:
+                first.setdefault(fault.name, fault)
         return Report(subject, [*first.values()], self.measures, outcomes)

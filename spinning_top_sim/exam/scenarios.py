@@ -134,7 +134,8 @@ def along(turns: Rotation, imu: Mapping[str, Any]) -> Run:
     """
     Return the readings along attitudes q(world <- sensor), without noise and acceleration; t <= 0.
 
-    They have the rate of the slow motion; it is constant between two of the n + 1 attitudes.
+    The readings have the sampling rate of the slow motion.  The sensor turns steadily from each of
+    the n + 1 attitudes to the next.
     """
     n, rate = len(turns) - 1, SLOW.rate
     t: Reals = np.arange(1 - n, 1) / rate
@@ -172,6 +173,7 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
         end_ns = round(end * scenario.rate) * period_ns
         steps = range(begin_ns + period_ns, end_ns + 1, period_ns)
         halves = simulation.segment.states(range(begin_ns, end_ns + 1, period_ns // 2))
+        # Three rows of rates, three of force, four of the quaternion.
         signals: Any = np.stack(np.broadcast_arrays(
             *itertools.chain(*device.true(halves)), *device.orientation(halves)))
         ends = signals[:, 2::2]

@@ -95,15 +95,15 @@ def _motion(arguments: argparse.Namespace,
         **{name: given.get(f'imu.{name}') for name in (
             'gyroscope_noise_density', 'accelerometer_noise_density')})
     if fits or not (given or known):
-        return _fitted(arguments, recorded, given, body)
+        return _motion_by_fit(arguments, recorded, given, body)
     if off := fitting.far_start(recorded.parts, top, start):
         raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
                          '--fit finds top and start')
     return body, start, None
 
 
-def _fitted(arguments: argparse.Namespace, recorded: Recorded, given: Mapping[str, Any],
-            body: Body) -> tuple[Body, State, fitting.Fit]:
+def _motion_by_fit(arguments: argparse.Namespace, recorded: Recorded, given: Mapping[str, Any],
+                   body: Body) -> tuple[Body, State, fitting.Fit]:
     """Return the same as fitted, but for the parts of `body` that are given."""
     found = fitting.fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
                         imu=arguments.fit_imu)
@@ -111,7 +111,7 @@ def _fitted(arguments: argparse.Namespace, recorded: Recorded, given: Mapping[st
         body = replace(body, mounting=found.mounting, lever_arm=body.lever_arm if (
             arguments.lever_arm or 'imu.lever_arm' in given) else found.lever_arm)
     if any(name.startswith('top.') for name in given):
-        return body, fitting.start_of(found, recorded.parts, body), found
+        return body, fitting.state_of_known_top(found, recorded.parts, body), found
     return replace(body, **vars(found.top)), found.start, found
 
 

@@ -63,6 +63,8 @@ def _terms(motion: Motion, dt: float) -> tuple[Reals, Mapping[str, Reals]]:
     gyroscopic = -np.cross(w, w * inertia) / inertia
     arms = [-body.mass * body.gravity * np.cross(axis, z) / inertia for axis in axes]
     gravity, products = body.com_distance * arms[2], w[:, [1, 2, 0]] * w[:, [2, 0, 1]]
+    # Effects of other moments: on the torque of gravity about e1 and e2 (I1, I2), then on
+    # (I2 - I3)/I1, (I3 - I1)/I2 and (I1 - I2)/I3; the last is fitted, but not read.
     euler = [gravity * axes[0], gravity * axes[1], *(products * axis for axis in axes)]
     nodes = {'gyroscopic': gyroscopic, 'gravity': gravity,
              'in world': rotation.inv().apply(-np.cross(world, world * inertia) / inertia),
@@ -79,11 +81,12 @@ def _terms(motion: Motion, dt: float) -> tuple[Reals, Mapping[str, Reals]]:
         name: size * effect for name, effect in effects.items()}
 
 
-def _gyroscopic(found: Reals) -> Fault:
+def _gyroscopic(found: Reals) -> Fault | None:
     share = 1.0 + float(found[0])
-    text = f'the gyroscopic term w x I w has {share:.3g} times its size'
-    return Fault('no_gyroscopic_term' if abs(share) < NEAR else
-                 'coriolis_sign' if share < 0.0 else 'inertia', text, share)
+    if share >= NEAR:               # `_inertia` tells the moments
+        return None
+    return Fault('no_gyroscopic_term' if share > -NEAR else 'coriolis_sign',
+                 f'the gyroscopic term w x I w has {share:.3g} times its size', share)
 
 
 def _step(found: Reals) -> Fault:

@@ -28,11 +28,14 @@ from spinning_top_sim.tools.verdict import number
 FEWEST = 32                 # attitudes that can be fitted
 GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
 LOST = 0.05                 # residual of a part that is too long to begin with [rad]
+FIXED = MOTION[:6]          # L3 and P stay as they are
 FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
-NAMES = {'theta': 'rad', 'theta_dot': 'rad/s', 'phi': 'rad', 'psi': 'rad', 'L3/lambda1': 'rad/s',
-         'Lz/lambda1': 'rad/s', 'lambda3/lambda1': '1', 'P/lambda1': '1/s^2', 'mounting_x': 'rad',
-         'mounting_y': 'rad', 'mounting_z': 'rad', 'lever_arm_x': 'm', 'lever_arm_y': 'm',
-         'lever_arm_z': 'm', 'stamp_offset': 's'}
+# Unit of each value; the value has the natural size of a rate to this power.
+NAMES = {'theta': ('rad', 0.0), 'theta_dot': ('rad/s', 1.0), 'phi': ('rad', 0.0),
+         'psi': ('rad', 0.0), 'L3/lambda1': ('rad/s', 1.0), 'Lz/lambda1': ('rad/s', 1.0),
+         'lambda3/lambda1': ('1', 0.0), 'P/lambda1': ('1/s^2', 2.0),
+         **{f'mounting_{axis}': ('rad', 0.0) for axis in 'xyz'},
+         **{f'lever_arm_{axis}': ('m', 0.0) for axis in 'xyz'}, 'stamp_offset': ('s', -1.0)}
 ANGLES, RATIO = (2, 3), 6   # of NAMES: those that may change by a turn, lambda3/lambda1
 EXACT = 1e-7                # residual that needs no noise: quaternions in single precision [rad]
 NEGLIGIBLE = 1e-5           # of readings: errors of a simulator's steps
@@ -50,24 +53,13 @@ class Fit:
     """
     A fitted motion; `lines` tells it.
 
-    Attributes
-    ----------
-    top, start : Top, State
-        At the first attitude.  lambda1 is as given: attitudes tell ratios only.
-    mounting, lever_arm : tuple of float
-        Of the IMU, as `Body` has them.
-    values, deviations : dict
-        Estimates and standard deviations by the names of NAMES; inf where the readings do not
-        tell the value.
-    covariance : (k, k) array
-        Of the values.
-    undetermined : tuple of str
-        What the readings cannot tell apart.
-    residual, noise : float
-        Root mean square of a component of the attitude residual, and of its white part [rad].
-    reached : bool
-        Whether the fit has converged and the residuals are noise.  If not, the intervals mean
-        nothing.
+    top, start : at the first attitude; lambda1 is as given, because attitudes tell ratios only
+    mounting, lever_arm : of the IMU, as `Body` has them
+    values, deviations : estimates and standard deviations by the names of NAMES; inf: not told
+    undetermined : what the readings cannot tell apart
+    residual, noise : rms of a component of the attitude residual, and of its white part [rad]
+    reached : whether the fit has converged and the residuals are noise; if not, the intervals
+        mean nothing
     """
 
     top: Top
@@ -76,7 +68,6 @@ class Fit:
     lever_arm: tuple[float, float, float]
     values: Mapping[str, float]
     deviations: Mapping[str, float]
-    covariance: Reals
     undetermined: tuple[str, ...]
     residual: float
     noise: float
@@ -96,7 +87,7 @@ class Fit:
         for name, value in self.values.items():
             spread = INTERVAL * self.deviations[name]
             yield f'  {name:<16}{value:>16.9g} ' + (
-                f'+- {spread:.2g} {NAMES[name]}' if math.isfinite(spread) else '(not told)')
+                f'+- {spread:.2g} {NAMES[name][0]}' if math.isfinite(spread) else '(not told)')
         yield from (f'  the file does not tell {one}' for one in self.undetermined)
 
 
@@ -115,21 +106,13 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     """
     Fit a top and its start to attitudes, and on request the place of an IMU to its readings.
 
-    Parameters
-    ----------
-    parts : mapping
-        Times (n,), ascending [s], and values (n, k) by name, as of a `Trajectory`: `attitudes`,
-        whose third axis is that of the top; `gyroscope` and `accelerations`; `rates` or
-        `gyroscope` also tell how many whole turns the top makes between two attitudes.
-    lambda1, gravity : float
-        Scale of the inertia [kg m^2] and gravity [m/s^2], which attitudes do not tell.
-    imu : bool
-        Whether mounting, lever arm and offset of the stamps of the IMU are fitted.
+    parts : times (n,), ascending [s], and values (n, k) by name, as of a `Trajectory`:
+        `attitudes`, whose third axis is that of the top; `gyroscope` and `accelerations`; `rates`
+        or `gyroscope` also tell how many whole turns the top makes between two attitudes
+    lambda1, gravity : scale of the inertia [kg m^2], gravity [m/s^2]; attitudes do not tell them
+    imu : whether mounting, lever arm and offset of the stamps of the IMU are fitted
 
-    Raises
-    ------
-    ValueError
-        If there are too few attitudes, or no readings.
+    Raises ValueError if there are too few attitudes, or no readings.
     """
     times, attitudes = parts['attitudes']
     if len(times) < FEWEST:
@@ -144,11 +127,12 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     across = np.cross(*turns[:2].apply((0.0, 0.0, 1.0))) / one.times[1]
     first = np.zeros(unknowns.UNKNOWNS)
     first[unknowns.RATES] = (*turns[0].inv().apply(across)[:2], spin)
-    small = [(0, *pair) for pair in unknowns.small_nutation(one.times, one.values)]
+    small = [(*pair, FIRST, FIXED) for pair in unknowns.small_nutation(one.times, one.values)]
     trials: list[_Trial] = []
-    for size, l3, p in ((FIRST, spin, 0.0), *small[:4], (4 * FIRST, spin, 0.0)):
+    for l3, p, size, free in ((spin, 0.0, FIRST, MOTION), *small[:4],
+                              (spin, 0.0, 4 * FIRST, MOTION)):
         first[[L3, P]] = l3, p
-        trials.append(_fit_from(one, first, size, gravity))
+        trials.append(_fit_from(one, first, size, free, gravity))
         if trials[-1].explained:
             break                               # another guess finds the same
     best = min(trials, key=lambda trial: trial.residual)
@@ -165,7 +149,7 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     return _conclude(best, lambda1, gravity)
 
 
-def start_of(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> State:
+def state_of_known_top(found: Fit, parts: Mapping[str, tuple[Reals, Reals]], top: Top) -> State:
     """Return the start of a known top: the fitted one, or if none was found that of the begin."""
     if not found.reached:
         times, attitudes = parts['attitudes']
@@ -184,18 +168,17 @@ def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) 
         f'at its begin the attitude is up to {math.degrees(np.max(apart)):.3g} deg off')
 
 
-def _fit_from(one: Samples, x: Reals, size: int, gravity: float) -> _Trial:
-    """Fit longer parts from `size` attitudes on; 0: from FIRST, L3 and P in the last only."""
+def _fit_from(one: Samples, x: Reals, size: int, free: Sequence[int], gravity: float) -> _Trial:
+    """Fit longer parts, from `size` attitudes on; before the last only the unknowns `free`."""
     problem = Problem([one], one.values[:, 0], gravity)
-    done, growth, level, last = (size or FIRST) / GROWTH, GROWTH, math.inf, len(one.times)
+    done, growth, level, last = size / GROWTH, GROWTH, math.inf, len(one.times)
     converged = False
     while done < last:
         count = min(math.ceil(done * growth), last)
         chosen = slice(0, count, math.ceil(count / ENOUGH) if count < last else 1)
         problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
-        free = MOTION if size or count == last else MOTION[:6]
-        found, converged = _descend(problem, x, free, *(
-            (30, 1e-8) if count == last else (8, 1e-3)))
+        found, converged = (_descend(problem, x, MOTION) if count == last else
+                            _descend(problem, x, free, 8, 1e-3))
         left = float(np.std(problem.residuals(found)))
         if left > max(LOST, 3.0 * level) and growth > LEAST_GROWTH:
             growth = math.sqrt(growth)
@@ -270,10 +253,25 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]]) -> _Trial
 def _conclude(trial: _Trial, lambda1: float, gravity: float) -> Fit:
     """Return the fit in public parameters, with what the readings do not tell."""
     problem, x = trial.problem, trial.x
+    values, deviations, hidden = _deviations_of(problem, x, trial.residual)
+    names = [*NAMES][:len(values)]
+    top, start = _top_and_start(values, lambda1, gravity)
+    mx, my, mz, mw = turned(problem.mounting, x[unknowns.MOUNTING]).as_quat().tolist()
+    arm_x, arm_y, arm_z = x[unknowns.PLACE].tolist()
+    return Fit(top, start, (mw, mx, my, mz), (arm_x, arm_y, arm_z),
+               dict(zip(names, values.tolist(), strict=True)),
+               dict(zip(names, deviations.tolist(), strict=True)),
+               tuple(_not_told(names, values, deviations, hidden)), trial.residual, trial.noise,
+               trial.reached)
+
+
+def _deviations_of(problem: Problem, x: Reals,
+                   residual: float) -> tuple[Reals, Reals, NDArray[np.bool_]]:
+    """Return public values (k,), their deviations (k,), and what is not told apart (k, m)."""
     free = [*MOTION, *SENSOR] if len(problem.readings) > 1 else [*MOTION]
     rate = float(max(np.linalg.norm(x[unknowns.RATES]), abs(x[L3]), math.sqrt(abs(x[P]))))
-    sizes = np.array([1.0] * 3 + [rate] * 4 + [rate * rate] + [1.0] * 6 + [1.0 / rate])[free]
-    at, frozen = _without_unseen_nutation(problem, x, trial.residual)
+    sizes = rate ** unknowns.RATE_POWERS[free]
+    at, frozen = _without_unseen_nutation(problem, x, residual)
     problem.jacobian(at, free)          # sets the steps
     jacobian = problem.jacobian(at, free, central=True) * sizes
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
@@ -286,25 +284,21 @@ def _conclude(trial: _Trial, lambda1: float, gravity: float) -> Fit:
     slopes *= 0.5 / STEP
     half = slopes @ (directions[told].T / singular[told])
     deviations = np.sqrt(np.sum(half * half, axis=1))
-    allowed = VAGUE * np.array([1.0, rate, 1.0, 1.0, rate, rate, abs(values[RATIO]), rate * rate,
-                                *sizes[8:]])
+    allowed = VAGUE * rate ** np.array([power for _, power in NAMES.values()])[free]
+    allowed[RATIO] *= abs(values[RATIO])
     hidden = np.abs(slopes @ directions[~told].T) > 0.01 * allowed[:, np.newaxis]
     deviations[np.any(hidden, axis=1) | ~(deviations < allowed)] = math.inf
-    names = [list(NAMES)[k] for k in free]
+    return values, deviations, hidden
+
+
+def _top_and_start(values: Reals, lambda1: float, gravity: float) -> tuple[Top, State]:
     theta, theta_dot, phi, psi, l3, lz, ratio, p = values[:8].tolist()
     # Of mass and com_distance only the product counts.
     distance = math.copysign(min(0.1, gravity / (4.0 * max(abs(p), 1e-9))), p) or 0.1
     top = Top(lambda1=lambda1, lambda3=(ratio if ratio > 0.0 else 1.0) * lambda1, gravity=gravity,
               com_distance=distance, mass=abs(p * lambda1 / (gravity or math.inf) / distance))
-    start = State(theta=theta, theta_dot=theta_dot, phi=phi, psi=psi, l3=l3 * lambda1,
-                  lz=lz * lambda1)
-    mx, my, mz, mw = turned(problem.mounting, x[unknowns.MOUNTING]).as_quat().tolist()
-    arm_x, arm_y, arm_z = x[unknowns.PLACE].tolist()
-    return Fit(top, start, (mw, mx, my, mz), (arm_x, arm_y, arm_z),
-               dict(zip(names, values.tolist(), strict=True)),
-               dict(zip(names, deviations.tolist(), strict=True)), half @ half.T,
-               tuple(_not_told(names, values, deviations, hidden)), trial.residual, trial.noise,
-               trial.reached)
+    return top, State(theta=theta, theta_dot=theta_dot, phi=phi, psi=psi, l3=l3 * lambda1,
+                      lz=lz * lambda1)
 
 
 def _not_told(names: Sequence[str], values: Reals, deviations: Reals,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from spinning_top_sim.exam.measures import convergence_order
+from spinning_top_sim.exam.trial import one_line
 from spinning_top_sim.grade import dynamics, sensors
 from spinning_top_sim.grade.motion import InvalidTrajectoryError, Motion, Trajectory
 from spinning_top_sim.grade.report import Fault, Report
@@ -62,7 +63,7 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
         raise TypeError(f'run = {run!r}: must be run(top, start, times, dt)')
     if not 0.0 < dt <= 1.0:
         raise ValueError(f'dt = {dt!r} s: must be in (0, 1]')
-    name = str(subject or getattr(run, '__name__', type(run).__name__))
+    name = one_line(subject or getattr(run, '__name__', type(run).__name__))
     faults: list[Fault] = []
     motions: list[Motion] = []
     orders = {}
@@ -129,7 +130,8 @@ def _run(run: Run, body: Body, start: Start, times: Reals, dt: float) -> Traject
     try:
         said = run(body, start, times.copy(), dt)
     except Exception as error:
-        raise InvalidTrajectoryError(f'run raises {type(error).__name__}: {error}') from error
+        raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
+                                     f'{one_line(error)}') from error
     return Trajectory.of(said, times)
 
 
@@ -138,7 +140,12 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
     """Return the report on these motions, and orders of convergence by the name of the scene."""
     if not motions:
         return Report(subject, faults, {})
-    faults += sensors.faults_of_rates(motions)
+    of_rates, _ = sensors.judge('rates', motions)
+    faults += of_rates
+    name = of_rates[0].name if of_rates else ''
+    if name in ('', 'rates_scale', 'rates_in_world'):       # they can be used
+        for motion in motions:
+            motion.use_told_rates(in_world=name == 'rates_in_world')
     marks = {f'{name}: {motion.name}': value for motion in motions
              for name, value in motion.marks.items()}
     marks.update({f'order: {name}': order for name, order in orders.items()})
@@ -147,8 +154,9 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
                if not (known and one.name == 'inaccurate')]
     faults += dynamics.energy_fault(motions[0])
     for kind in sensors.KINDS:
-        more, found = sensors.judge(kind, motions)
-        faults, marks = [*faults, *more], {**marks, **found}
+        if kind != 'rates':
+            more, found = sensors.judge(kind, motions)
+            faults, marks = [*faults, *more], {**marks, **found}
     return Report(subject, faults, marks)
 
 

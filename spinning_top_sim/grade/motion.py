@@ -33,24 +33,16 @@ class Trajectory:
     """
     A motion at n equally spaced times, as a simulator tells it.
 
-    Parameters
-    ----------
-    t : (n,) array
-        Times [s].
-    attitudes : (n, 4) array
-        q(world <- body) as w, x, y, z.
-    rates : (n, 3) array, optional
-        Angular velocity in the body frame [rad/s].
-    accelerations, gyroscope, magnetometer : (n, 3) array, optional
-        Readings in the frame of the IMU [m/s^2, +g upwards at rest], [rad/s], [T].
-    increments : (n, 6) array, optional
-        Rotation [rad] and velocity [m/s] in the frame of the IMU over the interval that ends at
-        each time; the first row is not used.
-    energy : (n,) array, optional
-        Kinetic and potential energy, but for a constant [J].
-    covariance : mapping, optional
-        Covariances (3, 3) that the simulator tells of 'gyroscope' and 'accelerations'; a single
-        matrix is meant for both.
+    t : times (n,) [s]
+    attitudes : q(world <- body) as w, x, y, z (n, 4)
+    rates : angular velocity in the body frame (n, 3) [rad/s]
+    accelerations, gyroscope, magnetometer : readings in the frame of the IMU (n, 3)
+        [m/s^2, +g upwards at rest], [rad/s], [T]
+    increments : rotation [rad] and velocity [m/s] in the frame of the IMU over the interval that
+        ends at each time (n, 6); the first row is not used
+    energy : kinetic and potential, but for a constant (n,) [J]
+    covariance : covariances (3, 3) that the simulator tells of 'gyroscope' and 'accelerations'; a
+        single matrix is meant for both
     """
 
     t: Reals
@@ -113,7 +105,7 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
     return numbers
 
 
-def errors_of(rotation: Rotation, truth: Rotation) -> dict[str, Reals]:
+def errors_by_angle(rotation: Rotation, truth: Rotation) -> dict[str, Reals]:
     """
     Return the angle between attitudes world <- body (n,), and its parts [rad].
 
@@ -136,7 +128,7 @@ class Motion:
 
     rates : body rates at all samples but `MARGIN` at each end (n - 6, 3), from the attitudes
         unless those told are right
-    derived : whether they are from the attitudes
+    derived : whether they are from the attitudes, as before `use_told_rates`
     """
 
     name: str
@@ -149,7 +141,7 @@ class Motion:
         self.solution = ExactSolution(self.body, self.start.state_of(self.body))
         self.truth: States = self.solution.states_at_seconds(self.trajectory.t)
         right = Rotation.from_quat(self.truth.quaternion)
-        self.errors = errors_of(self.trajectory.rotation, right)
+        self.errors = errors_by_angle(self.trajectory.rotation, right)
         self.worst = float(np.max(self.errors['total']))        # [rad]
         # The rotation from the exact attitudes turns slowly.
         error, n = right.inv() * self.trajectory.rotation, len(self.trajectory.t) - 2 * MARGIN
@@ -158,6 +150,13 @@ class Motion:
                     for at, weight in enumerate(_WEIGHTS) if weight)
         self.rates: Reals = total / self.trajectory.step + here.apply(
             self.truth.angular_velocity[MARGIN:-MARGIN])
+
+    def use_told_rates(self, in_world: bool) -> None:
+        """Make the rates told those of the motion; `in_world` : they are in axes of the world."""
+        told = self.trajectory.rates
+        if told is not None:
+            rates = self.trajectory.rotation.inv().apply(told) if in_world else told
+            self.derived, self.rates = False, rates[MARGIN:-MARGIN]
 
     @property
     def angular_accelerations(self) -> Reals:

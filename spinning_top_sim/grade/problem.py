@@ -30,6 +30,8 @@ TURN, RATES, SPIN, L3, P = slice(0, 3), slice(3, 6), 5, 6, 7
 MOUNTING, PLACE, LATE = slice(8, 11), slice(11, 14), 14
 MOTION, SENSOR = range(8), range(8, 15)
 UNKNOWNS = 15
+# The natural size of each unknown is that of a rate to this power.
+RATE_POWERS = np.array((0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 2.0, *np.zeros(6), -1.0))
 ROUNDING = 1e-14            # of rates
 FAR = 1e9
 CHANGE = 1e-5               # of the readings by a step of finite differences [rad], [rad/s], ..

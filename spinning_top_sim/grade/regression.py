@@ -17,8 +17,9 @@ ENOUGH, ENOUGH_OF_NOISE = 0.2, 0.1
 WORTHWHILE = 0.8        # share of what remains that another cause leaves at most
 TINY = 1e-6             # rms of an effect that cannot be seen
 NEAR = 0.25             # distance of a coefficient from the value that it has for a fault
-# Among causes that are as good as the best, the one with the fewest columns wins: those that leave
-# so many times more, or so small a share of what there was (at most the noise).
+# Causes count as equally good if they leave at most AS_GOOD times what the best one leaves, or at
+# most AS_GOOD_SHARE of what there was, but no more than the noise.  Of these the one with the
+# fewest columns wins.
 AS_GOOD, AS_GOOD_SHARE = 2.0, 0.02
 
 Judge = Callable[[Reals], Fault | None]     # of the coefficients of a cause; None: no fault

@@ -22,17 +22,12 @@ class Body(Top):
     """
     A top with an IMU on it.  The pivot is the origin of the body frame, e3 the axis.
 
-    Parameters
-    ----------
-    lever_arm : (3,) float
-        Position of the IMU in the body frame [m].
-    mounting : (4,) float
-        q(body <- IMU) as w, x, y, z.
-    field : (3,) float
-        Magnetic field in the world [T].
-    gyroscope_noise_density, accelerometer_noise_density : float
-        Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
-        sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
+    lever_arm : position of the IMU in the body frame [m]
+    mounting : q(body <- IMU) as w, x, y, z
+    field : magnetic field in the world [T]
+    gyroscope_noise_density, accelerometer_noise_density : of white noise [rad/s/sqrt(Hz)],
+        [m/s^2/sqrt(Hz)]: a sample has the density over sqrt(interval between the samples) as its
+        standard deviation; 0: no noise; None: unknown
     """
 
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -81,14 +76,9 @@ class Start:
     """
     How the top starts.
 
-    Parameters
-    ----------
-    attitude : (4,) float
-        q(world <- body) as w, x, y, z; z of the world points up.
-    rates : (3,) float
-        Angular velocity in the body frame [rad/s].
-    state : State, optional
-        The same in Euler angles and momenta; `of` and `state_of` convert.
+    attitude : q(world <- body) as w, x, y, z; z of the world points up
+    rates : angular velocity in the body frame [rad/s]
+    state : the same in Euler angles and momenta; `of` and `state_of` convert
     """
 
     attitude: tuple[float, float, float, float]

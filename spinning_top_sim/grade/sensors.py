@@ -17,18 +17,45 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade import regression
-from spinning_top_sim.grade.motion import MARGIN, Motion
+from spinning_top_sim.grade.motion import Motion
+from spinning_top_sim.grade.readings import FORCES, Readings, readings_of
 from spinning_top_sim.grade.regression import NEAR, Cause, beyond, fitted, instead, listed, pooled
 from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
 
+
+class Kind(NamedTuple):
+    """
+    A kind of readings.
+
+    units : factors of other units
+    strange : discrepancy beyond the noise from which on a cause is looked for
+    in_world, scale, sign : faults of readings in axes of the world, of another size, another sign
+    density : parameter of the body with the density of the noise
+    """
+
+    units: Sequence[float]
+    strange: float = 2e-3
+    in_world: str = 'reading_in_world'
+    scale: str = 'reading_scale'
+    sign: str = 'reading_sign'
+    density: str = ''
+
+
+_DEGREES, _G = (180.0 / math.pi, math.pi / 180.0), (1.0 / 9.80665,)
+KINDS = {
+    # They may be those of the middle of a step.
+    'rates': Kind(_DEGREES, 2e-2, 'rates_in_world', 'rates_scale', 'rates_scale'),
+    'gyroscope': Kind(_DEGREES, in_world='rates_in_world', density='gyroscope_noise_density'),
+    'accelerations': Kind(
+        _G, scale='acceleration_scale', density='accelerometer_noise_density'),
+    'magnetometer': Kind((1e4, 1e6, 1e9)),
+    'rotations': Kind(_DEGREES),
+    # Means over a step, compared with those of its ends.
+    'velocities': Kind(_G, 5e-2)}
+# Discrepancies and noise are relative to the rms of the reading.
 LAGS = range(-3, 31)        # lags that are tried [samples]
 LATE = 0.75                 # lag from which on it is a fault [steps]
-# Discrepancies and noise are relative to the rms of the reading.  From this discrepancy beyond
-# the noise on, a cause is looked for.  It is larger for velocities, which are means over a step
-# compared with those of its ends, and for rates, which may be those of the middle of a step.
-STRANGE = {'rates': 2e-2, 'velocities': 5e-2}
-STRANGE_OTHERS = 2e-3
 CONSISTENT = 1e-3           # discrepancy below which no lag is looked for
 TURNED = 0.02               # share of the discrepancy that a turn of the axes leaves at most
 UNEXPLAINED = 0.5           # share that causes leave where they explain nothing
@@ -36,113 +63,21 @@ NOISY = 1e-4                # smaller noise is rounding
 NOISE_BAND = 0.05           # share by which noise may differ from what is declared
 FOUR_SIGMA = 4.0            # standard deviations by which its measurement may differ besides
 LEAST_KURTOSIS = 2.4        # of normal noise; it is 3, and 1.8 of uniform noise
-DENSITIES = {'gyroscope': 'gyroscope_noise_density',
-             'accelerations': 'accelerometer_noise_density'}
-KINDS = ('gyroscope', 'accelerations', 'magnetometer', 'rotations', 'velocities')
-_DEGREES, _G = (180.0 / math.pi, math.pi / 180.0), (1.0 / 9.80665,)
-UNITS = {'gyroscope': _DEGREES, 'rates': _DEGREES, 'rotations': _DEGREES, 'accelerations': _G,
-         'velocities': _G, 'magnetometer': (1e4, 1e6, 1e9)}
-FORCES = ('accelerations', 'velocities')
-_per_step = partial(np.gradient, axis=0)        # change per step of values (m, 3)
-
-
-class Readings(NamedTuple):
-    """
-    What a sensor reads in one motion (n, 3), and what it should read, over its rms `size`.
-
-    effects : by name (m, 3), beginning with reading `first`: `terms` of the right reading, their
-        sum `total`, and its change by causes of size 1
-    """
-
-    reading: Reals
-    first: int
-    effects: Mapping[str, Reals]
-    terms: Sequence[str]
-    size: float
-
-    def apart(self, lag: int, names: Sequence[str] = ()) -> tuple[Reals, dict[str, Reals]]:
-        """Return reading less total, and the effects, for a reading that is `lag` samples late."""
-        total, begin = self.effects['total'], self.first + lag
-        end = min(begin + len(total), len(self.reading))
-        skip = max(0, -begin)
-        part = slice(skip, end - begin)
-        return self.reading[begin + skip:end] - total[part], {
-            name: self.effects[name][part] for name in names or self.effects}
-
-
-def _readings_of(kind: str, motion: Motion) -> Readings | None:
-    """Return the readings of a sensor, None if there are none."""
-    said, body, inner, w = motion.trajectory, motion.body, slice(MARGIN, -MARGIN), motion.rates
-    reading: Reals | None = getattr(said, 'increments' if kind in ('rotations', 'velocities')
-                                    else kind)
-    if reading is None:
-        return None
-    rotation, first, arms = said.rotation[inner], MARGIN, np.empty((0, len(w), 3))
-    mounting = (Rotation.identity() if kind == 'rates' else
-                Rotation.from_quat(np.roll(body.mounting, -1)))
-    if kind in ('rates', 'gyroscope'):
-        terms = {'rates': w}
-    elif kind == 'magnetometer':
-        terms = {'field': rotation.inv().apply(body.field)}
-    elif kind == 'rotations':
-        reading, first = reading[:, :3] / said.step, first + 1
-        terms = {'rates': (rotation[:-1].inv() * rotation[1:]).as_rotvec() / said.step}
-    else:
-        first, a, w = 2 * MARGIN, motion.angular_accelerations, w[inner]
-        axes = np.eye(3)[:, np.newaxis]
-        tangential, centripetal = np.cross(a, axes), np.cross(w, np.cross(w, axes))
-        arms = tangential + centripetal
-        terms = {'gravity': body.gravity * rotation[inner].inv().apply((0.0, 0.0, 1.0)),
-                 'tangential': np.tensordot(body.lever_arm, tangential, 1),
-                 'centripetal': np.tensordot(body.lever_arm, centripetal, 1)}
-        if kind == 'velocities':
-            reading, first = reading[:, 3:] / said.step, first + 1
-            arms = 0.5 * (arms[:, :-1] + arms[:, 1:])
-            terms = {name: 0.5 * (term[:-1] + term[1:]) for name, term in terms.items()}
-    effects = {name: mounting.inv().apply(term) for name, term in terms.items()}
-    effects['total'] = total = sum(effects.values(), np.zeros(1))
-    turn = said.rotation[first:first + len(total)] * mounting
-    effects |= {'step': _per_step(total), 'world': (world := turn.apply(total)),
-                'reversed': turn.apply(world)}
-    if kind in FORCES:
-        back, kinematic = turn.inv().apply, total - effects['gravity']
-        effects |= {'kinematic': kinematic, 'difference': back(_per_step(turn.apply(kinematic))),
-                    'turned': back(_per_step(world)) - effects['step'],
-                    'tangential step': _per_step(effects['tangential']),
-                    **{f'fixed {k}': 0.0 * total + axis for k, axis in enumerate(np.eye(3))},
-                    **{f'arm {k}': mounting.inv().apply(arm) for k, arm in enumerate(arms)}}
-    size = rms(reading) or 1.0
-    return Readings(reading / size, first, {
-        name: effect / size for name, effect in effects.items()}, [*terms], size)
-
-
-def faults_of_rates(motions: Sequence[Motion]) -> list[Fault]:
-    """Compare the rates told with the attitudes; unless unusable, they become `Motion.rates`."""
-    faults, _ = judge('rates', motions)
-    name = faults[0].name if faults else ''
-    for motion in motions:
-        said = motion.trajectory
-        if said.rates is not None and name in ('', 'rates_scale', 'rates_in_world'):
-            rates = (said.rotation.inv().apply(said.rates) if name == 'rates_in_world' else
-                     said.rates)
-            motion.derived, motion.rates = False, rates[MARGIN:-MARGIN]
-    return faults
-
 
 def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, float]]:
     """
-    Return faults and measures of the readings of one of KINDS, or of the rates told.
+    Return faults and measures of the readings of one of KINDS.
 
     Throughout, `noise` of each motion and `floor` of all are the rms of white noise in
     the discrepancy, by differences; `doubt` is the relative error of that, and `most` what the
     noise may be at most.
     """
-    runs = [one for motion in motions if (one := _readings_of(kind, motion))]
+    runs = [one for motion in motions if (one := readings_of(kind, motion))]
     if not runs:
         return [], {}
     # Velocities are means over a step.
     lag, late = (0, 0.0) if kind == 'velocities' else _lag(runs)
-    wrong, effects = zip(*(run.apart(lag) for run in runs), strict=True)
+    wrong, effects = zip(*(run.at_lag(lag) for run in runs), strict=True)
     target, sizes = np.concatenate(wrong), np.array([run.size for run in runs])
     noise, floor = np.array([*map(_white, wrong)]), _white(*wrong)
     doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
@@ -156,7 +91,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     found, residual, explained = _find_causes(
         kind, motions, *pooled(zip(wrong, effects, strict=True)), floor, most)
     faults += found
-    if explained and kind in DENSITIES and not any(
+    if explained and KINDS[kind].density and not any(
             fault.name in ('units', 'reading_scale') for fault in faults):
         noises = [size * one for size, one in zip(
             sizes, np.split(residual, np.cumsum([*map(len, wrong)])[:-1]), strict=True)]
@@ -170,7 +105,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
 def _find_causes(kind: str, motions: Sequence[Motion], target: Reals, effects: Mapping[str, Reals],
                floor: float, most: float) -> tuple[list[Fault], Reals, bool]:
     """Return the causes of a discrepancy, what they leave of it, and whether that is noise."""
-    before, strange = beyond(target, most), STRANGE.get(kind, STRANGE_OTHERS)
+    before, strange = beyond(target, most), KINDS[kind].strange
     if motions[0].derived and kind != 'rates':
         # Rates of the attitudes may be half a step apart from those of the simulator.
         turns = (one.trajectory.rotation[:2] for one in motions)
@@ -179,9 +114,9 @@ def _find_causes(kind: str, motions: Sequence[Motion], target: Reals, effects: M
         return [], target, True
     faults, residual = regression.explain(target, effects, _causes(kind, motions[0].body),
                                           math.hypot(floor, 0.5 * strange))
-    turned, left = _turned(target, effects['total'])
+    mounted, left = _mounted(target, effects['total'])
     if beyond(left, most) < min(TURNED * before, 0.1 * beyond(residual, most)):
-        faults, residual = turned, left
+        faults, residual = mounted, left
     rest = beyond(residual, most)
     if explained := rest <= max(UNEXPLAINED * before, strange):
         return faults, residual, explained
@@ -190,7 +125,7 @@ def _find_causes(kind: str, motions: Sequence[Motion], target: Reals, effects: M
     return [*faults, Fault(name, text, rest)], residual, explained
 
 
-def _turned(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
+def _mounted(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
     """Return the fault that the axes are not those of the IMU, and what it leaves (m, 3)."""
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')     # vectors along one line allow many turns
@@ -203,7 +138,7 @@ def _turned(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
 def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residual: Reals,
                   band: float) -> Iterator[Fault]:
     """Compare noise with what is declared and with normal noise; `band`: of the ratio to 1."""
-    density = getattr(motion.body, DENSITIES[kind])
+    density = getattr(motion.body, KINDS[kind].density)
     covariance = motion.trajectory.covariance.get(kind)
     root = math.sqrt(motion.trajectory.step)
     text = f'the noise has a standard deviation of {noise:.4g}'
@@ -230,16 +165,16 @@ def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residua
 def _lag(runs: Sequence[Readings]) -> tuple[int, float]:
     """Return by how many samples readings are late, with any size of their terms, and by what."""
     def left(lag: int) -> float:
-        target, effects = pooled(run.apart(lag, (*run.terms, 'step')) for run in runs)
+        target, effects = pooled(run.at_lag(lag, (*run.terms, 'step')) for run in runs)
         return rms(fitted(target, [*effects.values()])[1])
 
-    floor, now, best = _white(*(run.apart(0)[0] for run in runs)), left(0), 0
+    floor, now, best = _white(*(run.at_lag(0)[0] for run in runs)), left(0), 0
     if now ** 2 >= 1.1 * floor ** 2 + CONSISTENT ** 2:
         most = len(runs[0].effects['total']) // 4
         found = {lag: left(lag) for lag in LAGS if lag < most}
         best = min(found, key=lambda lag: found[lag])
         best = best if found[best] < 0.5 * now else 0
-    target, effects = pooled(run.apart(best) for run in runs)
+    target, effects = pooled(run.at_lag(best) for run in runs)
     # The acceleration of a step may be that of its begin, without a lag of the reading.
     steps, rest = fitted(target, [effects[name] for name in (
         'step', 'tangential step') if name in effects])
@@ -253,27 +188,25 @@ def _white(*runs: Reals) -> float:
 
 def _causes(kind: str, body: Body) -> list[Cause]:
     """Return what may be wrong with the readings of a sensor."""
-    in_world = 'rates_in_world' if kind in ('gyroscope', 'rates') else 'reading_in_world'
     text = 'the readings are in axes of '
-    causes = [Cause(['total'], partial(_scale, kind)), Cause(['step']), Cause(
-        ['total', 'world'], instead(in_world, f'{text}the world, not of the IMU')), Cause(
-        ['total', 'reversed'], instead('rotation_reversed', f'{text}a sensor that turns against '
-                                       'the IMU'))]
+    causes = [Cause(['total'], partial(_scale, KINDS[kind])), Cause(['step']),
+              Cause(['total', 'world'], instead(
+                  KINDS[kind].in_world, f'{text}the world, not of the IMU')),
+              Cause(['total', 'reversed'], instead(
+                  'rotation_reversed', f'{text}a sensor that turns against the IMU'))]
     if kind not in FORCES:
         return causes
     return [*causes, *(Cause([name], partial(_term, name)) for name in _TERMS),
             Cause(['gravity', 'fixed 0', 'fixed 1', 'fixed 2'], partial(_gravity_frame, body)),
-            Cause(['difference'], _difference), Cause(['tangential step']), Cause(['turned']),
+            Cause(['difference'], _difference), Cause(['tangential step']), Cause(['axes late']),
             Cause(['arm 0', 'arm 1', 'arm 2'], partial(_arm, body))]
 
 
-def _scale(kind: str, found: Reals) -> Fault:
+def _scale(kind: Kind, found: Reals) -> Fault:
     factor = 1.0 + float(found[0])
-    unit = any(abs(abs(factor) / unit - 1.0) < 0.01 for unit in UNITS[kind])
-    return Fault('units' if unit else 'rates_scale' if kind == 'rates' else 'reading_sign'
-                 if factor < 0.0 else 'acceleration_scale' if kind == 'accelerations' else
-                 'reading_scale', f'the readings are {factor:.4g} times what they should be',
-                 factor)
+    unit = any(abs(abs(factor) / unit - 1.0) < 0.01 for unit in kind.units)
+    return Fault('units' if unit else kind.sign if factor < 0.0 else kind.scale,
+                 f'the readings are {factor:.4g} times what they should be', factor)
 
 
 # Terms of a specific force: what each is, and the fault where it is missing.
