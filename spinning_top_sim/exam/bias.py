@@ -21,11 +21,7 @@ BIAS_OFF = 0.5                  # relative error of an estimate that is wrong
 
 
 def judge_bias(response: Response) -> None:
-    """
-    Compare the excitation with and without BIAS.
-
-    See `no_bias_estimate` and `bias_report` in docs/exam.md.
-    """
+    """Compare the excitation with and without BIAS, as docs/exam.md says."""
     given, findings, absolute = response.excitation, response.findings, response.absolute
     motion, size = given.motion, float(np.linalg.norm(BIAS))
     run, unbiased = given.run.part(slice(motion.stop)), response.outcome.part(slice(motion.stop))

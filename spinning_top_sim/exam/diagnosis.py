@@ -75,8 +75,9 @@ def quality(outcomes: Sequence[Outcome], imu: Mapping[str, Any],
 
 
 def error_of(outcome: Outcome, absolute: bool) -> float:
-    """Return the rms attitude error [rad]."""
-    return rms(outcome.errors.with_varying_heading(absolute))
+    """Return the rms attitude error [rad]; unless `absolute`, a constant heading error is none."""
+    errors = outcome.errors
+    return rms(np.hypot(errors.tilt, errors.varying_heading(absolute)))
 
 
 def offset_of(outcome: Outcome, absolute: bool) -> measures.Offset:

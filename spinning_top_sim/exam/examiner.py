@@ -40,12 +40,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     """
     Examine an attitude filter.
 
-    The filter has a method ``update(gyroscope, accelerometer, magnetometer, dt)``: the mean
-    angular velocity over the step [rad/s], specific force [m/s^2, +g upwards at rest] and field
-    [T, or None] at its end, in the frame of the sensor, and the length of the step [s].  It
-    returns the attitude at the end of the step, q(world <- sensor) in the order x, y, z, w; x of
-    the world is east, y north and z up.  Attributes `covariance` and `bias` are optional, see
-    `trial.Filter`.
+    The filter has a method ``update(gyroscope, accelerometer, magnetometer, dt)`` that returns the
+    attitude; attributes `covariance` and `bias` are optional.  `trial.Filter` says what each is.
 
     Parameters
     ----------
@@ -66,11 +62,6 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         crashes or never returns then ends the exam.
     restart : bool, optional
         If False, one filter is made, in this process, and used for all runs.
-
-    Returns
-    -------
-    Report
-        Faults with their evidence, and measures.
 
     Raises
     ------
@@ -129,17 +120,12 @@ def _seed_numbers(seeds: int | Iterable[int]) -> list[int]:
 
 
 class _Exam:
-    """
-    The runs of one exam.
-
-    findings : faults and measures
-    outcomes : of the noisy runs
-    """
+    """The runs of one exam."""
 
     def __init__(self, subject: Subject, seeds: Sequence[int]) -> None:
         self._subject, self._seeds = subject, seeds
         self.findings = Findings()
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[Outcome] = []       # of the noisy runs
 
     def sit(self) -> None:
         """Do all runs."""

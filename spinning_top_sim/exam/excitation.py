@@ -46,26 +46,16 @@ KICK_S, KICKS = 0.1, (
 
 
 class Excitation(NamedTuple):
-    """
-    Rests between turns, the slow motion, and kicks of the gyroscope alone at two rests.
+    """Rests between turns, the slow motion, and kicks of the gyroscope alone at two rests."""
 
-    run : with the kicks
-    still : without them
-    rests : index of the last sample of each rest (n,); at the first and the last but one the
-        attitude is the same
-    turns : index of the first sample of each turn (n,)
-    motion : where the slow motion is judged
-    kicks : index of the first sample of each kick, two at each rest
-    astray : where the heading has been turned far off, up to the end
-    """
-
-    run: Run
-    still: Run
+    run: Run                        # with the kicks
+    still: Run                      # without them
+    # Last sample of each rest; at the first and the last but one the attitude is the same.
     rests: NDArray[np.intp]
-    turns: NDArray[np.intp]
-    motion: slice
-    kicks: list[tuple[int, int]]
-    astray: slice
+    turns: NDArray[np.intp]         # first sample of each turn
+    motion: slice                   # where the slow motion is judged
+    kicks: list[tuple[int, int]]    # first sample of each kick, two at each rest
+    astray: slice                   # where the heading has been turned far off, up to the end
 
 
 def excite(imu: Mapping[str, Any], goes_astray: bool) -> Excitation:

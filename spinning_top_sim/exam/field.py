@@ -49,28 +49,19 @@ TAP = 60.0                      # standard deviation of its acceleration [m/s^2]
 
 @dataclass(frozen=True)
 class Scene:
-    """
-    A motion of a hand, and what disturbs its sensor.
-
-    rates, rates_hz : root mean squares of the rates of yaw, pitch and roll [rad/s], frequency
-    acceleration, acceleration_hz : those of the pivot of the arm, east, north, up [m/s^2]
-    arm, pitch : length of the arm [m], level at first, and pitch of the sensor on it [rad]
-    taps : taps on the sensor a second
-    magnet : standard deviation of the fields of what it passes [T]
-    motions : begin and end of each [s]
-    values : parameters of the vibration and of a magnet on the sensor; they override `imu`
-    """
+    """A motion of a hand, and what disturbs its sensor."""
 
     name: str
-    rates: tuple[float, float, float]
+    rates: tuple[float, float, float]           # rms of yaw, pitch and roll [rad/s]
     rates_hz: float
-    acceleration: tuple[float, float, float]
+    acceleration: tuple[float, float, float]    # rms of the arm's pivot, east, north, up [m/s^2]
     acceleration_hz: float
-    arm: float
-    pitch: float = 0.0
-    taps: float = 0.0
-    magnet: float = 5e-7
-    motions: tuple[tuple[float, float], ...] = ONE
+    arm: float                                  # its length [m]; it is level at first
+    pitch: float = 0.0                          # of the sensor on it [rad]
+    taps: float = 0.0                           # on the sensor, a second
+    magnet: float = 5e-7                        # standard deviation of the fields it passes [T]
+    motions: tuple[tuple[float, float], ...] = ONE      # begin and end of each [s]
+    # Parameters of the vibration and of a magnet on the sensor; they override `imu`.
     values: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -24,16 +24,11 @@ FARTHER = 1.03                  # of the error after the heading is turned: no r
 
 
 class Turns(NamedTuple):
-    """
-    Response to turns: increments of the attitude over those of the sensor.
+    """Increments of the attitude over those of the sensor; the identity for a right filter."""
 
-    whole, early : matrices (3, 3) of whole turns and of their begins; identities if right
-    late : delay of whole turns in samples; 0 if none explains the response
-    """
-
-    whole: Reals
-    early: Reals
-    late: int
+    whole: Reals        # matrix (3, 3) of whole turns
+    early: Reals        # of their begins
+    late: int           # delay of whole turns in samples; 0 if none explains the response
 
     @property
     def off(self) -> float:
@@ -65,12 +60,7 @@ def from_identity(matrix: Reals) -> float:
 
 def not_corrected(estimates: Reals, without: Reals, given: Excitation,
                   absolute: bool) -> list[Fault]:
-    """
-    Name the sensors that do not correct a kick.
-
-    estimates, without : attitudes (n, 4) with kicks and without
-    absolute : whether the heading is judged
-    """
+    """Name the sensors that do not correct a kick; attitudes with kicks and `without`, (n, 4)."""
     n = round(ANSWER_S * scenarios.SLOW.rate)
     error = (Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()).as_rotvec()
 

@@ -26,21 +26,13 @@ SIGNED = [sign * one for one in Rotation.create_group('O').as_matrix().round()
 
 
 class Hypothesis(NamedTuple):
-    """
-    A possible cause of errors, and its inverse.
+    """A possible cause of errors, and its inverse."""
 
-    faults : names; none if it is no fault
-    text : what its inverse is
-    given : changes the readings that are fed; None: nothing is fed again
-    read : changes the attitudes that are returned
-    shift : whether it shifts the time: sampling rates are compared without its inverse
-    """
-
-    faults: tuple[str, ...]
-    text: str
-    given: ChangeReadings | None = None
-    read: ChangeRows = lambda estimates: estimates
-    shift: bool = False
+    faults: tuple[str, ...]         # names; none if it is no fault
+    text: str                       # what its inverse is
+    given: ChangeReadings | None = None     # changes what is fed; None: nothing is fed again
+    read: ChangeRows = lambda estimates: estimates      # changes the attitudes that are returned
+    shift: bool = False             # it shifts the time: rates are compared without its inverse
 
 
 def changed(names: Sequence[str], change: ChangeRows) -> ChangeReadings:

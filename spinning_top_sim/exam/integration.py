@@ -42,7 +42,8 @@ def judge_integration(response: Response) -> None:
     findings, restarts = response.findings, response.subject.restarts
     # A filter that goes on has the one rate of its IMU.
     factors = FACTORS if restarts else FACTORS[:1]
-    runs = [_fast(response, factor) for factor in factors]
+    *runs, finest = (response.subject.record(replace(
+        scenarios.FAST, rate=factor * scenarios.FAST.rate)) for factor in (*factors, FINEST))
     unaided: tuple[Hypothesis, ...] = (WITHOUT_FIELD,)
     try:
         response.respond(runs[0].part(slice(10)), *unaided, shifted=False)
@@ -53,17 +54,12 @@ def judge_integration(response: Response) -> None:
     findings.measures['order'] = measures.convergence_order(factors, moved)
     findings.measures['integration_error_deg'] = math.degrees(moved[0])
     if restarts:
-        uneven = response.respond(_fast(response, FINEST).merged(UNEVEN), *unaided)
-        _judge_steps(response, [*outcomes, uneven.last()])
+        _judge_steps(response, [*outcomes, response.respond(
+            finest.merged(UNEVEN), *unaided, shifted=False).last()])
     absolute = response.absolute and not unaided
     fault = (_first_order(response, runs[0], diagnosis.error_of(outcomes[0], absolute), unaided)
              or _left_over(response, runs, outcomes, absolute))
     findings.faults += filter(None, [fault])
-
-
-def _fast(response: Response, factor: float) -> Run:
-    return response.subject.record(
-        replace(scenarios.FAST, rate=factor * scenarios.FAST.rate))
 
 
 def _error_of_turn(outcome: Outcome) -> float:
@@ -73,11 +69,7 @@ def _error_of_turn(outcome: Outcome) -> float:
 
 
 def _judge_steps(response: Response, outcomes: Sequence[Outcome]) -> None:
-    """
-    Judge whether the filter uses the step, or turns by the number of samples.
-
-    outcomes : at the rates of FACTORS, then in uneven steps
-    """
+    """Judge whether the filter uses the step, or turns by the number of samples."""
     findings = response.findings
     lengths, gains = zip(*itertools.chain(*map(gains_of, outcomes)), strict=True)
     slow, fast = gains[:2]          # at 100 Hz and 200 Hz

@@ -59,11 +59,6 @@ def examine_node(topic: str, command: str | None = None, level: str = 'quick',
     level, imu, seeds : optional
         As for `examine`.
 
-    Returns
-    -------
-    Report
-        Faults with their evidence, and measures.
-
     Raises
     ------
     NodeError

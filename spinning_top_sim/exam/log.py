@@ -61,11 +61,6 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
     north : {'true', 'magnetic'}, optional
         From which the heading counts; by default it needs only be steady.
 
-    Returns
-    -------
-    Report
-        Faults that show in a log, and measures.
-
     Raises
     ------
     LogError, ValueError

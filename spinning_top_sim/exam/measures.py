@@ -27,10 +27,6 @@ class Errors(NamedTuple):
     tilt: Reals
     heading: Reals
 
-    def with_varying_heading(self, absolute: bool) -> Reals:
-        """Return tilt and heading error combined (n,); see `varying_heading`."""
-        return np.hypot(self.tilt, self.varying_heading(absolute))
-
     def judged(self, absolute: bool) -> Reals:
         """Return tilt and heading error combined (n,), the tilt alone unless `absolute`."""
         return np.hypot(self.tilt, absolute * self.heading)
@@ -131,15 +127,11 @@ def time_offset(estimates: Reals, truth: Reals, rates: Reals, absolute: bool) ->
 
 
 class Nees(NamedTuple):
-    """
-    Mean of the NEES divided by its expectation, and its degrees of freedom.
-
-    known : degrees of freedom with which the variance of the mean itself is known; inf: exactly
-    """
+    """Mean of the NEES divided by its expectation, and its degrees of freedom."""
 
     ratio: float
     degrees: float
-    known: float
+    known: float        # degrees with which the variance of the mean is known; inf: exactly
 
     @property
     def band(self) -> tuple[float, float]:

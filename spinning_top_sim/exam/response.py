@@ -61,24 +61,19 @@ class Response:
 
     absolute : whether the heading is judged
     outcome : of the excitation; the causes that were found are undone
-    shifts : causes that shift the time, such as that a filter corrects before its step
-    unclear : whether an error is left that would be taken for that by a lever arm or a bias
     """
 
     def __init__(self, subject: Subject, absolute: bool, findings: Findings) -> None:
         self.subject, self.absolute, self.findings = subject, absolute, findings
-        self._undone: list[Hypothesis] = []         # other causes that were found
-        self.shifts: list[Hypothesis] = []
-        self._early, self.unclear = np.eye(3), False    # the response to the begin of turns
+        self.shifts: list[Hypothesis] = []      # causes found that shift the time
+        self._undone: list[Hypothesis] = []     # the others
+        self.unclear = False    # an error is left that would pass for a lever arm's or a bias's
+        self._early = np.eye(3)                 # response to the begin of turns
         self.excitation = excite(subject.imu, subject.restarts)
         self._run, self._rests = self.excitation.run, self.excitation.rests
 
     def identify(self) -> None:
-        """
-        Find causes until nothing is left to explain, and undo each.
-
-        Raises InvalidOutputError if the filter fails.
-        """
+        """Find causes until nothing is left to explain, and undo each.  Raises as `follow`."""
         self.outcome = self.respond(self._run)
         for _ in range(MOST_CAUSES):
             best = self._cause()

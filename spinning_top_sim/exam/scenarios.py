@@ -36,21 +36,14 @@ GRAVITY = 9.80665
 
 @dataclass(frozen=True)
 class Scenario:
-    """
-    One motion and the IMU on it.
-
-    values : parameters of the simulation that differ from their defaults
-    duration, rate : of the run [s], [Hz]
-    reversals : times at which an impulsive torque changes the sign of the momenta [s]
-    noisy : whether the IMU has its errors
-    """
+    """One motion and the IMU on it."""
 
     name: str
-    values: Mapping[str, Any]
-    duration: float = 30.0
-    rate: float = 100.0
-    reversals: tuple[float, ...] = ()
-    noisy: bool = True
+    values: Mapping[str, Any]       # parameters of the simulation that differ from their defaults
+    duration: float = 30.0          # [s]
+    rate: float = 100.0             # [Hz]
+    reversals: tuple[float, ...] = ()   # when an impulsive torque reverses the momenta [s]
+    noisy: bool = True              # the IMU has its errors
 
 
 # A wheel of 2 kg on a pivot 2 cm below its centre: 4 rad/s of spin, slow precession, and a
@@ -74,22 +67,16 @@ class Run:
 
     The gyroscope's reading is the mean over the step that ends, as of an integrating sensor; the
     other readings are of its end.
-
-    name : of the motion
-    t, dt : time and length of the step that ends there, by the stamps [s], (n,)
-    truth : q(world <- sensor) as x, y, z, w (n, 4)
-    rates : true angular velocity in the frame of the sensor (n, 3) [rad/s]
-    gyroscope, accelerometer, magnetometer : in the frame of the IMU, (n, 3) [rad/s], [m/s^2], [T]
     """
 
-    name: str
-    t: Reals
-    dt: Reals
-    truth: Reals
-    rates: Reals
-    gyroscope: Reals
-    accelerometer: Reals
-    magnetometer: Reals
+    name: str               # of the motion
+    t: Reals                # by the stamps (n,) [s]
+    dt: Reals               # length of the step that ends there (n,) [s]
+    truth: Reals            # q(world <- sensor) as x, y, z, w (n, 4)
+    rates: Reals            # true angular velocity in the frame of the sensor (n, 3) [rad/s]
+    gyroscope: Reals        # readings in the frame of the IMU (n, 3) [rad/s]
+    accelerometer: Reals    # [m/s^2]
+    magnetometer: Reals     # [T]
 
     def part(self, rows: slice | NDArray[np.int64]) -> 'Run':
         """Return the run at these times only."""

@@ -17,16 +17,11 @@ from spinning_top_sim.tools.verdict import Fault
 
 
 class ScoredRun(NamedTuple):
-    """
-    A run, and the samples of it whose errors count.
-
-    counts : samples of a known truth in motion (n,)
-    alone : error there of the gyroscope integrated from the truth [deg]; NaN: unknown
-    """
+    """A run, and the samples of it whose errors count."""
 
     run: Run
-    counts: NDArray[np.intp]
-    alone: float = math.nan
+    counts: NDArray[np.intp]    # samples of a known truth in motion
+    alone: float = math.nan     # error there of the gyroscope alone [deg]; NaN: unknown
 
     def follow(self, make_filter: MakeFilter, feed: Feed = feed_apart) -> Outcome:
         """Return the outcome of a new filter, the samples that count.  Raises as `follow`."""

@@ -72,17 +72,12 @@ Feed = Callable[[MakeFilter, Run], Output]
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    Output of a filter along a motion.
-
-    estimates : unit quaternions q(world <- sensor) (n, 4)
-    covariances, biases : (n, 3, 3) [rad^2] and (n, 3) [rad/s], NaN where unknown
-    """
+    """Output of a filter along a motion."""
 
     run: Run
-    estimates: Reals
-    covariances: Reals
-    biases: Reals
+    estimates: Reals        # unit quaternions q(world <- sensor) (n, 4)
+    covariances: Reals      # (n, 3, 3) [rad^2], NaN where unknown
+    biases: Reals           # (n, 3) [rad/s], NaN where unknown
 
     @property
     def errors(self) -> Errors:

@@ -50,28 +50,18 @@ OFF = 0.05                  # rad, and of the angle turned since: another start
 
 @dataclass(frozen=True)
 class Fit:
-    """
-    A fitted motion; `lines` tells it.
+    """A fitted motion; `lines` tells it."""
 
-    top, start : at the first attitude; lambda1 is as given, because attitudes tell ratios only
-    mounting, lever_arm : of the IMU, as `Body` has them
-    values, deviations : estimates and standard deviations by the names of NAMES; inf: not told
-    undetermined : what the readings cannot tell apart
-    residual, noise : rms of a component of the attitude residual, and of its white part [rad]
-    reached : whether the fit has converged and the residuals are noise; if not, the intervals
-        mean nothing
-    """
-
-    top: Top
-    start: State
-    mounting: tuple[float, float, float, float]
+    top: Top                            # lambda1 is as given: attitudes tell ratios only
+    start: State                        # at the first attitude
+    mounting: tuple[float, float, float, float]     # of the IMU, as `Body` has it
     lever_arm: tuple[float, float, float]
-    values: Mapping[str, float]
-    deviations: Mapping[str, float]
-    undetermined: tuple[str, ...]
-    residual: float
-    noise: float
-    reached: bool
+    values: Mapping[str, float]         # estimates by the names of NAMES
+    deviations: Mapping[str, float]     # standard deviations; inf: the readings do not tell it
+    undetermined: tuple[str, ...]       # what the readings cannot tell apart
+    residual: float                     # rms of a component of the attitude residual [rad]
+    noise: float                        # of its white part [rad]
+    reached: bool       # converged, and the residuals are noise; if not, intervals mean nothing
 
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; null: not told by the readings."""
@@ -129,10 +119,10 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     first[unknowns.RATES] = (*turns[0].inv().apply(across)[:2], spin)
     small = [(*pair, FIRST, FIXED) for pair in unknowns.small_nutation(one.times, one.values)]
     trials: list[_Trial] = []
-    for l3, p, size, free in ((spin, 0.0, FIRST, MOTION), *small[:4],
-                              (spin, 0.0, 4 * FIRST, MOTION)):
+    for l3, p, size, fitted in ((spin, 0.0, FIRST, MOTION), *small[:4],
+                                (spin, 0.0, 4 * FIRST, MOTION)):
         first[[L3, P]] = l3, p
-        trials.append(_fit_from(one, first, size, free, gravity))
+        trials.append(_fit_from(one, first, size, fitted, gravity))
         if trials[-1].explained:
             break                               # another guess finds the same
     best = min(trials, key=lambda trial: trial.residual)

@@ -47,11 +47,6 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
     subject : str, optional
         Name of the simulator; default: that of `run`.
 
-    Returns
-    -------
-    Report
-        The faults with their evidence, and the measures.
-
     Raises
     ------
     TypeError
@@ -107,9 +102,7 @@ def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
         Times [s], equally spaced; default: the `t` of the trajectory.
     dt : float, optional
         Step of the simulator [s]; default: the time between two samples.
-    tolerance : float
-        As of `grade`.
-    subject : str
+    tolerance, subject : float, str
         As of `grade`.
     **imu :
         Parameters of `Body` beside those of the top: `lever_arm`, `mounting`, ...

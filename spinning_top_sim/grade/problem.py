@@ -39,19 +39,13 @@ CHANGE = 1e-5               # of the readings by a step of finite differences [r
 
 @dataclass(eq=False)        # hashed by identity
 class Samples:
-    """
-    Samples at times.
+    """Samples at times."""
 
-    kind : 'attitude', q(world <- body) as x, y, z, w; 'rates' or 'force' of an IMU
-    times : (n,), ascending [s]
-    values : (4, n) or (3, n), [rad/s] or [m/s^2]
-    sigma : standard deviation of a component
-    """
-
+    # 'attitude', q(world <- body) as x, y, z, w; 'rates' or 'force' of an IMU.
     kind: str
-    times: Reals
-    values: Reals
-    sigma: float = 1.0
+    times: Reals            # (n,), ascending [s]
+    values: Reals           # (4, n) or (3, n), [rad/s] or [m/s^2]
+    sigma: float = 1.0      # standard deviation of a component
 
 
 class Problem:

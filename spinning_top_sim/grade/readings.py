@@ -17,17 +17,12 @@ _per_step = partial(np.gradient, axis=0)        # change per step of values (m, 
 
 
 class Readings(NamedTuple):
-    """
-    What a sensor reads in one motion (n, 3), and what it should read, over its rms `size`.
+    """What a sensor reads in one motion, and what it should read, over its rms `size`."""
 
-    effects : by name (m, 3), beginning with reading `first`: `terms` of the right reading, their
-        sum `total`, and its change by defects of size 1
-    """
-
-    reading: Reals
-    first: int
-    effects: Mapping[str, Reals]
-    terms: Sequence[str]
+    reading: Reals                  # (n, 3)
+    first: int                      # reading at which the effects begin
+    effects: Mapping[str, Reals]    # terms, their sum `total`, and its change by defects (m, 3)
+    terms: Sequence[str]            # of the right reading
     size: float
 
     def at_lag(self, lag: int, names: Sequence[str] = ()) -> tuple[Reals, dict[str, Reals]]:

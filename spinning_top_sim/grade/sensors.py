@@ -25,33 +25,26 @@ from spinning_top_sim.grade.scenes import Body, Reals
 
 
 class Kind(NamedTuple):
-    """
-    A kind of readings.
+    """A kind of readings."""
 
-    units : factors of other units
-    strange : discrepancy beyond the noise from which on a cause is looked for
-    in_world, scale, sign : faults of readings in axes of the world, of another size, another sign
-    density : parameter of the body with the density of the noise
-    """
-
-    units: Sequence[float]
-    strange: float = 2e-3
-    in_world: str = 'reading_in_world'
+    units: Sequence[float]          # factors of other units
+    strange: float = 2e-3           # discrepancy beyond the noise for which a cause is looked for
+    in_world: str = 'reading_in_world'      # faults in axes of the world, of size and of sign
     scale: str = 'reading_scale'
     sign: str = 'reading_sign'
-    density: str = ''
+    density: str = ''               # parameter of the body: the density of the noise
 
 
 _DEGREES, _G = (180.0 / math.pi, math.pi / 180.0), (1.0 / 9.80665,)
+# Rates may be those of the middle of a step; velocities are means over a step, compared with those
+# of its ends: a larger discrepancy is not strange.
 KINDS = {
-    # They may be those of the middle of a step.
     'rates': Kind(_DEGREES, 2e-2, 'rates_in_world', 'rates_scale', 'rates_scale'),
     'gyroscope': Kind(_DEGREES, in_world='rates_in_world', density='gyroscope_noise_density'),
     'accelerations': Kind(
         _G, scale='acceleration_scale', density='accelerometer_noise_density'),
     'magnetometer': Kind((1e4, 1e6, 1e9)),
     'rotations': Kind(_DEGREES),
-    # Means over a step, compared with those of its ends.
     'velocities': Kind(_G, 5e-2)}
 # Discrepancies and noise are relative to the rms of the reading.
 LAGS = range(-3, 31)        # lags that are tried [samples]
