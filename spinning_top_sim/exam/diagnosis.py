@@ -143,11 +143,7 @@ def noisy_limit(run: Run, absolute: bool, imu: Mapping[str, Any]) -> float:
 
 
 def inaccuracy(outcome: Outcome, absolute: bool, limit: float = DIVERGED) -> Fault | None:
-    """
-    Judge the error in the last quarter, and whether it grows from quarter to quarter.
-
-    limit : of that error [rad], at most DIVERGED
-    """
+    """Judge the error in the last quarter by a limit [rad] <= DIVERGED, and whether it grows."""
     quarters = [rms(part) for part in np.array_split(outcome.errors.judged(absolute), 4)]
     if quarters[-1] < limit:
         return None

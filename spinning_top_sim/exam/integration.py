@@ -54,8 +54,9 @@ def judge_integration(response: Response) -> None:
     findings.measures['order'] = measures.convergence_order(factors, moved)
     findings.measures['integration_error_deg'] = math.degrees(moved[0])
     if restarts:
-        _judge_steps(response, [*outcomes, response.respond(
-            finest.merged(UNEVEN), *unaided, shifted=False).last()])
+        # With a delay, the turns of a filter would not be those of the same uneven steps.
+        uneven = response.respond(finest.merged(UNEVEN), *unaided).last()
+        _judge_steps(response, [*outcomes, uneven])
     absolute = response.absolute and not unaided
     fault = (_first_order(response, runs[0], diagnosis.error_of(outcomes[0], absolute), unaided)
              or _left_over(response, runs, outcomes, absolute))

@@ -114,19 +114,13 @@ def errors_by_angle(rotation: Rotation, truth: Rotation) -> dict[str, Reals]:
 
 @dataclass
 class Motion:
-    """
-    A motion beside the exact one from the same state.
-
-    rates : body rates at all samples but `MARGIN` at each end (n - 6, 3), from the attitudes
-        unless those told are right
-    derived : whether they are from the attitudes, as before `use_told_rates`
-    """
+    """A motion beside the exact one from the same state."""
 
     name: str
     body: Body
     start: Start
     trajectory: Trajectory
-    derived: bool = True
+    derived: bool = True        # the rates are from the attitudes, as before `use_told_rates`
 
     def __post_init__(self) -> None:
         self.solution = ExactSolution(self.body, self.start.state_of(self.body))
@@ -139,6 +133,7 @@ class Motion:
         here = error[MARGIN:-MARGIN].inv()
         total = sum(weight * (here * error[at:at + n]).as_rotvec()
                     for at, weight in enumerate(_WEIGHTS) if weight)
+        # At all samples but MARGIN at each end (n - 6, 3).
         self.rates: Reals = total / self.trajectory.step + here.apply(
             self.truth.angular_velocity[MARGIN:-MARGIN])
 

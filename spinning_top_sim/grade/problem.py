@@ -49,15 +49,12 @@ class Samples:
 
 
 class Problem:
-    """
-    Residuals and Jacobian of readings.
-
-    reference, mounting : q(world <- body) at t = 0 and q(body <- IMU) before the unknown turns
-    """
+    """Residuals and Jacobian of readings."""
 
     def __init__(self, readings: Sequence[Samples], reference: Reals, gravity: float) -> None:
-        self.readings, self.reference, self.gravity = readings, reference, gravity
-        self.mounting: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
+        self.readings, self.gravity = readings, gravity
+        # q(world <- body) at t = 0 and q(body <- IMU), before the unknown turns.
+        self.reference, self.mounting = reference, np.array((0.0, 0.0, 0.0, 1.0))
         self._steps = np.full(UNKNOWNS, 1e-6)
         self._motion = lru_cache(maxsize=4)(self._motion_of)
 
