@@ -39,7 +39,7 @@ MEANINGS = {
 # What is no cause of an error with noise.
 NO_CAUSE = {'inaccurate', 'diverges', 'lever_arm', 'no_bias_estimate', 'bias_report',
             'invalid_output'}
-# Any of these faults hides those: it has such effects itself.
+# A fault of the first set hides those of the second, which are its effects.
 HIDES = (({*FAULTS} - NO_CAUSE, {'inaccurate', 'diverges'}), ({'diverges'}, {'inaccurate'}),
          ({'frame_ned'}, {'bias_report'}))
 

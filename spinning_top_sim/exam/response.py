@@ -90,7 +90,7 @@ class Response:
             self.unclear |= one.given is hypotheses.of_world
         clean = np.degrees(self._errors(self.outcome))
         self.findings.measures |= {'tilt_clean_deg': float(max(clean[::2])),
-                                 'heading_clean_deg': float(max(clean[1::2]))}
+                                   'heading_clean_deg': float(max(clean[1::2]))}
         others = self._unexplained()
         # A heading that nothing corrects is any.
         if 'magnetometer_wiring' in [fault.name for fault in others]:
@@ -246,20 +246,20 @@ class Response:
         """Try its sign, its unit, its axes, and the affine change that attitudes at rest show."""
         if self._errors(self.outcome)[0] < TILT:
             return
-        horizontal = 0, 1
+        up, horizontal = 2, (0, 1)      # axes of the world
         # Another unit corrects nothing.
         units = hypotheses.UNITS if self._kicks() != [] else ()
         yield from self._try(hypotheses.GRAVITY_SIGN, *units)
-        yield from self._permutations('accelerometer', 2, horizontal)
+        yield from self._permutations('accelerometer', up, horizontal)
         yield from self._affine('accelerometer', 'accelerometer_wiring', horizontal)
 
     def _of_magnetometer(self) -> Iterator[Tried]:
         """Try the field of a level sensor, its axes, and the same changes of the magnetometer."""
         if not self.absolute or max(self._errors(self.outcome)[:2]) < HEADING:
             return
-        east = 0,
+        north, east = 1, (0,)
         yield from self._try(hypotheses.LEVEL)
-        yield from self._permutations('magnetometer', 1, east)
+        yield from self._permutations('magnetometer', north, east)
         yield from self._affine('magnetometer', 'hard_iron', east, offset_only=True)
         yield from self._affine('magnetometer', 'magnetometer_wiring', east)
 

@@ -96,7 +96,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
 
 
 def _find_causes(kind: str, motions: Sequence[Motion], target: Reals, effects: Mapping[str, Reals],
-               floor: float, most: float) -> tuple[list[Fault], Reals, bool]:
+                 floor: float, most: float) -> tuple[list[Fault], Reals, bool]:
     """Return the causes of a discrepancy, what they leave of it, and whether that is noise."""
     before, strange = beyond(target, most), KINDS[kind].strange
     if motions[0].derived and kind != 'rates':
