@@ -90,16 +90,12 @@ class Start:
 
 @dataclass(frozen=True)
 class Scene:
-    """
-    A motion that is graded, from l3, lz, theta and theta_dot of its start, for so long [s].
-
-    divided : numbers by which dt is divided, 1 first; more than one give the order of convergence
-    """
+    """A motion that is graded."""
 
     name: str
-    start: Mapping[str, float]
-    duration: float
-    divided: tuple[int, ...] = (1,)
+    start: Mapping[str, float]          # l3, lz, theta and theta_dot
+    duration: float                     # [s]
+    divided: tuple[int, ...] = (1,)     # of dt, 1 first; several give the order of convergence
 
     def start_of(self, top: Top, seed: int) -> Start:
         """Return the start; the seed determines phi and psi."""
