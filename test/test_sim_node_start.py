@@ -128,8 +128,9 @@ def start_values(*arguments):
     """Return the values that a node starts with in the namespace /last."""
     argv = ['--ros-args', '-r', '__ns:=/last', *arguments]
     with as_a_process():
+        argv, make_node = sim_node._prepare(argv)
         rclpy.init(args=argv)
-        node = sim_node._prepare(argv)[1]()
+        node = make_node()
         values = node.start_values
         node.stop()
         node.destroy_node()
@@ -155,6 +156,8 @@ def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(tmp_path):
     found = start_values(*options, '--params-file', str(file))
     assert [found[name] for name in names] == [3.0, 1.0, 250.0, 1.0, 2.0, (1.0, 2.0, 3.0)]
     assert start_values('-p', 'spin.l3:=2', '-p', 'spin.l3:=1.5')['spin.l3'] == 1.5
+    found = start_values('-p', 'seed:=7', '--', '--scene', 'wavy')
+    assert (found['seed'], found['spin.lz']) == (7, 1.42)
 
 
 @pytest.mark.parametrize(('installed', 'wanted'), [(True, True), (False, True), (True, False)])

@@ -118,17 +118,19 @@ def _ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def without_ros_arguments(argv: Iterable[str]) -> list[str]:
-    """Return the arguments that are not between `--ros-args` and `--` or the end."""
-    words, are_of_ros = [], False
+def split_ros_arguments(argv: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Return the own arguments, and those of ROS: between `--ros-args` and `--` or the end."""
+    own: list[str] = []
+    for_ros: list[str] = []
+    words = own
     for word in argv:
         if word == '--ros-args':
-            are_of_ros = True
-        elif not are_of_ros:
+            words = for_ros
+        elif words is for_ros and word == '--':
+            words = own
+        else:
             words.append(word)
-        elif word == '--':
-            are_of_ros = False
-    return words
+    return own, for_ros
 
 
 def _cannot_start(name: str, error: Exception) -> int:

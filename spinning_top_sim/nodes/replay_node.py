@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
+from spinning_top_sim.nodes.executable import RunnableNode, run, split_ros_arguments
 from spinning_top_sim.nodes.playback import FASTEST, RATES, SLOWEST
 from spinning_top_sim.tools import cli
 
@@ -43,7 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
-    options = _parser().parse_args(without_ros_arguments(argv))
+    words, _ = split_ros_arguments(argv)
+    options = _parser().parse_args(words)
     from spinning_top_sim.nodes.replayer import Replayer, open_log  # noqa: PLC0415
     log = open_log(options.file, options.partial)
     return argv, lambda: Replayer(log, options)
