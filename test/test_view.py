@@ -184,6 +184,10 @@ def test_the_effective_potential_meets_the_energy_at_the_turning_points(shown):
         (lz - l3 * math.cos(theta)) ** 2 / (2 * shown.top.lambda1 * math.sin(theta) ** 2)
         + shown.top.gravity_torque * math.cos(theta))
     assert np.interp(turning.x, line.x, line.y) == pytest.approx(energy, abs=1e-3)
+    still, moves = (plots.Shown(track, stamp_ns, 0, stamp_ns, 0)
+                    for track in (Track('', shown.values), shown))
+    assert plots.motion_plots([moves, still])[0].energy == pytest.approx(energy)
+    assert math.isnan(plots.motion_plots([still, moves])[0].energy)
 
 
 def test_a_plot_is_svg_with_title_units_and_its_points():

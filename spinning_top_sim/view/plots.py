@@ -61,10 +61,11 @@ def motion_plots(tops: Sequence[Shown]) -> list[Plot]:
                        Line('sum', GREEN, times, kinetic + height, dash)]
     now = float(tops[0].seconds(np.array(tops[0].stamp_ns)))
     present = tops[0].track.attitudes.at(tops[0].stamp_ns)
+    motion = tops[0].track.motion_at(tops[0].stamp_ns)
     theta = float(shapes.tilt(shapes.axis_of(present[1]))[0]) if present else math.nan
     return [plot for plot in (
         Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', potential, theta,
-             float(potential[1].y[0]) if potential else None),
+             motion.energy if motion and motion.description else math.nan),
         Plot('Energy', 'time t [s]', 'E [J]', energy, now),
         Plot('Tilt', 'time t [s]', 'θ [deg]', tilt, now),
         Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', rate, now)) if plot.lines]
