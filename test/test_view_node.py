@@ -69,7 +69,7 @@ def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypa
         live._inbox.extend((topic, data) for topic, _, data in taken if topic in live._listeners)
         live._draw_once()
         assert live._track.span[1] == epoch_ns + NANOSECONDS // 2
-        assert live._page._tops[0].drawn[0] == epoch_ns + NANOSECONDS // 2
+        assert live._page._tops[0]._picture[0] == epoch_ns + NANOSECONDS // 2
     # The trace begins with the last reset.
     live._epoch_ns = epoch_ns + NANOSECONDS // 4
     live._draw_once()

@@ -10,6 +10,7 @@ from typing import Any
 import viser
 
 from spinning_top_sim.installation import parameter_files
+from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.view.page import Page, set_value
 
@@ -103,7 +104,7 @@ class Controls:
 
     def set_range(self, top: Top, l3: float, lz: float) -> None:
         """Set the range of the sliders to twice the greater of the present and the usual spin."""
-        usual = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))      # least spin to sleep
+        usual = 2.0 * natural_momentum(top)         # the least spin to sleep
         reach = 2.0 * (max(abs(l3), abs(lz), usual) or 1.0)
         digits = 1 - math.floor(math.log10(reach))
         reach = math.ceil(reach * 10.0 ** digits) / 10.0 ** digits

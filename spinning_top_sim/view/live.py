@@ -113,7 +113,7 @@ class LiveView(Node):
         needed = {'pose', 'joint_states'}
         if self.count_publishers(THROTTLED['ground_truth/odom']):     # both in one
             needed = {'ground_truth/odom'}
-        if self._page.arrows[shapes.ARROWS.index('specific force')].value:
+        if self._page.arrows['specific force'].value:
             needed |= {'ground_truth/imu'}
         for topic in needed - self._listeners.keys():
             self._listen(topic)

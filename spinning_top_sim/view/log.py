@@ -20,7 +20,14 @@ from spinning_top_sim.tools import recorded_run, svg
 from spinning_top_sim.tools.attitudes import LAYOUTS, decode
 from spinning_top_sim.view import plots, text
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
-from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Series, Track, joined
+from spinning_top_sim.view.track import (
+    WIDTHS,
+    DescribedMotion,
+    Series,
+    Track,
+    attitude_rows,
+    joined,
+)
 
 SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
 LONGEST_HTML_S = 60.0
@@ -70,16 +77,17 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
     track = Track(name, parameters.checked({}), has_body=False)
     for topic in reader.topics:
         found: dict[int, NDArray[np.float64]] = {}
-        for message in reader.messages([topic.name]) if topic.type_name in LAYOUTS else ():
+        if topic.type_name not in LAYOUTS:
+            continue
+        for message in reader.messages([topic.name]):
             with contextlib.suppress(ValueError):       # without an orientation
                 stamp_ns, quaternion, _ = decode(message.data, topic.type_name)
                 norm = float(np.linalg.norm(quaternion))
                 if 0.5 < norm < 2.0:
                     found[stamp_ns] = quaternion / norm
         if found:
-            rows = Series(np.array(list(found), np.int64), np.pad(
-                np.array(list(found.values())), ((0, 0), (0, 3))))
-            track.add('pose', rows)
+            track.add('pose', Series(np.array(list(found), np.int64), attitude_rows(
+                np.array(list(found.values())), place=0.0)))
             track.epoch_ns = track.span[0]
             break
     return track
@@ -177,8 +185,8 @@ class Player:
         seconds = min(self.length, LONGEST_HTML_S)
         words = ''.join(page.words(begin_ns + round(second * NANOSECONDS), self._epoch_ns)
                         for second in [0.0, *self._commands] if second <= seconds)
-        tops = page.shown(begin_ns, self._epoch_ns, begin_ns,
-                          begin_ns + round(seconds * NANOSECONDS))
+        tops = page.plotted(begin_ns, self._epoch_ns, begin_ns,
+                            begin_ns + round(seconds * NANOSECONDS))
         serializer = page.server.get_scene_serializer()
         for picture in range(1, int(seconds * RATE) + 1):
             serializer.insert_sleep(1.0 / RATE)

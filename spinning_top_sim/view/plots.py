@@ -27,7 +27,7 @@ LEAST = 1e-17                   # is drawn for 0 on a logarithmic axis
 BLUE, RED, GREEN, VIOLET = '#1c6dd0', '#d9482b', '#1e8a4c', '#7a52b3'
 
 
-class Shown(NamedTuple):
+class Plotted(NamedTuple):
     """A track, the stamp that is drawn, the span that is plotted, and the stamp of t = 0 [ns]."""
 
     track: Track
@@ -44,7 +44,7 @@ class Shown(NamedTuple):
         return self.seconds(stamps_ns), rows
 
 
-def motion_plots(tops: Sequence[Shown]) -> list[Plot]:
+def motion_plots(tops: Sequence[Plotted]) -> list[Plot]:
     """Return the plots of potential, energies, tilt and precession, as far as there are data."""
     potential, energy, tilt, rate = (list[Line]() for _ in range(4))
     for top, dash in zip(tops, ('', '5 3'), strict=False):
@@ -71,7 +71,7 @@ def motion_plots(tops: Sequence[Shown]) -> list[Plot]:
         Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', rate, now)) if plot.lines]
 
 
-def accuracy_plots(tops: Sequence[Shown]) -> list[Plot]:
+def accuracy_plots(tops: Sequence[Plotted]) -> list[Plot]:
     """Return the plots of the drift of the energy and of the error of the orientation."""
     now = float(tops[0].seconds(np.array(tops[0].stamp_ns)))
     parts = [top.part(top.track.samples['~/invariants']) for top in tops]
@@ -83,7 +83,7 @@ def accuracy_plots(tops: Sequence[Shown]) -> list[Plot]:
             ('Orientation error', 'log₁₀ [rad]', ORIENTATION_ERROR))]
 
 
-def _potential(top: Shown, dash: str) -> list[Line]:
+def _potential(top: Plotted, dash: str) -> list[Line]:
     """Return V around the bounds of theta, the energy of the axis, and the turning points."""
     motion = top.track.motion_at(top.stamp_ns)
     if motion is None or motion.description is None:
