@@ -154,7 +154,7 @@ class Track:
             # With imu.sampling = mean these are means, which are near enough for a picture.
             for columns, field in ((RATES, fields[1]), (FORCE, fields[2])):
                 _, in_body = self._imu.in_body(tuple(fields[0].T), tuple(field.T))
-                rows[:, columns] = np.transpose(in_body)
+                rows[:, columns] = np.vstack(in_body).T
         if topic in PLACE_TOPICS:
             norm = np.linalg.norm(fields[1], axis=1)
             rows[:, PLACE] = np.nan_to_num(fields[0][np.isfinite(norm) & (norm > 0.0)])
