@@ -28,8 +28,8 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import scan
+from spinning_top_sim.recording.chunks import record_bytes
 from spinning_top_sim.recording.log_file import LogFile
-from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
 
 
@@ -141,8 +141,8 @@ def test_memory_has_a_ceiling(tmp_path):
     done = subprocess.run(
         [sys.executable, '-c', textwrap.dedent(f"""
             import re, sys
-            from spinning_top_sim.recording import records
-            records.MAX_BYTES = {MAX_BYTES}
+            from spinning_top_sim.recording import parsing
+            parsing.MAX_BYTES = {MAX_BYTES}
             from spinning_top_sim.recording.reader import LogReader
             from spinning_top_sim.recording.errors import LogError
             from spinning_top_sim.tools.recover import main

@@ -88,7 +88,7 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
     assert synced == [str(path), str(tmp_path)]
     synced.clear()
     file.append(0, 1, pose_cdr(1))
-    file.write_chunk()
+    file.flush()
     file.finish()
     assert synced == [str(path), str(tmp_path)]
 
@@ -97,7 +97,7 @@ def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monk
     """The thread that writes has the error; the caller gets it, and can still finish the file."""
     file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='zstd')
     file.append_rows([rows_of(0, 100)])
-    file.write_chunk()
+    file.flush()
     pwrite = os.pwrite
 
     def refuse(*_):
@@ -107,9 +107,9 @@ def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monk
     with pytest.raises(OSError, match='No space'):
         for number in range(100, 1000, 100):
             file.append_rows([rows_of(number, number + 100)])
-        file.write_chunk()
+        file.flush()
     monkeypatch.setattr(os, 'pwrite', pwrite)
-    file.write_chunk()          # what was told once is not told again
+    file.flush()          # what was told once is not told again
     file.finish()
     assert is_indexed(tmp_path / 'run.mcap')
     assert numbers_in(tmp_path / 'run.mcap') == list(range(100))
@@ -353,10 +353,10 @@ def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
         file.append(index, stamp, data)
     monkeypatch.setattr(os, 'pwrite', interrupted)
     with pytest.raises(KeyboardInterrupt):
-        file.write_chunk()
+        file.flush()
     monkeypatch.setattr(os, 'pwrite', pwrite)
     assert file.size == path.stat().st_size == size
-    file.write_chunk()
+    file.flush()
     file.finish()
     with path.open('rb') as stream:
         list(StreamReader(stream, validate_crcs=True).records)

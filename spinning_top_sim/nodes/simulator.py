@@ -120,7 +120,7 @@ class Simulator(Node):
         """End the motion and close the recording, whether the context is valid or not."""
         self._pacer.stop()
         self._terminal.end()
-        path = self._session.numbers().get('recorded file')
+        path = self._session.path
         summary = self._session.stop()
         if summary:
             self._terminal.tell(f'{summary}\nnext: spinning-top inspect {path}\n'

@@ -13,7 +13,7 @@ from spinning_top_sim.physics.pivot import NEVER_NS
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, stamp_text
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.simulation import checked_velocity
 
@@ -106,8 +106,7 @@ class TickLoop:
     @property
     def time_text(self) -> str:
         """The simulated time for the user, with all its digits."""
-        seconds, nanoseconds = divmod(self.now_ns, NANOSECONDS)
-        return f'at t = {seconds}.{nanoseconds:09d} s'
+        return f'at t = {stamp_text(self.now_ns)} s'
 
     def start(self) -> None:
         """Let simulated time run from 0 on, unless the motion is paused or has failed."""

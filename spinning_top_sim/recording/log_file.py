@@ -26,7 +26,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.records import HEAD, MAX_DECLARED, DamagedError, check_size, parse
+from spinning_top_sim.recording.parsing import HEAD, MAX_DECLARED, DamagedError, check_size, parse
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
 

@@ -25,10 +25,9 @@ from spinning_top_sim.recording.chunks import CHUNK_BYTES
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError, why_not_written
 from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
+from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 
-METADATA_NAME = 'spinning_top_sim'
-OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
 QUEUE_BYTES = 32_000_000            # of a full queue; a burst that began with room may go on
 
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
@@ -193,7 +192,7 @@ class McapRecorder:
             self._write_queued()
             if closing or now >= next_flush:
                 next_flush = now + interval
-                self._file.write_chunk()
+                self._file.flush()
                 if closing and self._syncing is not None:
                     self._syncing.join()
                 if self._sync_error is not None:

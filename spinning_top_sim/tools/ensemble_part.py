@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
+from spinning_top_sim.recording.errors import reason_of
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS, CdrWriter, Field, Template, fill
+from spinning_top_sim.streams.messages import FIELDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
-from spinning_top_sim.tools.recorded_run import field_names, reason_of
 from spinning_top_sim.tools.simulate import write_log
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def versions() -> dict[str, str]:
 def _column_names(stream: Stream) -> Sequence[str]:
     """Return the names of the numbers in a message, '' for those that are not kept."""
     names = []
-    for field, count in zip(field_names(stream), stream.template.counts, strict=True):
+    for field, count in zip(FIELDS[stream.type_name], stream.template.counts, strict=True):
         labels = LABELS.get(stream.topic) or ('xyzw'[:count] if count <= 4 else range(count))
         # REP-145: a message may say that it has no orientation.
         is_kept = field != 'orientation' or getattr(stream, 'has_orientation', True)

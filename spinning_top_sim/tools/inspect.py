@@ -22,10 +22,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from spinning_top_sim.installation import needed
+from spinning_top_sim.recording.damage import count
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.scan import count, seconds
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.tools import cli, log_exports
 from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import MotionReport, Survey, survey
@@ -194,7 +194,7 @@ def _topics(found: Survey) -> Iterator[str]:
          _number(topic.missing, 15)) for name, topic in found.topics.items()])
     for name, topic in found.topics.items():
         for begin, end in topic.gaps_ns:
-            yield f'gap: {name} from {seconds(begin)} to {seconds(end)}'
+            yield f'gap: {name} from {stamp_text(begin)} s to {stamp_text(end)} s'
 
 
 def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
@@ -237,7 +237,7 @@ def _verdict(verdict: Comparison) -> Iterator[str]:
     first = verdict.first
     if first is not None:
         place = '' if first.byte is None else f', byte {first.byte}'
-        yield (f'verify: first: {first.topic} at {seconds(first.stamp_ns)}{place}, '
+        yield (f'verify: first: {first.topic} at {stamp_text(first.stamp_ns)} s{place}, '
                f'{first.field}: in the log {first.logged}, computed {first.computed}')
 
 

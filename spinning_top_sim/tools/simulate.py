@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spinning_top_sim.recording.provenance import provenance
+from spinning_top_sim.recording.provenance import run_metadata
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
@@ -169,29 +169,27 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     """
     values, epoch_ns = simulation.values, simulation.epoch_ns
     streams = journal.recorded_streams(simulation.streams, values)
-    commands_topic, events_topic = len(streams), len(streams) + 1
-    types = {stream.topic: stream.type_name for stream in streams} | dict(journal.TOPICS)
+    types = {stream.topic: stream.type_name for stream in streams} | journal.TOPICS
+    topics = list(types)
     file = create_file(
         path, [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
                for name, type_name in types.items()],
-        provenance(values, epoch_ns, -1, (), values), compression=values['record.compression'])
+        run_metadata(values, epoch_ns, -1, (), values), compression=values['record.compression'])
     try:
-        file.append(events_topic, epoch_ns, journal.event('start', 0, -1))
+        file.append(topics.index(journal.EVENTS), epoch_ns, journal.event('start', 0, -1))
         for done in _play(simulation, streams, stops, show):
             if isinstance(done, Block):
                 file.append_rows([(streams.index(stream), epoch_ns + t_ns, rows)
                                   for stream, t_ns, rows in done.messages])
             else:
-                t_ns, (l3, lz) = simulation.now_ns, done
-                file.append(events_topic, epoch_ns + t_ns, journal.event(
-                    'command', t_ns, t_ns, l3=l3, lz=lz))
-                file.append(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
+                for topic, data in journal.command_entries(simulation.now_ns, *done):
+                    file.append(topics.index(topic), epoch_ns + simulation.now_ns, data)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(f'{path} holds the run up to t = '
                                 f'{simulation.now_ns / NANOSECONDS:g} s') from interrupt
     finally:
         try:
-            file.write_chunk()
+            file.flush()
         finally:
             file.finish()
     return f'{file.messages} messages, {file.size / 1e6:.1f} MB'

@@ -20,21 +20,17 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
+from spinning_top_sim.recording.damage import Damage
+from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import LogMessage, LogReader
-from spinning_top_sim.recording.scan import Damage, seconds
 from spinning_top_sim.streams.blocks import Block
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured
-from spinning_top_sim.tools.recorded_run import (
-    LAST_LOG_TIME_NS,
-    MALFORMED,
-    RunDescription,
-    reason_of,
-)
+from spinning_top_sim.tools.recorded_run import LAST_LOG_TIME_NS, RunDescription
 
 MOST_GAPS = 10              # that are listed
 MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
@@ -126,7 +122,7 @@ def survey(reader: LogReader) -> Survey:
     except recorded_run.ForeignLogError as error:
         found.foreign_reason = str(error)
     else:
-        found.notes += [f'journal, entry at {seconds(stamp_ns)}: {reason}'
+        found.notes += [f'journal, entry at {stamp_text(stamp_ns)} s: {reason}'
                         for stamp_ns, reason in run.broken]
         for name, topic in run.topics.items():
             found.topics[topic].stream = name

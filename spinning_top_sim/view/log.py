@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.errors import MALFORMED, LogError, reason_of
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block
@@ -52,8 +52,8 @@ def _read_log(path: Path, name: str) -> Track:
             _read_samples(reader, track, run.topics)
             try:
                 _follow_run(track, run, reader.span[1])
-            except recorded_run.MALFORMED as error:
-                notes.append(f'the run cannot be followed: {recorded_run.reason_of(error)}')
+            except MALFORMED as error:
+                notes.append(f'the run cannot be followed: {reason_of(error)}')
     if not len(track.attitudes.rows):
         raise LogError(f'{path}: no attitude in it ({", ".join(LAYOUTS)})')
     if notes:

@@ -11,7 +11,7 @@ import numpy as np
 
 from spinning_top_sim.physics.regimes import SENTENCES, natural_momentum
 from spinning_top_sim.physics.top import Top
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.view.track import DescribedMotion, Track
 
 HERE = Path(__file__).parent
@@ -32,7 +32,6 @@ def number(value: float) -> str:
 
 def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns: int) -> str:
     """Return headline, sentence and numbers of a top, and stamp and time of what is drawn."""
-    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     description = motion.description if motion else None
     title, sentence = ((description.name, SENTENCES[description.name]) if description else
                        ('motion', PIVOT_MOVES if motion.pivot_moves else BEYOND) if motion else
@@ -47,7 +46,7 @@ def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns:
         *(f'<tr><td>{label}</td><td>{value}{f"<small>{note}</small>" if note else ""}</td></tr>'
           for label, value, note in rows),
         f'</table><p class="stamp">t = {since_ns / NANOSECONDS:.3f} s, stamp '
-        f'{seconds}.{nanoseconds:09d}</p></div>'))
+        f'{stamp_text(stamp_ns)}</p></div>'))
 
 
 def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:

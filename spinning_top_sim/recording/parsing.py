@@ -24,8 +24,13 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Chunk, McapRecord
 from mcap.stream_reader import StreamReader
 
-from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE, MESSAGE_FIELDS
-from spinning_top_sim.recording.mcap_writer import record_bytes
+from spinning_top_sim.recording.chunks import (
+    ENTRY_SIZE,
+    INDEX_HEAD,
+    MESSAGE,
+    MESSAGE_FIELDS,
+    record_bytes,
+)
 
 MAX_BYTES = 256 << 20               # of one record or one uncompressed chunk in memory
 MAX_DECLARED = 16 << 20             # of schemas, channels or metadata, which take ten times that
