@@ -27,7 +27,7 @@ from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording import scan
+from spinning_top_sim.recording import parsing
 from spinning_top_sim.recording.chunks import record_bytes
 from spinning_top_sim.recording.log_file import LogFile
 from spinning_top_sim.recording.reader import LogReader
@@ -172,8 +172,8 @@ def test_memory_has_a_ceiling(tmp_path):
 def test_a_search_unpacks_a_limited_amount(tmp_path, monkeypatch):
     """Chunks that are small and unpack to much, each with a wrong checksum."""
     unpacked = []
-    ordinary = scan.open_chunk
-    monkeypatch.setattr(scan, 'open_chunk', lambda chunk, max_bytes: (
+    ordinary = parsing.open_chunk
+    monkeypatch.setattr(parsing, 'open_chunk', lambda chunk, max_bytes: (
         unpacked.append(chunk.uncompressed_size), ordinary(chunk, max_bytes))[1])
     plain = bytearray(zstd_chunk(message(5, bytes(1_000_000))))
     plain[9 + 24] ^= 1

@@ -24,9 +24,9 @@ from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools import simulate, svg
+from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.scene_file import read_scene
-from spinning_top_sim.view import command, plots, shapes, text
+from spinning_top_sim.view import command, plots, shapes, svg, text
 from spinning_top_sim.view.track import Series, Track, attitude_rows
 
 pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')

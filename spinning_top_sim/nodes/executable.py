@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 from spinning_top_sim.installation import needed, remedy
 from spinning_top_sim.recording.errors import text_of
-from spinning_top_sim.tools.cli import printable
+from spinning_top_sim.tools import cli
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -36,8 +36,8 @@ class RunnableNode(Protocol):
     def destroy_node(self) -> None: ...
 
 
-def run(name: str, argv: Sequence[str] | None,
-        prepare: Callable[[list[str]], tuple[list[str], Callable[[], RunnableNode]]]) -> int:
+def run_node(name: str, argv: Sequence[str] | None,
+             prepare: Callable[[list[str]], tuple[list[str], Callable[[], RunnableNode]]]) -> int:
     """
     Run the node of `spinning-top NAME`; return its exit code.
 
@@ -136,9 +136,9 @@ def split_ros_arguments(argv: Iterable[str]) -> tuple[list[str], list[str]]:
 def _cannot_start(name: str, error: Exception) -> int:
     kind = type(error).__name__
     if isinstance(error, ImportError) and not find_spec('rclpy'):
+        without = '; `view LOG` works without' if name.endswith('view') else ''
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
-                             f'{remedy("ros")}' + name.endswith('view') * (
-                                 '; `view LOG` works without'))
+                             f'{remedy("ros")}{without}')
     expected = (isinstance(error, ValueError | RuntimeError | OSError | ImportError)
                 or kind.startswith('Invalid'))
     print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(text_of(error))}',
@@ -147,8 +147,8 @@ def _cannot_start(name: str, error: Exception) -> int:
 
 
 def one_line(text: object) -> str:
-    """Return a text as one line, without control characters and positions in the code of rcl."""
-    line = printable(' '.join(re.sub(r',\s*at \S+:\d+', '', str(text)).split()))
+    """Return a text as one line, without positions in the code of rcl, and not too long."""
+    line = cli.one_line(re.sub(r',\s*at \S+:\d+', '', str(text)))
     return line if len(line) <= 600 else f'{line[:300]} ... {line[-300:]}'
 
 

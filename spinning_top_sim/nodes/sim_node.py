@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 
-from spinning_top_sim.nodes.executable import RunnableNode, run, split_ros_arguments
+from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
 
 DESCRIPTION = """\
 Simulate the heavy symmetric top in real time as a ROS 2 node.
@@ -31,7 +31,7 @@ Publishes, where enabled:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node with these arguments, by default the program's; return its exit code."""
-    return run('node', argv, _prepare)
+    return run_node('node', argv, _prepare)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -307,12 +307,12 @@ class SimulationHandlers:
         self._check_entity(request.entity)
         self._fill_state(response.state)
 
-    def _set_entity_state(self, request: Any, _: Any) -> None:
+    def _set_entity_state(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
         self._check_runs()
         top, frame = self._simulation.top, self._node.values['world_frame']
         self._set_state(lambda now: entity.requested_state(
-            request, top, frame, now, self._pivot()))
+            request, response, top, frame, now, self._pivot()))
 
     def _get_entity_info(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)

@@ -19,21 +19,11 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
+from spinning_top_sim.recording import parsing
 from spinning_top_sim.recording.chunks import time_span
 from spinning_top_sim.recording.damage import Damage, Loss, count
 from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, Summary, known_topics
-from spinning_top_sim.recording.parsing import (
-    HEAD,
-    MAX_DECLARED,
-    DamagedError,
-    Messages,
-    check_size,
-    find_messages,
-    index_entries,
-    open_chunk,
-    parse,
-    size_of,
-)
+from spinning_top_sim.recording.parsing import HEAD, DamagedError, Messages, check_size
 
 _DATA_END_SIZE = HEAD.size + 4
 _RUN_BYTES = 1 << 20    # of messages outside of chunks that are read at a time
@@ -145,7 +135,7 @@ class Scan:
         self._behind_chunk = opcode == Opcode.CHUNK
         if isinstance(record, Schema | Channel | Metadata):
             self._small_bytes += end - offset
-            check_size(self._small_bytes, MAX_DECLARED)
+            check_size(self._small_bytes, parsing.MAX_DECLARED)
         for declared in (record, *messages.declared):
             if isinstance(declared, Schema):
                 self.index.schemas.setdefault(declared.id, declared)
@@ -168,20 +158,20 @@ class Scan:
             return _Decoded()
         raw = self._file.raw(offset, end)
         if opcode == Opcode.MESSAGE_INDEX:
-            return _Decoded(index_entries=index_entries(raw))
+            return _Decoded(index_entries=parsing.index_entries(raw))
         if opcode == Opcode.MESSAGE:
             if self._all_in_chunks:
                 raise DamagedError('all messages of the file are in chunks')
-            return _Decoded(messages=find_messages(raw))
-        record = parse(raw)
+            return _Decoded(messages=parsing.find_messages(raw))
+        record = parsing.parse(raw)
         if isinstance(record, Chunk):
-            return _Decoded(record, open_chunk(record, self._file.max_bytes))
+            return _Decoded(record, parsing.open_chunk(record, self._file.max_bytes))
         return _Decoded(record)
 
     def _true_end(self, record: McapRecord | None, offset: int, end: int) -> int:
         """Return the end that its fields or the next record prove; else raise DamagedError."""
         if record is not None:
-            own = offset + size_of(record)
+            own = offset + parsing.size_of(record)
             # Such a length would take in the records that follow.
             if own < end and isinstance(record, Schema | Channel) and self._is_record(own):
                 self._defects.append(f'{type(record).__name__.lower()} at byte {offset}: its '

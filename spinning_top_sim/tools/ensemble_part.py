@@ -38,11 +38,11 @@ Samples = dict[str, tuple[NDArray[np.float64], NDArray[np.bool_]]]
 EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
 DATA = 'data'                   # folder of the files of a dataset
 # Key of the metadata of a Parquet file: the reasons of the runs that failed, by run.
-FAILED = b'failed'
+FAILED_KEY = b'failed'
 # Names of the numbers in the fields of a topic, where they are not x, y, z and w.
-PLACE = ('latitude', 'longitude', 'altitude')
+GEODETIC = ('latitude', 'longitude', 'altitude')
 LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING,
-          'gnss/fix': PLACE, 'ground_truth/gnss/fix': PLACE}
+          'gnss/fix': GEODETIC, 'ground_truth/gnss/fix': GEODETIC}
 
 
 @cache
@@ -120,7 +120,7 @@ def _joined(parts: Sequence[NDArray[Any]], none: int | tuple[int, int],
     return parts[0] if len(parts) == 1 else np.concatenate([np.empty(none, kind), *parts], axis=-1)
 
 
-def table(specification: Specification, found: Mapping[int, Samples]) -> 'pyarrow.Table':
+def arrow_table(specification: Specification, found: Mapping[int, Samples]) -> 'pyarrow.Table':
     """Return the samples of runs as a table, beside the number of the run and what is drawn."""
     import pyarrow as pa  # noqa: PLC0415
 
@@ -157,7 +157,7 @@ def write_row(specification: Specification, run: int, path: Path) -> None:
         write_log(path, simulation, [(round(values['duration'] * NANOSECONDS), None)],
                   lambda done: None, '/')
     else:
-        rows = table(specification, {run: samples(specification, simulation)})
+        rows = arrow_table(specification, {run: samples(specification, simulation)})
         with open(path, 'xb') as file:
             parquet.write_table(rows, file)
 
@@ -173,7 +173,7 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
 
     path = Path(folder, DATA, f'part-{part:06d}.parquet')
     with contextlib.suppress(OSError, ValueError, KeyError):    # it is missing, or not whole
-        return dict(json.loads(parquet.read_metadata(path).metadata[FAILED]))
+        return dict(json.loads(parquet.read_metadata(path).metadata[FAILED_KEY]))
     begun, found = {}, {}
     failed: dict[str, str] = {}
     # All runs begin before one is played: caches of the processor hold the code of one of both.
@@ -184,7 +184,8 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
         with _noted(failed, run):
             found[run] = samples(specification, begun.pop(run))     # which holds much memory
     if found:
-        rows = table(specification, found).replace_schema_metadata({FAILED: json.dumps(failed)})
+        rows = arrow_table(specification, found).replace_schema_metadata(
+            {FAILED_KEY: json.dumps(failed)})
         constant = ['run', *specification.drawn(0)]
         written = path.with_name(f'.{path.name}.{uuid4()}')     # readers of Parquet skip it
         parquet.write_table(

@@ -37,8 +37,8 @@ def model(values: Mapping[str, Any], file_format: str, name: str) -> str:
 
     Raises ValueError if no rigid body has the inertia, or, of URDF, if the frames form no tree.
     """
-    if warning := robot.inertia_warning(values):
-        raise ValueError(warning.partition(', so the body')[0])
+    if fault := robot.inertia_fault(values):
+        raise ValueError(fault)
     return FORMATS[file_format](values, re.sub(r'[^\w.]+', '_', name))
 
 

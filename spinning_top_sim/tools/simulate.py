@@ -28,7 +28,7 @@ from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream, period_ns
 from spinning_top_sim.tools import cli, log_exports, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
-from spinning_top_sim.tools.table import RIDE_UNITS, Table, write_csv, write_parquet
+from spinning_top_sim.tools.table import RIDE_UNITS, UNITS, TrueStates, write_csv, write_parquet
 
 FORMATS = ('mcap', 'csv', 'parquet')
 
@@ -100,10 +100,9 @@ def _run(arguments: argparse.Namespace) -> int:
 def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
                  show: Callable[[float], object]) -> Mapping[str, str]:
     """Write a table; return the units of its columns."""
-    table = Table(period_ns(simulation.values['pose.rate']))
-    if simulation.pivot_path:
-        table = Table(table.period_ns, RIDE_UNITS, lambda samples: (
-            *samples.pivot.position, *samples.pivot.velocity))
+    every_ns = period_ns(simulation.values['pose.rate'])
+    table = TrueStates(every_ns, UNITS) if simulation.pivot_path is None else TrueStates(
+        every_ns, RIDE_UNITS, lambda samples: (*samples.pivot.position, *samples.pivot.velocity))
     write = write_csv if file_format == 'csv' else write_parquet
     # A command changes the rows after its time.
     write(path, (rows for done in _play(simulation, [table], stops, show)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.nodes.executable import RunnableNode, run, split_ros_arguments
+from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
 from spinning_top_sim.tools import cli, scene_file
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.log:
         return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs)
     with contextlib.ExitStack() as stack:
-        return run('view', argv, partial(_prepare, stack, arguments, for_ros))
+        return run_node('view', argv, partial(_prepare, stack, arguments, for_ros))
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ from collections import defaultdict, deque
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, Twist, Vector3
 from nav_msgs.msg import Odometry
@@ -33,14 +32,7 @@ from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import shapes
 from spinning_top_sim.view.controls import Controls
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
-from spinning_top_sim.view.track import (
-    ENERGY_DRIFT,
-    ORIENTATION_ERROR,
-    WIDTHS,
-    Series,
-    Track,
-    empty,
-)
+from spinning_top_sim.view.track import Track, empty
 
 # Best effort and a short queue, so that a slow page never makes the node wait.
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -164,9 +156,7 @@ class LiveView(Node):
             return
         newest_ns = track.span[1]
         if self._errors is not None:
-            row = np.full((1, WIDTHS['~/invariants']), math.nan)
-            row[0, [ENERGY_DRIFT, ORIENTATION_ERROR]] = self._errors
-            track.add('~/invariants', Series(np.array([newest_ns]), row))
+            track.add_errors(newest_ns, *self._errors)
             self._errors = None
         track.drop_before(max(newest_ns - KEPT_NS, min(self._epoch_ns or 0, newest_ns)))
         track.detect_motion()

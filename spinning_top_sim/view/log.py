@@ -16,18 +16,11 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools import recorded_run, svg
-from spinning_top_sim.tools.attitudes import LAYOUTS, decode
-from spinning_top_sim.view import plots, text
+from spinning_top_sim.tools import recorded_run
+from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
+from spinning_top_sim.view import plots, svg, text
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
-from spinning_top_sim.view.track import (
-    WIDTHS,
-    DescribedMotion,
-    Series,
-    Track,
-    attitude_rows,
-    joined,
-)
+from spinning_top_sim.view.track import DescribedMotion, Series, Track, attitude_rows, joined
 
 SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
 LONGEST_HTML_S = 60.0
@@ -63,7 +56,7 @@ def _read_log(path: Path, name: str) -> Track:
 
 def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) -> None:
     """Read the samples of a log of this package; `topics` as in RunDescription."""
-    names = {topics[name]: name for name in WIDTHS if name in topics}
+    names = {topics[name]: name for name in track.samples if name in topics}
     parts = defaultdict(list)
     for topic, group in reader.groups(names):
         stamps_ns, data = zip(*((one.log_time, one.data) for one in group), strict=True)

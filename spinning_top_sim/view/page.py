@@ -15,8 +15,7 @@ import numpy as np
 import viser
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools import svg
-from spinning_top_sim.view import body, plots, shapes, text
+from spinning_top_sim.view import body, plots, shapes, svg, text
 from spinning_top_sim.view.server import Server
 from spinning_top_sim.view.track import QUATERNION, DescribedMotion, Track
 

@@ -10,16 +10,10 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.regimes import effective_potential
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools.svg import Line, Plot
+from spinning_top_sim.streams.topics import INVARIANTS
 from spinning_top_sim.view import shapes
-from spinning_top_sim.view.track import (
-    ENERGY_DRIFT,
-    ORIENTATION_ERROR,
-    PRECESSION,
-    Series,
-    Track,
-    energies,
-)
+from spinning_top_sim.view.svg import Line, Plot
+from spinning_top_sim.view.track import PRECESSION, Series, Track, energies
 
 Reals = NDArray[np.float64]
 POINTS = 400                    # in a line at most
@@ -79,8 +73,8 @@ def accuracy_plots(tops: Sequence[Plotted]) -> list[Plot]:
         Line('', RED, times, np.log10(np.maximum(np.abs(rows[:, column]), LEAST)), dash)
         for (times, rows), dash in zip(parts, ('', '5 3'), strict=False)], now)
         for title, y_label, column in (
-            ('Energy drift, relative', 'log₁₀', ENERGY_DRIFT),
-            ('Orientation error', 'log₁₀ [rad]', ORIENTATION_ERROR))]
+            ('Energy drift, relative', 'log₁₀', INVARIANTS.index('energy_drift')),
+            ('Orientation error', 'log₁₀ [rad]', INVARIANTS.index('orientation_error')))]
 
 
 def _potential(top: Plotted, dash: str) -> list[Line]:

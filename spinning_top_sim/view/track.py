@@ -9,13 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics import attitude, placement
-from spinning_top_sim.physics.regimes import (
-    Description,
-    effective_potential,
-    natural_momentum,
-    regime,
-)
+from spinning_top_sim.physics import attitude, placement, regimes
+from spinning_top_sim.physics.regimes import Description, natural_momentum
 from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
@@ -32,7 +27,6 @@ PLACE_TOPICS = ('pose', 'ground_truth/odom')
 QUATERNION, RATES, FORCE, PRECESSION, PLACE = (
     slice(0, 4), slice(4, 7), slice(7, 10), 10, slice(11, 14))
 WIDTHS = {**dict.fromkeys(ATTITUDE_TOPICS, 14), '~/invariants': len(INVARIANTS)}
-ENERGY_DRIFT, ORIENTATION_ERROR = map(INVARIANTS.index, ('energy_drift', 'orientation_error'))
 SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
 SAME = 1e-6                 # relative difference between the constants of one motion
 MOST_MOTIONS = 99           # that are kept
@@ -105,7 +99,7 @@ class DescribedMotion:
     def of(cls, begin_ns: int, top: Top, state: State,
            description: Description | None, *, pivot_moves: bool = False) -> 'DescribedMotion':
         """Return the motion that begins in a state."""
-        height = effective_potential(top, state.l3, state.lz, np.array([state.theta]))
+        height = regimes.effective_potential(top, state.l3, state.lz, np.array([state.theta]))
         energy = 0.5 * top.lambda1 * state.theta_dot ** 2 + float(height[0])
         return cls(begin_ns, state.l3, state.lz, energy, description, pivot_moves)
 
@@ -164,6 +158,12 @@ class Track:
         """Add samples of a topic."""
         self.samples[topic] = joined([self.samples[topic], samples])
 
+    def add_errors(self, stamp_ns: int, energy_drift: float, orientation_error: float) -> None:
+        """Add what a node says of its errors as a sample of ~/invariants."""
+        row = dict.fromkeys(INVARIANTS, np.nan)
+        row.update(energy_drift=energy_drift, orientation_error=orientation_error)
+        self.add('~/invariants', Series(np.array([stamp_ns]), np.array([[*row.values()]])))
+
     def drop_before(self, before_ns: int) -> None:
         """Drop the samples before a stamp."""
         self.samples = {topic: samples.part(before_ns, np.iinfo(np.int64).max)
@@ -220,8 +220,10 @@ class Track:
         self._constants = constants
         description = None
         with contextlib.suppress(ArithmeticError, ValueError):
-            description = None if pivot_moves else dataclasses.replace(
-                ExactSolution(self.top, state).describe(), name=regime(self.top, state, SNAP))
+            if not pivot_moves:
+                description = dataclasses.replace(
+                    ExactSolution(self.top, state).describe(),
+                    name=regimes.regime(self.top, state, SNAP))
         self.motions = [*self.motions[-MOST_MOTIONS:], DescribedMotion.of(
             int(stamps_ns[-1]), self.top, state, description, pivot_moves=pivot_moves)]
 
