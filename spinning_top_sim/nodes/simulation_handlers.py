@@ -64,11 +64,7 @@ def offer(node: Simulator) -> None:
 
 
 class SimulationHandlers:
-    """
-    The handlers of one node.
-
-    messages, actions : the modules simulation_interfaces.msg and .action
-    """
+    """The handlers of one node; `messages`, `actions`: modules of simulation_interfaces."""
 
     def __init__(self, node: Simulator, messages: types.ModuleType,
                  actions: types.ModuleType) -> None:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Builds chunks, of single messages or of whole arrays of them, in memory that is reused."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from array import array
@@ -41,11 +39,7 @@ ENTRY_SIZE = 8 + 8                      # of a message index
 
 
 class ChunkBuilder:
-    """
-    The messages of a chunk, uncompressed.
-
-    compression : 'zstd', 'lz4' or 'none'
-    """
+    """The messages of a chunk, uncompressed; `compression` is 'zstd', 'lz4' or 'none'."""
 
     def __init__(self, compression: str = 'none') -> None:
         self._compression = compression

@@ -8,8 +8,6 @@ Layout: header, metadata of the run, schemas, channels | chunk, its message inde
 `rosbag2` metadata, data end | summary, footer.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os
@@ -94,11 +92,7 @@ class McapWriter:
             raise
 
     def write(self, record: records.McapRecord, raw: bytes = b'') -> None:
-        """
-        Write a schema, a channel (after its schema), metadata or an attachment.
-
-        raw : the bytes of the record in another file
-        """
+        """Write any record but a chunk, a channel after its schema; `raw` are its known bytes."""
         offset = self.size
         raw = raw or record_bytes(record)
         self._write([raw])
@@ -130,11 +124,7 @@ class McapWriter:
         return channel_id, sequence
 
     def append_all(self, messages: Iterable[tuple[int, int, bytes]], size: int) -> None:
-        """
-        Add messages as `append` does, one topic after the other, which takes less time.
-
-        size : what they take in a chunk, at most [bytes]
-        """
+        """Add messages as `append` does, in less time; they take `size` bytes at most."""
         if self._chunk.size + size > chunks.CHUNK_BYTES:
             self.flush()
         by_topic: defaultdict[int, list[tuple[int, int, bytes]]] = defaultdict(list)

@@ -6,8 +6,6 @@ Behind damage the scan goes on at the record to which the damaged one's length l
 the next chunk, schema, channel or metadata that can be decoded.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable

@@ -119,11 +119,7 @@ class Specification:
 
     @cached_property
     def kept(self) -> Sequence[str]:
-        """
-        Names of the streams that any of the runs keeps.
-
-        The table of each run has columns for all of them, so that the files form one table.
-        """
+        """Names of the streams that any of the runs keeps: the columns of the table of each."""
         return [name for name in STREAMS if any(
             journal.is_recorded(name, {**DEFAULTS, **values}) for values in self.alternatives)]
 

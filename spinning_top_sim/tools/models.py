@@ -29,11 +29,7 @@ MOST_PIECES = 20
 
 def model(values: Mapping[str, Any], file_format: str, name: str) -> str:
     """
-    Return the model of a top.
-
-    values : checked parameters
-    file_format : one of FORMATS
-    name : of the model
+    Return the model of a top with these checked parameters, in one of FORMATS.
 
     Raises ValueError if no rigid body has the inertia, or, of URDF, if the frames form no tree.
     """

@@ -140,11 +140,7 @@ def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
 
 def _play(simulation: Simulation, streams: Sequence[Stream], stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[Block | tuple[float, float]]:
-    """
-    Yield the blocks up to each stop, then L3 and Lz of its command, which has been applied.
-
-    Raises IntegrationError where the state cannot take a command.
-    """
+    """Yield the blocks up to each stop, then its command, applied.  Raises IntegrationError."""
     for stop_ns, momenta in stops:
         for block in simulation.play(streams, stop_ns):
             yield block

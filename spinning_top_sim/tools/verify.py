@@ -63,7 +63,9 @@ def compare(run: RunDescription, reader: LogReader, end_ns: int,
     show : takes the log time that is reached [ns]
     """
     topics = (*run.topics.values(), run.commands_topic)
-    verdict = Comparison(dict.fromkeys(filter(None, topics), 0), warnings=_warnings(run))
+    verdict = Comparison(dict.fromkeys(filter(None, topics), 0), warnings=[
+        f'{what} was {run.environment[what]}, is {here}'
+        for what, here in provenance.environment().items() if run.environment[what] != here])
     for stamp_ns, reason in run.broken:
         verdict.different += 1
         verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
@@ -138,8 +140,3 @@ def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
         code, text = '<d', '{!r}'
     one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))
     return Difference(*key, what, one, two, at)
-
-
-def _warnings(run: RunDescription) -> list[str]:
-    return [f'{what} was {run.environment[what]}, is {here}'
-            for what, here in provenance.environment().items() if run.environment[what] != here]

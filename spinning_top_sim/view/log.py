@@ -99,11 +99,7 @@ def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> 
 
 
 class Player:
-    """
-    Plays logs on a page.
-
-    length : of all logs [s]; the time of the player begins with the first sample
-    """
+    """Plays logs on a page; its time [s] begins with the first sample, and ends at `length`."""
 
     def __init__(self, page: Page, tracks: Sequence[Track]) -> None:
         self._page = page

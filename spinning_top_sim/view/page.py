@@ -46,11 +46,7 @@ def set_content(handle: viser.GuiHtmlHandle | viser.GuiMarkdownHandle, content: 
 
 
 class DrawnTop:
-    """
-    One top in the scene.
-
-    shift_ns : added to the stamp of the page
-    """
+    """One top in the scene; `shift_ns` is added to the stamp of the page."""
 
     def __init__(self, scene: viser.SceneApi, number: int, track: Track, shift_ns: int) -> None:
         self.track, self.shift_ns = track, shift_ns
@@ -76,9 +72,9 @@ class DrawnTop:
             f'{name}/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * radius, visible=False)
             for k in range(2)]
         self._arrows = {arrow: scene.add_arrows(
-            f'{name}/{arrow.replace(" ", "_")}', NO_LINES, look.colour,
+            f'{name}/{arrow.replace(" ", "_")}', NO_LINES, colour,
             shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
-            visible=False) for arrow, look in shapes.ARROWS.items()}
+            visible=False) for arrow, (colour, *_) in shapes.ARROWS.items()}
         self._colour = np.array(TRACES[number])
         self._limits: tuple[float, float] | None = None         # that are drawn [rad]
         self._picture: object = None                    # its stamp and switches
@@ -207,11 +203,7 @@ class Page:
         camera.near, camera.far = 0.01 * size, 100.0 * size
 
     def draw(self, page_ns: int, epoch_ns: int) -> None:
-        """
-        Draw all tops at a stamp of the page [ns].
-
-        epoch_ns : stamp of t = 0
-        """
+        """Draw all tops at a stamp of the page [ns]; `epoch_ns` is that of t = 0."""
         arrows = {name for name, switch in self.arrows.items() if switch.value}
         side = 0.0 if self._over.value else 1.3 * self._reach
         places = [top.track.places(np.array([page_ns + top.shift_ns]))[0] for top in self._tops]
@@ -254,6 +246,6 @@ class Page:
                          + (' (plots: dashed)' if k else '')) for k, top in enumerate(self._tops)]
         if self._bounds.value and any(top.track.motions for top in self._tops):
             entries.append((BOUNDS, 'bounds of θ'))
-        entries += [(shapes.ARROWS[name].colour, name)
+        entries += [(shapes.ARROWS[name][0], name)
                     for name, switch in self.arrows.items() if switch.value]
         return text.legend(entries)

@@ -2,8 +2,6 @@
 """The lines and arrows that show a top, and its tilt, as numbers."""
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +9,14 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.view.track import FORCE, QUATERNION, RATES, Series, Track
+from spinning_top_sim.view.track import (
+    ATTITUDE_TOPICS,
+    FORCE,
+    QUATERNION,
+    RATE_TOPICS,
+    RATES,
+    Track,
+)
 
 TRACE_NS = 10 * NANOSECONDS     # length of the trace of the tip
 TRACE_POINTS = 1500             # samples in the trace at most
@@ -117,27 +122,20 @@ def _force(track: Track, row: Vectors, _: int) -> Vectors:
     return in_world(row[QUATERNION], row[FORCE]) / (abs(track.top.gravity) or 1.0)
 
 
-class Arrow(NamedTuple):
-    """An arrow; `vector` is that in the world, over the length of the axis, at a row and stamp."""
-
-    colour: tuple[int, int, int]
-    samples: Callable[[Track], Series]
-    vector: Callable[[Track, Vectors, int], Vectors]
-
-
-# The length of the axis stands for the usual angular momentum or velocity, for 1 g, and for the
-# torque of gravity when the axis is horizontal.
+# Of each arrow the colour, the topics of its samples, and its vector in the world.  The length of
+# the axis, here 1, stands for the usual angular momentum or velocity, for 1 g, and for the torque
+# of gravity when the axis is horizontal.
 ARROWS = {
-    'angular momentum': Arrow((20, 120, 70), lambda track: track.rates, _momentum),
-    'angular velocity': Arrow((196, 50, 150), lambda track: track.rates, _velocity),
-    'torque': Arrow((20, 150, 180), lambda track: track.attitudes, _torque),
-    'specific force': Arrow(
-        (230, 130, 20), lambda track: track.samples['ground_truth/imu'], _force)}
+    'angular momentum': ((20, 120, 70), RATE_TOPICS, _momentum),
+    'angular velocity': ((196, 50, 150), RATE_TOPICS, _velocity),
+    'torque': ((20, 150, 180), ATTITUDE_TOPICS, _torque),
+    'specific force': ((230, 130, 20), ('ground_truth/imu',), _force)}
 
 
 def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
-    """Return one of ARROWS (3,) in the world; None if no sample has it."""
-    sample = ARROWS[name].samples(track).at(stamp_ns)
+    """Return one of ARROWS (3,) in the scene; None if no sample has it."""
+    _, topics, vector = ARROWS[name]
+    sample = track.best(topics).at(stamp_ns)
     if sample is None or not track.has_body:
         return None
-    return abs(reach(track)) * ARROWS[name].vector(track, sample[1], stamp_ns)
+    return abs(reach(track)) * vector(track, sample[1], stamp_ns)
