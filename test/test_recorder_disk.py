@@ -15,16 +15,8 @@ from operator import ge
 from types import SimpleNamespace
 
 import pytest
-from helpers.recordings import (
-    ARRAY,
-    METADATA,
-    TOPICS,
-    complete_messages,
-    pose_cdr,
-    rows_of,
-    some_messages,
-    write,
-)
+from helpers import recordings
+from helpers.recordings import METADATA, TOPICS, complete_messages, pose_cdr, rows_of, write
 from helpers.reference import ROOT
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
@@ -151,7 +143,7 @@ def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, 
         import os, signal, sys
         from spinning_top_sim.recording.rosbag2 import RecordedTopic
         from spinning_top_sim.recording.recorder import McapRecorder
-        topics = [RecordedTopic('/a', {ARRAY!r})]
+        topics = [RecordedTopic('/a', {recordings.ARRAY!r})]
         recorder = McapRecorder(sys.argv[1], topics, {{}}, min_free_bytes=0, max_loss=60.0)
         for number in range(100):
             recorder.write_all([(0, number, bytes(8))])
@@ -349,7 +341,7 @@ def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return len(data) // 2
 
-    for index, stamp, data in some_messages(100):
+    for index, stamp, data in recordings.some_messages(100):
         file.append(index, stamp, data)
     monkeypatch.setattr(os, 'pwrite', interrupted)
     with pytest.raises(KeyboardInterrupt):
