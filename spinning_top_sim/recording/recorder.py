@@ -56,18 +56,15 @@ class McapRecorder:
     """
     A running recording into a new file, until `close`.
 
-    Trouble with the disk never reaches the caller: the recording stops, `state` becomes 'failed'
-    and `error` says why, naming the path.  What was written up to then stays readable.
+    It begins as `create_file`.  Later trouble with the disk never reaches the caller: the
+    recording stops, `state` becomes 'failed' and `error` says why, naming the path.  What was
+    written up to then stays readable.
     """
 
     def __init__(self, path: str | os.PathLike[str], topics: Sequence[RecordedTopic],
                  metadata: Mapping[str, str], *, max_loss: float = 0.5,
                  compression: str = 'zstd', min_free_bytes: int = 100_000_000) -> None:
-        """
-        Create the file and start recording; raises as `create_file`.
-
-        max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
-        """
+        """Start recording; a SIGKILL or a power loss takes the last `max_loss` [s] at most."""
         self.path = Path(path)
         self._file = create_file(self.path, topics, metadata, compression=compression,
                                  min_free_bytes=min_free_bytes)

@@ -143,12 +143,7 @@ def arrow_table(specification: Specification, found: Mapping[int, Samples]) -> '
 
 
 def write_row(specification: Specification, run: int, path: Path) -> None:
-    """
-    Compute one run into a new file, .mcap or .parquet.
-
-    Raises RecordingError or OSError if it exists, ValueError if no motion begins, IntegrationError
-    if it ends early.
-    """
+    """Compute one run into a new file, .mcap or .parquet; an existing file raises an error."""
     from pyarrow import parquet  # noqa: PLC0415
 
     values = specification.values(run)
@@ -166,8 +161,7 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
     """
     Compute the file of a part, unless it is in `folder`; return the runs that failed, and why.
 
-    The file depends on the specification and the versions alone.
-    Raises OSError if the file cannot be written.
+    The file depends on the specification and the versions alone.  Raises OSError.
     """
     from pyarrow import parquet  # noqa: PLC0415
 

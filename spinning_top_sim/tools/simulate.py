@@ -157,11 +157,7 @@ def _play(simulation: Simulation, streams: Sequence[Stream], stops: Sequence[Sto
 
 def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
               show: Callable[[float], object], namespace: str) -> str:
-    """
-    Simulate a run into a new log; return the number of messages and the size of the file.
-
-    After an error the log is closed and readable, and holds what was computed before.
-    """
+    """Simulate a run into a new log, whole also after an error; return a text on its size."""
     values, epoch_ns = simulation.values, simulation.epoch_ns
     streams = journal.recorded_streams(simulation.streams, values)
     types = {stream.topic: stream.type_name for stream in streams} | journal.TOPICS
