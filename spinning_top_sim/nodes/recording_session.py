@@ -64,7 +64,7 @@ class RecordingSession:
             self._begun = streams, topics, run
 
     def open(self) -> str:
-        """Open the log that `start` has begun; return a text with its path."""
+        """Open the log that `start` has begun; return a text, or raise RecordingError."""
         with self._file_lock:
             if self._recorder is not None:
                 return f'recording already to {self._recorder.path}'

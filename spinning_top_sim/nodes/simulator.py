@@ -283,9 +283,7 @@ class Simulator(Node):
 
     def start_again(self, paused: bool | None = None) -> None:
         """
-        Reset the motion.
-
-        paused : whether the motion is paused after the reset; None keeps the present state
+        Reset the motion, and pause it or not; None keeps the present state.
 
         Raises RuntimeError before the motion begins, and ValueError if no motion begins with the
         present parameters; nothing changes then.

@@ -79,10 +79,6 @@ class DrawnTop:
         self._limits: tuple[float, float] | None = None         # that are drawn [rad]
         self._picture: object = None                    # its stamp and switches
 
-    def motion(self, page_ns: int) -> DescribedMotion | None:
-        """Return the motion at a stamp of the page."""
-        return self.track.motion_at(page_ns + self.shift_ns)
-
     def draw(self, page_ns: int, *, trace: bool, bounds: bool, arrows: Set[str]) -> None:
         """Draw the newest samples up to a stamp of the page, with some of the parts."""
         stamp_ns = page_ns + self.shift_ns
@@ -104,7 +100,7 @@ class DrawnTop:
             vector = shapes.arrow(self.track, name, stamp_ns) if arrow.visible else None
             arrow.points = NO_LINES if vector is None else shapes.segments(
                 np.vstack((np.zeros(3), vector)))
-        self._draw_bounds(self.motion(page_ns), bounds)
+        self._draw_bounds(self.track.motion_at(stamp_ns), bounds)
 
     def _draw_trace(self, lines: shapes.Lines) -> None:
         """Draw a trace that fades with its age; the colours of a line's points are linear."""
@@ -233,10 +229,13 @@ class Page:
 
     def words(self, page_ns: int, epoch_ns: int) -> str:
         """Return HTML about the motions and the samples that are drawn."""
-        drawn = [(top, top.track.attitudes.at(page_ns + top.shift_ns)) for top in self._tops]
-        return ''.join(text.words(top.track, top.motion(page_ns), sample[0],
-                                  sample[0] - top.shift_ns - epoch_ns) if sample else
-                       f'<p>{top.track.name} {NO_SAMPLES}</p>' for top, sample in drawn)
+        parts = []
+        for track, shift_ns in ((top.track, top.shift_ns) for top in self._tops):
+            sample = track.attitudes.at(page_ns + shift_ns)
+            parts.append(f'<p>{track.name} {NO_SAMPLES}</p>' if sample is None else text.words(
+                track, track.motion_at(page_ns + shift_ns), sample[0],
+                sample[0] - shift_ns - epoch_ns))
+        return ''.join(parts)
 
     def legend(self) -> str:
         """Return HTML about the colours of what is switched on."""
