@@ -106,12 +106,12 @@ def test_a_run_tells_where_its_log_is(main, monkeypatch, tmp_path):
     kinds, ordinary = [], executable._executor
     monkeypatch.setattr(executable, '_executor', lambda node: (
         kinds.append(ordinary(node)) or kinds[0]))
-    run = main('--ros-args', '-p', 'record.enabled:=true', '-p', 'duration:=0.3', '-p',
+    run = main('--ros-args', '-p', 'record.enabled:=true', '-p', 'duration:=1.0', '-p',
                'status_period:=0.1')
     assert run.code == 0
     assert isinstance(kinds[0], SingleThreadedExecutor), 'there is no other one'
     path = the_log(tmp_path)
-    assert len(log_of(path)[0]['/pose']) == 31
+    assert len(log_of(path)[0]['/pose']) == 101
     assert f'recording to {path}' in run.err
     assert ' s | cusps | theta' in run.out and '\x1b' not in run.out and '\r' not in run.out
 
