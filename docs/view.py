@@ -12,7 +12,6 @@ from playwright.sync_api import sync_playwright
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.view.log import Player, read_logs
 from spinning_top_sim.view.page import Page
-from spinning_top_sim.view.shapes import ARROWS
 
 HERE = Path(__file__).parent
 SHOWN_S = 12.3
@@ -41,7 +40,7 @@ def main():
         log = Path(folder) / 'cusp.mcap'
         simulate.main(['-o', str(log), '--duration', '30', '--quiet'])
         page = Page('cusp.mcap', '127.0.0.1', 0)
-        page.arrows[ARROWS.index('angular momentum')].value = True
+        page.arrows['angular momentum'].value = True
         player = Player(page, read_logs([log]))
         stopped = threading.Event()
 

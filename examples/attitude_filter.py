@@ -513,7 +513,7 @@ def main(argv: list[str] | None = None) -> int:
         comparisons = [Comparison(name, arguments.rpy or (0.0, 0.0, 0.0),
                                   arguments.declination or 0.0)
                        for name in arguments.filter]
-        code = executable.run('attitude_filter', argv, lambda argv: (
+        code = executable.run_node('attitude_filter', argv, lambda argv: (
             argv, lambda: make_node(comparisons, arguments.duration)))
         return code or (0 if report(comparisons, arguments) else 1)
     from spinning_top_sim.recording.errors import LogError

@@ -35,7 +35,8 @@ MAY_NOT_IMPORT = {
     'nodes': {'scipy', 'viser'},
     'view': ROS | {'scipy'},
 }
-MAY_IMPORT_ROS = {f'{NAME}.{module}' for module in ('exam.live', 'view.live', 'view.command')}
+MAY_IMPORT_ROS = {f'{NAME}.{module}' for module in (
+    'exam.live', 'view.live', 'view.sim_node', 'view.command')}
 MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): path
            for path in sorted(PACKAGE.rglob('*.py'))}
 

@@ -16,7 +16,7 @@ from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import ensemble_spec
 from spinning_top_sim.tools.ensemble import main
-from spinning_top_sim.tools.ensemble_part import EPOCH_NS, compute_part, samples, table
+from spinning_top_sim.tools.ensemble_part import EPOCH_NS, arrow_table, compute_part, samples
 
 pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='Dask is not there')
 pa = pytest.importorskip('pyarrow')
@@ -81,7 +81,7 @@ def whole(tmp_path_factory):
 
 def table_of(specification, run):
     simulation = Simulation(specification.values(run), EPOCH_NS)
-    return table(specification, {run: samples(specification, simulation)})
+    return arrow_table(specification, {run: samples(specification, simulation)})
 
 
 def test_every_stream_has_columns_or_is_left_out():

@@ -27,9 +27,9 @@ from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording import scan
+from spinning_top_sim.recording import parsing
+from spinning_top_sim.recording.chunks import record_bytes
 from spinning_top_sim.recording.log_file import LogFile
-from spinning_top_sim.recording.mcap_writer import record_bytes
 from spinning_top_sim.recording.reader import LogReader
 
 
@@ -141,8 +141,8 @@ def test_memory_has_a_ceiling(tmp_path):
     done = subprocess.run(
         [sys.executable, '-c', textwrap.dedent(f"""
             import re, sys
-            from spinning_top_sim.recording import records
-            records.MAX_BYTES = {MAX_BYTES}
+            from spinning_top_sim.recording import parsing
+            parsing.MAX_BYTES = {MAX_BYTES}
             from spinning_top_sim.recording.reader import LogReader
             from spinning_top_sim.recording.errors import LogError
             from spinning_top_sim.tools.recover import main
@@ -172,8 +172,8 @@ def test_memory_has_a_ceiling(tmp_path):
 def test_a_search_unpacks_a_limited_amount(tmp_path, monkeypatch):
     """Chunks that are small and unpack to much, each with a wrong checksum."""
     unpacked = []
-    ordinary = scan.open_chunk
-    monkeypatch.setattr(scan, 'open_chunk', lambda chunk, max_bytes: (
+    ordinary = parsing.open_chunk
+    monkeypatch.setattr(parsing, 'open_chunk', lambda chunk, max_bytes: (
         unpacked.append(chunk.uncompressed_size), ordinary(chunk, max_bytes))[1])
     plain = bytearray(zstd_chunk(message(5, bytes(1_000_000))))
     plain[9 + 24] ^= 1

@@ -231,7 +231,7 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
 @pytest.mark.parametrize('option', ['--plot', '--animate'])
 def test_pictures_overwrite_nothing_and_an_interrupted_one_leaves_no_file(
         short, tmp_path, capsys, monkeypatch, option):
-    plots = pytest.importorskip('spinning_top_sim.tools.plots')
+    plots = pytest.importorskip('spinning_top_sim.tools.log_pictures')
     path = tmp_path / 'keep'
     path.write_text('precious')
     code, out, err = told(capsys, short, option, path)

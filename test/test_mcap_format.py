@@ -44,7 +44,7 @@ from mcap.records import Attachment, Header, MessageIndex, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import reader as reader_module
-from spinning_top_sim.recording.mcap_writer import record_bytes
+from spinning_top_sim.recording.chunks import record_bytes
 from spinning_top_sim.recording.reader import LogReader
 
 

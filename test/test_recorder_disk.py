@@ -15,16 +15,8 @@ from operator import ge
 from types import SimpleNamespace
 
 import pytest
-from helpers.recordings import (
-    ARRAY,
-    METADATA,
-    TOPICS,
-    complete_messages,
-    pose_cdr,
-    rows_of,
-    some_messages,
-    write,
-)
+from helpers import recordings
+from helpers.recordings import METADATA, TOPICS, complete_messages, pose_cdr, rows_of, write
 from helpers.reference import ROOT
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
@@ -88,7 +80,7 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
     assert synced == [str(path), str(tmp_path)]
     synced.clear()
     file.append(0, 1, pose_cdr(1))
-    file.write_chunk()
+    file.flush()
     file.finish()
     assert synced == [str(path), str(tmp_path)]
 
@@ -97,7 +89,7 @@ def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monk
     """The thread that writes has the error; the caller gets it, and can still finish the file."""
     file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='zstd')
     file.append_rows([rows_of(0, 100)])
-    file.write_chunk()
+    file.flush()
     pwrite = os.pwrite
 
     def refuse(*_):
@@ -107,9 +99,9 @@ def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monk
     with pytest.raises(OSError, match='No space'):
         for number in range(100, 1000, 100):
             file.append_rows([rows_of(number, number + 100)])
-        file.write_chunk()
+        file.flush()
     monkeypatch.setattr(os, 'pwrite', pwrite)
-    file.write_chunk()          # what was told once is not told again
+    file.flush()          # what was told once is not told again
     file.finish()
     assert is_indexed(tmp_path / 'run.mcap')
     assert numbers_in(tmp_path / 'run.mcap') == list(range(100))
@@ -151,7 +143,7 @@ def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, 
         import os, signal, sys
         from spinning_top_sim.recording.rosbag2 import RecordedTopic
         from spinning_top_sim.recording.recorder import McapRecorder
-        topics = [RecordedTopic('/a', {ARRAY!r})]
+        topics = [RecordedTopic('/a', {recordings.ARRAY!r})]
         recorder = McapRecorder(sys.argv[1], topics, {{}}, min_free_bytes=0, max_loss=60.0)
         for number in range(100):
             recorder.write_all([(0, number, bytes(8))])
@@ -349,14 +341,14 @@ def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return len(data) // 2
 
-    for index, stamp, data in some_messages(100):
+    for index, stamp, data in recordings.some_messages(100):
         file.append(index, stamp, data)
     monkeypatch.setattr(os, 'pwrite', interrupted)
     with pytest.raises(KeyboardInterrupt):
-        file.write_chunk()
+        file.flush()
     monkeypatch.setattr(os, 'pwrite', pwrite)
     assert file.size == path.stat().st_size == size
-    file.write_chunk()
+    file.flush()
     file.finish()
     with path.open('rb') as stream:
         list(StreamReader(stream, validate_crcs=True).records)

@@ -256,7 +256,7 @@ def test_rows_are_written_in_order_and_the_bytes_are_always_the_same(tmp_path, c
             file.append_rows([(index, times, block)])
             block[:] = 0                # the rows were copied
         file.append(1, 8000, array_cdr(8000))
-        file.write_chunk()
+        file.flush()
         assert file.chunk_count == 41
         file.finish()
         contents.append(path.read_bytes())

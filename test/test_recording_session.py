@@ -39,9 +39,9 @@ class Recorded:
         self.session = RecordingSession(self.simulation, self.lock, self.topics)
 
     def topics(self, streams):
-        names = [*((stream.topic, stream.type_name) for stream in streams), *journal.TOPICS]
+        types = {stream.topic: stream.type_name for stream in streams} | journal.TOPICS
         return [(f'/ns/{name.lstrip("~/")}', type_name, {'depth': 10})
-                for name, type_name in names]
+                for name, type_name in types.items()]
 
     def start(self):
         self.session.start(self.values)

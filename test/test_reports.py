@@ -13,8 +13,8 @@ pytest.importorskip('diagnostic_msgs')
 
 from builtin_interfaces.msg import Time
 
-from spinning_top_sim.nodes import reports
-from spinning_top_sim.nodes.reports import NodeStatus
+from spinning_top_sim.nodes import node_status, terminal
+from spinning_top_sim.nodes.node_status import NodeStatus
 from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
@@ -23,7 +23,7 @@ from spinning_top_sim.streams.live import LiveSimulation
 @pytest.fixture
 def clock(monkeypatch):
     clock = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(reports, 'time', SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(node_status, 'time', SimpleNamespace(monotonic=lambda: clock.now))
     return clock
 
 
@@ -120,25 +120,25 @@ def standard_output(monkeypatch, *, isatty):
     """Return a standard output of 12 columns."""
     out = io.StringIO()
     out.isatty = lambda: isatty
-    monkeypatch.setattr(reports.sys, 'stdout', out)
-    monkeypatch.setattr(reports.shutil, 'get_terminal_size', lambda: os.terminal_size((12, 24)))
+    monkeypatch.setattr(terminal.sys, 'stdout', out)
+    monkeypatch.setattr(terminal.shutil, 'get_terminal_size', lambda: os.terminal_size((12, 24)))
     return out
 
 
 def test_a_line_that_stays_stands_below_the_status_line_which_fits_the_terminal(monkeypatch):
-    out, terminal = standard_output(monkeypatch, isatty=True), reports.Terminal()
-    terminal.show('one | two | three')
-    terminal.end()
-    terminal.end()
-    terminal.show('four')
-    terminal.tell('done')
+    out, line = standard_output(monkeypatch, isatty=True), terminal.Terminal()
+    line.show('one | two | three')
+    line.end()
+    line.end()
+    line.show('four')
+    line.tell('done')
     assert out.getvalue() == '\r\x1b[Kone | two |\n\r\x1b[Kfour\ndone\n'
 
 
 def test_without_a_terminal_each_status_is_a_line(monkeypatch):
-    out, terminal = standard_output(monkeypatch, isatty=False), reports.Terminal()
-    terminal.show('a | b')
-    terminal.end()
+    out, line = standard_output(monkeypatch, isatty=False), terminal.Terminal()
+    line.show('a | b')
+    line.end()
     assert out.getvalue() == 'a | b\n'
-    monkeypatch.setattr(reports.sys, 'stdout', None)
-    terminal.show('c')                      # a closed standard output is no terminal
+    monkeypatch.setattr(terminal.sys, 'stdout', None)
+    line.show('c')                      # a closed standard output is no terminal

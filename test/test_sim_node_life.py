@@ -26,7 +26,7 @@ from helpers.node_logs import (
 from helpers.own_node import OwnNode
 from helpers.simulations import play, simulate, stream
 
-from spinning_top_sim.nodes import reports
+from spinning_top_sim.nodes import terminal
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
@@ -89,10 +89,10 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(monkeypa
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, 'w') as out:
-        monkeypatch.setattr(reports.sys, 'stdout', out)
-        terminal = reports.Terminal()
-        terminal.show('one')
-        terminal.show('two')
+        monkeypatch.setattr(terminal.sys, 'stdout', out)
+        shown = terminal.Terminal()
+        shown.show('one')
+        shown.show('two')
 
 
 def test_overload_skips_what_is_live_records_everything_and_stays_reachable(tmp_path, capfd):

@@ -10,16 +10,9 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseStamped
+from helpers import node_logs
 from helpers.node_harness import DrivenClock, SimNode, wait_for
-from helpers.node_logs import (
-    PERIODS_NS,
-    SECOND,
-    TRACEBACK,
-    assert_clean_end,
-    settled,
-    stamp_of,
-    stamps_of,
-)
+from helpers.node_logs import PERIODS_NS, SECOND, assert_clean_end, settled, stamp_of, stamps_of
 from rosgraph_msgs.msg import Clock
 
 
@@ -91,6 +84,6 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
         assert set(stamps_of(pose) % PERIODS_NS['pose']) == {0}
         waits()                             # it has stopped
         assert_clean_end(node, node.end())
-    assert TRACEBACK not in node.err
+    assert node_logs.TRACEBACK not in node.err
     pose.muted = True
     clock.stop()

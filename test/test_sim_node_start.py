@@ -106,12 +106,12 @@ def test_a_run_tells_where_its_log_is(main, monkeypatch, tmp_path):
     kinds, ordinary = [], executable._executor
     monkeypatch.setattr(executable, '_executor', lambda node: (
         kinds.append(ordinary(node)) or kinds[0]))
-    run = main('--ros-args', '-p', 'record.enabled:=true', '-p', 'duration:=0.3', '-p',
+    run = main('--ros-args', '-p', 'record.enabled:=true', '-p', 'duration:=1.0', '-p',
                'status_period:=0.1')
     assert run.code == 0
     assert isinstance(kinds[0], SingleThreadedExecutor), 'there is no other one'
     path = the_log(tmp_path)
-    assert len(log_of(path)[0]['/pose']) == 31
+    assert len(log_of(path)[0]['/pose']) == 101
     assert f'recording to {path}' in run.err
     assert ' s | cusps | theta' in run.out and '\x1b' not in run.out and '\r' not in run.out
 
@@ -128,8 +128,9 @@ def start_values(*arguments):
     """Return the values that a node starts with in the namespace /last."""
     argv = ['--ros-args', '-r', '__ns:=/last', *arguments]
     with as_a_process():
+        argv, make_node = sim_node._prepare(argv)
         rclpy.init(args=argv)
-        node = sim_node._prepare(argv)[1]()
+        node = make_node()
         values = node.start_values
         node.stop()
         node.destroy_node()
@@ -155,6 +156,8 @@ def test_the_last_value_wins_whatever_the_types_and_as_in_simulate(tmp_path):
     found = start_values(*options, '--params-file', str(file))
     assert [found[name] for name in names] == [3.0, 1.0, 250.0, 1.0, 2.0, (1.0, 2.0, 3.0)]
     assert start_values('-p', 'spin.l3:=2', '-p', 'spin.l3:=1.5')['spin.l3'] == 1.5
+    found = start_values('-p', 'seed:=7', '--', '--scene', 'wavy')
+    assert (found['seed'], found['spin.lz']) == (7, 1.42)
 
 
 @pytest.mark.parametrize(('installed', 'wanted'), [(True, True), (False, True), (True, False)])

@@ -147,6 +147,10 @@ def test_simulate_steps_ends_as_it_is_told_to(top):
     assert (goal.end, goal.feedback) == ('canceled', [(1, 3), (2, 2)])
     assert (result.result, result.error_message) == (FAILED, 'canceled after 2 of 4 steps')
     assert top.simulation.now_ns == 20_000_000
+    goal, coroutine = top.steps(1)
+    goal.publish_feedback = None
+    with pytest.raises(TypeError):
+        finished(coroutine)
     top.done('StepSimulation', steps=1)         # the next ones may begin
 
 

@@ -80,7 +80,7 @@ def test_frames_that_no_tree_has_are_refused(values, named):
 def test_an_inertia_that_no_body_has_is_left_out_with_a_warning(name):
     values = ILLEGAL[name]
     assert '<inertial' not in described(values)
-    warning = urdf.inertia_warning(parameters.checked(values))
+    warning = urdf.inertia_fault(parameters.checked(values))
     for parameter, value in values.items():
         assert f'{parameter} = {value!r}' in warning
     assert 'lambda3 <= 2' in warning

@@ -24,10 +24,10 @@ from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools import simulate, svg
+from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.scene_file import read_scene
-from spinning_top_sim.view import command, plots, shapes, text
-from spinning_top_sim.view.track import Series, Track
+from spinning_top_sim.view import command, plots, shapes, svg, text
+from spinning_top_sim.view.track import Series, Track, attitude_rows
 
 pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')
 
@@ -122,17 +122,16 @@ def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     assert len(lines) == 200            # 2 s at 100 Hz
     track = Track('', parameters.checked({}))
     half = math.sqrt(0.5)
-    track.add('pose', Series(np.arange(4), np.array(
-        [(0, 0, 0, 1, 0, 0, 0), (0, 0.01, 0, 1, 0, 0, 0), (0, half, 0, half, 0, 0, 0),
-         (0, half, 0.01, half, 0, 0, 0)], float)))
+    turns = np.array([(0, 0, 0, 1), (0, 0.01, 0, 1), (0, half, 0, half), (0, half, 0.01, half)])
+    track.add('pose', Series(np.arange(4), attitude_rows(turns, place=0.0)))
     assert len(shapes.trace(track, 3)) == 2
 
 
 def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
     moved = solve(shown.top, parameters.start_state(shown.values), np.arange(20) * 0.04)
     track = Track('', shown.values)
-    track.add('joint_states', Series(np.arange(20) * 40_000_000, np.column_stack(
-        (moved.quaternion, moved.angular_velocity, moved.phi_dot))))
+    track.add('joint_states', Series(np.arange(20) * 40_000_000, attitude_rows(
+        moved.quaternion, moved.angular_velocity, moved.phi_dot)))
     stamps_ns, axis, joined = shapes.path(track, 0, NANOSECONDS)
     assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
     exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
@@ -141,7 +140,7 @@ def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
 
 def plotted(shown, stamp_ns):
     """Return the lines of the plots of 2.5 s, by plot and name."""
-    top = plots.Shown(shown, stamp_ns, shown.epoch_ns, stamp_ns, shown.epoch_ns)
+    top = plots.Plotted(shown, stamp_ns, shown.epoch_ns, stamp_ns, shown.epoch_ns)
     return {(plot.title, line.name): (plot, line) for plot in (
         *plots.motion_plots([top]), *plots.accuracy_plots([top])) for line in plot.lines}
 
@@ -184,6 +183,10 @@ def test_the_effective_potential_meets_the_energy_at_the_turning_points(shown):
         (lz - l3 * math.cos(theta)) ** 2 / (2 * shown.top.lambda1 * math.sin(theta) ** 2)
         + shown.top.gravity_torque * math.cos(theta))
     assert np.interp(turning.x, line.x, line.y) == pytest.approx(energy, abs=1e-3)
+    still, moves = (plots.Plotted(track, stamp_ns, 0, stamp_ns, 0)
+                    for track in (Track('', shown.values), shown))
+    assert plots.motion_plots([moves, still])[0].energy == pytest.approx(energy)
+    assert math.isnan(plots.motion_plots([still, moves])[0].energy)
 
 
 def test_a_plot_is_svg_with_title_units_and_its_points():
@@ -207,14 +210,14 @@ def test_every_scene_has_words_and_plots(scene):
     values = parameters.checked(read_scene(parameter_files('scene')[scene]))
     track, start = Track('', values), parameters.start_state(values)
     moved = solve(track.top, start, np.arange(300) * 0.01)
-    rows = np.column_stack((moved.quaternion, moved.angular_velocity, moved.phi_dot))
+    rows = attitude_rows(moved.quaternion, moved.angular_velocity, moved.phi_dot)
     for part in np.array_split(np.arange(300), 60):
         track.add('joint_states', Series(part * 10_000_000, rows[part]))
         track.detect_motion()
     (motion,) = track.motions
     words = text.words(track, motion, 0, 0)
     assert SENTENCES[motion.description.name] in words and 'nan' not in words
-    for plot in plots.motion_plots([plots.Shown(track, 0, 0, NANOSECONDS, 0)]):
+    for plot in plots.motion_plots([plots.Plotted(track, 0, 0, NANOSECONDS, 0)]):
         ElementTree.fromstring(svg.draw(plot))
         assert 'nan' not in svg.draw(plot)
 
@@ -264,7 +267,8 @@ def test_the_log_of_another_program_shows_its_attitudes(log, shown, page, tmp_pa
     track, = logs.read_logs([path])
     assert not track.has_body and track.epoch_ns == track.span[0]
     if topic == '/pose':
-        assert track.attitudes.rows == pytest.approx(shown.samples['pose'].rows, abs=1e-15)
+        assert track.attitudes.rows == pytest.approx(
+            shown.samples['pose'].rows, abs=1e-15, nan_ok=True)
     player = logs.Player(page, [track])
     player.draw_next(0.5)
     assert 'The body is not in this log' in page._words.content

@@ -57,7 +57,7 @@ def live():
 def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypatch):
     """Without ground_truth/odom, and where a new run has an earlier clock."""
     values = parameters.checked({'spin.lz': 1.4})
-    live._stale, live._track = False, Track('', values)
+    live._sim_node.is_stale, live._track = False, Track('', values)
     live._page.set_tracks([live._track])
     for seconds, count in ((100, 1), (200, 0), (300, 1), (5, 1)):
         epoch_ns = seconds * NANOSECONDS
@@ -69,7 +69,7 @@ def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypa
         live._inbox.extend((topic, data) for topic, _, data in taken if topic in live._listeners)
         live._draw_once()
         assert live._track.span[1] == epoch_ns + NANOSECONDS // 2
-        assert live._page._tops[0].drawn[0] == epoch_ns + NANOSECONDS // 2
+        assert live._page._tops[0]._picture[0] == epoch_ns + NANOSECONDS // 2
     # The trace begins with the last reset.
     live._epoch_ns = epoch_ns + NANOSECONDS // 4
     live._draw_once()

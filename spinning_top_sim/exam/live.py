@@ -26,7 +26,7 @@ from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import Reals
 from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools.attitudes import NO_ORIENTATION
+from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
 
 try:                            # takes least processor time
     from rclpy.experimental import EventsExecutor as Executor

@@ -22,10 +22,10 @@ from spinning_top_sim.exam.diagnosis import degrees
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import OF_PLACE, Reals, Run
 from spinning_top_sim.exam.trial import Outcome, invalid, one_line
+from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader, LogTopic
-from spinning_top_sim.recording.recorder import METADATA_NAME
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools.attitudes import LAYOUTS, decode
+from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
 from spinning_top_sim.tools.verdict import Fault
 
 # The first of these topics in the log is the truth.  An Imu is about the sensor, the others are

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from spinning_top_sim.exam.hypotheses import Hypothesis
 from spinning_top_sim.exam.measures import Errors, errors_of
 from spinning_top_sim.exam.scenarios import Reals, Run
-from spinning_top_sim.tools.cli import printable
+from spinning_top_sim.tools.cli import one_line
 
 # Covariance and bias are read after every tenth update.
 READ_EVERY = 10
@@ -169,8 +169,3 @@ def _numbers(what: str, value: object, shape: tuple[int, ...]) -> Reals:
         raise InvalidOutputError(f'{what} {one_line(value)[:80]}: must be '
                                  f'{" x ".join(map(str, shape))} finite numbers')
     return numbers
-
-
-def one_line(value: object) -> str:
-    """Return the text of a value as one printable line."""
-    return printable(' '.join(str(value).split()))

@@ -19,7 +19,6 @@ TAGS = ('spinning_top', 'heavy_symmetric_top', 'imu')
 # Tolerances for the rounding of a client: of the pivot's place [m] and its velocity [m/s], and
 # of a quaternion's length.
 SMALLEST_LENGTH, SMALLEST_SPEED, LENGTH_ERROR = 1e-6, 1e-6, 1e-3
-UNSUPPORTED, INVALID_POSE = 0, 101      # of Result and SetEntityState
 
 
 class RefusedError(RuntimeError):
@@ -50,11 +49,12 @@ def fill_state(message: Message, states: States, pivot: Kinematics, stamp_ns: in
             setattr(target, name, float(column[0]))
 
 
-def requested_state(request: Message, top: Top, frame: str, now: States,
+def requested_state(request: Message, response: Message, top: Top, frame: str, now: States,
                     pivot: Kinematics) -> State:
     """
     Return the state that a SetEntityState request asks for.
 
+    response : has the codes of refusals
     now : the present state (n = 1), which holds for what the request does not set
     pivot : what the pivot does at present, which cannot be set
 
@@ -67,28 +67,28 @@ def requested_state(request: Message, top: Top, frame: str, now: States,
         raise ValueError('set_pose and set_twist are false: one of them must be true; the '
                          'acceleration follows from pose and twist')
     if requested_frame not in ('', frame):
-        raise RefusedError(
-            UNSUPPORTED, f'header.frame_id = {requested_frame!r}: must be {frame!r} or empty')
+        raise RefusedError(response.result.RESULT_FEATURE_UNSUPPORTED,
+                           f'header.frame_id = {requested_frame!r}: must be {frame!r} or empty')
     rotation = np.concatenate(now.rows_quaternion)
     rates = np.concatenate(attitude.rotated(now.rows_quaternion, now.rows_angular_velocity))
     if sets_pose:
         rotation = _numbers(wanted.pose.orientation, 'xyzw')
         position = _numbers(wanted.pose.position, 'xyz')
         if not np.all(np.abs(position - pivot.position[:, 0]) <= SMALLEST_LENGTH):
-            raise RefusedError(INVALID_POSE, f'pose.position = {position.tolist()} m: must be the '
-                               f'pivot, {pivot.position[:, 0].tolist()} (within '
+            raise RefusedError(response.INVALID_POSE, f'pose.position = {position.tolist()} m: '
+                               f'must be the pivot, {pivot.position[:, 0].tolist()} (within '
                                f'{SMALLEST_LENGTH:g})')
         length = float(np.linalg.norm(rotation))
         if not abs(length - 1.0) <= LENGTH_ERROR:
-            raise RefusedError(INVALID_POSE, f'pose.orientation = {rotation.tolist()} has length '
-                               f'{length!r}: must be 1 (within {LENGTH_ERROR:g})')
+            raise RefusedError(response.INVALID_POSE, f'pose.orientation = {rotation.tolist()} '
+                               f'has length {length!r}: must be 1 (within {LENGTH_ERROR:g})')
     if sets_twist:
         rates = _numbers(wanted.twist.angular, 'xyz')
         velocity = _numbers(wanted.twist.linear, 'xyz')
-        moves = pivot.velocity[:, 0]
-        if not np.all(np.abs(velocity - moves) <= SMALLEST_SPEED):
+        pivot_velocity = pivot.velocity[:, 0]
+        if not np.all(np.abs(velocity - pivot_velocity) <= SMALLEST_SPEED):
             raise ValueError(f'twist.linear = {velocity.tolist()} m/s: must be that of the pivot, '
-                             f'{moves.tolist()} (within {SMALLEST_SPEED:g})')
+                             f'{pivot_velocity.tolist()} (within {SMALLEST_SPEED:g})')
         if not np.all(np.isfinite(rates)):
             raise ValueError(f'twist.angular = {rates.tolist()} rad/s: must be finite')
     return state_of(top, rotation, rates)

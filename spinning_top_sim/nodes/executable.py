@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 from spinning_top_sim.installation import needed, remedy
 from spinning_top_sim.recording.errors import text_of
-from spinning_top_sim.tools.cli import printable
+from spinning_top_sim.tools import cli
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -36,8 +36,8 @@ class RunnableNode(Protocol):
     def destroy_node(self) -> None: ...
 
 
-def run(name: str, argv: Sequence[str] | None,
-        prepare: Callable[[list[str]], tuple[list[str], Callable[[], RunnableNode]]]) -> int:
+def run_node(name: str, argv: Sequence[str] | None,
+             prepare: Callable[[list[str]], tuple[list[str], Callable[[], RunnableNode]]]) -> int:
     """
     Run the node of `spinning-top NAME`; return its exit code.
 
@@ -118,25 +118,27 @@ def _ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def without_ros_arguments(argv: Iterable[str]) -> list[str]:
-    """Return the arguments that are not between `--ros-args` and `--` or the end."""
-    words, are_of_ros = [], False
+def split_ros_arguments(argv: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Return the own arguments, and those of ROS: between `--ros-args` and `--` or the end."""
+    own: list[str] = []
+    for_ros: list[str] = []
+    words = own
     for word in argv:
         if word == '--ros-args':
-            are_of_ros = True
-        elif not are_of_ros:
+            words = for_ros
+        elif words is for_ros and word == '--':
+            words = own
+        else:
             words.append(word)
-        elif word == '--':
-            are_of_ros = False
-    return words
+    return own, for_ros
 
 
 def _cannot_start(name: str, error: Exception) -> int:
     kind = type(error).__name__
     if isinstance(error, ImportError) and not find_spec('rclpy'):
+        without = '; `view LOG` works without' if name.endswith('view') else ''
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
-                             f'{remedy("ros")}' + name.endswith('view') * (
-                                 '; `view LOG` works without'))
+                             f'{remedy("ros")}{without}')
     expected = (isinstance(error, ValueError | RuntimeError | OSError | ImportError)
                 or kind.startswith('Invalid'))
     print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(text_of(error))}',
@@ -145,8 +147,8 @@ def _cannot_start(name: str, error: Exception) -> int:
 
 
 def one_line(text: object) -> str:
-    """Return a text as one line, without control characters and positions in the code of rcl."""
-    line = printable(' '.join(re.sub(r',\s*at \S+:\d+', '', str(text)).split()))
+    """Return a text as one line, without positions in the code of rcl, and not too long."""
+    line = cli.one_line(re.sub(r',\s*at \S+:\d+', '', str(text)))
     return line if len(line) <= 600 else f'{line[:300]} ... {line[-300:]}'
 
 

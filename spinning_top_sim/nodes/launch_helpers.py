@@ -12,7 +12,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from spinning_top_sim.streams.journal import resolve_topic
-from spinning_top_sim.tools.urdf import inertia_warning, robot_description
+from spinning_top_sim.tools.urdf import inertia_fault, robot_description
 
 STATE_PUBLISHER = 'robot_state_publisher'
 
@@ -25,8 +25,10 @@ def state_publisher(share: Path, values: Mapping[str, Any], namespace: str, join
         description = robot_description(values, share / 'urdf')
     except (PackageNotFoundError, ImportError) as error:
         return _missing('TF', 'xacro' if isinstance(error, ImportError) else STATE_PUBLISHER)
-    warning = inertia_warning(values)
-    return [*([LogInfo(msg=f'WARNING: {warning}')] if warning else []), Node(
+    fault = inertia_fault(values)
+    warning = LogInfo(msg=f'WARNING: {fault}, so the body is without <inertial>; frames and '
+                          'shapes are there')
+    return [*([warning] if fault else []), Node(
         package=STATE_PUBLISHER, executable=STATE_PUBLISHER, namespace=namespace,
         remappings=[('joint_states', joint_states)], parameters=[{
             'robot_description': ParameterValue(description, value_type=str),

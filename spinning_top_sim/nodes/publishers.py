@@ -118,4 +118,4 @@ class StreamPublishers:
                 name: int(getattr(publisher.qos_profile, name)) for name in (
                     'history', 'depth', 'reliability', 'durability', 'liveliness')}))
         return topics + [(self._node.resolve_topic_name(name), type_name, {})
-                         for name, type_name in journal.TOPICS]
+                         for name, type_name in journal.TOPICS.items()]

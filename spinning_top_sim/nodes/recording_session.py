@@ -64,11 +64,7 @@ class RecordingSession:
             self._begun = streams, topics, run
 
     def open(self) -> str:
-        """
-        Open the log that `start` has begun; return a text with its path.
-
-        Raises RecordingError, and records nothing.
-        """
+        """Open the log that `start` has begun; return a text, or raise RecordingError."""
         with self._file_lock:
             if self._recorder is not None:
                 return f'recording already to {self._recorder.path}'
@@ -115,8 +111,8 @@ class RecordingSession:
         return reason
 
     def write_command(self, l3: float, lz: float) -> None:
-        self.write_event('command', l3=l3, lz=lz)
-        self._write_now(journal.COMMANDS, journal.command(l3, lz))
+        for topic, data in journal.command_entries(self._simulation.now_ns, l3, lz):
+            self._write_now(topic, data)
 
     def write_event(self, event: str, sent_ns: int | None = None, **details: object) -> None:
         """Record what happens to the motion now; see `journal.event`."""
@@ -126,7 +122,7 @@ class RecordingSession:
 
     def _write_now(self, topic: str, data: bytes) -> None:
         if self._write is not None:
-            index = self._journal_index + [name for name, _ in journal.TOPICS].index(topic)
+            index = self._journal_index + list(journal.TOPICS).index(topic)
             stamp_ns = self._simulation.epoch_ns + max(self._simulation.now_ns, 0)
             self._write([(index, stamp_ns, data)])
 
@@ -145,6 +141,11 @@ class RecordingSession:
         recorder = self._recorder
         return recorder.warning if recorder else None
 
+    @property
+    def path(self) -> Path | None:
+        """The log that is open."""
+        return self._recorder.path if self._recorder else None
+
     def numbers(self) -> dict[str, object]:
         recorder = self._recorder
         if recorder is None:
@@ -159,11 +160,11 @@ class RecordingSession:
 def _open_log(topics: Sequence[Topic], run: Mapping[str, Any]) -> McapRecorder:
     """Open the log that `record.uri` names; in a folder, under the first free name."""
     with needed('a recording'):
-        from spinning_top_sim.recording.provenance import provenance  # noqa: PLC0415
+        from spinning_top_sim.recording.provenance import run_metadata  # noqa: PLC0415
         from spinning_top_sim.recording.recorder import McapRecorder  # noqa: PLC0415
         from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
 
-    values, metadata = run['values_at_recording'], provenance(**run)
+    values, metadata = run['values_at_recording'], run_metadata(**run)
     recorded = [RecordedTopic(*topic) for topic in topics]
     folder = path = Path(values['record.uri']).expanduser().absolute()
     if values['record.uri'].endswith('/'):

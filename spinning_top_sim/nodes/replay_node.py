@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
+from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
 from spinning_top_sim.nodes.playback import FASTEST, RATES, SLOWEST
 from spinning_top_sim.tools import cli
 
@@ -39,11 +39,12 @@ exit code: 0 played (also in part: topics left out, ended by a signal),
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node with these arguments, by default the program's; return its exit code."""
-    return run('replay', argv, _prepare)
+    return run_node('replay', argv, _prepare)
 
 
 def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
-    options = _parser().parse_args(without_ros_arguments(argv))
+    words, _ = split_ros_arguments(argv)
+    options = _parser().parse_args(words)
     from spinning_top_sim.nodes.replayer import Replayer, open_log  # noqa: PLC0415
     log = open_log(options.file, options.partial)
     return argv, lambda: Replayer(log, options)

@@ -27,8 +27,9 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
-from spinning_top_sim.nodes import playback, reports
+from spinning_top_sim.nodes import playback
 from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
+from spinning_top_sim.nodes.terminal import Terminal
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
@@ -42,7 +43,7 @@ class Replayer(Node):
         super().__init__('replay', parameter_overrides=given)
         self.finished: Future = Future()    # completes with the exit code when all is played
         self._reader, self._options = log, options
-        self._terminal = reports.Terminal()
+        self._terminal = Terminal()
         log_begin_ns, end_ns = log.span
         self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
         self._span_ns = end_ns - self._begin_ns

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 
-from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
+from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
 
 DESCRIPTION = """\
 Simulate the heavy symmetric top in real time as a ROS 2 node.
@@ -31,7 +31,7 @@ Publishes, where enabled:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node with these arguments, by default the program's; return its exit code."""
-    return run('node', argv, _prepare)
+    return run_node('node', argv, _prepare)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +58,7 @@ def _interface() -> Iterator[str]:
 
 
 def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
-    words = without_ros_arguments(argv)
+    words, for_ros = split_ros_arguments(argv)
     if words:
         from spinning_top_sim.tools import cli  # noqa: PLC0415
         from spinning_top_sim.tools.scene_file import chosen_files  # noqa: PLC0415
@@ -69,7 +69,7 @@ def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
         given = [word for path in chosen_files(arguments)
                  for word in ('--params-file', str(path))]
         given += [word for parameter in arguments.param for word in ('-p', parameter)]
-        argv = ['--ros-args', *given, '--', *argv[len(words):]]
+        argv = ['--ros-args', *given, *for_ros]
     from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
 
     def make_node() -> RunnableNode:

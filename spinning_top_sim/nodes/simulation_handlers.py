@@ -64,11 +64,7 @@ def offer(node: Simulator) -> None:
 
 
 class SimulationHandlers:
-    """
-    The handlers of one node.
-
-    messages, actions : the modules simulation_interfaces.msg and .action
-    """
+    """The handlers of one node; `messages`, `actions`: modules of simulation_interfaces."""
 
     def __init__(self, node: Simulator, messages: types.ModuleType,
                  actions: types.ModuleType) -> None:
@@ -79,7 +75,7 @@ class SimulationHandlers:
         self._name = node.get_name()            # of the entity
         self._category = messages.EntityCategory.CATEGORY_ROBOT
         self._pause_at_start = -1               # `loop.interruptions` when PAUSED was set at t = 0
-        self._quits = self._steps = False
+        self._quits = self._is_stepping = False
 
     def serve(self, name: str, request: object, response: object) -> object:
         """Handle a request for the service of this type; return the response."""
@@ -180,7 +176,7 @@ class SimulationHandlers:
             if self._state() != self._states.STATE_PAUSED:
                 raise RuntimeError('the simulation is not paused: SetSimulationState must set '
                                    'STATE_PAUSED first')
-        if self._steps:
+        if self._is_stepping:
             raise RuntimeError('SimulateSteps is stepping: wait for its end, or cancel it')
 
     def _step(self, count: int) -> None:
@@ -196,27 +192,11 @@ class SimulationHandlers:
     async def simulate_steps(self, goal_handle: object) -> object:
         """Execute a goal of the action; between two steps the executor has its turn."""
         goal: Any = goal_handle
-        action, context = self._actions.SimulateSteps, self._node.context
-        result, feedback = action.Result(), action.Feedback()
         steps, done, ok = goal.request.steps, 0, self._results.RESULT_OK
         code, text = self._outcome(lambda: self._check_steps(steps))
-        accepted = code == ok
-        self._steps |= accepted
-        interruptions = self._loop.interruptions
-        while code == ok and done < steps and not goal.is_cancel_requested and context.ok():
-            progress = f'after {done} of {steps} steps'
-            code, text = self._outcome(partial(self._next_step, interruptions, progress))
-            if code == ok:
-                done += 1
-                feedback.completed_steps, feedback.remaining_steps = done, steps - done
-                try:
-                    goal.publish_feedback(feedback)
-                except Exception:
-                    if context.ok():
-                        raise
-            await _turn()
-        self._steps &= not accepted
-        while not context.ok():     # a signal ends the process soon, and nothing can be sent
+        if code == ok:
+            done, code, text = await self._run_steps(goal, steps)
+        while not self._node.context.ok():      # a signal ends the process, nothing can be sent
             await _turn()
         if code != ok:
             goal.abort()
@@ -226,8 +206,32 @@ class SimulationHandlers:
                           f'canceled after {done} of {steps} steps')
         else:
             goal.succeed()
+        result = self._actions.SimulateSteps.Result()
         result.result.result, result.result.error_message = code, text
         return result
+
+    async def _run_steps(self, goal: Any, steps: int) -> tuple[int, int, str]:
+        """Step until the end or an interruption; return the number of steps, code and text."""
+        feedback, context = self._actions.SimulateSteps.Feedback(), self._node.context
+        interruptions, ok = self._loop.interruptions, self._results.RESULT_OK
+        done, code, text = 0, ok, ''
+        self._is_stepping = True
+        try:
+            while code == ok and done < steps and not goal.is_cancel_requested and context.ok():
+                progress = f'after {done} of {steps} steps'
+                code, text = self._outcome(partial(self._next_step, interruptions, progress))
+                if code == ok:
+                    done += 1
+                    feedback.completed_steps, feedback.remaining_steps = done, steps - done
+                    try:
+                        goal.publish_feedback(feedback)
+                    except Exception:
+                        if context.ok():
+                            raise
+                await _turn()
+        finally:
+            self._is_stepping = False
+        return done, code, text
 
     def _next_step(self, interruptions: int, progress: str) -> None:
         """Step once, or raise RuntimeError if the motion was interrupted meanwhile."""
@@ -299,12 +303,12 @@ class SimulationHandlers:
         self._check_entity(request.entity)
         self._fill_state(response.state)
 
-    def _set_entity_state(self, request: Any, _: Any) -> None:
+    def _set_entity_state(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
         self._check_runs()
         top, frame = self._simulation.top, self._node.values['world_frame']
         self._set_state(lambda now: entity.requested_state(
-            request, top, frame, now, self._pivot()))
+            request, response, top, frame, now, self._pivot()))
 
     def _get_entity_info(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)

@@ -19,13 +19,15 @@ from rclpy.timer import Timer
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from spinning_top_sim.nodes import reports, ros_parameters
+from spinning_top_sim.nodes import ros_parameters
 from spinning_top_sim.nodes.executable import wait_for_all_acked
+from spinning_top_sim.nodes.node_status import NodeStatus
 from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.publishers import StreamPublishers
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.stamp_clock import StampClock
+from spinning_top_sim.nodes.terminal import Terminal
 from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import journal, parameters
@@ -47,7 +49,7 @@ class Simulator(Node):
         super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()        # completes after `duration`
         self.has_goals = False                  # those of actions end with the motion
-        self._terminal = reports.Terminal()
+        self._terminal = Terminal()
         values = ros_parameters.declare(self, argv)
         simulation = self.simulation = LiveSimulation(values)
         # A reset starts with this spin.  An unset spin.lz stays unset: it follows initial.theta.
@@ -66,7 +68,7 @@ class Simulator(Node):
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.outputs),
             source=self._date.now_ns if self._date.follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self.loop.grid, self.fail)
-        self._report = reports.NodeStatus(simulation, self.loop, self._session)
+        self._report = NodeStatus(simulation, self.loop, self._session)
         self._status_timer: Timer | None = None
         self._status_period = 0.0
         self._outputs.check(simulation.outputs, values)
@@ -120,7 +122,7 @@ class Simulator(Node):
         """End the motion and close the recording, whether the context is valid or not."""
         self._pacer.stop()
         self._terminal.end()
-        path = self._session.numbers().get('recorded file')
+        path = self._session.path
         summary = self._session.stop()
         if summary:
             self._terminal.tell(f'{summary}\nnext: spinning-top inspect {path}\n'
@@ -281,9 +283,7 @@ class Simulator(Node):
 
     def start_again(self, paused: bool | None = None) -> None:
         """
-        Reset the motion.
-
-        paused : whether the motion is paused after the reset; None keeps the present state
+        Reset the motion, and pause it or not; None keeps the present state.
 
         Raises RuntimeError before the motion begins, and ValueError if no motion begins with the
         present parameters; nothing changes then.

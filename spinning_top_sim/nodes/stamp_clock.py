@@ -14,13 +14,10 @@ PATIENCE_S = 2.0        # a /clock that does not change for longer has stopped
 
 
 class StampClock:
-    """
-    The clock of the system or, with `use_sim_time`, the /clock of another node.
-
-    follows : whether it is a /clock; a node does not follow its own
-    """
+    """The clock of the system or, with `use_sim_time`, the /clock of another node."""
 
     def __init__(self, node: Node, publishes_clock: bool) -> None:
+        # Whether it is a /clock; a node does not follow its own.
         self.follows = bool(node.get_parameter('use_sim_time').value) and not publishes_clock
         self._clock = (node.get_clock() if self.follows
                        else Clock(clock_type=ClockType.SYSTEM_TIME))
@@ -34,12 +31,9 @@ class StampClock:
         return int(self._clock.now().nanoseconds)
 
     def first_ns(self) -> int:
-        """
-        Return the date of a t = 0 that begins now [ns].
-
-        Stamps are never ahead of a /clock that is followed, and 0 means "no time".
-        """
+        """Return the date of a t = 0 that begins now [ns]."""
         date_ns = self.now_ns()
+        # Stamps are never ahead of a /clock that is followed, and 0 means "no time".
         return max(date_ns // EPOCH_GRID_NS, 1) * EPOCH_GRID_NS if self.follows else date_ns
 
     def is_missing(self) -> bool:

@@ -13,7 +13,7 @@ from spinning_top_sim.physics.pivot import NEVER_NS
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, stamp_text
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.simulation import checked_velocity
 
@@ -30,7 +30,8 @@ STEP_BUDGET_NS = 2_000_000_000
 LATEST_NS = 500_000_000         # samples later than this are recorded, but not published any more
 # A simulation further behind than this lets its clock slip: its real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
-# Velocities of the pivot are applied at most this often: each of them begins another motion.
+# Velocities of the pivot are applied at most this often, the last of several: each of them begins
+# another motion.
 DRIVE_PERIOD_NS = 20_000_000
 # No motion begins later than a day before the stamps end.
 LAST_EPOCH_NS = LAST_STAMP_NS - 86_400 * NANOSECONDS
@@ -106,8 +107,7 @@ class TickLoop:
     @property
     def time_text(self) -> str:
         """The simulated time for the user, with all its digits."""
-        seconds, nanoseconds = divmod(self.now_ns, NANOSECONDS)
-        return f'at t = {seconds}.{nanoseconds:09d} s'
+        return f'at t = {stamp_text(self.now_ns)} s'
 
     def start(self) -> None:
         """Let simulated time run from 0 on, unless the motion is paused or has failed."""
@@ -237,11 +237,7 @@ class TickLoop:
         self.commands += 1
 
     def set_state(self, change: Callable[[States], State]) -> None:
-        """
-        Send what is due, then let the top be in another state, or raise ValueError.
-
-        change : takes the present state (n = 1), and returns the new one
-        """
+        """Send what is due, then let `change` turn the present state, n = 1, into a new one."""
         self._send_before_change()
         state = change(self._simulation.state())
         self._simulation.set_state(state)
@@ -249,11 +245,7 @@ class TickLoop:
         self.commands += 1
 
     def drive(self, velocity: Sequence[float]) -> None:
-        """
-        Let the pivot go to a velocity [m/s] from the end of a tick on, or raise ValueError.
-
-        Of several velocities in DRIVE_PERIOD_NS of simulated time the last one counts.
-        """
+        """Let the pivot go to a velocity [m/s] from the end of a tick on, or raise ValueError."""
         self._velocity = checked_velocity(velocity)
 
     def _apply_velocity(self) -> None:

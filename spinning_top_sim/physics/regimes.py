@@ -45,6 +45,11 @@ SENTENCES = {
 }
 
 
+def natural_momentum(top: Top) -> float:
+    """Return sqrt(lambda1 |P|) [kg m^2/s]; an upright top sleeps above twice this."""
+    return math.sqrt(top.lambda1 * abs(top.gravity_torque))
+
+
 @dataclass(frozen=True)
 class Description:
     """

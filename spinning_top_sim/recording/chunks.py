@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Builds chunks, of single messages or of whole arrays of them, in memory that is reused."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from array import array
@@ -12,8 +10,9 @@ from collections.abc import Mapping
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import zstandard
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Chunk
+from mcap.records import Chunk, McapRecord
 from numpy.typing import NDArray
 
 CHUNK_BYTES = 1 << 20   # uncompressed; a single larger message still makes a chunk of its own
@@ -31,6 +30,8 @@ Entries = Mapping[int, 'array[int]']
 # Only what grows with every message is packed here (MCAP specification, "Message" and "Message
 # Index"); mcap's record classes do the rest.
 MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log and publish time
+HEAD_TYPE = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
+             ('log_time', '<u8'), ('publish_time', '<u8')]      # the same, for arrays
 MESSAGE_FIELDS = 2 + 4 + 8 + 8      # what `length` counts besides the data
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)   # is packed faster
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
@@ -38,11 +39,7 @@ ENTRY_SIZE = 8 + 8                      # of a message index
 
 
 class ChunkBuilder:
-    """
-    The messages of a chunk, uncompressed.
-
-    compression : 'zstd', 'lz4' or 'none'
-    """
+    """The messages of a chunk, uncompressed; `compression` is 'zstd', 'lz4' or 'none'."""
 
     def __init__(self, compression: str = 'none') -> None:
         self._compression = compression
@@ -103,15 +100,13 @@ class ChunkBuilder:
         offset, end = self.size, self.size + count * record_size
         if end > len(self._memory):
             self._enlarge(end)
-        messages = np.frombuffer(self._memory[offset:end], np.uint8).reshape(count, record_size)
-        head = MESSAGE.pack(_MESSAGE_OPCODE, MESSAGE_FIELDS + size, channel_id, 0, 0, 0)
-        messages[:, :MESSAGE.size] = np.frombuffer(head, np.uint8)
-        messages[:, MESSAGE.size:] = rows
-        numbers = messages.view(np.dtype({
-            'names': ('sequence', 'log_time', 'publish_time'), 'formats': ('<u4', '<u8', '<u8'),
-            'offsets': (11, 15, 23), 'itemsize': record_size}))[:, 0]
-        numbers['sequence'] = np.arange(sequence, sequence + count)
-        numbers['log_time'] = numbers['publish_time'] = times_ns
+        messages = np.frombuffer(self._memory[offset:end], np.dtype([
+            *HEAD_TYPE, ('data', 'u1', (size,))]))
+        messages['opcode'], messages['length'] = Opcode.MESSAGE, MESSAGE_FIELDS + size
+        messages['channel'] = channel_id
+        messages['sequence'] = np.arange(sequence, sequence + count)
+        messages['log_time'] = messages['publish_time'] = times_ns
+        messages['data'] = rows
         entries = np.empty((count, 2), np.uint64)
         entries[:, 0] = times_ns
         entries[:, 1] = np.arange(offset, end, record_size)
@@ -127,6 +122,13 @@ class ChunkBuilder:
         larger = memoryview(bytearray(size))
         larger[:self.size] = self.data
         self._memory = larger
+
+
+def record_bytes(record: McapRecord) -> bytes:
+    """Return a record as it stands in a file."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
 
 
 def message_indexes(entries: Entries) -> dict[int, bytes]:

@@ -3,6 +3,10 @@
 
 from pathlib import Path
 
+# What values raise that are not as this package writes them.
+MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+MOST_TEXT = 300             # of a reason
+
 
 class RecordingError(RuntimeError):
     """A recording cannot start, or has stopped; the text names the path or type and the reason."""
@@ -17,6 +21,12 @@ def text_of(error: BaseException) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f'{error.filename}: {error.strerror}'
     return str(error)
+
+
+def reason_of(error: Exception) -> str:
+    """Return a line about an error, with its kind."""
+    text = f'{type(error).__name__}: {error}'
+    return text if len(text) <= MOST_TEXT else f'{text[:MOST_TEXT]}...'
 
 
 def why_not_written(path: Path, error: Exception) -> str:

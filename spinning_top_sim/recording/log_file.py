@@ -11,22 +11,14 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 
+from mcap import records
 from mcap.exceptions import McapError
-from mcap.records import (
-    Channel,
-    ChunkIndex,
-    Footer,
-    McapRecord,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.records import HEAD, MAX_DECLARED, DamagedError, check_size, parse
+from spinning_top_sim.recording.parsing import HEAD, MAX_DECLARED, DamagedError, check_size, parse
 
 MAGIC_SIZE = len(MCAP0_MAGIC)
 
@@ -79,7 +71,7 @@ class LogFile:
         check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
-    def record(self, offset: int, limit: int) -> McapRecord:
+    def record(self, offset: int, limit: int) -> records.McapRecord:
         _, end = self.head(offset, limit)
         return parse(self.raw(offset, end))
 
@@ -98,11 +90,11 @@ class Summary:
     data_limit: int         # no record of the data section ends behind this offset
     closed: bool = False    # the file ends with a footer and the closing magic
     problem: str = ''       # why there is no summary, '' also if the file was written without one
-    schemas: dict[int, Schema] = field(default_factory=dict)        # by id
-    channels: dict[int, Channel] = field(default_factory=dict)      # by id
-    statistics: Statistics | None = None
-    chunks: dict[int, ChunkIndex] = field(default_factory=dict)     # by offset
-    metadata: list[MetadataIndex] = field(default_factory=list)
+    schemas: dict[int, records.Schema] = field(default_factory=dict)        # by id
+    channels: dict[int, records.Channel] = field(default_factory=dict)      # by id
+    statistics: records.Statistics | None = None
+    chunks: dict[int, records.ChunkIndex] = field(default_factory=dict)     # by offset
+    metadata: list[records.MetadataIndex] = field(default_factory=list)
 
     @property
     def indexes_all_messages(self) -> bool:
@@ -124,7 +116,8 @@ class Summary:
             <= known_topics(self.schemas, self.channels).keys())
 
 
-def known_topics(schemas: dict[int, Schema], channels: dict[int, Channel]) -> dict[int, str]:
+def known_topics(schemas: dict[int, records.Schema],
+                 channels: dict[int, records.Channel]) -> dict[int, str]:
     """Return the topics, by channel id, of channels whose schema is there, or that have none."""
     return {number: channel.topic for number, channel in channels.items()
             if channel.schema_id == 0 or channel.schema_id in schemas}
@@ -137,7 +130,7 @@ def read_summary(file: LogFile) -> Summary:
         return Summary(file.size, problem='the file does not end as an MCAP file ends')
     try:
         footer = file.record(footer_offset, file.size - MAGIC_SIZE)
-        if not isinstance(footer, Footer):
+        if not isinstance(footer, records.Footer):
             raise DamagedError('the footer is damaged')
         start = footer.summary_start or footer_offset
         if not MAGIC_SIZE <= start <= footer_offset:
@@ -150,20 +143,20 @@ def read_summary(file: LogFile) -> Summary:
         return Summary(file.size, closed=True, problem=f'the summary is not used: {damage}')
 
 
-def _read_section(section: bytes, footer: Footer, summary: Summary) -> None:
+def _read_section(section: bytes, footer: records.Footer, summary: Summary) -> None:
     if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
         raise DamagedError('its checksum is wrong')
     try:
         for record in StreamReader(BytesIO(section), skip_magic=True, emit_chunks=True).records:
-            if isinstance(record, Schema):
+            if isinstance(record, records.Schema):
                 summary.schemas[record.id] = record
-            elif isinstance(record, Channel):
+            elif isinstance(record, records.Channel):
                 summary.channels[record.id] = record
-            elif isinstance(record, Statistics):
+            elif isinstance(record, records.Statistics):
                 summary.statistics = record
-            elif isinstance(record, ChunkIndex):
+            elif isinstance(record, records.ChunkIndex):
                 summary.chunks[record.chunk_start_offset] = record
-            elif isinstance(record, MetadataIndex):
+            elif isinstance(record, records.MetadataIndex):
                 summary.metadata.append(record)
     except (McapError, struct.error, OverflowError, UnicodeDecodeError):
         raise DamagedError('a record in it is damaged') from None

@@ -8,8 +8,6 @@ Layout: header, metadata of the run, schemas, channels | chunk, its message inde
 `rosbag2` metadata, data end | summary, footer.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os
@@ -22,12 +20,11 @@ from pathlib import Path
 
 import numpy as np
 from mcap import records
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import chunks
-from spinning_top_sim.recording.chunks import ChunkBuilder
+from spinning_top_sim.recording.chunks import ChunkBuilder, record_bytes
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata_yaml
 
 _COMPRESSING = 2    # chunks of rows that are compressed at once
@@ -40,8 +37,8 @@ class McapWriter:
     A new MCAP file, which must not exist (FileExistsError), used by one thread at a time.
 
     Messages come one by one into a chunk in memory (`append`, `append_all`, and `add_message` with
-    its numbers), or as arrays that make a chunk (`append_rows`).  `write_chunk` and `copy_chunk`
-    write a chunk, `write` any other record.
+    its numbers), or as arrays that make a chunk (`append_rows`).  `flush` writes the chunk in
+    memory, `write_chunk` another one, `write` any other record.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
@@ -95,11 +92,7 @@ class McapWriter:
             raise
 
     def write(self, record: records.McapRecord, raw: bytes = b'') -> None:
-        """
-        Write a schema, a channel (after its schema), metadata or an attachment.
-
-        raw : the bytes of the record in another file
-        """
+        """Write any record but a chunk, a channel after its schema; `raw` are its known bytes."""
         offset = self.size
         raw = raw or record_bytes(record)
         self._write([raw])
@@ -121,19 +114,19 @@ class McapWriter:
 
     def append(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
         """Add the next message of channel `topic_index + 1`, as `add_message` does."""
+        self.add_message(*self._numbered(topic_index, 1), log_time_ns, log_time_ns, data)
+
+    def _numbered(self, topic_index: int, count: int) -> tuple[int, int]:
+        """Return a topic's channel, and the sequence number of the first of `count` messages."""
         channel_id = topic_index + 1
         sequence = self._next_sequence[channel_id]
-        self._next_sequence[channel_id] += 1
-        self.add_message(channel_id, sequence, log_time_ns, log_time_ns, data)
+        self._next_sequence[channel_id] += count
+        return channel_id, sequence
 
     def append_all(self, messages: Iterable[tuple[int, int, bytes]], size: int) -> None:
-        """
-        Add messages as `append` does, one topic after the other, which takes less time.
-
-        size : what they take in a chunk, at most [bytes]
-        """
+        """Add messages as `append` does, in less time; they take `size` bytes at most."""
         if self._chunk.size + size > chunks.CHUNK_BYTES:
-            self.write_chunk()
+            self.flush()
         by_topic: defaultdict[int, list[tuple[int, int, bytes]]] = defaultdict(list)
         for message in messages:
             by_topic[message[0]].append(message)
@@ -143,18 +136,16 @@ class McapWriter:
                 for message in group:
                     self.append(*message)
                 continue
-            channel_id = topic_index + 1
             self._chunk.add_rows(
-                channel_id, self._next_sequence[channel_id], np.array(times_ns, np.uint64),
+                *self._numbered(topic_index, len(data)), np.array(times_ns, np.uint64),
                 np.frombuffer(b''.join(data), np.uint8).reshape(len(data), len(data[0])))
-            self._next_sequence[channel_id] += len(data)
 
     def add_message(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
                     data: bytes | bytearray | memoryview) -> None:
         """Add a message to the chunk in memory; write the chunk when it is full."""
         self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
         if self._chunk.size >= chunks.CHUNK_BYTES:
-            self.write_chunk()
+            self.flush()
 
     def append_rows(self, blocks: Iterable[chunks.RowBlock]) -> None:
         """
@@ -171,19 +162,17 @@ class McapWriter:
             self._chunk = self._spare_chunks.get()
         chunk = self._spare_chunks.get()
         for topic_index, times_ns, rows in blocks:
-            channel_id = topic_index + 1
-            chunk.add_rows(channel_id, self._next_sequence[channel_id], times_ns, rows)
-            self._next_sequence[channel_id] += len(rows)
+            chunk.add_rows(*self._numbered(topic_index, len(rows)), times_ns, rows)
         self._queue(chunk)
 
-    def write_chunk(self) -> None:
+    def flush(self) -> None:
         """Write the chunk in memory, if it holds anything, after those of `append_rows`."""
         self._wait()
         if self._chunk.size:
-            self.copy_chunk(self._chunk.record(), self._chunk.entries)
+            self.write_chunk(self._chunk.record(), self._chunk.entries)
             self._chunk.clear()
 
-    def copy_chunk(self, chunk: records.Chunk, entries: chunks.Entries) -> None:
+    def write_chunk(self, chunk: records.Chunk, entries: chunks.Entries) -> None:
         raw = record_bytes(chunk)
         indexes = chunks.message_indexes(entries)
         offsets = list(itertools.accumulate(
@@ -252,7 +241,7 @@ class McapWriter:
         try:
             record = chunk.record()
             before.result()
-            self.copy_chunk(record, chunk.entries)
+            self.write_chunk(record, chunk.entries)
         finally:
             chunk.clear()
             self._spare_chunks.put(chunk)
@@ -298,13 +287,6 @@ class McapWriter:
                 os.ftruncate(descriptor, self.size)
             raise
         self._end = offset, crc
-
-
-def record_bytes(record: records.McapRecord) -> bytes:
-    """Return a record as it stands in a file."""
-    builder = RecordBuilder()
-    record.write(builder)
-    return builder.end()
 
 
 def sync_directory(directory: Path) -> None:

@@ -9,12 +9,15 @@ from typing import Any
 
 from spinning_top_sim.installation import version
 
+METADATA_NAME = 'spinning_top_sim'
+OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
 
-def provenance(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
-               history: Iterable[tuple[int, *tuple[float, ...]]],
-               values_at_recording: Mapping[str, Any]) -> dict[str, str]:
+
+def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
+                 history: Iterable[tuple[int, *tuple[float, ...]]],
+                 values_at_recording: Mapping[str, Any]) -> dict[str, str]:
     """
-    Return the `spinning_top_sim` metadata record.
+    Return the metadata record METADATA_NAME.
 
     values_at_start : parameters at the start of the motion (the last reset)
     epoch_ns : stamp of t = 0

@@ -16,19 +16,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, Header, Metadata, Schema
+from mcap.records import Chunk, ChunkIndex, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording import records
+from spinning_top_sim.recording import parsing
+from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, known_topics, read_summary
-from spinning_top_sim.recording.recorder import OUR_LIBRARY
-from spinning_top_sim.recording.records import HEAD, DamagedError, LogMessage, Messages
+from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, read_summary
+from spinning_top_sim.recording.parsing import HEAD, DamagedError, LogMessage, Messages
+from spinning_top_sim.recording.provenance import OUR_LIBRARY
 from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
-from spinning_top_sim.recording.scan import Damage, Part, Scan
+from spinning_top_sim.recording.scan import Index, Part, Scan
 
 BLOCK = 16384               # messages that are read together
 _FIRST_DATE = 10 ** 17      # [ns], in 1973
@@ -79,15 +79,6 @@ def _file_of(path: Path) -> Path:
     return path / files[0]
 
 
-class _Index(NamedTuple):
-    """What a summary tells, as in `Scan`."""
-
-    parts: list[Part]
-    metadata: dict[str, dict[str, str]]
-    schemas: dict[int, Schema]
-    channels: dict[int, Channel]
-
-
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
     An MCAP file, open for reading; a context manager.
@@ -108,7 +99,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         For what is no MCAP file, or cannot be read.
     """
 
-    def __init__(self, path: str | os.PathLike[str], max_bytes: int = records.MAX_BYTES) -> None:
+    def __init__(self, path: str | os.PathLike[str], max_bytes: int = parsing.MAX_BYTES) -> None:
         self.path = _file_of(Path(path))
         self.left_out = 0       # damaged chunks that `messages` has skipped
         self.file = LogFile(self.path, max_bytes)
@@ -188,9 +179,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             A message that is read completely.
         """
         names = None if topics is None else frozenset(topics)
-        channels = self._index.channels
-        wanted = {number: topic
-                  for number, topic in known_topics(self._index.schemas, channels).items()
+        wanted = {number: topic for number, topic in self._index.topics.items()
                   if names is None or topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
         held: list[int] = []        # bytes of each part that is read and not yet passed
@@ -220,11 +209,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def open_part(self, part: Part) -> Messages:
         """Return the messages of a part.  Raises DamagedError."""
         if part.opcode == Opcode.MESSAGE:
-            return records.find_messages(self.file.read(part.offset, part.end - part.offset))
+            return parsing.find_messages(self.file.read(part.offset, part.end - part.offset))
         chunk = self.file.record(part.offset, part.end)
         if not isinstance(chunk, Chunk):
             raise DamagedError('it is no chunk')
-        return records.open_chunk(chunk, self.file.max_bytes)
+        return parsing.open_chunk(chunk, self.file.max_bytes)
 
     def _stream(self, part: Part, wanted: Mapping[int, str], held: list[int],
                 ) -> Iterator[LogMessage]:
@@ -245,11 +234,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         held.remove(held_bytes)
 
     @functools.cached_property
-    def _index(self) -> 'Scan | _Index':
+    def _index(self) -> Index:
         """What the summary tells, if that is all and right, else what a scan finds."""
         summary = self._summary
         if not (summary.is_complete and all(map(self._leads_to_chunk, summary.chunks.values()))):
-            return self.scan()
+            return self.scan().index
         metadata = {}
         for index in summary.metadata:
             with contextlib.suppress(DamagedError):
@@ -259,7 +248,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         parts = [Part(Opcode.CHUNK, offset, offset + chunk.chunk_length,
                       frozenset(chunk.message_index_offsets), chunk.message_start_time,
                       chunk.message_end_time) for offset, chunk in sorted(summary.chunks.items())]
-        return _Index(parts, metadata, summary.schemas, summary.channels)
+        return Index(parts, metadata, summary.schemas, summary.channels)
 
     @property
     def _messages(self) -> list[Part]:

@@ -25,10 +25,9 @@ from spinning_top_sim.recording.chunks import CHUNK_BYTES
 from spinning_top_sim.recording.definitions import find_definition
 from spinning_top_sim.recording.errors import RecordingError, why_not_written
 from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
+from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 
-METADATA_NAME = 'spinning_top_sim'
-OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
 QUEUE_BYTES = 32_000_000            # of a full queue; a burst that began with room may go on
 
 _ENTRY_BYTES = 128  # what a queued message costs besides its data, about
@@ -57,18 +56,15 @@ class McapRecorder:
     """
     A running recording into a new file, until `close`.
 
-    Trouble with the disk never reaches the caller: the recording stops, `state` becomes 'failed'
-    and `error` says why, naming the path.  What was written up to then stays readable.
+    It begins as `create_file`.  Later trouble with the disk never reaches the caller: the
+    recording stops, `state` becomes 'failed' and `error` says why, naming the path.  What was
+    written up to then stays readable.
     """
 
     def __init__(self, path: str | os.PathLike[str], topics: Sequence[RecordedTopic],
                  metadata: Mapping[str, str], *, max_loss: float = 0.5,
                  compression: str = 'zstd', min_free_bytes: int = 100_000_000) -> None:
-        """
-        Create the file and start recording; raises as `create_file`.
-
-        max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
-        """
+        """Start recording; a SIGKILL or a power loss takes the last `max_loss` [s] at most."""
         self.path = Path(path)
         self._file = create_file(self.path, topics, metadata, compression=compression,
                                  min_free_bytes=min_free_bytes)
@@ -193,7 +189,7 @@ class McapRecorder:
             self._write_queued()
             if closing or now >= next_flush:
                 next_flush = now + interval
-                self._file.write_chunk()
+                self._file.flush()
                 if closing and self._syncing is not None:
                     self._syncing.join()
                 if self._sync_error is not None:

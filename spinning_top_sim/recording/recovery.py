@@ -34,7 +34,7 @@ def recover(reader: LogReader, output: str | os.PathLike[str],
         with writer.discarded_on_failure():
             scan = reader.scan(lambda offset: progress(offset / 2))
             declared = False
-            for part in scan.parts:
+            for part in scan.index.parts:
                 progress((reader.size + part.offset) / 2)
                 if part.channel_ids:
                     if not declared:    # channels stand before the messages, metadata as it stood
@@ -43,13 +43,13 @@ def recover(reader: LogReader, output: str | os.PathLike[str],
                     _copy_messages(reader, part, writer)
                 else:
                     _copy_record(reader, part, writer)
-            writer.write_chunk()
+            writer.flush()
             if not declared:
                 _declare(scan, writer)
             if not writer.messages and not reader.whole:
                 raise LogError(f'nothing to save in {reader.path}: there is no whole message in '
                                'it')
-            writer.finish(bag=reader.profile == 'ros2' or BAG_METADATA in scan.metadata)
+            writer.finish(bag=reader.profile == 'ros2' or BAG_METADATA in scan.index.metadata)
     except OSError as error:
         raise LogError(f'cannot write {output}: {why_not_written(output, error)}') from error
     progress(reader.size)
@@ -58,22 +58,22 @@ def recover(reader: LogReader, output: str | os.PathLike[str],
 
 def _declare(scan: Scan, writer: McapWriter) -> None:
     """Write all schemas and channels, but for channels without their schema."""
-    for schema in scan.schemas.values():
+    for schema in scan.index.schemas.values():
         writer.write(schema)
-    for number, channel in scan.channels.items():
-        if number in scan.known_topics:
+    for number, channel in scan.index.channels.items():
+        if number in scan.index.topics:
             writer.write(channel)
 
 
 def _copy_messages(reader: LogReader, part: Part, writer: McapWriter) -> None:
     messages = reader.open_part(part)
-    topics = reader.scan().known_topics
+    topics = reader.scan().index.topics
     if part.opcode == Opcode.CHUNK and not messages.declared and part.channel_ids <= set(topics):
         chunk = reader.file.record(part.offset, part.end)
         assert isinstance(chunk, Chunk)
         chunk.message_start_time, chunk.message_end_time = part.start_ns, part.end_ns
-        writer.write_chunk()            # what came before stays before
-        writer.copy_chunk(chunk, messages.entries)
+        writer.flush()                  # what came before stays before
+        writer.write_chunk(chunk, messages.entries)
         return
     for message in messages.in_order(topics):
         writer.add_message(message.channel_id, message.sequence, message.log_time,

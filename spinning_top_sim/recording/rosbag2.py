@@ -101,11 +101,7 @@ def _is_int64(value: object) -> TypeGuard[int]:
 
 def bag_metadata_yaml(topics: Sequence[tuple[Channel, str, int]], *, file_name: str,
                       start_ns: int, end_ns: int) -> str:
-    """
-    Return the `serialized_metadata` of the `rosbag2` record.
-
-    topics : channels with their type and the number of their messages, in the order of the file
-    """
+    """Return the text of the `rosbag2` record; `topics` are channels, types and message counts."""
     # A file name may hold bytes that are no text: they must not spoil the closing of a log.
     file_name = file_name.encode(errors='replace').decode()
     start = {'nanoseconds_since_epoch': start_ns}

@@ -6,32 +6,22 @@ Behind damage the scan goes on at the record to which the damaged one's length l
 the next chunk, schema, channel or metadata that can be decoded.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
+from spinning_top_sim.recording import parsing
 from spinning_top_sim.recording.chunks import time_span
+from spinning_top_sim.recording.damage import Damage, Loss, count
 from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, Summary, known_topics
-from spinning_top_sim.recording.records import (
-    HEAD,
-    MAX_DECLARED,
-    DamagedError,
-    Messages,
-    check_size,
-    find_messages,
-    index_entries,
-    open_chunk,
-    parse,
-    size_of,
-)
+from spinning_top_sim.recording.parsing import HEAD, DamagedError, Messages, check_size
 
 _DATA_END_SIZE = HEAD.size + 4
 _RUN_BYTES = 1 << 20    # of messages outside of chunks that are read at a time
@@ -49,69 +39,6 @@ _SEARCHED = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.CHUNK)
 _MAX_EFFORT = 4         # bytes of candidates read, as a multiple of the file's size
 
 
-@dataclass(frozen=True)
-class Loss:
-    """A range of a file that cannot be decoded, or messages in it that cannot be understood."""
-
-    offset: int
-    bytes: int
-    what: str                       # the kind of the record at the offset
-    reason: str
-
-    def __str__(self) -> str:
-        return (f'lost: {self.what} at byte {self.offset} ({count(self.bytes, "byte")}): '
-                f'{self.reason}')
-
-
-@dataclass(frozen=True)
-class Damage:
-    """What a scan of a whole file found."""
-
-    truncated: bool                 # the file does not end as an MCAP file ends
-    losses: tuple[Loss, ...]        # in the order of the file
-    defects: tuple[str, ...]        # what is wrong but costs nothing
-    # Exact if `missing_exactly`, by the statistics of the file; else a lower bound, by the message
-    # indexes of lost chunks.
-    missing_messages: int
-    missing_exactly: bool
-    # The earliest and the latest log time of the messages that are there; 0 without any.
-    start_ns: int
-    end_ns: int
-
-    @property
-    def lossless(self) -> bool:
-        """Whether everything that the log is known to have held is there."""
-        return not self.losses and not self.missing_messages
-
-    @property
-    def lost_bytes(self) -> int:
-        return sum(loss.bytes for loss in self.losses)
-
-    @property
-    def lost_chunks(self) -> int:
-        return sum(loss.what == 'chunk' for loss in self.losses)
-
-    def lines(self) -> list[str]:
-        """Return a human-readable report: the sums if something is lost, then each loss."""
-        lines = []
-        if not self.lossless:
-            number = count(self.missing_messages, 'message')
-            lines.append(f'lost: {count(self.lost_bytes, "byte")}, ' + (
-                number if self.missing_exactly else f'at least {number}' if self.missing_messages
-                else 'an unknown number of messages'))
-        return [*lines, *map(str, self.losses), *(f'found: {defect}' for defect in self.defects)]
-
-
-def count(number: int, noun: str) -> str:
-    """Return a number with its noun."""
-    return f'{number} {noun}{"" if number == 1 else "s"}'
-
-
-def seconds(time_ns: int) -> str:
-    """Return a stamp in seconds to the nanosecond, exactly."""
-    return f'{time_ns // 10 ** 9}.{time_ns % 10 ** 9:09d} s'
-
-
 class Part(NamedTuple):
     """A chunk, adjacent messages outside of chunks, metadata or an attachment."""
 
@@ -121,6 +48,29 @@ class Part(NamedTuple):
     channel_ids: frozenset[int] = frozenset()   # of its messages
     start_ns: int = 0                           # their earliest log time
     end_ns: int = 0                             # the latest
+
+
+@dataclass
+class Index:
+    """Where the messages of a log are, and what it says of them."""
+
+    parts: list[Part]                       # in file order
+    metadata: dict[str, dict[str, str]]     # by name
+    schemas: dict[int, Schema]              # by id
+    channels: dict[int, Channel]
+
+    @cached_property
+    def topics(self) -> dict[int, str]:
+        """The topics, by channel id, of channels whose schema is there, or that have none."""
+        return known_topics(self.schemas, self.channels)
+
+
+class _Decoded(NamedTuple):
+    """A record and the messages in it; or the number of entries of a message index."""
+
+    record: McapRecord | None = None
+    messages: Messages = Messages(b'')
+    index_entries: int | None = None
 
 
 class Scan:
@@ -133,10 +83,7 @@ class Scan:
 
     def __init__(self, file: LogFile, summary: Summary, *, ours: bool,
                  progress: Callable[[int], object] = lambda offset: None) -> None:
-        self.parts: list[Part] = []                 # in file order
-        self.metadata: dict[str, dict[str, str]] = {}   # by name
-        self.schemas, self.channels = summary.schemas.copy(), summary.channels.copy()   # by id
-
+        self.index = Index([], {}, summary.schemas.copy(), summary.channels.copy())
         self._file = file
         self._summary = summary
         self._ours = ours
@@ -156,7 +103,6 @@ class Scan:
         if file.read(0, MAGIC_SIZE) != MCAP0_MAGIC:
             self._defects.append('the first eight bytes are not those of an MCAP file')
         self._walk(progress)
-        self.known_topics = known_topics(self.schemas, self.channels)   # by channel id
         self.damage = self._damage()
 
     def _walk(self, progress: Callable[[int], object]) -> None:
@@ -179,54 +125,51 @@ class Scan:
 
     def _take(self, opcode: int, offset: int, end: int) -> int:
         """Note what is in a record, and return where the next one begins."""
-        record, messages = self._decode(opcode, offset, end)
+        record, messages, index_entries = self._decode(opcode, offset, end)
         end = self._true_end(record, offset, end)
-        if isinstance(record, int):
-            self._lost += 0 if self._behind_chunk else record
+        if index_entries is not None:
+            self._lost += 0 if self._behind_chunk else index_entries
             return end
         self._behind_chunk = opcode == Opcode.CHUNK
         if isinstance(record, Schema | Channel | Metadata):
             self._small_bytes += end - offset
-            check_size(self._small_bytes, MAX_DECLARED)
+            check_size(self._small_bytes, parsing.MAX_DECLARED)
         for declared in (record, *messages.declared):
             if isinstance(declared, Schema):
-                self.schemas.setdefault(declared.id, declared)
+                self.index.schemas.setdefault(declared.id, declared)
             elif isinstance(declared, Channel):
-                self.channels.setdefault(declared.id, declared)
+                self.index.channels.setdefault(declared.id, declared)
         if isinstance(record, Metadata):
-            self.metadata[record.name] = record.metadata
+            self.index.metadata[record.name] = record.metadata
         if messages.entries:
             self._is_proven &= isinstance(record, Chunk) and record.uncompressed_crc != 0
             self._add(opcode, offset, end, messages)
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
-            self.parts.append(Part(opcode, offset, end))
+            self.index.parts.append(Part(opcode, offset, end))
         return end
 
-    def _decode(self, opcode: int, offset: int, end: int,
-                ) -> tuple[McapRecord | int | None, Messages]:
-        """Return a record, of a message index the number of entries, and the messages in it."""
-        nothing = Messages(b'')
+    def _decode(self, opcode: int, offset: int, end: int) -> _Decoded:
         if opcode > Opcode.DATA_END:    # of an application, or of a later version of the format
             if self._ours:
                 raise DamagedError('there is no such kind of record')
             check_size(end - offset - HEAD.size, self._file.max_bytes)
-            return None, nothing
+            return _Decoded()
         raw = self._file.raw(offset, end)
         if opcode == Opcode.MESSAGE_INDEX:
-            return index_entries(raw), nothing
+            return _Decoded(index_entries=parsing.index_entries(raw))
         if opcode == Opcode.MESSAGE:
             if self._all_in_chunks:
                 raise DamagedError('all messages of the file are in chunks')
-            return None, find_messages(raw)
-        record = parse(raw)
+            return _Decoded(messages=parsing.find_messages(raw))
+        record = parsing.parse(raw)
         if isinstance(record, Chunk):
-            return record, open_chunk(record, self._file.max_bytes)
-        return record, nothing
+            return _Decoded(record, parsing.open_chunk(record, self._file.max_bytes))
+        return _Decoded(record)
 
-    def _true_end(self, record: McapRecord | int | None, offset: int, end: int) -> int:
+    def _true_end(self, record: McapRecord | None, offset: int, end: int) -> int:
         """Return the end that its fields or the next record prove; else raise DamagedError."""
-        if isinstance(record, McapRecord):
-            own = offset + size_of(record)
+        if record is not None:
+            own = offset + parsing.size_of(record)
             # Such a length would take in the records that follow.
             if own < end and isinstance(record, Schema | Channel) and self._is_record(own):
                 self._defects.append(f'{type(record).__name__.lower()} at byte {offset}: its '
@@ -252,20 +195,23 @@ class Scan:
         for channel_id, entries in messages.entries.items():
             self._found[channel_id] += len(entries) // 2
         part = Part(opcode, offset, end, frozenset(messages.entries), *time_span(messages.entries))
-        last = self.parts[-1] if self.parts else part
+        parts = self.index.parts
+        last = parts[-1] if parts else part
         if opcode == Opcode.MESSAGE == last.opcode and (
                 last.end == offset < last.offset + _RUN_BYTES):
             part = Part(opcode, last.offset, end, part.channel_ids | last.channel_ids,
                         min(part.start_ns, last.start_ns), max(part.end_ns, last.end_ns))
-            self.parts.pop()
-        self.parts.append(part)
+            parts.pop()
+        parts.append(part)
 
     # ------------------------------------------------------------------------------- damage
 
     def _skip(self, offset: int, damage: DamagedError) -> int:
         """Note a damaged record, and return where the next one begins, or the limit."""
         opcode = self._file.read(offset, 1)[0]
-        what = ('chunk' if offset in self._summary.chunks
+        is_chunk = opcode == Opcode.CHUNK or offset in self._summary.chunks
+        is_index = opcode == Opcode.MESSAGE_INDEX and not is_chunk
+        what = ('chunk' if is_chunk
                 else Opcode(opcode).name.lower().replace('_', ' ') if opcode in set(Opcode)
                 else 'record of unknown kind')
         try:
@@ -277,13 +223,13 @@ class Scan:
         is_truncated = not stated_end and not self._summary.closed and end == self._limit
         # A recovery makes these anew; behind messages, we write no other metadata.
         is_bag = opcode == Opcode.METADATA and self._ours and self._found.total() > 0
-        if what == 'message index' or (is_truncated and (opcode == Opcode.DATA_END or is_bag)):
+        if is_index or (is_truncated and (opcode == Opcode.DATA_END or is_bag)):
             self._defects.append(f'{what} at byte {offset}: {damage}')
             if offset < stated_end < end:
                 self._losses.append(Loss(stated_end, end - stated_end, 'something',
                                          'no record can be decoded there'))
         else:
-            self._losses.append(Loss(offset, end - offset, what, str(damage)))
+            self._losses.append(Loss(offset, end - offset, what, str(damage), is_chunk))
         self._behind_chunk &= opcode == Opcode.MESSAGE_INDEX
         return end
 
@@ -309,7 +255,7 @@ class Scan:
                 self._unpacking -= min(stated, self._file.max_bytes)
             if self._effort < 0 or self._unpacking < 0:
                 return False
-            _, messages = self._decode(opcode, offset, end)
+            messages = self._decode(opcode, offset, end).messages
         except DamagedError:
             return False
         # Zeros look like an empty chunk.
@@ -337,13 +283,14 @@ class Scan:
     def _damage(self) -> Damage:
         if self._summary.problem:
             self._defects.append(self._summary.problem)
-        found = sum(self._found[number] for number in self.known_topics)
+        topics = self.index.topics
+        found = sum(self._found[number] for number in topics)
         unknown = self._found.total() - found
         if unknown:
             self._losses.append(Loss(0, 0, count(unknown, 'message'),
                                      'no whole record declares their channels'))
         statistics = self._summary.statistics
-        parts = [part for part in self.parts if part.channel_ids & self.known_topics.keys()]
+        parts = [part for part in self.index.parts if part.channel_ids & topics.keys()]
         return Damage(
             truncated=not self._summary.closed, losses=tuple(self._losses),
             defects=tuple(self._defects),

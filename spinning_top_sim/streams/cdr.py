@@ -25,6 +25,11 @@ LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
 Field = NDArray[np.float64] | Sequence[NDArray[np.float64] | float]
 
 
+def stamp_text(time_ns: int) -> str:
+    """Return a time in seconds, to the nanosecond."""
+    return f'{time_ns // NANOSECONDS}.{time_ns % NANOSECONDS:09d}'
+
+
 class CdrWriter:
     """
     Appends the parts of a message in the order of its definition; its methods return itself.

@@ -14,8 +14,8 @@ from spinning_top_sim.streams.stream import Stream
 
 NODE_NAME = 'spinning_top'
 COMMANDS, EVENTS = '~/commands', '~/events'
-# Recorded behind the streams, in this order.
-TOPICS = ((COMMANDS, 'std_msgs/msg/Float64MultiArray'), (EVENTS, 'std_msgs/msg/String'))
+# Topics and types, recorded behind the streams, in this order.
+TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/String'}
 
 
 def recorded_streams(streams: Sequence[Stream], values: Mapping[str, Any]) -> list[Stream]:
@@ -46,6 +46,11 @@ def is_enabled(parameter: str, values: Mapping[str, Any]) -> bool:
 def command(l3: float, lz: float) -> bytes:
     """Return an applied command as it is logged: std_msgs/Float64MultiArray [L3, Lz]."""
     return messages.float64_multi_array(('l3', 'lz')).encode_one(0, (l3, lz))
+
+
+def command_entries(t_ns: int, l3: float, lz: float) -> list[tuple[str, bytes]]:
+    """Return what is logged of a command at the simulated time `t_ns`, by topic."""
+    return [(EVENTS, event('command', t_ns, t_ns, l3=l3, lz=lz)), (COMMANDS, command(l3, lz))]
 
 
 def event(name: str, t_ns: int, sent_ns: int, **details: object) -> bytes:

@@ -18,6 +18,26 @@ BODY_COLOR = (0.20, 0.40, 0.70, 1.0)            # red, green, blue, alpha
 AXIS_COLOR = (0.95, 0.75, 0.20, 1.0)
 TRACE_COLOR = (0.90, 0.30, 0.20, 1.0)
 ORIGIN, NO_ROTATION = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+# Names in the message definitions of the fields of a template, by type.
+FIELDS = {
+    'geometry_msgs/msg/PoseStamped': ('pose.position', 'pose.orientation'),
+    'tf2_msgs/msg/TFMessage': ('transforms[0].transform.translation',
+                               'transforms[0].transform.rotation'),
+    'sensor_msgs/msg/JointState': ('position', 'velocity'),
+    'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
+    'sensor_msgs/msg/MagneticField': ('magnetic_field', 'magnetic_field_covariance'),
+    'sensor_msgs/msg/NavSatFix': ('position',),
+    'geometry_msgs/msg/TwistWithCovarianceStamped': ('twist.twist.linear',),
+    'nav_msgs/msg/Odometry': ('pose.pose.position', 'pose.pose.orientation',
+                              'twist.twist.linear', 'twist.twist.angular'),
+    'geometry_msgs/msg/QuaternionStamped': ('quaternion',),
+    'geometry_msgs/msg/Vector3Stamped': ('vector',),
+    'rosgraph_msgs/msg/Clock': (),
+    'std_msgs/msg/Float64MultiArray': ('data',),
+    'visualization_msgs/msg/MarkerArray': (
+        'markers[0].pose.position', 'markers[0].pose.orientation',
+        'markers[1].pose.position', 'markers[1].pose.orientation', 'markers[2].points'),
+}
 
 
 def diagonal(*variances: float) -> tuple[float, ...]:

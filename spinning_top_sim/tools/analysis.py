@@ -24,6 +24,7 @@ DEGREE, WINDOW = 15, 64
 LEAST_SAMPLES = 9.0         # in a nutation, for a spline as good as the data
 RESTS = 1e-9                # a tilt that changes less does not nutate: rounding decides [rad]
 LARGEST_STEP = 2.5          # between two samples of an angle that can be unwrapped [rad]
+RATES, TURNS = slice(4, 7), slice(7, 10)        # of the rows of Attitudes
 
 
 class Attitudes:
@@ -48,15 +49,15 @@ class Attitudes:
         tip_x, tip_y, self.height = attitude.axis_in_world(self.quaternion)
         up_1, up_2, _ = self.up = attitude.vertical_in_body(self.quaternion)
         self.tip, self.body_tip = tip_x + 1j * tip_y, -up_1 + 1j * up_2
-        self.omega = tuple(rows[4:7]) or None
+        self.omega = tuple(rows[RATES]) or None
         self.phi_dot = None
         if self.omega is not None:
             one, two, _ = self.omega
             with np.errstate(invalid='ignore'):     # NaN at a pole
                 self.phi_dot = (one * up_1 + two * up_2) / (up_1 ** 2 + up_2 ** 2)
-        self.counts_turns = len(rows) == 10
+        self.counts_turns = len(rows) == TURNS.stop
         if self.counts_turns:
-            self.phi, self.psi, self.phi_dot = rows[7:]
+            self.phi, self.psi, self.phi_dot = rows[TURNS]
         else:
             self.phi, self.psi = (np.unwrap(np.angle(tip)) for tip in (self.tip, self.body_tip))
 

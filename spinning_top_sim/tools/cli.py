@@ -72,6 +72,11 @@ def printable(text: str) -> str:
                    character.encode('unicode_escape').decode() for character in text)
 
 
+def one_line(value: object) -> str:
+    """Return the text of a value as one printable line."""
+    return printable(' '.join(str(value).split()))
+
+
 def print_line(text: str, file: TextIO | None = None) -> None:
     """Print a line, by default to the standard output; names in it cannot act on a terminal."""
     print(printable(text), file=file or sys.stdout)
@@ -92,7 +97,7 @@ def progress(what: str, total: float, unit: str, *, quiet: bool = False,
         yield lambda done: bar.update(min(done, total) - bar.n)
 
 
-def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+def table_lines(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """Yield the lines of a table; all columns but the first are right-aligned."""
     cells = [[*map(printable, row)] for row in (head, *rows)]
     first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))

@@ -29,9 +29,9 @@ from pathlib import Path
 from typing import Any
 
 from spinning_top_sim.installation import needed
+from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.tools import cli, ensemble_spec
 from spinning_top_sim.tools.ensemble_part import DATA, compute_part, versions, write_row
-from spinning_top_sim.tools.recorded_run import MALFORMED, reason_of
 
 MANIFEST = 'manifest.json'
 

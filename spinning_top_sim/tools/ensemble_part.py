@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
+from spinning_top_sim.recording.errors import reason_of
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.cdr import NANOSECONDS, CdrWriter, Field, Template, fill
+from spinning_top_sim.streams.messages import FIELDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
-from spinning_top_sim.tools.recorded_run import field_names, reason_of
 from spinning_top_sim.tools.simulate import write_log
 
 if TYPE_CHECKING:
@@ -37,11 +38,11 @@ Samples = dict[str, tuple[NDArray[np.float64], NDArray[np.bool_]]]
 EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
 DATA = 'data'                   # folder of the files of a dataset
 # Key of the metadata of a Parquet file: the reasons of the runs that failed, by run.
-FAILED = b'failed'
+FAILED_KEY = b'failed'
 # Names of the numbers in the fields of a topic, where they are not x, y, z and w.
-PLACE = ('latitude', 'longitude', 'altitude')
+GEODETIC = ('latitude', 'longitude', 'altitude')
 LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING,
-          'gnss/fix': PLACE, 'ground_truth/gnss/fix': PLACE}
+          'gnss/fix': GEODETIC, 'ground_truth/gnss/fix': GEODETIC}
 
 
 @cache
@@ -54,7 +55,7 @@ def versions() -> dict[str, str]:
 def _column_names(stream: Stream) -> Sequence[str]:
     """Return the names of the numbers in a message, '' for those that are not kept."""
     names = []
-    for field, count in zip(field_names(stream), stream.template.counts, strict=True):
+    for field, count in zip(FIELDS[stream.type_name], stream.template.counts, strict=True):
         labels = LABELS.get(stream.topic) or ('xyzw'[:count] if count <= 4 else range(count))
         # REP-145: a message may say that it has no orientation.
         is_kept = field != 'orientation' or getattr(stream, 'has_orientation', True)
@@ -119,7 +120,7 @@ def _joined(parts: Sequence[NDArray[Any]], none: int | tuple[int, int],
     return parts[0] if len(parts) == 1 else np.concatenate([np.empty(none, kind), *parts], axis=-1)
 
 
-def table(specification: Specification, found: Mapping[int, Samples]) -> 'pyarrow.Table':
+def arrow_table(specification: Specification, found: Mapping[int, Samples]) -> 'pyarrow.Table':
     """Return the samples of runs as a table, beside the number of the run and what is drawn."""
     import pyarrow as pa  # noqa: PLC0415
 
@@ -142,12 +143,7 @@ def table(specification: Specification, found: Mapping[int, Samples]) -> 'pyarro
 
 
 def write_row(specification: Specification, run: int, path: Path) -> None:
-    """
-    Compute one run into a new file, .mcap or .parquet.
-
-    Raises RecordingError or OSError if it exists, ValueError if no motion begins, IntegrationError
-    if it ends early.
-    """
+    """Compute one run into a new file, .mcap or .parquet; an existing file raises an error."""
     from pyarrow import parquet  # noqa: PLC0415
 
     values = specification.values(run)
@@ -156,7 +152,7 @@ def write_row(specification: Specification, run: int, path: Path) -> None:
         write_log(path, simulation, [(round(values['duration'] * NANOSECONDS), None)],
                   lambda done: None, '/')
     else:
-        rows = table(specification, {run: samples(specification, simulation)})
+        rows = arrow_table(specification, {run: samples(specification, simulation)})
         with open(path, 'xb') as file:
             parquet.write_table(rows, file)
 
@@ -165,14 +161,13 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
     """
     Compute the file of a part, unless it is in `folder`; return the runs that failed, and why.
 
-    The file depends on the specification and the versions alone.
-    Raises OSError if the file cannot be written.
+    The file depends on the specification and the versions alone.  Raises OSError.
     """
     from pyarrow import parquet  # noqa: PLC0415
 
     path = Path(folder, DATA, f'part-{part:06d}.parquet')
     with contextlib.suppress(OSError, ValueError, KeyError):    # it is missing, or not whole
-        return dict(json.loads(parquet.read_metadata(path).metadata[FAILED]))
+        return dict(json.loads(parquet.read_metadata(path).metadata[FAILED_KEY]))
     begun, found = {}, {}
     failed: dict[str, str] = {}
     # All runs begin before one is played: caches of the processor hold the code of one of both.
@@ -183,7 +178,8 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
         with _noted(failed, run):
             found[run] = samples(specification, begun.pop(run))     # which holds much memory
     if found:
-        rows = table(specification, found).replace_schema_metadata({FAILED: json.dumps(failed)})
+        rows = arrow_table(specification, found).replace_schema_metadata(
+            {FAILED_KEY: json.dumps(failed)})
         constant = ['run', *specification.drawn(0)]
         written = path.with_name(f'.{path.name}.{uuid4()}')     # readers of Parquet skip it
         parquet.write_table(

@@ -119,11 +119,7 @@ class Specification:
 
     @cached_property
     def kept(self) -> Sequence[str]:
-        """
-        Names of the streams that any of the runs keeps.
-
-        The table of each run has columns for all of them, so that the files form one table.
-        """
+        """Names of the streams that any of the runs keeps: the columns of the table of each."""
         return [name for name in STREAMS if any(
             journal.is_recorded(name, {**DEFAULTS, **values}) for values in self.alternatives)]
 
@@ -188,14 +184,16 @@ def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
 def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
     """Return how a parameter is sampled, checked: {distribution: [a, b]}, or {values: [...]}."""
     what, kinds = f'sample: {name}', (*DISTRIBUTIONS, VALUES)
-    if name != PARAMS and (not parse_section({name: 0.0}, 'sample') or str(name).endswith(
-            ('.enabled', 'record.streams', 'publish_clock'))):
-        raise ValueError(f'{what} must not be sampled: `streams`, or a set of `params`, says '
-                         'which streams there are')
+    if name != PARAMS:
+        ours = parse_section({name: 0.0}, 'sample')         # refuses an unknown name
+        if not ours or str(name).endswith(('.enabled', 'record.streams', 'publish_clock')):
+            raise ValueError(f'{what} must not be sampled: `streams`, or a set of `params`, says '
+                             'which streams there are')
     if not isinstance(rule, Mapping) or len(rule) != 1 or not set(rule) <= set(kinds):
         raise ValueError(f'{what} = {shown(rule)}: must be one of {", ".join(kinds)} with a list')
     (kind, given), = rule.items()
-    items, parameter = _list(given, f'{what}: {kind}'), parameters.BY_NAME.get(str(name))
+    items = _list(given, f'{what}: {kind}')
+    parameter = parameters.BY_NAME.get(str(name))
     if kind == VALUES:
         check = parameter.check if parameter else partial(_parameter_set, what=what, folder=folder)
         if not items:

@@ -24,14 +24,14 @@ from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Samples, period_ns
 from spinning_top_sim.tools import cli, models, scene_file
-from spinning_top_sim.tools.table import UNITS, Table, write_csv, write_parquet
+from spinning_top_sim.tools.table import UNITS, TrueStates, write_csv, write_parquet
 
 COLUMNS = {**UNITS, **{f'{name}_{axis}': unit for name, unit in (
     ('gyroscope', 'rad/s'), ('accelerometer', 'm/s^2'), ('pivot_acceleration', 'm/s^2'))
     for axis in 'xyz'}}
 # The IMU where a scene has one at the pivot: off the axis and turned, so that its readings show
 # every term of a simulator's formulas.
-PLACE = {'imu.lever_arm': (0.03, -0.02, 0.05), 'imu.rpy': (0.3, -0.2, 1.1)}
+MOUNTING = {'imu.lever_arm': (0.03, -0.02, 0.05), 'imu.rpy': (0.3, -0.2, 1.1)}
 SUFFIXES = {'mjcf': 'mjcf.xml', 'urdf': 'urdf', 'sdf': 'sdf'}
 
 SCHEMA = """# Reference trajectories of the heavy symmetric top
@@ -118,7 +118,7 @@ def _run(arguments: argparse.Namespace) -> int:
         for stem, path in parameter_files('scene').items()}
     cli.check_output(arguments.reference)
     _write_reference(arguments.reference, {
-        name: parameters.checked({**PLACE, **values, 'solver.method': 'exact'})
+        name: parameters.checked({**MOUNTING, **values, 'solver.method': 'exact'})
         for name, values in scenes.items()}, arguments.duration, arguments.rate)
     return cli.OK
 
@@ -129,7 +129,7 @@ def _write_reference(folder: Path, scenes: Mapping[str, Mapping[str, Any]], dura
     folder.mkdir(parents=True)
     facts = {}
     for name, values in scenes.items():
-        table = Table(period_ns(rate), COLUMNS, partial(_imu_and_pivot, Imu(values)))
+        table = TrueStates(period_ns(rate), COLUMNS, partial(_imu_and_pivot, Imu(values)))
         rows = [rows for block in Simulation(values).play([table], round(duration * NANOSECONDS))
                 for _, _, rows in block.messages]
         write_parquet(folder / f'{name}.parquet', rows, COLUMNS)

@@ -22,10 +22,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from spinning_top_sim.installation import needed
+from spinning_top_sim.recording.damage import count
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.scan import count, seconds
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.tools import cli, log_exports
 from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import MotionReport, Survey, survey
@@ -99,8 +99,9 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
     if found.shown is None:
         raise LogError('nothing to draw: no attitude of a top in this log')
     with needed('a picture', 'plot'):
-        from spinning_top_sim.tools import plots  # noqa: PLC0415
-    for path, draw in ((arguments.plot, plots.draw_page), (arguments.animate, plots.animate)):
+        from spinning_top_sim.tools import log_pictures  # noqa: PLC0415
+    for path, draw in ((arguments.plot, log_pictures.draw_page),
+                       (arguments.animate, log_pictures.animate)):
         if path is not None:
             try:
                 draw(found.path.name, *found.shown, path)
@@ -167,7 +168,7 @@ def _as_text(found: Survey, verdict: Comparison | None) -> Iterator[str]:
     for number, motion in enumerate(found.motions, start=1):
         yield from _motion(number, motion, damage.start_ns)
     if found.errors or found.drifts:
-        yield from cli.table(
+        yield from cli.table_lines(
             'largest relative drifts in a motion, orientation error against the exact solution '
             '[rad]', ('from', 'E', 'L3', 'Lz', 'error'),
             [(topic, *(_number(found.drifts.get(topic, {}).get(name), 2)
@@ -189,12 +190,12 @@ def _journal(run: RunDescription) -> str:
 
 def _topics(found: Survey) -> Iterator[str]:
     head = 'topic', 'type', 'messages', 'rate [Hz]', 'grid [Hz]', 'missing'
-    yield from cli.table('topics', head, [
+    yield from cli.table_lines('topics', head, [
         (name, topic.type, str(topic.count), _number(topic.rate), _number(topic.grid_rate),
          _number(topic.missing, 15)) for name, topic in found.topics.items()])
     for name, topic in found.topics.items():
         for begin, end in topic.gaps_ns:
-            yield f'gap: {name} from {seconds(begin)} to {seconds(end)}'
+            yield f'gap: {name} from {stamp_text(begin)} s to {stamp_text(end)} s'
 
 
 def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
@@ -209,7 +210,7 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
         expected, seen = (None if value is None else value * factor for value in (
             getattr(exact, key, None), getattr(measured, key, None)))
         rows.append((text, _number(expected, 12), _number(seen, 12), _difference(expected, seen)))
-    yield from cli.table(title, ('', 'exact', 'measured', 'difference'), rows)
+    yield from cli.table_lines(title, ('', 'exact', 'measured', 'difference'), rows)
     if measured is not None:
         yield f'measured from {motion.source}: {count(measured.nutations, "whole nutation")}'
         yield from (f'not measured: {reason}' for reason in measured.missing)
@@ -237,7 +238,7 @@ def _verdict(verdict: Comparison) -> Iterator[str]:
     first = verdict.first
     if first is not None:
         place = '' if first.byte is None else f', byte {first.byte}'
-        yield (f'verify: first: {first.topic} at {seconds(first.stamp_ns)}{place}, '
+        yield (f'verify: first: {first.topic} at {stamp_text(first.stamp_ns)} s{place}, '
                f'{first.field}: in the log {first.logged}, computed {first.computed}')
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.streams.cdr import stamp_text
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.recorded_run import RunDescription
@@ -63,8 +64,8 @@ def check(exports: Sequence[tuple[str, Path]], topics: Collection[str],
         for topic in KINDS[kind][0]:
             if topic not in topics:
                 raise ValueError(f'--export {kind}: the log has no {topic}')
-        for name in KALIBR_NEEDS if kind == 'kalibr' else ():
-            if not values[name] > 0.0:
+        for name in KALIBR_NEEDS:
+            if kind == 'kalibr' and not values[name] > 0.0:
                 raise ValueError(f'--export kalibr: {name} = {values[name]!r}: kalibr reads only '
                                   'what is > 0')
         cli.check_output(path)
@@ -85,8 +86,7 @@ def write(reader: LogReader, run: RunDescription,
 
 def _tum(reader: LogReader, run: RunDescription) -> Iterator[str]:
     for stamps_ns, (position, orientation, *_) in _blocks(reader, run, ODOMETRY):
-        stamps = (f'{stamp_ns // 10 ** 9}.{stamp_ns % 10 ** 9:09d}' for stamp_ns in stamps_ns)
-        yield from _rows(' ', stamps, position, orientation)
+        yield from _rows(' ', map(stamp_text, stamps_ns), position, orientation)
 
 
 def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:

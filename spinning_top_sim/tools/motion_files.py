@@ -6,8 +6,6 @@ The fields of messages are columns like those of tables.  docs/grade_files.md li
 messages and the names of columns that are understood.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import math
@@ -30,7 +28,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 from spinning_top_sim.tools import recorded_run
-from spinning_top_sim.tools.attitudes import deserialized
+from spinning_top_sim.tools.foreign_messages import deserialized
 
 ATTITUDES, GYROSCOPE, RATES = 'attitudes', 'gyroscope', 'rates'
 ACCELERATIONS, MAGNETOMETER, ANGLES = 'accelerations', 'magnetometer', 'angles'
@@ -78,12 +76,14 @@ class Recorded:
         w, x, y, z; rates, in the body; gyroscope, accelerations and magnetometer of the IMU
     covariance : (3, 3) that the first message of an IMU tells, by name
     parameters : of the run, if the file tells them, as `parameters.checked` returns them
+    sources : table or columns of each part, by name
     notes : what was chosen or left out
     """
 
     parts: dict[str, tuple[Reals, Reals]] = field(default_factory=dict)
     covariance: dict[str, Reals] = field(default_factory=dict)
     parameters: Mapping[str, Any] | None = None
+    sources: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def add(self, tables: Mapping[str, Table], origin: Decimal | None = None) -> None:
@@ -100,8 +100,9 @@ class Recorded:
                 at, first = np.unique(times[known], return_index=True)
                 if len(at) and kind not in self.parts:
                     self.parts[kind] = at, values[known][first]
-                    self.notes.append(f'{kind} of {name or ", ".join(names)}: {len(at)} from '
-                                      f'{at[0]:.6g} to {at[-1]:.6g} s')
+                    source = self.sources[kind] = name or ', '.join(names)
+                    self.notes.append(f'{kind} of {source}: {len(at)} from {at[0]:.6g} to '
+                                      f'{at[-1]:.6g} s')
 
 
 def read(path: Path, topic: str | None = None) -> Recorded:
@@ -198,10 +199,10 @@ def _kind(words: Sequence[str]) -> tuple[str, str]:
     said, component = {*words[:-1]}, COMPONENTS.get(words[-1], '') if words else ''
     if said & OTHERS:
         return '', ''
-    for angle in [ANGLE_WORDS[word] for word in words if word in ANGLE_WORDS]:
-        return ('', '') if {'dot', 'rate', 'velocity'} & {*words} else (ANGLES, angle)
-    for kind, names in WORDS.items() if component else ():
-        if said & names and not (kind == ACCELERATIONS and 'angular' in said):
+    if angles := [ANGLE_WORDS[word] for word in words if word in ANGLE_WORDS]:
+        return ('', '') if {'dot', 'rate', 'velocity'} & {*words} else (ANGLES, angles[0])
+    for kind, names in WORDS.items():
+        if component and said & names and not (kind == ACCELERATIONS and 'angular' in said):
             return (GYROSCOPE if kind == RATES and 'imu' in said else kind), component
     return '', ''
 
@@ -258,8 +259,9 @@ def _seconds(stamps: Mapping[str, Sequence[Any]]) -> NDArray[np.object_]:
     """Return stamps (n,), decimals [s], of columns by their unit."""
     unit = next(iter(stamps))
     times = np.array([_decimal(cell) for cell in stamps[unit]], object)
-    for fine in stamps.keys() & {'nanosec', 'nsec'} if unit in ('sec', 'secs') else ():
-        times += [_decimal(part) * Decimal('1e-9') for part in stamps[fine]]
+    if unit in ('sec', 'secs'):
+        for fine in stamps.keys() & {'nanosec', 'nsec'}:
+            times += [_decimal(part) * Decimal('1e-9') for part in stamps[fine]]
     scale = Decimal(SECONDS.get(unit, '1'))
     first = min((one for one in times if one.is_finite()), default=Decimal(0))
     if scale == 1 and first > 10 ** 11:         # a date in ms, us or ns: in s it has ten digits
@@ -289,7 +291,7 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
     recorded.add({' '.join(filter(None, one)): tables[one] for one in chosen}, origin)
     for topic, message in first.items():
         recorded.covariance.update((kind, matrix) for kind, matrix in _covariances(message)
-                                   if f'{kind} of {topic}: ' in ''.join(recorded.notes))
+                                   if recorded.sources.get(kind) == topic)
     return recorded
 
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from spinning_top_sim.physics.top import State
+from spinning_top_sim.recording.errors import MALFORMED, reason_of
+from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader, LogTopic
-from spinning_top_sim.recording.recorder import METADATA_NAME
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.blocks import Block
@@ -19,10 +20,7 @@ from spinning_top_sim.streams.simulation import Command, Drive, ImuRate, NewStat
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
-# What values raise that are not as this package writes them.
-MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 LAST_LOG_TIME_NS = 1 << 62  # the difference of any two log times fits into int64
-MOST_TEXT = 300             # of a reason
 # What is computed for a log at most: for a small one, and more for each of its bytes.
 LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
 LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
@@ -30,34 +28,7 @@ LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
 # differ in the count of numbers.
 APPLIED = {'command': Command._fields[1:], 'state': NewState._fields[1:],
            'parameters': ImuRate._fields[1:], 'drive': Drive._fields[1:]}
-# Numbers of the events that begin another motion at the present time.
-FIELDS_OF = {name: APPLIED[name] for name in ('command', 'state', 'drive')}
-# Names in the message definition of the arrays of numbers in a template, in their order, by topic
-# or by type.
-FIELDS = {
-    'geometry_msgs/msg/PoseStamped': ('pose.position', 'pose.orientation'),
-    'tf2_msgs/msg/TFMessage': ('transforms[0].transform.translation',
-                               'transforms[0].transform.rotation'),
-    'sensor_msgs/msg/JointState': ('position', 'velocity'),
-    'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
-    'sensor_msgs/msg/MagneticField': ('magnetic_field', 'magnetic_field_covariance'),
-    'sensor_msgs/msg/NavSatFix': ('position',),
-    'geometry_msgs/msg/TwistWithCovarianceStamped': ('twist.twist.linear',),
-    'nav_msgs/msg/Odometry': ('pose.pose.position', 'pose.pose.orientation',
-                              'twist.twist.linear', 'twist.twist.angular'),
-    'geometry_msgs/msg/QuaternionStamped': ('quaternion',),
-    'geometry_msgs/msg/Vector3Stamped': ('vector',),
-    'std_msgs/msg/Float64MultiArray': ('data',),
-    'visualization_msgs/msg/MarkerArray': (
-        'markers[0].pose.position', 'markers[0].pose.orientation',
-        'markers[1].pose.position', 'markers[1].pose.orientation', 'markers[2].points'),
-}
-
-
-def field_names(stream: Stream) -> Sequence[str]:
-    """Return the names of the fields of a stream's template, by FIELDS or else numbered."""
-    return FIELDS.get(stream.topic) or FIELDS.get(stream.type_name) or [
-        f'field{number}' for number in range(len(stream.template.counts))]
+NEW_MOTIONS = ('command', 'state', 'drive')     # events that begin another motion at once
 
 
 class ForeignLogError(Exception):
@@ -132,7 +103,7 @@ def _journal(reader: LogReader, topic: str | None, epoch_ns: int,
              ) -> tuple[list[Event], list[tuple[int, str]]]:
     """Return the events in a topic, and stamp [ns] and reason of each that cannot be one."""
     events, broken, reached_ns = [], [], epoch_ns - 1
-    for message in () if topic is None else reader.messages(topics=[topic]):
+    for message in reader.messages(topics=[] if topic is None else [topic]):
         try:
             event = _event(message.log_time, message.data)
             sent_ns = epoch_ns + event.sent_ns
@@ -156,21 +127,15 @@ def _applied_before(epoch_ns: int, t_ns: int, *numbers: float) -> Event:
     return Event(name, epoch_ns + t_ns, t_ns, t_ns, details)
 
 
-def reason_of(error: Exception) -> str:
-    """Return a line about an error."""
-    text = f'{type(error).__name__}: {error}'
-    return text if len(text) <= MOST_TEXT else f'{text[:MOST_TEXT]}...'
-
-
 def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, str]:
     every = all_streams(values)
     recorded = [*((stream.topic, stream.type_name)
-                  for stream in journal.recorded_streams(every, values)), *journal.TOPICS]
+                  for stream in journal.recorded_streams(every, values)), *journal.TOPICS.items()]
     # As the log was written they have this order, whatever they were remapped to.  In a log that
     # was put together anew they are known by the ends of their names.
     if [topic.type_name for topic in topics] == [type_name for _, type_name in recorded]:
         return {name: topic.name for topic, (name, _) in zip(topics, recorded, strict=True)}
-    known = [*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS]
+    known = [*((stream.topic, stream.type_name) for stream in every), *journal.TOPICS.items()]
     return {name: topic.name for topic in reversed(topics) for name, type_name in known
             if type_name == topic.type_name and topic.name.endswith('/' + name.lstrip('~/'))}
 
@@ -181,9 +146,9 @@ def _event(stamp_ns: int, data: bytes) -> Event:
     if journal.event(name, t_ns, sent_ns, **details) != data:
         raise ValueError('the bytes of the entry are not as it was written')
     operator.index(t_ns), operator.index(sent_ns)
-    if name in FIELDS_OF:
+    if name in NEW_MOTIONS:
         details = {key: (operator.index if key == 'stop_ns' else float)(details[key])
-                   for key in FIELDS_OF[name]}
+                   for key in APPLIED[name]}
     elif name == 'parameters':
         details = {key: parameters.BY_NAME[key].check(value) for key, value in details.items()}
     elif name == 'reset':
@@ -245,8 +210,8 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
 
     # The journal: samples up to each event that acts on them, and up to the end.
     for event in run.events:
-        if event.name in ('reset', *FIELDS_OF) or not at_once.isdisjoint(event.details):
-            yield from up_to(event.sent_ns, moves=event.name in FIELDS_OF)
+        if event.name in ('reset', *NEW_MOTIONS) or not at_once.isdisjoint(event.details):
+            yield from up_to(event.sent_ns, moves=event.name in NEW_MOTIONS)
             _apply(simulation, event)
             yield simulation, event
     yield from up_to(end_ns - simulation.epoch_ns)
@@ -254,11 +219,11 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
 
 def _apply(simulation: Simulation, event: Event) -> None:
     details = event.details
-    if event.name in FIELDS_OF:
+    if event.name in NEW_MOTIONS:
         if event.name == 'command':
             simulation.command(**details)
         elif event.name == 'drive':
-            *velocity, stop_ns = (details[key] for key in FIELDS_OF['drive'])
+            *velocity, stop_ns = (details[key] for key in APPLIED['drive'])
             simulation.drive(velocity, stop_ns)
         else:
             simulation.set_state(State(**details))

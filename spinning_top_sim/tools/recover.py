@@ -17,9 +17,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from spinning_top_sim.recording.damage import count
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recovery import recover
-from spinning_top_sim.recording.scan import count
 from spinning_top_sim.tools import cli
 
 SOME_LOST = 3
@@ -48,7 +48,8 @@ def _run(arguments: argparse.Namespace) -> int:
     damage = reader.damage
     for line in damage.lines():
         cli.print_line(line)
-    cli.print_line(f'kept{" all" * damage.lossless}: {count(recovered.messages, "message")} in '
+    kept = 'kept all' if damage.lossless else 'kept'
+    cli.print_line(f'{kept}: {count(recovered.messages, "message")} in '
                    f'{count(recovered.chunk_count, "chunk")}, {count(recovered.size, "byte")} in '
                    f'{output}')
     return cli.OK if damage.lossless else SOME_LOST

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spinning_top_sim.recording.provenance import provenance
+from spinning_top_sim.recording.provenance import run_metadata
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
@@ -28,7 +28,7 @@ from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream, period_ns
 from spinning_top_sim.tools import cli, log_exports, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
-from spinning_top_sim.tools.table import RIDE_UNITS, Table, write_csv, write_parquet
+from spinning_top_sim.tools.table import RIDE_UNITS, UNITS, TrueStates, write_csv, write_parquet
 
 FORMATS = ('mcap', 'csv', 'parquet')
 
@@ -100,10 +100,9 @@ def _run(arguments: argparse.Namespace) -> int:
 def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
                  show: Callable[[float], object]) -> Mapping[str, str]:
     """Write a table; return the units of its columns."""
-    table = Table(period_ns(simulation.values['pose.rate']))
-    if simulation.pivot_path:
-        table = Table(table.period_ns, RIDE_UNITS, lambda samples: (
-            *samples.pivot.position, *samples.pivot.velocity))
+    every_ns = period_ns(simulation.values['pose.rate'])
+    table = TrueStates(every_ns, UNITS) if simulation.pivot_path is None else TrueStates(
+        every_ns, RIDE_UNITS, lambda samples: (*samples.pivot.position, *samples.pivot.velocity))
     write = write_csv if file_format == 'csv' else write_parquet
     # A command changes the rows after its time.
     write(path, (rows for done in _play(simulation, [table], stops, show)
@@ -141,11 +140,7 @@ def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
 
 def _play(simulation: Simulation, streams: Sequence[Stream], stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[Block | tuple[float, float]]:
-    """
-    Yield the blocks up to each stop, then L3 and Lz of its command, which has been applied.
-
-    Raises IntegrationError where the state cannot take a command.
-    """
+    """Yield the blocks up to each stop, then its command, applied.  Raises IntegrationError."""
     for stop_ns, momenta in stops:
         for block in simulation.play(streams, stop_ns):
             yield block
@@ -162,36 +157,30 @@ def _play(simulation: Simulation, streams: Sequence[Stream], stops: Sequence[Sto
 
 def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
               show: Callable[[float], object], namespace: str) -> str:
-    """
-    Simulate a run into a new log; return the number of messages and the size of the file.
-
-    After an error the log is closed and readable, and holds what was computed before.
-    """
+    """Simulate a run into a new log, whole also after an error; return a text on its size."""
     values, epoch_ns = simulation.values, simulation.epoch_ns
     streams = journal.recorded_streams(simulation.streams, values)
-    commands_topic, events_topic = len(streams), len(streams) + 1
-    types = {stream.topic: stream.type_name for stream in streams} | dict(journal.TOPICS)
+    types = {stream.topic: stream.type_name for stream in streams} | journal.TOPICS
+    topics = list(types)
     file = create_file(
         path, [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
                for name, type_name in types.items()],
-        provenance(values, epoch_ns, -1, (), values), compression=values['record.compression'])
+        run_metadata(values, epoch_ns, -1, (), values), compression=values['record.compression'])
     try:
-        file.append(events_topic, epoch_ns, journal.event('start', 0, -1))
+        file.append(topics.index(journal.EVENTS), epoch_ns, journal.event('start', 0, -1))
         for done in _play(simulation, streams, stops, show):
             if isinstance(done, Block):
                 file.append_rows([(streams.index(stream), epoch_ns + t_ns, rows)
                                   for stream, t_ns, rows in done.messages])
             else:
-                t_ns, (l3, lz) = simulation.now_ns, done
-                file.append(events_topic, epoch_ns + t_ns, journal.event(
-                    'command', t_ns, t_ns, l3=l3, lz=lz))
-                file.append(commands_topic, epoch_ns + t_ns, journal.command(l3, lz))
+                for topic, data in journal.command_entries(simulation.now_ns, *done):
+                    file.append(topics.index(topic), epoch_ns + simulation.now_ns, data)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(f'{path} holds the run up to t = '
                                 f'{simulation.now_ns / NANOSECONDS:g} s') from interrupt
     finally:
         try:
-            file.write_chunk()
+            file.flush()
         finally:
             file.finish()
     return f'{file.messages} messages, {file.size / 1e6:.1f} MB'

@@ -20,21 +20,17 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
+from spinning_top_sim.recording.damage import Damage
+from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import LogMessage, LogReader
-from spinning_top_sim.recording.scan import Damage, seconds
 from spinning_top_sim.streams.blocks import Block
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured
-from spinning_top_sim.tools.recorded_run import (
-    LAST_LOG_TIME_NS,
-    MALFORMED,
-    RunDescription,
-    reason_of,
-)
+from spinning_top_sim.tools.recorded_run import LAST_LOG_TIME_NS, RunDescription
 
 MOST_GAPS = 10              # that are listed
 MOST_EXACT = 1000           # motions that are compared with the exact one: 10 ms each
@@ -126,7 +122,7 @@ def survey(reader: LogReader) -> Survey:
     except recorded_run.ForeignLogError as error:
         found.foreign_reason = str(error)
     else:
-        found.notes += [f'journal, entry at {seconds(stamp_ns)}: {reason}'
+        found.notes += [f'journal, entry at {stamp_text(stamp_ns)} s: {reason}'
                         for stamp_ns, reason in run.broken]
         for name, topic in run.topics.items():
             found.topics[topic].stream = name
@@ -234,26 +230,32 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
         duration_ns = int(stamps_ns[-1] - stamps_ns[0])
         report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
     for section in sections:
-        stream, epoch_ns = section.streams[topic], section.epoch_ns
-        period_ns, late_ns = stream.period_ns, stream.late_ns
         end = int(np.searchsorted(stamps_ns, section.end_ns, 'right'))
-        here, stamps_ns = stamps_ns[:end] - epoch_ns, stamps_ns[end:]
-        bounds_ns = max(section.begin_ns - epoch_ns, -1), section.end_ns - epoch_ns
-        due = stream.times(*bounds_ns)
-        silences = [(begin + late_ns, end + late_ns) for begin, end in stream.silences_ns]
-        silent = sum(len(stream.times(max(bounds_ns[0], begin - 1), min(bounds_ns[1], end - 1)))
-                     for begin, end in silences)
-        report.grid_rate = NANOSECONDS / period_ns
-        # A sample that is there twice does not replace a missing one.
-        present = np.unique(here[(here - late_ns) % period_ns == 0])
-        report.missing = (report.missing or 0) + len(due) - silent - len(present)
-        edges_ns = np.array([due.start - period_ns, *here, due.start + len(due) * period_ns])
-        for place in np.flatnonzero(np.diff(edges_ns) > period_ns):
-            begin_ns, end_ns = int(edges_ns[place]) + period_ns, int(edges_ns[place + 1])
-            if len(report.gaps_ns) < MOST_GAPS and not any(
-                    begin <= begin_ns and end_ns - period_ns < end
-                    for begin, end in silences):
-                report.gaps_ns.append((epoch_ns + begin_ns, epoch_ns + end_ns - period_ns))
+        _count_section(report, section, section.streams[topic], stamps_ns[:end])
+        stamps_ns = stamps_ns[end:]
+
+
+def _count_section(report: TopicReport, section: Section, stream: Stream,
+                   stamps_ns: Stamps) -> None:
+    """Add the samples and the gaps of a section; its times count from t = 0."""
+    period_ns, late_ns = stream.period_ns, stream.late_ns
+    times_ns = stamps_ns - section.epoch_ns
+    begin_ns = max(section.begin_ns - section.epoch_ns, -1)
+    end_ns = section.end_ns - section.epoch_ns
+    due = stream.times(begin_ns, end_ns)
+    expected_gaps = [(begin + late_ns, end + late_ns) for begin, end in stream.silences_ns]
+    silent = sum(len(stream.times(max(begin_ns, begin - 1), min(end_ns, end - 1)))
+                 for begin, end in expected_gaps)
+    report.grid_rate = NANOSECONDS / period_ns
+    # A sample that is there twice does not replace a missing one.
+    present = np.unique(times_ns[(times_ns - late_ns) % period_ns == 0])
+    report.missing = (report.missing or 0) + len(due) - silent - len(present)
+    edges_ns = np.array([due.start - period_ns, *times_ns, due.start + len(due) * period_ns])
+    for place in np.flatnonzero(np.diff(edges_ns) > period_ns):
+        first_ns, last_ns = int(edges_ns[place]) + period_ns, int(edges_ns[place + 1]) - period_ns
+        if len(report.gaps_ns) < MOST_GAPS and not any(
+                begin <= first_ns and last_ns < end for begin, end in expected_gaps):
+            report.gaps_ns.append((section.epoch_ns + first_ns, section.epoch_ns + last_ns))
 
 
 def _measure(found: Survey, motion: MotionReport) -> None:

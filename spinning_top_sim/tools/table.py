@@ -20,14 +20,14 @@ UNITS = {
 RIDE_UNITS = {**UNITS, 'x': 'm', 'y': 'm', 'z': 'm', 'vx': 'm/s', 'vy': 'm/s', 'vz': 'm/s'}
 
 
-class Table(Stream):
+class TrueStates(Stream):
     """
     The true states as rows of numbers: a stream whose messages are the rows of a table.
 
     units : names and units of its columns: UNITS, and those that `added` returns for samples
     """
 
-    def __init__(self, period_ns: int, units: Mapping[str, str] = UNITS,
+    def __init__(self, period_ns: int, units: Mapping[str, str],
                  added: Callable[[Samples], Sequence[NDArray[np.float64]]] = lambda _: (),
                  ) -> None:
         self.period_ns, self.units, self._added = period_ns, units, added
@@ -49,7 +49,7 @@ class Table(Stream):
 
 
 def write_csv(path: Path, blocks: Iterable[NDArray[np.float64]],
-              units: Mapping[str, str] = UNITS) -> None:
+              units: Mapping[str, str]) -> None:
     """Write rows with a head of names and units.  An existing file raises FileExistsError."""
     with open(path, 'x', encoding='utf-8') as file:
         file.write(','.join(f'{name} [{unit}]' for name, unit in units.items()) + '\n')
@@ -59,7 +59,7 @@ def write_csv(path: Path, blocks: Iterable[NDArray[np.float64]],
 
 
 def write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]],
-                  units: Mapping[str, str] = UNITS) -> None:
+                  units: Mapping[str, str]) -> None:
     """Write a Parquet file.  Raises ImportError, and makes no file, without pyarrow."""
     with needed('a Parquet file', 'parquet'):
         import pyarrow as pa  # noqa: PLC0415

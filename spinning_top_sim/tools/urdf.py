@@ -40,12 +40,11 @@ def robot_description(values: Mapping[str, Any], folder: str | Path) -> str:
     return '<?xml version="1.0"?>\n' + document.documentElement.toprettyxml(indent='  ')
 
 
-def inertia_warning(values: Mapping[str, Any]) -> str:
-    """Return why the robot description has no inertia, '' if it has one."""
+def inertia_fault(values: Mapping[str, Any]) -> str:
+    """Return why no rigid body has the inertia of a top, '' if one has."""
     top = parameters.top_of(values)
     if top.mass > 0.0 and top.lambda1_at_com > 0.0 and top.is_realizable:
         return ''
     return (f'top.mass = {top.mass!r} kg, top.com_distance = {top.com_distance!r} m, '
             f'top.lambda1 = {top.lambda1!r} and top.lambda3 = {top.lambda3!r} kg m^2: '
-            'no rigid body has these (mass > 0, lambda3 <= 2 (lambda1 - M R^2)), so the '
-            'body is without <inertial>; frames and shapes are there')
+            'no rigid body has these (mass > 0, lambda3 <= 2 (lambda1 - M R^2))')

@@ -10,17 +10,13 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from spinning_top_sim.recording import provenance
+from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal
 from spinning_top_sim.streams.blocks import Block
+from spinning_top_sim.streams.messages import FIELDS
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.tools.recorded_run import (
-    MALFORMED,
-    RunDescription,
-    field_names,
-    reason_of,
-    rerun,
-)
+from spinning_top_sim.tools.recorded_run import RunDescription, rerun
 
 # Streams and messages by stamp and topic: several commands may have the same.
 _Computed = defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]]
@@ -67,7 +63,9 @@ def compare(run: RunDescription, reader: LogReader, end_ns: int,
     show : takes the log time that is reached [ns]
     """
     topics = (*run.topics.values(), run.commands_topic)
-    verdict = Comparison(dict.fromkeys(filter(None, topics), 0), warnings=_warnings(run))
+    verdict = Comparison(dict.fromkeys(filter(None, topics), 0), warnings=[
+        f'{what} was {run.environment[what]}, is {here}'
+        for what, here in provenance.environment().items() if run.environment[what] != here])
     for stamp_ns, reason in run.broken:
         verdict.different += 1
         verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
@@ -138,12 +136,7 @@ def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
     if number < 0:
         what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
     else:
-        what = f'{field_names(stream)[number]}[{element}]'
+        what = f'{FIELDS[stream.type_name][number]}[{element}]'
         code, text = '<d', '{!r}'
     one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))
     return Difference(*key, what, one, two, at)
-
-
-def _warnings(run: RunDescription) -> list[str]:
-    return [f'{what} was {run.environment[what]}, is {here}'
-            for what, here in provenance.environment().items() if run.environment[what] != here]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.nodes.executable import RunnableNode, run, without_ros_arguments
+from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
 from spinning_top_sim.tools import cli, scene_file
 
 if TYPE_CHECKING:
@@ -41,23 +41,23 @@ LAST_PORT = 65535
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    words = without_ros_arguments(argv)
+    words, for_ros = split_ros_arguments(argv)
     parser = cli.Parser('view', DESCRIPTION)
     add_arguments(parser)
     arguments = parser.parse_args(words)
     if arguments.log:
         return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs)
     with contextlib.ExitStack() as stack:
-        return run('view', argv, partial(_prepare, stack, arguments))
+        return run_node('view', argv, partial(_prepare, stack, arguments, for_ros))
 
 
 @contextlib.contextmanager
-def _node(files: Iterable[Path], ros_arguments: Sequence[str]) -> Iterator[None]:
+def _node(files: Iterable[Path], for_ros: Sequence[str]) -> Iterator[None]:
     """Run a node with these parameter files while the page is shown."""
     node = subprocess.Popen([
         sys.executable, '-m', 'spinning_top_sim', 'node', '--ros-args',
-        *(word for path in files for word in ('--params-file', str(path))), '--',
-        *(ros_arguments or ['--ros-args']), '-p', 'status_period:=0.0'])
+        *(word for path in files for word in ('--params-file', str(path))),
+        *for_ros, '-p', 'status_period:=0.0'])
     try:
         yield
     finally:
@@ -104,11 +104,7 @@ def _show_logs(arguments: argparse.Namespace) -> int:
 
 
 def _open_page(arguments: argparse.Namespace, title: str) -> Page:
-    """
-    Return the page; print its address, and open it in the browser if there is a desktop.
-
-    Raises ValueError for a wrong port, and OSError if the server cannot start.
-    """
+    """Return the page, in the browser if there is a desktop.  Raises ValueError or OSError."""
     if arguments.port is not None and not 0 <= arguments.port <= LAST_PORT:
         raise ValueError(f'--port {arguments.port}: must be from 0 to {LAST_PORT}')
     with needed('the page', 'view'):
@@ -126,8 +122,8 @@ def _open_page(arguments: argparse.Namespace, title: str) -> Page:
     return page
 
 
-def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, argv: list[str],
-             ) -> tuple[list[str], Callable[[], RunnableNode]]:
+def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, for_ros: Sequence[str],
+             argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
     """Return what opens the page; a node of a scene or IMU runs until `stack` is closed."""
     if arguments.html is not None:
         raise ValueError(f'--html {arguments.html}: must have a log')
@@ -137,6 +133,6 @@ def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, argv: l
     def make_node() -> RunnableNode:
         view = LiveView(_open_page(arguments, 'spinning_top'))
         if files:
-            stack.enter_context(_node(files, argv[len(without_ros_arguments(argv)):]))
+            stack.enter_context(_node(files, for_ros))
         return view
     return argv, make_node

@@ -10,8 +10,10 @@ from typing import Any
 import viser
 
 from spinning_top_sim.installation import parameter_files
+from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
-from spinning_top_sim.view.page import Page, set_value
+from spinning_top_sim.view.page import Page, set_content, set_value
+from spinning_top_sim.view.sim_node import SimNode
 
 STEPS = 1000                    # of a slider
 # Velocity x, y of the pivot [m/s] that a button asks for, until `pivot.cmd_timeout` ends it.
@@ -21,14 +23,10 @@ LEFT_ALONE_S = 1.0              # after that a slider follows the node again
 
 
 class Controls:
-    """
-    The controls.  Their callbacks run in threads of viser; only one at a time acts.
+    """The controls.  Their callbacks run in threads of viser; only one at a time acts."""
 
-    node : the `LiveView`, whose requests return the message to show, or raise with the reason
-    """
-
-    def __init__(self, page: Page, node: Any) -> None:
-        self._page, self._node = page, node
+    def __init__(self, page: Page, sim_node: SimNode) -> None:
+        self._page, self._sim_node = page, sim_node
         self._lock = threading.Lock()
         self._paused = False
         self._spin = [0.0, 0.0]                     # L3 and Lz of the node
@@ -49,13 +47,15 @@ class Controls:
             pad = gui.add_button_group('pivot', tuple(PAD), hint=(
                 'push the pivot: 0.5 m/s along an axis of the world; it brakes soon'))
         for slider in self._sliders:
-            slider.on_update(self._on_slider)
+            slider.on_update(self._by_user(self._send))
         self._pause.on_click(lambda _: self._act(self._switch_pause))
-        step.on_click(lambda _: self._act(lambda: node.call('step')))
-        reset.on_click(lambda _: self._act(lambda: node.call('reset')))
-        pad.on_click(lambda _: self._act(lambda: node.drive(*PAD[pad.value])))
-        self._record.on_update(self._on_record)
-        self._scene.on_update(self._on_scene)
+        step.on_click(lambda _: self._act(lambda: sim_node.call('step')))
+        reset.on_click(lambda _: self._act(lambda: sim_node.call('reset')))
+        pad.on_click(lambda _: self._act(lambda: sim_node.drive(*PAD[pad.value])))
+        self._record.on_update(self._by_user(
+            lambda: sim_node.call('record', self._record.value)))
+        self._scene.on_update(self._by_user(
+            lambda: sim_node.choose(self._scene.value) if self._scene.value else ''))
 
     def _act(self, action: Callable[[], str]) -> None:
         with self._lock:
@@ -64,27 +64,19 @@ class Controls:
             except Exception as error:
                 self._page.message.content = f'**refused:** {error}'
 
-    def _on_record(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:        # somebody in a browser
-            self._act(lambda: self._node.call('record', self._record.value))
-
-    def _on_scene(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None and self._scene.value:
-            self._act(lambda: self._node.choose(self._scene.value))
-
-    def _on_slider(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:
-            self._moved_at = time.monotonic()
-            self._act(self._send)
+    def _by_user(self, action: Callable[[], str]) -> Callable[[viser.GuiEvent[Any]], None]:
+        """Return a callback that acts if somebody in a browser has changed an input."""
+        return lambda event: None if event.client is None else self._act(action)
 
     def _send(self) -> str:
+        self._moved_at = time.monotonic()
         values = [slider.value for slider in self._sliders]
         l3, lz = (value if abs(value - shown) > 0.5 * self._sliders[0].step else present
                   for value, shown, present in zip(values, self._shown, self._spin, strict=True))
         if [l3, lz] == self._spin:      # they are sent: a slider may move while a request waits
             return self._page.message.content
         try:
-            said = self._node.command(l3, lz)
+            said = self._sim_node.command(l3, lz)
         except Exception:
             self._leave_sliders()           # show the spin of the node again
             self.show_spin(*self._spin)
@@ -93,7 +85,7 @@ class Controls:
         return said
 
     def _switch_pause(self) -> str:
-        said = self._node.call('set_pause', not self._paused)
+        said = self._sim_node.call('set_pause', not self._paused)
         self._show_paused(not self._paused)
         return said
 
@@ -103,7 +95,7 @@ class Controls:
 
     def set_range(self, top: Top, l3: float, lz: float) -> None:
         """Set the range of the sliders to twice the greater of the present and the usual spin."""
-        usual = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))      # least spin to sleep
+        usual = 2.0 * natural_momentum(top)         # the least spin to sleep
         reach = 2.0 * (max(abs(l3), abs(lz), usual) or 1.0)
         digits = 1 - math.floor(math.log10(reach))
         reach = math.ceil(reach * 10.0 ** digits) / 10.0 ** digits
@@ -142,6 +134,4 @@ class Controls:
 
     def tell_end(self, reason: str) -> None:
         """Show why no samples come, until the next `tell_status`."""
-        text = f'**{reason}**'
-        if self._status.content != text:
-            self._status.content = text
+        set_content(self._status, f'**{reason}**')

@@ -6,55 +6,34 @@ import threading
 import time
 import traceback
 from collections import defaultdict, deque
-from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, Twist, Vector3
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
-from rclpy.client import Client
 from rclpy.node import Node
-from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
-from std_srvs.srv import SetBool, Trigger
 
-from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.nodes.publishers import THROTTLED
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.journal import NODE_NAME
-from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import shapes
 from spinning_top_sim.view.controls import Controls
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
-from spinning_top_sim.view.track import (
-    ENERGY_DRIFT,
-    ORIENTATION_ERROR,
-    WIDTHS,
-    Series,
-    Track,
-    empty,
-)
+from spinning_top_sim.view.sim_node import ANSWER_S, RequestError, SimNode
+from spinning_top_sim.view.track import Track, empty
 
 # Best effort and a short queue, so that a slow page never makes the node wait.
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INBOX = 2000                    # messages that wait for the next picture
-ANSWER_S = 5.0                  # timeout of a service call
 SILENT_S = 5.0                  # timeout of /diagnostics, which come every second
 RESTART_NS = NANOSECONDS        # a step back of the stamps by more is another run
 KEPT_NS = 2 * max(WINDOW_NS, shapes.TRACE_NS)
 KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom': Odometry,
            'ground_truth/imu': Imu}
-
-
-class RequestError(Exception):
-    """The sim_node refuses or does not answer; the text is the reason."""
 
 
 class LiveView(Node):
@@ -72,23 +51,16 @@ class LiveView(Node):
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
         self._arrived = threading.Event()       # something is in the inbox
         self._listeners: dict[str, Subscription] = {}
-        self._sim = self.resolve_topic_name(NODE_NAME)
+        self._sim_node = SimNode(self)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, QOS)
-        self._velocity = self.create_publisher(Twist, f'{NODE_NAME}/cmd_vel', 10)
         self.create_timer(0.2, self._listen_as_needed)
-        self._services_of_sim = {
-            name: self.create_client(kind, f'{NODE_NAME}/{name}') for name, kind in (
-                ('get_parameters', GetParameters),
-                ('set_parameters_atomically', SetParametersAtomically), ('set_pause', SetBool),
-                ('record', SetBool), ('step', Trigger), ('reset', Trigger))}
         self._track: Track | None = None
-        self._stale = True              # the parameters have to be read, as after a reset
         self._epoch_ns: int | None = None      # stamp of t = 0; unknown before /diagnostics
         self._errors: tuple[float, float] | None = None         # from /diagnostics, not drawn yet
         self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
         self._gone = False              # whether the page says that the node has ended
         self._stopped = False
-        self._controls = Controls(page, self)
+        self._controls = Controls(page, self._sim_node)
         self._thread = threading.Thread(target=self._draw, name='page', daemon=True)
 
     def start(self) -> None:
@@ -113,7 +85,7 @@ class LiveView(Node):
         needed = {'pose', 'joint_states'}
         if self.count_publishers(THROTTLED['ground_truth/odom']):     # both in one
             needed = {'ground_truth/odom'}
-        if self._page.arrows[shapes.ARROWS.index('specific force')].value:
+        if self._page.arrows['specific force'].value:
             needed |= {'ground_truth/imu'}
         for topic in needed - self._listeners.keys():
             self._listen(topic)
@@ -122,13 +94,14 @@ class LiveView(Node):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name == self._sim.lstrip('/'):
+            if status.name == self._sim_node.name.lstrip('/'):
                 self._heard_at = time.monotonic()
                 numbers = {pair.key: pair.value for pair in status.values}
                 self._controls.tell_status(status.message, numbers)
                 epoch_ns = int(numbers['stamp of t = 0 [ns]'])
                 if self._epoch_ns not in (None, epoch_ns):
-                    self._stale = True      # not `|=`: that could undo what `choose` writes
+                    # Not `|=`: that could undo what `choose` writes.
+                    self._sim_node.is_stale = True
                 self._epoch_ns = epoch_ns
                 self._errors = float(numbers['energy drift']), float(
                     numbers['orientation error [rad]'])
@@ -150,23 +123,21 @@ class LiveView(Node):
             self._arrived.wait(1.0 / RATE)
 
     def _draw_once(self) -> None:
-        ready = self._services_of_sim['get_parameters'].service_is_ready()
-        if self._stale and ready:
+        ready = self._sim_node.is_there
+        if self._sim_node.is_stale and ready:
             self._read_parameters()
         if self._track is None:
             return
         self._gone = not ready or time.monotonic() > self._heard_at + SILENT_S
         if self._gone:
-            self._controls.tell_end(f'{self._sim} has ended, or does not answer')
+            self._controls.tell_end(f'{self._sim_node.name} has ended, or does not answer')
         self._take_messages()
         track = self._track
         if not len(track.attitudes.rows):
             return
         newest_ns = track.span[1]
         if self._errors is not None:
-            row = np.full((1, WIDTHS['~/invariants']), math.nan)
-            row[0, [ENERGY_DRIFT, ORIENTATION_ERROR]] = self._errors
-            track.add('~/invariants', Series(np.array([newest_ns]), row))
+            track.add_errors(newest_ns, *self._errors)
             self._errors = None
         track.drop_before(max(newest_ns - KEPT_NS, min(self._epoch_ns or 0, newest_ns)))
         track.detect_motion()
@@ -193,74 +164,15 @@ class LiveView(Node):
 
     def _read_parameters(self) -> None:
         """Read the parameters of the sim_node, and draw its top."""
-        self._stale = False
-        names = [name for name in parameters.BY_NAME if name not in SPIN]
         try:
-            answer = self._ask('get_parameters', GetParameters.Request(names=[*names, *SPIN]))
+            values = self._sim_node.values()
         except RequestError:
-            self._stale = True
             return
-        shown = list(map(parameter_value_to_python, answer.values))
-        # The present spin is not checked: it need not be possible at the start.
-        values = {**parameters.checked(dict(zip(names, shown, strict=False))),
-                  **dict(zip(SPIN, shown[-len(SPIN):], strict=True))}
         track = Track('', values)
         if self._track is not None:
-            if all(values[name] == self._track.values[name] for name in names):
+            if all(values[name] == self._track.values[name] for name in values.keys() - SPIN):
                 return
             track.samples = self._track.samples
         self._track = track
         self._page.set_tracks([track])
         self._controls.set_range(track.top, *(values[name] for name in SPIN))
-
-    # Called by the page's controls, in threads of their own.
-
-    def _ask(self, name: str, request: object) -> Any:
-        """Return the answer of a service.  Raises RequestError if there is none."""
-        client: Client = self._services_of_sim[name]
-        if not client.service_is_ready():
-            raise RequestError(f'there is no {self._sim}')
-        answer = client.call(request, ANSWER_S)
-        if answer is None:
-            raise RequestError(f'{self._sim}/{name} has not answered')
-        return answer
-
-    def call(self, name: str, *on: bool) -> str:
-        """Call a service of the sim_node; return its message.  Raises RequestError."""
-        request = SetBool.Request(data=on[0]) if on else Trigger.Request()
-        answer = self._ask(name, request)
-        if not answer.success:
-            raise RequestError(answer.message)
-        return f'{name.removeprefix("set_")}: {answer.message}'
-
-    def command(self, l3: float, lz: float) -> str:
-        """Set L3 and Lz [kg m^2/s]; return them.  Raises RequestError."""
-        self._set(dict(zip(SPIN, (l3, lz), strict=True)))
-        return f'spin.l3 = {l3:.4g}, spin.lz = {lz:.4g}'
-
-    def drive(self, x: float, y: float) -> str:
-        """Send a velocity of the pivot [m/s]; return it.  Raises RequestError."""
-        if not self._velocity.get_subscription_count():
-            raise RequestError(f'there is no {self._sim}')
-        self._velocity.publish(Twist(linear=Vector3(x=x, y=y)))
-        return f'pivot: {x:g}, {y:g} m/s'
-
-    def choose(self, scene: str) -> str:
-        """Set the top and the start of an installed scene, and reset.  Raises RequestError."""
-        values = parameters.checked(read_scene(parameter_files('scene')[scene]))
-        values['spin.lz'] = parameters.start_state(values).lz
-        try:
-            self._set({name: list(value) if isinstance(value, tuple) else value
-                       for name, value in values.items()
-                       if name.startswith(('top.', 'initial.', 'spin.', 'pivot.'))})
-            return f'{scene}, {self.call("reset")}'
-        finally:
-            self._stale = True      # the node may do what it has not answered in time
-
-    def _set(self, values: Mapping[str, object]) -> None:
-        """Set parameters of the sim_node.  Raises RequestError."""
-        result = self._ask('set_parameters_atomically', SetParametersAtomically.Request(
-            parameters=[Parameter(name, value=value).to_parameter_msg()
-                        for name, value in values.items()])).result
-        if not result.successful:
-            raise RequestError(result.reason)

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.errors import MALFORMED, LogError, reason_of
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools import recorded_run, svg
-from spinning_top_sim.tools.attitudes import LAYOUTS, decode
-from spinning_top_sim.view import plots, text
+from spinning_top_sim.tools import recorded_run
+from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
+from spinning_top_sim.view import plots, svg, text
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
-from spinning_top_sim.view.track import WIDTHS, DescribedMotion, Series, Track, joined
+from spinning_top_sim.view.track import DescribedMotion, Series, Track, attitude_rows, joined
 
 SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
 LONGEST_HTML_S = 60.0
@@ -45,8 +45,8 @@ def _read_log(path: Path, name: str) -> Track:
             _read_samples(reader, track, run.topics)
             try:
                 _follow_run(track, run, reader.span[1])
-            except recorded_run.MALFORMED as error:
-                notes.append(f'the run cannot be followed: {recorded_run.reason_of(error)}')
+            except MALFORMED as error:
+                notes.append(f'the run cannot be followed: {reason_of(error)}')
     if not len(track.attitudes.rows):
         raise LogError(f'{path}: no attitude in it ({", ".join(LAYOUTS)})')
     if notes:
@@ -56,7 +56,7 @@ def _read_log(path: Path, name: str) -> Track:
 
 def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) -> None:
     """Read the samples of a log of this package; `topics` as in RunDescription."""
-    names = {topics[name]: name for name in WIDTHS if name in topics}
+    names = {topics[name]: name for name in track.samples if name in topics}
     parts = defaultdict(list)
     for topic, group in reader.groups(names):
         stamps_ns, data = zip(*((one.log_time, one.data) for one in group), strict=True)
@@ -70,16 +70,17 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
     track = Track(name, parameters.checked({}), has_body=False)
     for topic in reader.topics:
         found: dict[int, NDArray[np.float64]] = {}
-        for message in reader.messages([topic.name]) if topic.type_name in LAYOUTS else ():
+        if topic.type_name not in LAYOUTS:
+            continue
+        for message in reader.messages([topic.name]):
             with contextlib.suppress(ValueError):       # without an orientation
                 stamp_ns, quaternion, _ = decode(message.data, topic.type_name)
                 norm = float(np.linalg.norm(quaternion))
                 if 0.5 < norm < 2.0:
                     found[stamp_ns] = quaternion / norm
         if found:
-            rows = Series(np.array(list(found), np.int64), np.pad(
-                np.array(list(found.values())), ((0, 0), (0, 3))))
-            track.add('pose', rows)
+            track.add('pose', Series(np.array(list(found), np.int64), attitude_rows(
+                np.array(list(found.values())), place=0.0)))
             track.epoch_ns = track.span[0]
             break
     return track
@@ -98,11 +99,7 @@ def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> 
 
 
 class Player:
-    """
-    Plays logs on a page.
-
-    length : of all logs [s]; the time of the player begins with the first sample
-    """
+    """Plays logs on a page; its time [s] begins with the first sample, and ends at `length`."""
 
     def __init__(self, page: Page, tracks: Sequence[Track]) -> None:
         self._page = page
@@ -177,8 +174,8 @@ class Player:
         seconds = min(self.length, LONGEST_HTML_S)
         words = ''.join(page.words(begin_ns + round(second * NANOSECONDS), self._epoch_ns)
                         for second in [0.0, *self._commands] if second <= seconds)
-        tops = page.shown(begin_ns, self._epoch_ns, begin_ns,
-                          begin_ns + round(seconds * NANOSECONDS))
+        tops = page.plotted(begin_ns, self._epoch_ns, begin_ns,
+                            begin_ns + round(seconds * NANOSECONDS))
         serializer = page.server.get_scene_serializer()
         for picture in range(1, int(seconds * RATE) + 1):
             serializer.insert_sleep(1.0 / RATE)

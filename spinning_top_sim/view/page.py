@@ -8,17 +8,16 @@ one; a stamp of another is `page_ns + shift_ns`, so that the t = 0 of all coinci
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import TypeVar
 
 import numpy as np
 import viser
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools import svg
-from spinning_top_sim.view import body, plots, shapes, text
+from spinning_top_sim.view import body, plots, shapes, svg, text
 from spinning_top_sim.view.server import Server
-from spinning_top_sim.view.track import DescribedMotion, Track
+from spinning_top_sim.view.track import QUATERNION, DescribedMotion, Track
 
 RATE = 30.0                     # pictures per second
 CATCH_UP_S = 0.2                # delay up to which late pictures follow each other at once
@@ -30,7 +29,6 @@ VIEW_ANGLE = math.radians(35.0)
 STANDS_TO = math.radians(100.0)     # tilt up to which the pivot stands on a peg; else it hangs
 TRACES = ((217, 72, 43), (30, 138, 76))
 BOUNDS, SPHERE, STAND, FOOT = (122, 82, 179), (190, 200, 215), (120, 126, 136), 0.8
-ARROW_COLOURS = ((20, 120, 70), (196, 50, 150), (20, 150, 180), (230, 130, 20))
 NO_LINES = np.zeros((1, 2, 3), np.float32)
 NO_SAMPLES = 'no samples yet'
 Value = TypeVar('Value')
@@ -48,12 +46,7 @@ def set_content(handle: viser.GuiHtmlHandle | viser.GuiMarkdownHandle, content: 
 
 
 class DrawnTop:
-    """
-    One top in the scene.
-
-    shift_ns : added to the stamp of the page
-    drawn : stamp [ns] and row of the attitude that is drawn, None if there is none
-    """
+    """One top in the scene; `shift_ns` is added to the stamp of the page."""
 
     def __init__(self, scene: viser.SceneApi, number: int, track: Track, shift_ns: int) -> None:
         self.track, self.shift_ns = track, shift_ns
@@ -78,41 +71,36 @@ class DrawnTop:
         self._bounds = [scene.add_line_segments(
             f'{name}/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * radius, visible=False)
             for k in range(2)]
-        self._arrows = [scene.add_arrows(
+        self._arrows = {arrow: scene.add_arrows(
             f'{name}/{arrow.replace(" ", "_")}', NO_LINES, colour,
             shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
-            visible=False) for arrow, colour in zip(shapes.ARROWS, ARROW_COLOURS, strict=True)]
+            visible=False) for arrow, (colour, *_) in shapes.ARROWS.items()}
         self._colour = np.array(TRACES[number])
         self._limits: tuple[float, float] | None = None         # that are drawn [rad]
-        self.drawn: tuple[int, shapes.Vectors] | None = None
-        self._shown: object = None                      # stamp and switches of the picture
+        self._picture: object = None                    # its stamp and switches
 
-    def motion(self, page_ns: int) -> DescribedMotion | None:
-        """Return the motion at a stamp of the page."""
-        return self.track.motion_at(page_ns + self.shift_ns)
-
-    def draw(self, page_ns: int, *, trace: bool, bounds: bool, arrows: Sequence[bool]) -> None:
+    def draw(self, page_ns: int, *, trace: bool, bounds: bool, arrows: Set[str]) -> None:
         """Draw the newest samples up to a stamp of the page, with some of the parts."""
         stamp_ns = page_ns + self.shift_ns
-        self.drawn = sample = self.track.attitudes.at(stamp_ns)
+        sample = self.track.attitudes.at(stamp_ns)
         self.root.visible = sample is not None
-        shown = sample and (sample[0], trace, bounds, arrows)
-        if shown == self._shown:        # as while it is paused
+        picture = sample and (sample[0], trace, bounds, arrows)
+        if picture == self._picture:        # as while it is paused
             return
-        self._shown = shown
+        self._picture = picture
         if sample is None:
             return
-        x, y, z, w = sample[1][:4].tolist()
+        x, y, z, w = sample[1][QUATERNION].tolist()
         self._body.wxyz = (w, x, y, z)
         self._trace.visible = self._sphere.visible = trace
         if trace:
             self._draw_trace(shapes.trace(self.track, stamp_ns))
-        for name, arrow, on in zip(shapes.ARROWS, self._arrows, arrows, strict=True):
-            arrow.visible = on
-            vector = shapes.arrow(self.track, name, stamp_ns) if on else None
+        for name, arrow in self._arrows.items():
+            arrow.visible = name in arrows
+            vector = shapes.arrow(self.track, name, stamp_ns) if arrow.visible else None
             arrow.points = NO_LINES if vector is None else shapes.segments(
                 np.vstack((np.zeros(3), vector)))
-        self._draw_bounds(self.motion(page_ns), bounds)
+        self._draw_bounds(self.track.motion_at(stamp_ns), bounds)
 
     def _draw_trace(self, lines: shapes.Lines) -> None:
         """Draw a trace that fades with its age; the colours of a line's points are linear."""
@@ -124,16 +112,19 @@ class DrawnTop:
         self._trace.points = lines
 
     def _draw_bounds(self, motion: DescribedMotion | None, on: bool) -> None:
-        moves = motion.description if motion else None
+        description = motion.description if motion else None
         for bound in self._bounds:
-            bound.visible = on and moves is not None
-        if moves is None or self._limits == (moves.theta_min, moves.theta_max):
+            bound.visible = on and description is not None
+        if description is None:
             return
-        self._limits = moves.theta_min, moves.theta_max
+        limits = description.theta_min, description.theta_max
+        if limits == self._limits:
+            return
+        self._limits = limits
         for bound, theta in zip(self._bounds, self._limits, strict=True):
             bound.points = shapes.circle(shapes.reach(self.track), theta)
         # A top that comes low hangs from above.
-        self._stand.wxyz = (1, 0, 0, 0) if moves.theta_max < STANDS_TO else (0, 1, 0, 0)
+        self._stand.wxyz = (1, 0, 0, 0) if description.theta_max < STANDS_TO else (0, 1, 0, 0)
 
 
 class Page:
@@ -143,7 +134,7 @@ class Page:
     title : such as the name of the log
     controls : the folder for the controls of the source of the samples
     message : what was done, or the reason why not
-    arrows : the switches of shapes.ARROWS
+    arrows : the switches of shapes.ARROWS, by name
     """
 
     def __init__(self, title: str, host: str, port: int | None) -> None:
@@ -163,7 +154,7 @@ class Page:
         with gui.add_folder('Show'):
             self._trace = gui.add_checkbox('trace of the axis', True)
             self._bounds = gui.add_checkbox('bounds of θ', True)
-            self.arrows = [gui.add_checkbox(name, False) for name in shapes.ARROWS]
+            self.arrows = {name: gui.add_checkbox(name, False) for name in shapes.ARROWS}
             self._over = gui.add_checkbox('one over the other', False, visible=False)
         self._accuracy_folder = gui.add_folder('Accuracy', expand_by_default=False)
         with self._accuracy_folder:
@@ -194,8 +185,8 @@ class Page:
         self._over.visible = len(tracks) > 1
         self._bounds.visible = self._accuracy_folder.visible = any(
             track.has_body for track in tracks)
-        for arrow in self.arrows:
-            arrow.visible = self._bounds.visible
+        for switch in self.arrows.values():
+            switch.visible = self._bounds.visible
         self._ground = scene.add_grid(
             '/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
             cell_color=(238, 240, 244), section_color=(228, 231, 236), fade_distance=9 * size,
@@ -208,12 +199,8 @@ class Page:
         camera.near, camera.far = 0.01 * size, 100.0 * size
 
     def draw(self, page_ns: int, epoch_ns: int) -> None:
-        """
-        Draw all tops at a stamp of the page [ns].
-
-        epoch_ns : stamp of t = 0
-        """
-        arrows = [switch.value for switch in self.arrows]
+        """Draw all tops at a stamp of the page [ns]; `epoch_ns` is that of t = 0."""
+        arrows = {name for name, switch in self.arrows.items() if switch.value}
         side = 0.0 if self._over.value else 1.3 * self._reach
         places = [top.track.places(np.array([page_ns + top.shift_ns]))[0] for top in self._tops]
         with self.server.atomic():
@@ -227,34 +214,37 @@ class Page:
                 top.draw(page_ns, trace=self._trace.value, bounds=self._bounds.value,
                          arrows=arrows)
         if self._number % PLOT_EVERY == 0:
-            tops = self.shown(page_ns, epoch_ns, page_ns - WINDOW_NS, page_ns)
+            tops = self.plotted(page_ns, epoch_ns, page_ns - WINDOW_NS, page_ns)
             set_content(self._plots, ''.join(map(svg.draw, plots.motion_plots(tops))))
             set_content(self._accuracy, ''.join(map(svg.draw, plots.accuracy_plots(tops))))
             set_content(self._words, self.words(page_ns, epoch_ns))
             set_content(self._legend, self.legend())
         self._number += 1
 
-    def shown(self, page_ns: int, epoch_ns: int, begin_ns: int,
-              end_ns: int) -> list[plots.Shown]:
+    def plotted(self, page_ns: int, epoch_ns: int, begin_ns: int,
+                end_ns: int) -> list[plots.Plotted]:
         """Return what is plotted of the tops at a stamp, for a span of stamps of the page."""
-        return [plots.Shown(top.track, *(stamp_ns + top.shift_ns for stamp_ns in (
+        return [plots.Plotted(top.track, *(stamp_ns + top.shift_ns for stamp_ns in (
             page_ns, begin_ns, end_ns, epoch_ns))) for top in self._tops]
 
     def words(self, page_ns: int, epoch_ns: int) -> str:
         """Return HTML about the motions and the samples that are drawn."""
-        drawn = [(top, top.track.attitudes.at(page_ns + top.shift_ns)) for top in self._tops]
-        return ''.join(text.words(top.track, top.motion(page_ns), sample[0],
-                                  sample[0] - top.shift_ns - epoch_ns) if sample else
-                       f'<p>{top.track.name} {NO_SAMPLES}</p>' for top, sample in drawn)
+        parts = []
+        for track, shift_ns in ((top.track, top.shift_ns) for top in self._tops):
+            sample = track.attitudes.at(page_ns + shift_ns)
+            parts.append(f'<p>{track.name} {NO_SAMPLES}</p>' if sample is None else text.words(
+                track, track.motion_at(page_ns + shift_ns), sample[0],
+                sample[0] - shift_ns - epoch_ns))
+        return ''.join(parts)
 
     def legend(self) -> str:
         """Return HTML about the colours of what is switched on."""
         entries = []
         if self._trace.value:
             entries += [(TRACES[k], f'trace of the axis {top.track.name}'.rstrip()
-                         + k * ' (plots: dashed)') for k, top in enumerate(self._tops)]
+                         + (' (plots: dashed)' if k else '')) for k, top in enumerate(self._tops)]
         if self._bounds.value and any(top.track.motions for top in self._tops):
             entries.append((BOUNDS, 'bounds of θ'))
-        entries += [(colour, name) for name, colour, switch in zip(
-            shapes.ARROWS, ARROW_COLOURS, self.arrows, strict=True) if switch.value]
+        entries += [(shapes.ARROWS[name][0], name)
+                    for name, switch in self.arrows.items() if switch.value]
         return text.legend(entries)

@@ -10,16 +10,10 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.regimes import effective_potential
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.tools.svg import Line, Plot
+from spinning_top_sim.streams.topics import INVARIANTS
 from spinning_top_sim.view import shapes
-from spinning_top_sim.view.track import (
-    ENERGY_DRIFT,
-    ORIENTATION_ERROR,
-    PRECESSION,
-    Series,
-    Track,
-    energies,
-)
+from spinning_top_sim.view.svg import Line, Plot
+from spinning_top_sim.view.track import PRECESSION, Series, Track, energies
 
 Reals = NDArray[np.float64]
 POINTS = 400                    # in a line at most
@@ -27,7 +21,7 @@ LEAST = 1e-17                   # is drawn for 0 on a logarithmic axis
 BLUE, RED, GREEN, VIOLET = '#1c6dd0', '#d9482b', '#1e8a4c', '#7a52b3'
 
 
-class Shown(NamedTuple):
+class Plotted(NamedTuple):
     """A track, the stamp that is drawn, the span that is plotted, and the stamp of t = 0 [ns]."""
 
     track: Track
@@ -44,7 +38,7 @@ class Shown(NamedTuple):
         return self.seconds(stamps_ns), rows
 
 
-def motion_plots(tops: Sequence[Shown]) -> list[Plot]:
+def motion_plots(tops: Sequence[Plotted]) -> list[Plot]:
     """Return the plots of potential, energies, tilt and precession, as far as there are data."""
     potential, energy, tilt, rate = (list[Line]() for _ in range(4))
     for top, dash in zip(tops, ('', '5 3'), strict=False):
@@ -61,16 +55,17 @@ def motion_plots(tops: Sequence[Shown]) -> list[Plot]:
                        Line('sum', GREEN, times, kinetic + height, dash)]
     now = float(tops[0].seconds(np.array(tops[0].stamp_ns)))
     present = tops[0].track.attitudes.at(tops[0].stamp_ns)
+    motion = tops[0].track.motion_at(tops[0].stamp_ns)
     theta = float(shapes.tilt(shapes.axis_of(present[1]))[0]) if present else math.nan
     return [plot for plot in (
         Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', potential, theta,
-             float(potential[1].y[0]) if potential else None),
+             motion.energy if motion and motion.description else math.nan),
         Plot('Energy', 'time t [s]', 'E [J]', energy, now),
         Plot('Tilt', 'time t [s]', 'θ [deg]', tilt, now),
         Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', rate, now)) if plot.lines]
 
 
-def accuracy_plots(tops: Sequence[Shown]) -> list[Plot]:
+def accuracy_plots(tops: Sequence[Plotted]) -> list[Plot]:
     """Return the plots of the drift of the energy and of the error of the orientation."""
     now = float(tops[0].seconds(np.array(tops[0].stamp_ns)))
     parts = [top.part(top.track.samples['~/invariants']) for top in tops]
@@ -78,11 +73,11 @@ def accuracy_plots(tops: Sequence[Shown]) -> list[Plot]:
         Line('', RED, times, np.log10(np.maximum(np.abs(rows[:, column]), LEAST)), dash)
         for (times, rows), dash in zip(parts, ('', '5 3'), strict=False)], now)
         for title, y_label, column in (
-            ('Energy drift, relative', 'log₁₀', ENERGY_DRIFT),
-            ('Orientation error', 'log₁₀ [rad]', ORIENTATION_ERROR))]
+            ('Energy drift, relative', 'log₁₀', INVARIANTS.index('energy_drift')),
+            ('Orientation error', 'log₁₀ [rad]', INVARIANTS.index('orientation_error')))]
 
 
-def _potential(top: Shown, dash: str) -> list[Line]:
+def _potential(top: Plotted, dash: str) -> list[Line]:
     """Return V around the bounds of theta, the energy of the axis, and the turning points."""
     motion = top.track.motion_at(top.stamp_ns)
     if motion is None or motion.description is None:

@@ -81,11 +81,7 @@ def refusal(asked: str | None, origin: str | None, names: set[str]) -> str:
 
 @contextlib.contextmanager
 def _guarded(names: set[str]) -> Iterator[None]:
-    """
-    Make the servers that are started in this context refuse requests of other sites.
-
-    viser has no option for it, so this wraps the function by which viser answers requests.
-    """
+    """Make servers that start in this context refuse other sites; viser has no option for it."""
     serve = websockets.asyncio.server.serve
 
     def guarded(*arguments: object, process_request: Answer, **options: object) -> object:

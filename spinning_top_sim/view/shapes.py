@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lines and arrows that show a top, and its tilt and energies, as numbers."""
+"""The lines and arrows that show a top, and its tilt, as numbers."""
 
 import math
 
@@ -7,8 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.view.track import Track
+from spinning_top_sim.view.track import (
+    ATTITUDE_TOPICS,
+    FORCE,
+    QUATERNION,
+    RATE_TOPICS,
+    RATES,
+    Track,
+)
 
 TRACE_NS = 10 * NANOSECONDS     # length of the trace of the tip
 TRACE_POINTS = 1500             # samples in the trace at most
@@ -16,7 +24,6 @@ REACH = 1.6                     # radius of the sphere of the trace / distance o
 LONGEST_CHORD = 0.5             # of a step of the trace / its radius; a longer step is a jump
 TRACE_STEP_NS, MOST_STEPS = 10_000_000, 4       # interpolation of the trace between two samples
 STEPS = 48                      # of a full circle
-ARROWS = ('angular momentum', 'angular velocity', 'torque', 'specific force')
 Stamps = NDArray[np.int64]
 Vectors = NDArray[np.float64]
 Lines = NDArray[np.float32]     # (n, 2, 3), as viser takes them
@@ -59,9 +66,9 @@ def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDA
     steps = np.diff(axis, axis=0)
     longest_ns = int(np.max(np.diff(stamps_ns), initial=0))
     count = min(-(-longest_ns // TRACE_STEP_NS), MOST_STEPS)
-    if count < 2 or rows.shape[1] < 8:          # close together, or without a velocity
+    if count < 2 or np.isnan(rows[:, RATES]).any():
         return stamps_ns, axis, np.linalg.norm(steps, axis=1) < LONGEST_CHORD
-    velocity = np.cross(in_world(rows[:, :4].T, rows[:, 4:7].T), axis, axisa=0)
+    velocity = np.cross(in_world(rows[:, QUATERNION].T, rows[:, RATES].T), axis, axisa=0)
     span = 1e-9 * np.diff(stamps_ns)[:, np.newaxis]
     before, after = span * velocity[:-1], span * velocity[1:]
     joined = np.linalg.norm(steps - 0.5 * (before + after), axis=1) < LONGEST_CHORD
@@ -75,8 +82,8 @@ def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDA
 
 
 def axis_of(rows: Vectors) -> Vectors:
-    """Return the axis in the world (n, 3) of rows that begin with quaternions, or of one."""
-    x, y, z, w = np.atleast_2d(rows)[:, :4].T
+    """Return the axis in the world (n, 3) of rows of a track, or of one."""
+    x, y, z, w = np.atleast_2d(rows)[:, QUATERNION].T
     return np.column_stack(attitude.axis_in_world((x, y, z, w)))
 
 
@@ -90,29 +97,45 @@ def in_world(quaternion: Vectors, vector: Vectors) -> Vectors:
     return np.array(attitude.rotated(tuple(quaternion), tuple(vector)))
 
 
-def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
-    """
-    Return a vector of ARROWS (3,) in the world, scaled for drawing; None if no sample has it.
+def _momentum(track: Track, row: Vectors, stamp_ns: int) -> Vectors:
+    moments = np.array([track.top.lambda1, track.top.lambda1, track.top.lambda3])
+    return in_world(row[QUATERNION], moments * row[RATES]) / _usual_momentum(track, stamp_ns)
 
-    The length of the axis stands for the usual angular momentum or velocity, for 1 g, and for the
-    torque of gravity when the axis is horizontal.
-    """
-    samples = {'specific force': track.samples['ground_truth/imu'],
-               'torque': track.attitudes}.get(name, track.rates)
-    sample = samples.at(stamp_ns)
+
+def _velocity(track: Track, row: Vectors, stamp_ns: int) -> Vectors:
+    least = min(track.top.lambda1, track.top.lambda3)
+    return least / _usual_momentum(track, stamp_ns) * in_world(row[QUATERNION], row[RATES])
+
+
+def _usual_momentum(track: Track, stamp_ns: int) -> float:
+    motion = track.motion_at(stamp_ns)
+    present = max(abs(motion.l3), abs(motion.lz)) if motion else 0.0
+    return max(natural_momentum(track.top), present, 1e-30)
+
+
+def _torque(track: Track, row: Vectors, _: int) -> Vectors:
+    ((x, y, _z),) = axis_of(row)        # r x m g: along the line of nodes
+    return np.sign(track.top.gravity_torque) * np.array((-y, x, 0.0))
+
+
+def _force(track: Track, row: Vectors, _: int) -> Vectors:
+    return in_world(row[QUATERNION], row[FORCE]) / (abs(track.top.gravity) or 1.0)
+
+
+# Of each arrow the colour, the topics of its samples, and its vector in the world.  The length of
+# the axis, here 1, stands for the usual angular momentum or velocity, for 1 g, and for the torque
+# of gravity when the axis is horizontal.
+ARROWS = {
+    'angular momentum': ((20, 120, 70), RATE_TOPICS, _momentum),
+    'angular velocity': ((196, 50, 150), RATE_TOPICS, _velocity),
+    'torque': ((20, 150, 180), ATTITUDE_TOPICS, _torque),
+    'specific force': ((230, 130, 20), ('ground_truth/imu',), _force)}
+
+
+def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
+    """Return one of ARROWS (3,) in the scene; None if no sample has it."""
+    _, topics, vector = ARROWS[name]
+    sample = track.best(topics).at(stamp_ns)
     if sample is None or not track.has_body:
         return None
-    top, row, length = track.top, sample[1], abs(reach(track))
-    if name == 'specific force':
-        return length / (abs(top.gravity) or 1.0) * in_world(row[:4], row[7:10])
-    if name == 'torque':        # r x m g: along the line of nodes
-        ((x, y, _),) = axis_of(row)
-        return length * np.sign(top.gravity_torque) * np.array((-y, x, 0.0))
-    omega = row[4:7]
-    momentum = np.array([top.lambda1, top.lambda1, top.lambda3]) * omega
-    motion = track.motion_at(stamp_ns)
-    usual = max(math.sqrt(top.lambda1 * abs(top.gravity_torque)),
-                *(abs(x) for x in ((motion.l3, motion.lz) if motion else (0.0,))), 1e-30)
-    if name == 'angular velocity':
-        return length * min(top.lambda1, top.lambda3) / usual * in_world(row[:4], omega)
-    return length / usual * in_world(row[:4], momentum)
+    return abs(reach(track)) * vector(track, sample[1], stamp_ns)

@@ -9,9 +9,9 @@ from string import Template
 
 import numpy as np
 
-from spinning_top_sim.physics.regimes import SENTENCES
+from spinning_top_sim.physics.regimes import SENTENCES, natural_momentum
 from spinning_top_sim.physics.top import Top
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.view.track import DescribedMotion, Track
 
 HERE = Path(__file__).parent
@@ -32,7 +32,6 @@ def number(value: float) -> str:
 
 def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns: int) -> str:
     """Return headline, sentence and numbers of a top, and stamp and time of what is drawn."""
-    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     description = motion.description if motion else None
     title, sentence = ((description.name, SENTENCES[description.name]) if description else
                        ('motion', PIVOT_MOVES if motion.pivot_moves else BEYOND) if motion else
@@ -47,26 +46,27 @@ def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns:
         *(f'<tr><td>{label}</td><td>{value}{f"<small>{note}</small>" if note else ""}</td></tr>'
           for label, value, note in rows),
         f'</table><p class="stamp">t = {since_ns / NANOSECONDS:.3f} s, stamp '
-        f'{seconds}.{nanoseconds:09d}</p></div>'))
+        f'{stamp_text(stamp_ns)}</p></div>'))
 
 
 def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
-    moves = motion.description
-    if moves is not None:
-        low, high = (number(math.degrees(theta)) for theta in (moves.theta_min, moves.theta_max))
-        period = number(moves.nutation_period) if moves.nutation_period else ''
+    description = motion.description
+    if description is not None:
+        low = number(math.degrees(description.theta_min))
+        high = number(math.degrees(description.theta_max))
+        period = number(description.nutation_period) if description.nutation_period else ''
         yield 'Tilt θ', f'{low}° to {high}°' if period else f'{low}°', (
             f'nutation period {period} s' if period else '')
-        if moves.theta_max > VERTICAL and moves.theta_min < math.pi - VERTICAL:
-            slow, fast = number(moves.precession_min), number(moves.precession_max)
-            yield 'Precession φ′', f'{number(moves.mean_precession_rate)} rad/s', (
+        if description.theta_max > VERTICAL and description.theta_min < math.pi - VERTICAL:
+            slow, fast = number(description.precession_min), number(description.precession_max)
+            yield 'Precession φ′', f'{number(description.mean_precession_rate)} rad/s', (
                 f'mean; from {slow} to {fast}' if period else '')
-            yield 'Spin ψ′', f'{number(moves.mean_spin_rate)} rad/s', 'mean' if period else ''
+            spin = number(description.mean_spin_rate)
+            yield 'Spin ψ′', f'{spin} rad/s', 'mean' if period else ''
     yield 'Angular mo&shy;mentum', f'L₃ = {number(motion.l3)}' + (
         '' if motion.pivot_moves else f', L<sub>z</sub> = {number(motion.lz)}'), (
         'kg m²/s; axis' + ('' if motion.pivot_moves else ', vertical'))
-    least = 2.0 * math.sqrt(top.lambda1 * abs(top.gravity_torque))
-    if least:
+    if least := 2.0 * natural_momentum(top):
         yield 'Stable upright', f'if |L₃| &gt; {number(least)} kg m²/s', ''
 
 

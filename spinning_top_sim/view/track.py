@@ -3,41 +3,41 @@
 
 import contextlib
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics import attitude, placement
-from spinning_top_sim.physics.regimes import Description, effective_potential, regime
+from spinning_top_sim.physics import attitude, placement, regimes
+from spinning_top_sim.physics.regimes import Description, natural_momentum
 from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.topics import all_streams
+from spinning_top_sim.streams.topics import INVARIANTS, all_streams
 from spinning_top_sim.tools.analysis import attitudes_of
 
-# Number of columns of each topic.  First come the attitude x, y, z, w and the angular velocity in
-# the body; then phi', or for the IMU the specific force.  PLACES end with that of the pivot.
-WIDTHS = {'pose': 7, 'joint_states': 8, 'ground_truth/odom': 11, 'ground_truth/imu': 10,
-          '~/invariants': 8}
-ATTITUDES = ('pose', 'joint_states', 'ground_truth/odom', 'ground_truth/imu')     # best first
-RATES = ('joint_states', 'ground_truth/odom')
-PLACES = ('pose', 'ground_truth/odom')
-PRECESSION = 7              # column of RATES
-ENERGY_DRIFT, ORIENTATION_ERROR = 3, 7     # columns of ~/invariants
+# The topics that tell the attitude, the best first; those that tell its rates, and the pivot.
+ATTITUDE_TOPICS = ('pose', 'joint_states', 'ground_truth/odom', 'ground_truth/imu')
+RATE_TOPICS = ('joint_states', 'ground_truth/odom')
+PLACE_TOPICS = ('pose', 'ground_truth/odom')
+# Their columns, NaN where a topic has none: x, y, z, w; the angular velocity and the specific
+# force in the body; phi'; the place of the pivot.
+QUATERNION, RATES, FORCE, PRECESSION, PLACE = (
+    slice(0, 4), slice(4, 7), slice(7, 10), 10, slice(11, 14))
+WIDTHS = {**dict.fromkeys(ATTITUDE_TOPICS, 14), '~/invariants': len(INVARIANTS)}
 SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
 SAME = 1e-6                 # relative difference between the constants of one motion
 MOST_MOTIONS = 99           # that are kept
+Rows = NDArray[np.float64]
 
 
 class Series(NamedTuple):
     """Ascending stamps (n,) [ns] and one row of numbers for each (n, width)."""
 
     stamps_ns: NDArray[np.int64]
-    rows: NDArray[np.float64]
+    rows: Rows
 
     def part(self, begin_ns: int, end_ns: int) -> 'Series':
         """Return the samples from one stamp to another, both included."""
@@ -45,7 +45,7 @@ class Series(NamedTuple):
         end = int(np.searchsorted(self.stamps_ns, end_ns, 'right'))
         return Series(self.stamps_ns[begin:end], self.rows[begin:end])
 
-    def at(self, stamp_ns: int) -> tuple[int, NDArray[np.float64]] | None:
+    def at(self, stamp_ns: int) -> tuple[int, Rows] | None:
         """Return stamp and row of the newest sample up to a stamp, None if there is none."""
         index = int(np.searchsorted(self.stamps_ns, stamp_ns, 'right')) - 1
         return None if index < 0 else (int(self.stamps_ns[index]), self.rows[index])
@@ -69,6 +69,15 @@ def empty(topic: str) -> Series:
     return Series(np.empty(0, np.int64), np.empty((0, WIDTHS[topic])))
 
 
+def attitude_rows(quaternion: Rows, rates: Rows | float = np.nan,
+                  precession: Rows | float = np.nan, place: Rows | float = np.nan) -> Rows:
+    """Return rows with these columns, each (n, k)."""
+    rows = np.full((len(quaternion), WIDTHS['pose']), np.nan)
+    rows[:, QUATERNION], rows[:, RATES] = quaternion, rates
+    rows[:, PRECESSION], rows[:, PLACE] = precession, place
+    return rows
+
+
 @dataclasses.dataclass(frozen=True)
 class DescribedMotion:
     """
@@ -90,7 +99,7 @@ class DescribedMotion:
     def of(cls, begin_ns: int, top: Top, state: State,
            description: Description | None, *, pivot_moves: bool = False) -> 'DescribedMotion':
         """Return the motion that begins in a state."""
-        height = effective_potential(top, state.l3, state.lz, np.array([state.theta]))
+        height = regimes.effective_potential(top, state.l3, state.lz, np.array([state.theta]))
         energy = 0.5 * top.lambda1 * state.theta_dot ** 2 + float(height[0])
         return cls(begin_ns, state.l3, state.lz, energy, description, pivot_moves)
 
@@ -131,24 +140,29 @@ class Track:
             return Series(stamps, fields[0])
         found = attitudes_of(topic, self._imu, stamps, fields)
         assert found is not None
-        rows = found.rows.T
-        if topic in RATES:
-            assert found.phi_dot is not None
-            rows = np.column_stack((rows[:, :7], found.phi_dot))
+        rows = attitude_rows(found.rows[:4].T)
+        if topic in RATE_TOPICS:
+            assert found.omega is not None and found.phi_dot is not None
+            rows[:, RATES], rows[:, PRECESSION] = np.transpose(found.omega), found.phi_dot
         if topic == 'ground_truth/imu':
             # With imu.sampling = mean these are means, which are near enough for a picture.
-            (_, rates), (_, force) = (self._imu.in_body(tuple(fields[0].T), tuple(field.T))
-                                      for field in fields[1:3])
-            rows = np.column_stack((rows[:, :4], *rates, *force))
-        if topic in PLACES:
+            for columns, field in ((RATES, fields[1]), (FORCE, fields[2])):
+                _, in_body = self._imu.in_body(tuple(fields[0].T), tuple(field.T))
+                rows[:, columns] = np.vstack(in_body).T
+        if topic in PLACE_TOPICS:
             norm = np.linalg.norm(fields[1], axis=1)
-            place = np.nan_to_num(fields[0][np.isfinite(norm) & (norm > 0.0)])
-            rows = np.column_stack((rows[:, :4] if topic == 'pose' else rows, place))
+            rows[:, PLACE] = np.nan_to_num(fields[0][np.isfinite(norm) & (norm > 0.0)])
         return Series(found.stamps_ns, rows)
 
     def add(self, topic: str, samples: Series) -> None:
         """Add samples of a topic."""
         self.samples[topic] = joined([self.samples[topic], samples])
+
+    def add_errors(self, stamp_ns: int, energy_drift: float, orientation_error: float) -> None:
+        """Add what a node says of its errors as a sample of ~/invariants."""
+        row = dict.fromkeys(INVARIANTS, np.nan)
+        row.update(energy_drift=energy_drift, orientation_error=orientation_error)
+        self.add('~/invariants', Series(np.array([stamp_ns]), np.array([[*row.values()]])))
 
     def drop_before(self, before_ns: int) -> None:
         """Drop the samples before a stamp."""
@@ -157,28 +171,29 @@ class Track:
 
     @property
     def attitudes(self) -> Series:
-        """The samples that show the attitude, in their first four columns."""
-        return self._best(ATTITUDES)
+        """The samples that show the attitude."""
+        return self.best(ATTITUDE_TOPICS)
 
     @property
     def rates(self) -> Series:
         """The samples that show attitude, angular velocity and phi'."""
-        return self._best(RATES)
+        return self.best(RATE_TOPICS)
 
-    def places(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def places(self, stamps_ns: NDArray[np.int64]) -> Rows:
         """Return where the pivot is at stamps (n,), (n, 3) [m]; the origin where not known."""
-        known_ns, rows = self._best(PLACES)
+        known_ns, rows = self.best(PLACE_TOPICS)
         if not len(rows):
             return np.zeros((len(stamps_ns), 3))
         return np.stack([np.interp(stamps_ns - known_ns[0], known_ns - known_ns[0], column)
-                         for column in rows[:, -3:].T], axis=-1)
+                         for column in rows[:, PLACE].T], axis=-1)
 
     @property
-    def moves(self) -> bool:
+    def pivot_moves(self) -> bool:
         """Whether the pivot has moved between the last two samples."""
-        return bool(np.diff(self._best(PLACES).rows[-2:, -3:], axis=0).any())
+        return bool(np.diff(self.best(PLACE_TOPICS).rows[-2:, PLACE], axis=0).any())
 
-    def _best(self, topics: Sequence[str]) -> Series:
+    def best(self, topics: Sequence[str]) -> Series:
+        """Return the samples of the first of these topics that has some."""
         return next((self.samples[topic] for topic in topics
                      if len(self.samples[topic].stamps_ns)), self.samples[topics[0]])
 
@@ -199,31 +214,28 @@ class Track:
         if not len(rows):
             return
         constants, state = constants_and_state(self.top, rows[-1])
-        if pivot_moves := self.moves:     # L3 alone is constant
+        if pivot_moves := self.pivot_moves:     # L3 alone is constant
             constants = 0.0, constants[1], 0.0
         if self._constants is not None and _same(self.top, constants, self._constants):
             return
         self._constants = constants
         description = None
         with contextlib.suppress(ArithmeticError, ValueError):
-            description = None if pivot_moves else dataclasses.replace(
-                ExactSolution(self.top, state).describe(), name=regime(self.top, state, SNAP))
+            if not pivot_moves:
+                description = dataclasses.replace(
+                    ExactSolution(self.top, state).describe(),
+                    name=regimes.regime(self.top, state, SNAP))
         self.motions = [*self.motions[-MOST_MOTIONS:], DescribedMotion.of(
             int(stamps_ns[-1]), self.top, state, description, pivot_moves=pivot_moves)]
 
 
-def constants_and_state(top: Top, row: NDArray[np.float64],
-                        ) -> tuple[tuple[float, float, float], State]:
-    """
-    Return energy, L3 and Lz of a row of RATES, and its state.
-
-    A state within rounding errors of a special motion becomes that motion.
-    """
-    quaternion, omega = row[:4], row[4:7]
+def constants_and_state(top: Top, row: Rows) -> tuple[tuple[float, float, float], State]:
+    """Return energy, L3 and Lz of a row of `Track.rates`, and the state without its rounding."""
+    quaternion, omega = row[QUATERNION], row[RATES]
     state = placement.state_of(top, quaternion, np.array(
         attitude.rotated(tuple(quaternion), tuple(omega))))
     energy = float(np.sum(energies(top, row[np.newaxis])))
-    dust = SNAP * max(abs(state.l3), abs(state.lz), _natural_momentum(top))
+    dust = SNAP * max(abs(state.l3), abs(state.lz), natural_momentum(top))
     l3, lz = (0.0 if abs(value) < dust else value for value in (state.l3, state.lz))
     lz = next((pole for pole in (l3, -l3) if abs(lz - pole) < dust), lz)
     theta_dot = state.theta_dot if top.lambda1 * abs(state.theta_dot) > dust else 0.0
@@ -231,21 +243,16 @@ def constants_and_state(top: Top, row: NDArray[np.float64],
                                                lz=lz)
 
 
-def energies(top: Top, rows: NDArray[np.float64],
-             ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def energies(top: Top, rows: Rows) -> tuple[Rows, Rows]:
     """Return kinetic and potential energy (n,) [J] of rows with attitude and angular velocity."""
     moments = np.array((top.lambda1, top.lambda1, top.lambda3))
-    x, y, z, w = rows[:, :4].T
-    return (0.5 * rows[:, 4:7] ** 2 @ moments,
+    x, y, z, w = rows[:, QUATERNION].T
+    return (0.5 * rows[:, RATES] ** 2 @ moments,
             top.gravity_torque * attitude.axis_in_world((x, y, z, w))[2])
-
-
-def _natural_momentum(top: Top) -> float:
-    return math.sqrt(top.lambda1 * abs(top.gravity_torque))
 
 
 def _same(top: Top, one: Sequence[float], other: Sequence[float]) -> bool:
     """Return whether two sets of energy, L3 and Lz are equal but for rounding."""
-    natural = _natural_momentum(top)
+    natural = natural_momentum(top)
     return all(abs(a - b) <= SAME * max(abs(a), abs(b), least) for a, b, least in zip(
         one, other, (abs(top.gravity_torque), natural, natural), strict=True))

@@ -12,7 +12,7 @@ from spinning_top_sim.streams.topics import all_streams
 
 FILE = Path(__file__).parents[2] / 'spinning_top_sim/recording/definitions.json'
 TYPES = sorted({stream.type_name for stream in all_streams(parameters.checked({}))}
-               | {type_name for _, type_name in journal.TOPICS})
+               | {type_name for _, type_name in journal.TOPICS.items()})
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 
 

@@ -57,7 +57,7 @@ def write_log(path, chunks=CHUNKS, compression='zstd', messages_per_chunk=MESSAG
         file.append(index, stamp, data)
         messages.append((TOPICS[index].name, stamp, data))
         if (number + 1) % messages_per_chunk == 0:
-            file.write_chunk()
+            file.flush()
     file.finish()
     return messages
 

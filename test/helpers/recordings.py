@@ -45,8 +45,8 @@ def write_rows(path, topics, rows, per_chunk=None):
     for number, row in enumerate(rows, start=1):
         file.append(*row)
         if per_chunk and number % per_chunk == 0:
-            file.write_chunk()
-    file.write_chunk()
+            file.flush()
+    file.flush()
     file.finish()
     return path
 

@@ -29,7 +29,8 @@ class Plot(NamedTuple):
     """
     A plot with a mark at x = now.
 
-    energy : with it x is the tilt [deg], and the mark has a point here; without it x is time [s]
+    energy : with it x is the tilt [deg], and the mark has a point here unless it is NaN; without
+        it x is time [s]
     """
 
     title: str
@@ -110,7 +111,7 @@ def _mark(frame: _Frame, plot: Plot) -> str:
     if not math.isfinite(plot.now):
         return ''
     now, point = frame.place_one(plot.now, plot.energy or 0.0)
-    dot = '' if plot.energy is None else f'<circle cy="{point}" r="5"/>'
+    dot = '' if plot.energy is None or math.isnan(point) else f'<circle cy="{point}" r="5"/>'
     return (f'<g class="now" transform="translate({now} 0)">'
             f'<path d="M0 {TOP}V{HEIGHT - BOTTOM}"/>{dot}</g>')
 

@@ -49,11 +49,7 @@ def deserialized(data: bytes, type_name: str) -> Any:
 
 
 def decode(data: bytes, type_name: str) -> Attitude:
-    """
-    Return the attitude in a serialized message of a type of LAYOUTS.
-
-    Raises ValueError if it is no such message or has no orientation.
-    """
+    """Return the attitude in a message of a type of LAYOUTS.  Raises ValueError without one."""
     message, (place, matrix_place) = deserialized(data, type_name), LAYOUTS[type_name]
     stamp, q = message.header.stamp, attrgetter(place)(message)
     covariance = np.full((3, 3), np.nan)

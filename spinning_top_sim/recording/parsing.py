@@ -24,8 +24,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Chunk, McapRecord
 from mcap.stream_reader import StreamReader
 
-from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE, MESSAGE_FIELDS
-from spinning_top_sim.recording.mcap_writer import record_bytes
+from spinning_top_sim.recording.chunks import ENTRY_SIZE, INDEX_HEAD, MESSAGE, record_bytes
 
 MAX_BYTES = 256 << 20               # of one record or one uncompressed chunk in memory
 MAX_DECLARED = 16 << 20             # of schemas, channels or metadata, which take ten times that
@@ -75,11 +74,7 @@ class Messages:
 
     def in_order(self, topics: Mapping[int, str], *, by_time: bool = False,
                  ) -> Iterator[LogMessage]:
-        """
-        Yield the messages in file order, or by log time and equal ones in file order.
-
-        topics : names by channel id; messages of other channels are left out
-        """
+        """Yield the messages of `topics` (names by channel id) in file order, or by log time."""
         entries = [np.frombuffer(numbers, np.uint64).reshape(-1, 2)
                    for channel_id, numbers in self.entries.items() if channel_id in topics]
         if not entries:
@@ -159,7 +154,7 @@ def find_messages(plain: bytes) -> Messages:
             raise DamagedError('a record in it is truncated')
         opcode, length = HEAD.unpack_from(plain, offset)
         end = offset + HEAD.size + length
-        if end > size or (opcode == _MESSAGE_OPCODE and length < MESSAGE_FIELDS):
+        if end > size or (opcode == _MESSAGE_OPCODE and end < offset + MESSAGE.size):
             raise DamagedError('the length of a record in it is wrong')
         if opcode == _MESSAGE_OPCODE:
             _, _, channel_id, _, log_time, _ = MESSAGE.unpack_from(plain, offset)
