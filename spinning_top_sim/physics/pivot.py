@@ -51,9 +51,8 @@ class Piece(NamedTuple):
     acceleration: Exact
     begins: NDArray[np.float64]
 
-    def at(self, times_ns: NDArray[np.int64]) -> Kinematics:
-        """Return what the pivot does at times (n,) [ns]."""
-        return kinematics([self], [len(times_ns)], times_ns)
+
+REST = Piece(0, NEVER_NS, ZERO, np.zeros(9))
 
 
 def kinematics(pieces: Sequence[Piece], counts: Sequence[int],

@@ -130,7 +130,6 @@ class SteppedMotion(ABC):
 
     derivative: Callable[..., Vector]   # f of the unknowns, which it takes one by one
     ns_limit = 2 ** 63 - 1              # steps go on for ever
-    chains = False
 
     def __init__(self, top: Top, start: State, y: Vector, tolerance: float,
                  fastest_rate: float) -> None:
@@ -192,9 +191,6 @@ class SteppedMotion(ABC):
     def exact(self) -> ExactSolution | None:
         with suppress(ValueError):
             return ExactSolution(self.top, self.start)
-        return None
-
-    def posture(self, ns: int) -> None:
         return None
 
     @property

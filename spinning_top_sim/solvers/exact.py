@@ -19,8 +19,8 @@ from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import TIMES_TOGETHER, States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.multiprecision import BITS, exact, precision
-from spinning_top_sim.solvers.theta_setup import Posture, ThetaMotion, set_up
+from spinning_top_sim.solvers.multiprecision import BITS, precision
+from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import (
     LARGEST_NUMBER,
     Constants,
@@ -48,17 +48,16 @@ class ClosedForm:
 
     steps = evaluations = 0
     reached_ns = LARGEST_NS
-    chains = False
     start: State
 
     def __init__(self, top: Top, motion: ThetaMotion, l3: mpfr, lz: mpfr) -> None:
         self.top = top
         with precision(BITS):
-            alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * exact(top.lambda1)
+            alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * mpfr(top.lambda1)
             bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
             in_range('the fastest rate', max(map(abs, (
                 motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
-                l3 / exact(top.lambda3)))))
+                l3 / mpfr(top.lambda3)))))
             self.bottom_rate, self.top_rate = float(bottom_rate), float(top_rate)
             self.constants = Constants(motion)
             fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * const_pi()),
@@ -73,12 +72,6 @@ class ClosedForm:
     @property
     def exact(self) -> Self:
         return self
-
-    def describe(self) -> Description | None:
-        return None
-
-    def posture(self, ns: int) -> Posture | None:
-        return None
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
         return True                     # there are no steps to take
@@ -148,11 +141,12 @@ class ExactSolution(ClosedForm):
             theta=min(abs(theta), math.pi), theta_dot=self.sign * start.theta_dot,
             phi=start.phi + half_turn, psi=start.psi - half_turn,
             l3=start.l3, lz=start.lz)
-        motion = set_up(top, exact(top.gravity), self.start)
-        super().__init__(top, motion, exact(start.l3), exact(start.lz))
-        alpha, beta, phi, psi = motion.alpha, motion.beta, self.start.phi, self.start.psi
-        self.m, self.m1 = float(motion.m), float(motion.m1)
+        phi, psi = self.start.phi, self.start.psi
         with precision(BITS):
+            motion = set_up(top, mpfr(top.gravity), self.start)
+            super().__init__(top, motion, mpfr(start.l3), mpfr(start.lz))
+            alpha, beta, self.m, self.m1 = (
+                motion.alpha, motion.beta, float(motion.m), float(motion.m1))
             # 2 K/w, two quarter periods
             self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
             self.mean_precession_rate = float(alpha.rate + beta.rate)

@@ -8,7 +8,6 @@ ACM Trans. Math. Softw. 33 (2007), 13.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 
 import gmpy2
 from gmpy2 import mpc, mpfr
@@ -29,13 +28,6 @@ def precision(bits: int) -> Iterator[None]:
         yield
     finally:
         gmpy2.set_context(before)       # which `with gmpy2.context` of gmpy2 2.1 does not
-
-
-@lru_cache(64)
-def exact(x: float) -> mpfr:
-    """Return a double without rounding, whatever the precision that is set."""
-    with precision(53):
-        return mpfr(x)
 
 
 def atan2(y: mpfr, x: mpfr) -> mpfr:

@@ -15,7 +15,6 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ClosedForm, ExactSolution
-from spinning_top_sim.solvers.theta_setup import Posture
 from spinning_top_sim.solvers.theta_values import LARGEST_NUMBER
 from spinning_top_sim.solvers.transport import TransportMotion
 
@@ -30,20 +29,17 @@ class Motion(Protocol):
     top : what moves
     ns_limit : the last time that it can give at all [ns]
     steps, evaluations : counts
-    chains : whether it is an `AcceleratedMotion` that can be read together with others
     start : from where it moves
     reached_ns : the last time that `states` can give without further steps [ns]
     exact : the closed form; None where doubles cannot hold it
 
-    `SteppedMotion` says what its other members do.  `posture` returns attitude and angular
-    velocity in the world at a time [ns], or None if they are known in doubles only.
+    `SteppedMotion` says what its other members do.
     """
 
     top: Top
     ns_limit: int
     steps: int
     evaluations: int
-    chains: bool
 
     @property
     def start(self) -> State: ...
@@ -53,8 +49,6 @@ class Motion(Protocol):
 
     @property
     def exact(self) -> ClosedForm | None: ...
-
-    def posture(self, ns: int) -> Posture | None: ...
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool: ...
 

@@ -57,7 +57,6 @@ from spinning_top_sim.solvers.multiprecision import (
     ONE,
     ZERO,
     atan2,
-    exact,
     half_turns,
     precision,
 )
@@ -126,21 +125,6 @@ class ThetaMotion(NamedTuple):
     size: int = MOST_TERMS
 
 
-class Posture(NamedTuple):
-    """
-    Attitude and angular velocity of a top at one instant, in multiprecision.
-
-    alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
-    across : omega_1 + i omega_2 in the body [rad/s]
-    l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
-    """
-
-    alpha: mpc
-    beta: mpc
-    across: mpc
-    l3: float
-
-
 class HalfAngles(NamedTuple):
     """
     A state in multiprecision; theta is in [0, pi/2].
@@ -201,8 +185,8 @@ class _Side(NamedTuple):
 
 
 def _set_up(top: Top, gravity: mpfr, start: State | HalfAngles) -> ThetaMotion:
-    torque = exact(top.mass) * gravity * exact(top.com_distance)
-    lambda1, lambda3 = exact(top.lambda1), exact(top.lambda3)
+    torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
+    lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
     alpha_turns, beta_turns, alpha, beta = ZERO, ZERO, mpc(1), mpc(1)
     if isinstance(start, HalfAngles):
         sin_half, cos_half, theta_dot, alpha, beta, l3, lz = start

@@ -29,14 +29,12 @@ from spinning_top_sim.solvers.multiprecision import (
     IMAGINARY,
     ONE,
     ZERO,
-    exact,
     precision,
 )
 from spinning_top_sim.solvers.theta_series import SIN_ODD
 from spinning_top_sim.solvers.theta_setup import (
     Factor,
     HalfAngles,
-    Posture,
     ThetaMotion,
     set_up,
 )
@@ -49,6 +47,21 @@ POLE = 1e-30
 # If the distance by which a motion misses a pole is less than this share of the largest possible,
 # it passes exactly: the set-up squares the share, and keeps some 40 digits.
 THROUGH = 1e-19
+
+
+class Posture(NamedTuple):
+    """
+    Attitude and angular velocity of a top at one instant, in multiprecision.
+
+    alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
+    across : omega_1 + i omega_2 in the body [rad/s]
+    l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
+    """
+
+    alpha: mpc
+    beta: mpc
+    across: mpc
+    l3: float
 
 
 class Vertical(NamedTuple):
@@ -86,11 +99,11 @@ class Vertical(NamedTuple):
         # + i theta') exp(-i psi)
         rates = across * (alpha * beta.conjugate())
         half_tilt = cosine * sine
-        tilt, unit, lambda1 = 2 * half_tilt, half_tilt * size2, exact(top.lambda1)
+        tilt, unit, lambda1 = 2 * half_tilt, half_tilt * size2, mpfr(top.lambda1)
         lz = (1 - 2 * sine * sine) * l3 - lambda1 * rates.real / unit * tilt
         most2 = THROUGH ** 2 * tilt * tilt * (l3 * l3 * tilt * tilt + lambda1 * (
             lambda1 * norm(across)
-            + abs(self.gravity * exact(top.mass) * exact(top.com_distance))))
+            + abs(self.gravity * mpfr(top.mass) * mpfr(top.com_distance))))
         for pole in (l3, -l3):
             if (lz - pole) ** 2 <= most2:
                 lz = pole or ZERO
@@ -119,7 +132,6 @@ class AcceleratedMotion(ClosedForm):
         self._posture = posture
         self._motion = set_up(top, self.vertical.gravity, self.halves)
         super().__init__(self.vertical.top, self._motion, *self.halves[-2:])
-        self.chains = self.constants.chains
 
     @cached_property
     def start(self) -> State:       # type: ignore[override]
@@ -139,7 +151,7 @@ class AcceleratedMotion(ClosedForm):
         with precision(BITS):
             vertical = self.vertical
             alpha, beta, u_dot = _cayley_klein(self._motion, mpfr(ns) / 10 ** 9)
-            across = _across(exact(self.top.lambda1), *self.halves[-2:], alpha, beta, u_dot)
+            across = _across(mpfr(self.top.lambda1), *self.halves[-2:], alpha, beta, u_dot)
             alpha, beta = _product(vertical.alpha, vertical.beta, alpha, beta)
             return Posture(alpha, beta, across, self._posture.l3)
 
@@ -218,7 +230,7 @@ def posture_of(top: Top, state: State) -> Posture:
         sine, cosine = sin_cos(mpfr(state.theta) / 2)
         half_phi, half_psi = (_phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
         back = half_psi.conjugate()
-        l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * exact(top.lambda1)
+        l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * mpfr(top.lambda1)
         swing = ZERO                # phi' sin(theta)
         if lz + l3:
             swing += (lz + l3) / two_lambda1 * sine / cosine

@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.integrals import Increments
-from spinning_top_sim.physics.pivot import NEVER_NS, Kinematics, Piece
+from spinning_top_sim.physics.pivot import REST, Kinematics, Piece, kinematics
 from spinning_top_sim.physics.states import Point, States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.physics.world_states import WorldStates
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ClosedForm
 from spinning_top_sim.solvers.propagator import Motion
-from spinning_top_sim.solvers.theta_setup import Posture
 from spinning_top_sim.solvers.times import Times
 from spinning_top_sim.solvers.vertical import (
     AcceleratedMotion,
     AcceleratedStates,
+    Posture,
     Vertical,
     posture_at,
 )
@@ -64,7 +64,7 @@ class Segment:
     def __init__(self, motion: Motion, start_ns: int, ride: Ride | None = None, *,
                  jumps: bool) -> None:
         self.motion, self.start_ns, self.ride, self.jumps = motion, start_ns, ride, jumps
-        self.chains, self.reached_ns = motion.chains, start_ns + motion.reached_ns
+        self.chains = isinstance(motion, AcceleratedMotion) and motion.constants.chains
         self.filter_state: NDArray[np.float64] | None = None
 
     @property
@@ -85,10 +85,11 @@ class Segment:
 
     @cached_property
     def energy(self) -> float:
-        posture, top, start = self.motion.posture(0), self.motion.top, self.start
-        if posture is None:
+        motion, start = self.motion, self.start
+        if not isinstance(motion, AcceleratedMotion):
             return float(self._first.energy[0])
-        o1, o2 = float(posture.across.real), float(posture.across.imag)  # evaluates no states
+        top, across = motion.top, motion.posture(0).across      # evaluates no states
+        o1, o2 = float(across.real), float(across.imag)
         return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
                 + top.gravity_torque * math.cos(start.theta))
 
@@ -99,20 +100,26 @@ class Segment:
         return exact if exact is not None and exact.ns_limit >= LAST_STAMP_NS else None
 
     @property
+    def piece(self) -> Piece:
+        """The piece of the path of the pivot."""
+        return self.ride.piece if self.ride else REST
+
+    @property
     def end_ns(self) -> int:
         """When the acceleration of the pivot changes [ns]."""
-        return self.ride.piece.end_ns if self.ride else NEVER_NS
+        return self.piece.end_ns
 
-    def reach(self, t_ns: int, max_steps: int) -> bool:
+    @property
+    def reached_ns(self) -> int:
+        return self.start_ns + self.motion.reached_ns
+
+    def reach(self, t_ns: int, max_steps: int | None = None) -> bool:
         """
         Let the motion step up to a time [ns]; return False if that takes more steps.
 
         Raises IntegrationError if the equations cannot go on; `reached_ns` tells where they stop.
         """
-        try:
-            return self.motion.reach(t_ns - self.start_ns, max_steps)
-        finally:
-            self.reached_ns = self.start_ns + self.motion.reached_ns
+        return self.motion.reach(t_ns - self.start_ns, max_steps)
 
     def states(self, times: range | NDArray[np.int64]) -> States:
         """Return the states in the world at ascending times [ns]."""
@@ -128,14 +135,13 @@ class Segment:
 
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time [ns]."""
-        return (self.motion.posture(t_ns - self.start_ns)
-                or posture_at(self.states(range(t_ns, t_ns + 1))))
+        if isinstance(self.motion, AcceleratedMotion):
+            return self.motion.posture(t_ns - self.start_ns)
+        return posture_at(self.states(range(t_ns, t_ns + 1)))
 
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at times (n,) [ns]."""
-        if self.ride:
-            return self.ride.piece.at(times_ns)
-        return Kinematics(*np.zeros((3, 3, len(times_ns))))
+        return kinematics([self.piece], [len(times_ns)], times_ns)
 
     def _since_start(self, times: range | NDArray[np.int64]) -> range | NDArray[np.int64]:
         if isinstance(times, np.ndarray):
@@ -264,8 +270,8 @@ class Path:
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at ascending times (n,) [ns], those before now too."""
         shares = self._shares(times_ns) or [(self._segments[-1], times_ns)]
-        return Kinematics(*(np.concatenate(parts, axis=1) for parts in zip(*(
-            segment.pivot(times) for segment, times in shares), strict=True)))
+        return kinematics([segment.piece for segment, _ in shares],
+                          [len(times) for _, times in shares], times_ns)
 
     def increments(self, begin_ns: int, end_ns: int, point: Point, count: int = 1,
                    step_ns: int = 1) -> Increments:

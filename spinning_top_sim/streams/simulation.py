@@ -13,11 +13,11 @@ from spinning_top_sim.physics.pivot import NEVER_NS, PivotPath
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
-from spinning_top_sim.solvers.exact import MOST_TURNS
+from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
 from spinning_top_sim.solvers.propagator import Motion, propagate
-from spinning_top_sim.solvers.theta_setup import Posture
 from spinning_top_sim.solvers.vertical import (
     AcceleratedMotion,
+    Posture,
     about_vertical,
     posture_of,
     rounded,
@@ -181,8 +181,10 @@ class Simulation:
 
         None where the closed form cannot hold it, or the pivot moves.
         """
-        exact = None if self.segment.ride else self.segment.exact
-        return None if exact is None else exact.describe()
+        exact = self.segment.exact
+        if self.segment.ride or not isinstance(exact, ExactSolution):
+            return None
+        return exact.describe()
 
     def play(self, streams: Sequence[Stream], until_ns: int) -> Iterator[Block]:
         """
@@ -283,8 +285,7 @@ class Simulation:
     def _settle(self) -> None:
         """Let the solver reach `now_ns`, and be at t = 0 at least."""
         self.now_ns = max(self.now_ns, 0)
-        while not self.segment.reach(self.now_ns, OFFLINE_STEPS):
-            pass
+        self.segment.reach(self.now_ns)
 
     def _continue(self, start: State | Posture, pivot: PivotPath | None = None) -> None:
         """Go on from another state, or from the present posture on another path of the pivot."""
@@ -298,8 +299,7 @@ class Simulation:
 
     def _follow(self, last: Segment) -> Segment:
         """Return the segment behind the end of one: the pivot changes its acceleration."""
-        while not last.reach(last.end_ns, OFFLINE_STEPS):
-            pass
+        last.reach(last.end_ns)
         return _segment(self.top, last.posture(last.end_ns), last.end_ns, self.values,
                         self.pivot_path)
 

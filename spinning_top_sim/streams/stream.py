@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.pivot import Kinematics, kinematics
+from spinning_top_sim.physics.pivot import Kinematics
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, Field, Template
@@ -64,10 +64,7 @@ class Samples:
     @cached_property
     def pivot(self) -> Kinematics:
         """Position, velocity and acceleration of the pivot in the world, (3, n) each."""
-        if len(self.shares) == 1:
-            return self._segments[0].pivot(self.t_ns)
-        return kinematics([segment.ride.piece for segment in self._segments if segment.ride],
-                          self._counts, self.t_ns)
+        return self.path.pivot(self.t_ns)
 
     def at_start(self, name: str) -> NDArray[np.float64]:
         """Return a constant of the motion, (n,), as it is at the start of each segment."""
