@@ -136,15 +136,21 @@ def nutation_cubic(lambda1: Real, torque: Real, l3: Real, lz: Real, theta_dot: R
     """
     s0, c0 = sin_half * sin_half, cos_half * cos_half
     u0, sine = c0 - s0, 2 * sin_half * cos_half
-    # Lz - L3 u0, and phi' sin(theta).
-    momentum = (lz - l3) + 2 * l3 * s0 if s0 < c0 else (lz + l3) - 2 * l3 * c0
-    across = momentum / lambda1 / sine if sine else 0 * sine
+    momentum = precession_momentum(l3, lz, s0, c0)
+    across = momentum / lambda1 / sine if sine else 0 * sine    # phi' sin(theta)
     kinetic = lambda1 * (theta_dot * theta_dot + across * across) / 2     # of the axis
     return (sine * sine * theta_dot * theta_dot,
             2 * momentum * l3 / lambda1 / lambda1
             - 2 / lambda1 * (2 * u0 * kinetic + torque * sine * sine),
             2 / lambda1 * (2 * u0 * torque - kinetic) - (l3 / lambda1) * (l3 / lambda1),
             2 * torque / lambda1)
+
+
+def precession_momentum(l3: Real, lz: Real, sin2_half: Real, cos2_half: Real) -> Real:
+    """Return Lz - L3 cos(theta), without cancellation at either pole."""
+    if sin2_half < cos2_half:
+        return (lz - l3) + 2 * l3 * sin2_half
+    return (lz + l3) - 2 * l3 * cos2_half
 
 
 def _bisect(f0: float, f1: float, f2: float, f3: float, end: float) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 from gmpy2 import const_pi, mpfr
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import TIMES_TOGETHER, States
@@ -270,10 +271,8 @@ class ThetaStates(States):
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        """omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top"."""
         theta_dot, cos_psi, sin_psi = self._axis_rates
-        across = self._across()
-        return theta_dot * sin_psi - across * cos_psi, theta_dot * cos_psi + across * sin_psi
+        return attitude.transverse(theta_dot, self._across(), cos_psi, sin_psi)
 
 
 class _ExactStates(ThetaStates):

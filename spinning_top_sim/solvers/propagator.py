@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.physics.pivot import Exact
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
@@ -17,6 +18,14 @@ from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ClosedForm, ExactSolution
 from spinning_top_sim.solvers.theta_values import LARGEST_NUMBER
 from spinning_top_sim.solvers.transport import TransportMotion
+from spinning_top_sim.solvers.vertical import (
+    AcceleratedMotion,
+    Posture,
+    Vertical,
+    about_vertical,
+    posture_of,
+    rounded,
+)
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
@@ -93,6 +102,22 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
         raise ValueError(f'{top} from {start}: the constants are too far apart in size for '
                          'doubles to hold the motion')
     return motion
+
+
+def accelerated(top: Top, start: State | Posture, acceleration: Exact, *, method: str,
+                **settings: Any) -> tuple[Motion, Vertical]:
+    """
+    Return the motion while the pivot accelerates uniformly, and the vertical that it is about.
+
+    acceleration : of the pivot in the world [m/s^2]
+    method, settings : as of `propagate`
+    """
+    posture = posture_of(top, start) if isinstance(start, State) else start
+    if method == 'exact':
+        motion = AcceleratedMotion(top, posture, acceleration)
+        return motion, motion.vertical
+    vertical, halves = about_vertical(top, posture, acceleration)
+    return propagate(vertical.top, rounded(halves), method=method, **settings), vertical
 
 
 def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -> Motion:

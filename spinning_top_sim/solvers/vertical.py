@@ -21,6 +21,7 @@ from gmpy2 import const_pi, mpc, mpfr, norm, rint, sin_cos, sinh, sqrt
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.pivot import Exact
+from spinning_top_sim.physics.regimes import precession_momentum
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
@@ -285,9 +286,7 @@ def _across(lambda1: mpfr, l3: mpfr, lz: mpfr, alpha: mpc, beta: mpc, u_dot: mpf
     cosine2, sine2 = norm(alpha), norm(beta)
     if not (cosine2 and sine2):
         return mpc(0)               # it rests at a pole
-    # Lz - L3 u, without cancellation at either pole
-    momentum = ((lz - l3) + 2 * l3 * sine2 if sine2 < cosine2
-                else (lz + l3) - 2 * l3 * cosine2)
+    momentum = precession_momentum(l3, lz, sine2, cosine2)
     return -(momentum / lambda1 + IMAGINARY * u_dot) / (2 * alpha * beta.conjugate())
 
 

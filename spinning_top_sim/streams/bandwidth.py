@@ -13,7 +13,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.integrals import fastest_rate
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.path import Segment
 
@@ -70,9 +69,8 @@ class LowPass:
 
     def _edges(self, segment: Segment) -> NDArray[np.float64]:
         """Return how long before a sample the panels begin and end [ns], (panels + 1, 1)."""
-        rate = fastest_rate(segment.motion.top, segment.l3, segment.energy)
         # A specific force has squares of rates, thus twice their frequency.
-        seconds = ANGLE / (self._corner + 2.0 * rate)
+        seconds = ANGLE / (self._corner + 2.0 * segment.fastest_rate)
         panels = min(math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS)
         return np.linspace(0.0, self.memory_ns, panels + 1)[:, np.newaxis]
 

@@ -9,8 +9,8 @@ docs/sensor.md describes the whole chain.
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,16 +31,13 @@ from spinning_top_sim.streams.vibration import Vibration
 # The longest interval over which means and increments are taken [ns].
 LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
 KINDS = ('gyroscope', 'accelerometer')
-# Parameters of the errors that both kinds of axes have.
-ERRORS = ('M', 'noise_density', 'turn_on_bias', 'random_walk', 'bias_stddev', 'bias_instability',
-          'resolution', 'range')
 
 
 class Imu:
     """
     An ideal IMU at `imu.lever_arm` [m] with orientation `imu.rpy` [rad] on the body.
 
-    sensor : returns the `Sensor` for a sample period [ns], which adds the errors
+    sensor : adds the errors
     takes_means : whether a sample is the mean over the interval before it (`imu.sampling`)
     length_ns : period of its samples [ns]
 
@@ -53,9 +50,9 @@ class Imu:
         self._lever_arm: tuple[float, float, float] = values['imu.lever_arm']
         self._is_rotated = any(values['imu.rpy'])
         self._mounting = _quaternion(*values['imu.rpy'])
-        self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
         self.takes_means = values['imu.sampling'] == 'mean'
-        self.length_ns = period_ns(values['imu.rate'])
+        self._values, self.length_ns = values, period_ns(values['imu.rate'])
+        self.sensor = Sensor(values, self.length_ns)
         # When this rate began, and where the first interval after that begins [ns].
         self._since_ns = self._first_begin_ns = 0
         bandwidth = values['imu.bandwidth']
@@ -70,10 +67,6 @@ class Imu:
         interval_ns = min(self.length_ns, LONGEST_NS) + self._since_ns - self._first_begin_ns
         return max(interval_ns, self._low_pass.memory_ns if self._low_pass else 0)
 
-    @property
-    def present_sensor(self) -> 'Sensor':
-        return self.sensor(self.length_ns)
-
     def set_rate(self, rate: float, now_ns: int) -> bool:
         """Take samples at this rate [Hz] after `now_ns`; return whether the period changes."""
         length_ns = period_ns(rate)
@@ -83,6 +76,7 @@ class Imu:
         if last_ns <= self._since_ns:       # no sample since the change before this one
             last_ns = self._first_begin_ns
         self.length_ns, self._since_ns = length_ns, now_ns
+        self.sensor = Sensor(self._values, length_ns)
         self._first_begin_ns = max(last_ns, now_ns - LONGEST_NS)
         return True
 
@@ -154,7 +148,7 @@ class Imu:
 
     def measured_increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
         """Return `increments` with the errors of the sensor and its vibration."""
-        exact, sensor = self.increments(samples), self.present_sensor
+        exact, sensor = self.increments(samples), self.sensor
         if sensor.is_perfect and self._vibration.is_off:
             return exact
         means, seconds = samples.once(self.means), self._lengths(samples.times)
@@ -223,9 +217,10 @@ class Sensor:
     def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
         self._rate_matrix, self._force_matrix = (values[f'imu.{kind}_M'] for kind in KINDS)
         self._g_sensitivity = values['imu.gyroscope_A']
-        self.is_perfect = not any(self._g_sensitivity) and all(
-            values[name] == BY_NAME[name].default
-            for name in (f'imu.{kind}_{error}' for kind in KINDS for error in ERRORS))
+        self.is_perfect = all(
+            values[name] == one.default for name, one in BY_NAME.items()
+            if name.startswith(('imu.gyroscope_', 'imu.accelerometer_'))
+            and not name.endswith('correlation_time'))
         self._resolutions, self._ranges = _six(values, 'resolution'), _six(values, 'range')
         white = np.array(_six(values, 'noise_density')) / math.sqrt(period_ns * 1e-9)
         variances = (white ** 2 + np.array(self._resolutions) ** 2 / 12.0).tolist()

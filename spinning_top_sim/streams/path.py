@@ -93,6 +93,10 @@ class Segment:
         return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
                 + top.gravity_torque * math.cos(start.theta))
 
+    @cached_property
+    def fastest_rate(self) -> float:
+        return integrals.fastest_rate(self.motion.top, self.l3, self.energy)
+
     @property
     def exact(self) -> ClosedForm | None:
         """The closed form; None where doubles cannot hold it, or not up to the last stamp."""
@@ -302,9 +306,8 @@ class Path:
 
 def _within(segment: Segment, begins: range, length_ns: int, point: Point) -> list[Increments]:
     """Return the increments over consecutive panels of intervals within a segment."""
-    rate = integrals.fastest_rate(segment.motion.top, segment.l3, segment.energy)
-    count = integrals.panels(rate, length_ns)
+    count = integrals.panels(segment.fastest_rate, length_ns)
     edges = [length_ns * k // count for k in range(count + 1)]
     return [integrals.increments(
         segment.own_states, range(begins.start + begin, begins.stop + begin, begins.step),
-        end - begin, point, rate) for begin, end in pairwise(edges)]
+        end - begin, point, segment.fastest_rate) for begin, end in pairwise(edges)]

@@ -14,14 +14,8 @@ from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
-from spinning_top_sim.solvers.propagator import Motion, propagate
-from spinning_top_sim.solvers.vertical import (
-    AcceleratedMotion,
-    Posture,
-    about_vertical,
-    posture_of,
-    rounded,
-)
+from spinning_top_sim.solvers.propagator import accelerated, propagate
+from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
@@ -38,33 +32,6 @@ LONGEST_OFFLINE_NS = 100 * NANOSECONDS      # for the sake of progress
 MOST_BLOCKS = 20_000            # of a run; then they are longer
 # Turns a second whose phases doubles hold up to the last stamp.
 MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
-
-
-class Command(NamedTuple):
-    """Momenta that were commanded [kg m^2/s], and when [ns]."""
-
-    t_ns: int
-    l3: float
-    lz: float
-
-
-class NewState(NamedTuple):
-    """A `State` that was set, and when [ns]."""
-
-    t_ns: int
-    theta: float
-    theta_dot: float
-    phi: float
-    psi: float
-    l3: float
-    lz: float
-
-
-class ImuRate(NamedTuple):
-    """Another `imu.rate` [Hz], and from when on [ns]."""
-
-    t_ns: int
-    rate: float
 
 
 class Drive(NamedTuple):
@@ -86,7 +53,8 @@ class Simulation:
     streams : every stream, whether it is switched on or not
     path : the motion
     now_ns : every sample up to here is done (-1: not even that of t = 0); may be set
-    history : what was applied since the start
+    history : what was applied since the start: time [ns], then L3 and Lz of a command, the fields
+        of a `State`, the rate of the IMU [Hz], or those of a `Drive`
     pivot_path : of the pivot; None while it rests at the origin
     lz : as last commanded, about the vertical of the world [kg m^2/s]
     epoch_ns : stamp of t = 0 [ns]
@@ -125,7 +93,7 @@ class Simulation:
         self.imu = Imu(values)
         self.values, self.top = dict(values), top
         self.streams = all_streams(values, self.imu)
-        self.history: list[Command | NewState | ImuRate | Drive] = []
+        self.history: list[tuple[int, *tuple[float, ...]]] = []
         self.now_ns = -1
         # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
@@ -207,7 +175,7 @@ class Simulation:
         imu, rate = self.imu, changes.get('imu.rate')
         if rate is not None and imu.set_rate(rate, max(self.now_ns, 0)):
             self.path.keep_steps_ns = imu.keep_ns
-            self.history.append(ImuRate(max(self.now_ns, 0), rate))
+            self.history.append((max(self.now_ns, 0), rate))
         for stream in self.streams:
             stream.apply(changes)
         self.version += 1
@@ -232,7 +200,7 @@ class Simulation:
         self._continue(ContinuedState(
             theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
             psi=float(now.psi[0]), l3=l3, lz=lz))
-        self.history.append(Command(self.now_ns, l3, lz))
+        self.history.append((self.now_ns, l3, lz))
 
     def set_state(self, state: State) -> None:
         """
@@ -242,7 +210,7 @@ class Simulation:
         """
         self._settle()
         self._continue(state)
-        self.history.append(NewState(self.now_ns, *astuple(state)))
+        self.history.append((self.now_ns, *astuple(state)))
 
     def drive(self, velocity: Sequence[float], stop_ns: int | None = None) -> int | None:
         """
@@ -343,21 +311,11 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
 
 
 def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
-           pivot: PivotPath | None) -> Segment:
-    step = partial(propagate, method=values['solver.method'],
-                   equations=values['solver.equations'], rtol=values['solver.rtol'],
-                   atol=values['solver.atol'])
+                 pivot: PivotPath | None) -> Segment:
+    settings = {name: values[f'solver.{name}'] for name in ('method', 'equations', 'rtol', 'atol')}
     if pivot is None:
         assert isinstance(start, State)
-        return Segment(step(top, start), start_ns, jumps=True)
-    posture, piece = start, pivot.lasting(start_ns)
-    if isinstance(posture, State):
-        posture = posture_of(top, posture)
-    motion: Motion
-    if values['solver.method'] == 'exact':
-        motion = accelerated = AcceleratedMotion(top, posture, piece.acceleration)
-        vertical = accelerated.vertical
-    else:
-        vertical, halves = about_vertical(top, posture, piece.acceleration)
-        motion = step(vertical.top, rounded(halves))
+        return Segment(propagate(top, start, **settings), start_ns, jumps=True)
+    piece = pivot.lasting(start_ns)
+    motion, vertical = accelerated(top, start, piece.acceleration, **settings)
     return Segment(motion, start_ns, Ride(top, vertical, piece), jumps=isinstance(start, State))

@@ -56,13 +56,13 @@ def _joints(samples: Samples) -> Sequence[Field]:
 
 
 def _readings(imu: Imu, samples: Samples) -> Sequence[Field]:
-    return (messages.NO_ROTATION, *imu.present_sensor.read(samples.once(imu.felt), samples.times))
+    return (messages.NO_ROTATION, *imu.sensor.read(samples.once(imu.felt), samples.times))
 
 
 def _estimates(imu: Imu, samples: Samples) -> Sequence[Field]:
     _, *readings = _readings(imu, samples)
     exact = imu.orientation(samples.states)
-    return (imu.present_sensor.orientation(exact, samples.times), *readings)
+    return (imu.sensor.orientation(exact, samples.times), *readings)
 
 
 def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
@@ -101,7 +101,7 @@ class ImuStream(Stream):
     def _template(self) -> Template:
         covariances = 3 * [messages.EXACT]
         if self._is_noisy:
-            sensor = self.imu.present_sensor
+            sensor = self.imu.sensor
             covariances = [messages.diagonal(*variances) for variances in (
                 sensor.orientation_variances, 3 * (sensor.rate_variance,),
                 3 * (sensor.force_variance,))]
@@ -200,7 +200,7 @@ def all_streams(values: Mapping[str, Any], imu: Imu | None = None) -> list[Strea
                is_noisy=True),
         of_imu('imu_data', 'imu/data', partial(_estimates, imu), is_noisy=True),
         of_imu('imu', 'ground_truth/imu_bias', has_orientation=False, fields=lambda samples: (
-            messages.NO_ROTATION, *imu.present_sensor.bias(samples.times))),
+            messages.NO_ROTATION, *imu.sensor.bias(samples.times))),
         of_imu('ground_truth_imu', 'ground_truth/imu',
                lambda samples: (imu.orientation(samples.states), *imu.sampled(samples))),
         stream('imu_timing', 'ground_truth/imu_timing', ARRAY,

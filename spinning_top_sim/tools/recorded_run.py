@@ -5,7 +5,7 @@ import contextlib
 import json
 import operator
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from spinning_top_sim.physics.top import State
@@ -15,7 +15,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import ENCAPSULATION
-from spinning_top_sim.streams.simulation import Command, Drive, ImuRate, NewState, Simulation
+from spinning_top_sim.streams.simulation import Drive, Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
@@ -28,8 +28,8 @@ LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
 LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
 # What entries of `Simulation.history` have after their time, by the events that record them; they
 # differ in the count of numbers.
-APPLIED = {'command': Command._fields[1:], 'state': NewState._fields[1:],
-           'parameters': ImuRate._fields[1:], 'drive': Drive._fields[1:]}
+APPLIED = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fields(State)),
+           'parameters': ('rate',), 'drive': Drive._fields[1:]}
 # Numbers of the events that begin another motion at the present time.
 FIELDS_OF = {name: APPLIED[name] for name in ('command', 'state', 'drive')}
 # Names in the message definition of the arrays of numbers in a template, in their order, by topic
