@@ -20,7 +20,7 @@ from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import GRAVITY, Reals, Run
 from spinning_top_sim.exam.trial import Feed, MakeFilter
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.imu import Sensor
+from spinning_top_sim.streams.inertial_sensor import Sensor
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.vibration import Vibration
 

@@ -21,28 +21,6 @@ from spinning_top_sim.physics.top import State, Top
 Real = Any              # float, or a multiprecision number
 # Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
 COINCIDE = 1e-12
-# What one sees of each motion, by its name.
-SENTENCES = {
-    'at rest': 'Nothing turns: the axis stays where it is.',
-    'cusps': 'Released without a push: the axis falls, is turned aside, and rises to stand still '
-             'for an instant.',
-    'free top': 'No torque acts: the axis goes round a fixed direction, that of the angular '
-                'momentum.',
-    'hanging': 'The axis hangs straight down, and the body only spins.',
-    'loops': 'Pushed backwards at the start: where the axis is highest it moves backwards, and '
-             'draws loops.',
-    'planar pendulum, rotating': 'Without spin: the axis goes over the top in one vertical plane.',
-    'planar pendulum, swinging': 'Without spin: the axis swings in one vertical plane.',
-    'sleeping': 'The axis stands upright and the spin is fast enough to hold it there.',
-    'sleeping, unstable': 'The axis stands upright, but the spin is too slow: a touch makes it '
-                          'fall.',
-    'spherical pendulum': 'Without spin: the axis swings round the vertical like a weight on a '
-                          'string.',
-    'steady precession': 'The axis goes round the vertical at one tilt and one speed.',
-    'through the bottom': 'The axis passes through the straight-down position in each nutation.',
-    'through the top': 'The axis passes through the upright position in each nutation.',
-    'waves': 'The axis nods up and down while it always goes round the same way.',
-}
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Quaternion, Vector
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.imu import converted, transformed
+from spinning_top_sim.streams.inertial_sensor import converted, transformed
 
 
 class Magnetometer:

@@ -21,6 +21,7 @@ from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.stream import Samples, Stream, Timing, faults_of
 
+NODE_NAME = 'spinning_top'
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
               'quaternion_norm_error', 'orientation_error')
@@ -227,3 +228,11 @@ def all_streams(values: Mapping[str, Any], imu: Imu | None = None) -> list[Strea
         stream('invariants', '~/invariants', ARRAY, messages.float64_multi_array(INVARIANTS),
                _invariants),
         Markers(values)]
+
+
+def resolve_topic(topic: str, namespace: str) -> str:
+    """Return the full name of a topic, as ROS resolves it for the node in this namespace."""
+    if topic.startswith('/'):
+        return topic
+    parts = [namespace.strip('/'), topic.replace('~', NODE_NAME, 1)]
+    return '/' + '/'.join(filter(None, parts))

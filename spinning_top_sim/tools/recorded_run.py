@@ -15,6 +15,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import ENCAPSULATION
+from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.simulation import Drive, Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
@@ -97,7 +98,7 @@ class RunDescription:
     def values_in_effect(self) -> dict[str, Any]:
         """The parameters of the first sample: a change that waits for a reset is not in it."""
         return {parameter.name: (
-            self.values_at_start if parameter.effect is parameters.Effect.RESET
+            self.values_at_start if parameter.effect is Effect.RESET
             else self.values_at_recording)[parameter.name] for parameter in parameters.TABLE}
 
 
@@ -239,7 +240,7 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     if samples:
         yield from play(run.begun_ns, ())
     simulation.now_ns = run.begun_ns
-    at_once = {one.name for one in parameters.TABLE if one.effect is parameters.Effect.NOW}
+    at_once = {one.name for one in parameters.TABLE if one.effect is Effect.NOW}
     simulation.apply({name: run.values_at_recording[name] for name in at_once})
     yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
 

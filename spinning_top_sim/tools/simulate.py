@@ -26,6 +26,7 @@ from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream, period_ns
+from spinning_top_sim.streams.topics import resolve_topic
 from spinning_top_sim.tools import cli, log_exports, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
 from spinning_top_sim.tools.table import RIDE_UNITS, Table, write_csv, write_parquet
@@ -172,7 +173,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     commands_topic, events_topic = len(streams), len(streams) + 1
     types = {stream.topic: stream.type_name for stream in streams} | dict(journal.TOPICS)
     file = create_file(
-        path, [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
+        path, [RecordedTopic(resolve_topic(name, namespace), type_name)
                for name, type_name in types.items()],
         provenance(values, epoch_ns, -1, (), values), compression=values['record.compression'])
     try:

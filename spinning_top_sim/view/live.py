@@ -28,7 +28,7 @@ from spinning_top_sim.nodes.publishers import THROTTLED
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.journal import NODE_NAME
+from spinning_top_sim.streams.topics import NODE_NAME
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import shapes
 from spinning_top_sim.view.controls import Controls
