@@ -94,7 +94,7 @@ class Simulator(Node):
         if self._date.now_ns() == 0:
             return
         if self.values['max_error'] > 0.0:
-            _ = self.simulation.segment.exact    # its modules take a while to import
+            _ = self.simulation.segment.closed_form  # its modules take a while to import
         now_ns = self._date.first_ns()
         try:
             self.simulation.epoch_ns = next_epoch(now_ns)
@@ -341,7 +341,7 @@ class Simulator(Node):
         if self.values['max_error'] > 0.0:
             with self.lock:
                 segment = self.simulation.segment
-            _ = segment.exact       # it takes milliseconds: with the lock, ticks would wait
+            _ = segment.closed_form     # it takes milliseconds: with the lock, ticks would wait
         with self.lock:
             message = self._report.diagnostics(
                 self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),

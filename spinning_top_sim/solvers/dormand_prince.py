@@ -188,7 +188,7 @@ class SteppedMotion(ABC):
         self._kept.append(Step(t, y, derivative, end, y_new, derivative_new))
 
     @functools.cached_property
-    def exact(self) -> ExactSolution | None:
+    def closed_form(self) -> ExactSolution | None:
         with suppress(ValueError):
             return ExactSolution(self.top, self.start)
         return None

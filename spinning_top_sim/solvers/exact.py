@@ -24,8 +24,8 @@ from spinning_top_sim.solvers.multiprecision import BITS, precision
 from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import (
     LARGEST_NUMBER,
-    Constants,
-    ThetaFunctions,
+    ConstantArrays,
+    MotionConstants,
     ThetaValues,
     in_range,
 )
@@ -60,18 +60,18 @@ class ClosedForm:
                 motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
                 l3 / mpfr(top.lambda3)))))
             self.bottom_rate, self.top_rate = float(bottom_rate), float(top_rate)
-            self.constants = Constants(motion)
+            self.constants = MotionConstants(motion)
             fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * const_pi()),
                           abs(beta.rate) / (2 * const_pi()), 1e-300)
             limit = min(MOST_TURNS / fastest, LARGEST_NUMBER)
             self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
 
     @cached_property
-    def theta(self) -> ThetaFunctions:
-        return ThetaFunctions([self.constants])
+    def arrays(self) -> ConstantArrays:
+        return ConstantArrays([self.constants])
 
     @property
-    def exact(self) -> Self:
+    def closed_form(self) -> Self:
         return self
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
@@ -177,15 +177,15 @@ class ExactSolution(ClosedForm):
 
     @cached_property
     def at_start(self) -> ThetaValues:
-        return ThetaValues(self.theta, Times.from_ns(range(1)))
+        return ThetaValues(self.arrays, Times.from_ns(range(1)))
 
     @property
     def theta_min(self) -> float:
-        return self.theta.bounds[0]
+        return self.arrays.bounds[0]
 
     @property
     def theta_max(self) -> float:
-        return self.theta.bounds[1]
+        return self.arrays.bounds[1]
 
     def describe(self) -> Description:
         top, start = self.top, self.start
@@ -229,10 +229,10 @@ class ThetaStates(States):
 
     method = 'exact'
 
-    def __init__(self, top: Top, start: State, theta: ThetaFunctions, times: Times,
+    def __init__(self, top: Top, start: State, arrays: ConstantArrays, times: Times,
                  **columns: Column) -> None:
         super().__init__(top, start, len(times), **columns)
-        self._theta, self._times = theta, times
+        self._arrays, self._times = arrays, times
 
     @cached_property
     def t(self) -> Column:
@@ -240,12 +240,12 @@ class ThetaStates(States):
 
     @cached_property
     def _block(self) -> ThetaValues:
-        return ThetaValues(self._theta, self._times)
+        return ThetaValues(self._arrays, self._times)
 
     def _rows(self, name: str) -> NDArray[np.float64]:
         """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
         blocks = (self._block,) if len(self) <= TIMES_TOGETHER else (
-            ThetaValues(self._theta, self._times[first:first + TIMES_TOGETHER])
+            ThetaValues(self._arrays, self._times[first:first + TIMES_TOGETHER])
             for first in range(0, len(self), TIMES_TOGETHER))
         rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
         return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
@@ -279,14 +279,14 @@ class _ExactStates(ThetaStates):
     """The states of an exact solution, on the branch of its start."""
 
     def __init__(self, solution: ExactSolution, times: Times) -> None:
-        super().__init__(solution.top, solution.start, solution.theta, times)
+        super().__init__(solution.top, solution.start, solution.arrays, times)
         self._solution = solution
 
     @cached_property
     def _block(self) -> ThetaValues:
         if len(self) == 1 and not self._times.latest:
             return self._solution.at_start
-        return ThetaValues(self._theta, self._times)
+        return ThetaValues(self._arrays, self._times)
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.physics.pivot import Exact
+from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
@@ -40,7 +40,7 @@ class Motion(Protocol):
     steps, evaluations : counts
     start : from where it moves
     reached_ns : the last time that `states` can give without further steps [ns]
-    exact : the closed form; None where doubles cannot hold it
+    closed_form : the closed form; None where doubles cannot hold it
 
     `SteppedMotion` says what its other members do.
     """
@@ -57,7 +57,7 @@ class Motion(Protocol):
     def reached_ns(self) -> int: ...
 
     @property
-    def exact(self) -> ClosedForm | None: ...
+    def closed_form(self) -> ClosedForm | None: ...
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool: ...
 
@@ -104,7 +104,7 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
     return motion
 
 
-def accelerated(top: Top, start: State | Posture, acceleration: Exact, *, method: str,
+def accelerated(top: Top, start: State | Posture, acceleration: Fractions, *, method: str,
                 **settings: Any) -> tuple[Motion, Vertical]:
     """
     Return the motion while the pivot accelerates uniformly, and the vertical that it is about.

@@ -32,7 +32,7 @@ class Sensor:
 
     rate_variance, force_variance : variances of white noise and rounding together
     orientation_variances : about the axes of the IMU [rad^2]
-    is_perfect : whether the readings are exact
+    is_perfect : whether the readings are the true values
 
     (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
     estimation", 2005, eqs. 133, 140; for the matrices J. Rehder et al., "Extending kalibr", ICRA
@@ -62,13 +62,13 @@ class Sensor:
             values['seed'], noise.Purpose.ORIENTATION, period_ns,
             np.array(deviations)[:, np.newaxis], np.zeros((3, 1)))
 
-    def read(self, exact: tuple[Vector, Vector], times: range) -> tuple[Vector, Vector]:
-        """Return the readings [rad/s], [m/s^2] of `exact`, the true values at these times [ns]."""
+    def read(self, true: tuple[Vector, Vector], times: range) -> tuple[Vector, Vector]:
+        """Return the readings [rad/s], [m/s^2] of `true`, the true values at these times [ns]."""
         if self.is_perfect:
-            return exact
+            return true
         white, bias = self._noise.at(times)
         # The chain of docs/sensor.md: matrices, g-sensitivity, bias, noise, rounding, range.
-        rates, force = exact
+        rates, force = true
         rates = transformed(self._rate_matrix, rates)
         if any(self._g_sensitivity):
             x, y, z = transformed(self._g_sensitivity, force)
@@ -80,14 +80,14 @@ class Sensor:
                 self._ranges, strict=True))
         return (w1, w2, w3), (f1, f2, f3)
 
-    def orientation(self, exact: Quaternion, times: range) -> Quaternion:
+    def orientation(self, true: Quaternion, times: range) -> Quaternion:
         """Return the orientation that the IMU estimates; its error is in the IMU's frame."""
         if not any(self.orientation_variances):
-            return exact
+            return true
         (x, y, z), _ = self._orientation_noise.at(times)
-        return attitude.product(exact, attitude.quaternion_of_vector((x, y, z)))
+        return attitude.product(true, attitude.quaternion_of_vector((x, y, z)))
 
-    def disturb(self, exact: tuple[Quaternion, Vector], means: tuple[Vector, Vector],
+    def disturb(self, true: tuple[Quaternion, Vector], means: tuple[Vector, Vector],
                 readings: tuple[Vector, Vector], seconds: Column,
                 ) -> tuple[Quaternion, Vector]:
         """
@@ -96,12 +96,12 @@ class Sensor:
         The error of the mean readings acts throughout the interval, in the frame of the sensor:
         it adds to the rotation vector, and to the velocity half-way through the rotation.
 
-        exact : the true increments
+        true : the true increments
         means : the true mean rates [rad/s] and forces [m/s^2]
         readings : those of the sensor, of the same
         seconds : lengths of the intervals (n,) [s]
         """
-        rotation, (v1, v2, v3) = exact
+        rotation, (v1, v2, v3) = true
         r1, r2, r3, *force = (
             seconds * (reading - mean) for reading, mean in zip(
                 itertools.chain(*readings), itertools.chain(*means), strict=True))

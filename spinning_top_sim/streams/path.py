@@ -51,7 +51,7 @@ class Segment:
     A motion from its start, or from a command, until the next command or change of the pivot's.
 
     Times are simulated times [ns]; those of `motion` count from `start_ns`.  Where the pivot
-    moves, `motion`, `exact`, `start` and the constants are about the effective vertical.
+    moves, `motion`, `closed_form`, `start` and the constants are about the effective vertical.
 
     ride : what the pivot does; None while it rests at the origin
     jumps : whether the angular velocity jumps at its start, as by a command
@@ -88,8 +88,8 @@ class Segment:
         motion, start = self.motion, self.start
         if not isinstance(motion, AcceleratedMotion):
             return float(self._first.energy[0])
-        top, across = motion.top, motion.posture(0).across      # evaluates no states
-        o1, o2 = float(across.real), float(across.imag)
+        top, omega = motion.top, motion.posture(0).transverse       # evaluates no states
+        o1, o2 = float(omega.real), float(omega.imag)
         return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
                 + top.gravity_torque * math.cos(start.theta))
 
@@ -98,10 +98,10 @@ class Segment:
         return integrals.fastest_rate(self.motion.top, self.l3, self.energy)
 
     @property
-    def exact(self) -> ClosedForm | None:
-        """The closed form; None where doubles cannot hold it, or not up to the last stamp."""
-        exact = self.motion.exact
-        return exact if exact is not None and exact.ns_limit >= LAST_STAMP_NS else None
+    def closed_form(self) -> ClosedForm | None:
+        """That of the motion; None where doubles cannot hold it, or not up to the last stamp."""
+        form = self.motion.closed_form
+        return form if form is not None and form.ns_limit >= LAST_STAMP_NS else None
 
     @property
     def piece(self) -> Piece:
@@ -154,17 +154,17 @@ class Segment:
 
     def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
         """Return the angles (n,) [rad] to the exact attitudes, NaN where these are not known."""
-        if self.exact is self.motion:
+        if self.closed_form is self.motion:
             return np.zeros(len(times))
-        if self.exact is None:
+        if self.closed_form is None:
             return np.full(len(times), math.nan)
-        truth = self._in_world(self.exact.states(self._since_start(times))).rows_quaternion
+        truth = self._in_world(self.closed_form.states(self._since_start(times))).rows_quaternion
         return attitude.angle_between(states.rows_quaternion, truth)
 
     def exact_point(self, times_ns: NDArray[np.int64], along: float) -> attitude.Vector:
         """Return where a point of the axis is at times (n,) [ns]; the start's where not known."""
-        states = (self._first if self.exact is None
-                  else self.exact.states(times_ns - self.start_ns))
+        states = (self._first if self.closed_form is None
+                  else self.closed_form.states(times_ns - self.start_ns))
         # Of the first state alone, one value for all times.
         x, y, z = (along * np.broadcast_to(part, times_ns.shape)
                    for part in self._in_world(states).rows_axis)

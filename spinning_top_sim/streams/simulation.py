@@ -149,10 +149,10 @@ class Simulation:
 
         None where the closed form cannot hold it, or the pivot moves.
         """
-        exact = self.segment.exact
-        if self.segment.ride or not isinstance(exact, ExactSolution):
+        solution = self.segment.closed_form
+        if self.segment.ride or not isinstance(solution, ExactSolution):
             return None
-        return exact.describe()
+        return solution.describe()
 
     def play(self, streams: Sequence[Stream], until_ns: int) -> Iterator[Block]:
         """
