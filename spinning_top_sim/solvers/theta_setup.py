@@ -204,9 +204,9 @@ def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion
         return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
     # theta -> pi - theta leaves P >= 0, and exchanges alpha and beta.
     mirror = -1 if torque < 0 else 1
-    return _nutating(sides[::mirror], lambda1, mirror, l3, lz - l3 + 2 * l3 * sin_half ** 2, (
-        f0, mirror * f1, f2, mirror * f3 or NO_GRAVITY * abs(f2)),
-        falling=mirror * theta_dot > 0)
+    return _nutating(
+        sides[::mirror], lambda1, mirror, l3, lz - l3 + 2 * l3 * sin_half ** 2,
+        (f0, mirror * f1, f2, mirror * f3 or NO_GRAVITY * abs(f2)), falling=mirror * theta_dot > 0)
 
 
 def _resting(side: _Side, lambda1: mpfr) -> Factor:

@@ -54,8 +54,7 @@ class TransportMotion(SteppedMotion):
     with c the part of L3 that these equations carry.  They are those of a frame that turns about
     e3 with the body, less a known uniform rate chi = L3/lambda3 - (L3 - c)/lambda1.  The factor
     exp(+-i chi t/2) is put on when a state is read, so the step size follows the nutation and not
-    the spin.  With c = L3/2 the spectrum of alpha and beta is centred about zero;
-    docs/accuracy.md has the reasons for this choice.
+    the spin.  With c = L3/2 the spectrum of alpha and beta is centred about zero.
 
     The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each
     sample (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).

@@ -113,7 +113,7 @@ TABLE: tuple[Parameter, ...] = (
               '0 = never', 's', 0.0, LONGEST, smallest=1e-3),
     # No range: the limit depends on the motion.
     _at_once('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
-              'kg m^2/s'),
+             'kg m^2/s'),
     _at_once('spin.lz', None, 'Angular momentum along the vertical; a change is a command; unset: '
              'L3 cos(initial.theta), the cusp', 'kg m^2/s'),
     _at_reset('solver.method', 'rk45', 'Dormand-Prince steps or the closed form', choices=METHODS),
@@ -123,7 +123,7 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', '', 1e-14, 1e-2),
     _at_reset('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2),
     _at_once('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
-              'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
+             'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
     _at_once('tick_rate', 200.0, 'How often due samples are sent; 4 Hz at least', 'Hz', 1e-2,
              HIGHEST_RATE),
     _at_once('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
@@ -207,7 +207,7 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
               10_000),
     _at_once('duration', 0.0, 'End after this much simulated time, 0 = never', 's', 0.0,
-              LONGEST, smallest=1e-9),
+             LONGEST, smallest=1e-9),
     _at_start('record.enabled', False, 'Record from the start'),
     _at_recording('record.uri', '', 'File or folder of a recording; empty: '
                   'spinning_top_<date>_<time>.mcap here'),
@@ -222,7 +222,7 @@ TABLE: tuple[Parameter, ...] = (
     _at_once('step.count', 1, 'Steps of one ~/step', '', 1, 1_000_000),
     _at_once('step.dt', 0.01, 'Simulated time of one step', 's', 1e-6, 1e3),
     _at_once('status_period', 1.0, 'Period of the status line on the terminal, 0 = none', 's', 0.0,
-              LONGEST, smallest=0.01),
+             LONGEST, smallest=0.01),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
 

@@ -52,13 +52,14 @@ class Simulation:
     top : the top that they describe
     streams : every stream, whether it is switched on or not
     path : the motion
-    now_ns : every sample up to here is done (-1: not even that of t = 0); may be set
+    now_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
     history : what was applied since the start: time [ns], then L3 and Lz of a command, the fields
         of a `State`, the rate of the IMU [Hz], or those of a `Drive`
     pivot_path : of the pivot; None while it rests at the origin
     lz : as last commanded, about the vertical of the world [kg m^2/s]
     epoch_ns : stamp of t = 0 [ns]
-    version : changes with all but `epoch_ns` that makes samples after `now_ns` other ones
+    version : counts changes that make samples after `now_ns` other than they would have been; a
+        change of `epoch_ns` is not counted
 
     Raises ValueError where there is no motion from the start state.
     """
@@ -99,8 +100,7 @@ class Simulation:
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
         self.pivot_path, self.lz = pivot, start.lz
         self.path = Path(segment, self._follow, self.imu.carry,
-                         keep_ns=max(trace_ns, LONGEST_NS, self.imu.keep_ns),
-                         keep_steps_ns=self.imu.keep_ns)
+                         keep_ns=max(trace_ns, LONGEST_NS), keep_steps_ns=self.imu.keep_ns)
         self.version += 1
 
     @property

@@ -19,7 +19,8 @@ from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.gnss import Fix, Velocity
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
-from spinning_top_sim.streams.stream import Samples, Stream, Timing, faults_of
+from spinning_top_sim.streams.stream import Samples, Stream
+from spinning_top_sim.streams.timing import Timing, faults_of
 
 NODE_NAME = 'spinning_top'
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
