@@ -120,7 +120,13 @@ def components(vectors: Sequence[float] | Sequence[Vector]) -> Rows:
 
 class SteppedMotion(ABC):
     """
-    A `Motion` by steps of equations y' = f(y).
+    A motion from its start at t = 0, by steps of equations y' = f(y).
+
+    top, start : what moves, and from where
+    ns_limit : the last time that it can give at all [ns]
+    reached_ns : the last time that `states` can give without further steps [ns]
+    steps, evaluations : counts
+    closed_form : the same motion; None where doubles cannot hold it
 
     A subclass has the equations: f, its derivative, the error that is tolerated, and the states.
 
@@ -195,7 +201,6 @@ class SteppedMotion(ABC):
 
     @property
     def reached_ns(self) -> int:
-        """The last time that `states` can give without further steps [ns]."""
         end = self._kept[-1].t1
         ns = math.floor(end * NANOSECONDS)
         return ns if ns / NANOSECONDS <= end else ns - 1

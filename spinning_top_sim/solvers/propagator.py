@@ -4,16 +4,16 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
+from spinning_top_sim.solvers.dormand_prince import SteppedMotion
 from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ClosedForm, ExactSolution
 from spinning_top_sim.solvers.theta_values import LARGEST_NUMBER
@@ -29,43 +29,8 @@ from spinning_top_sim.solvers.vertical import (
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
-
-
-class Motion(Protocol):
-    """
-    A motion from its start at t = 0; every time counts from there.
-
-    top : what moves
-    ns_limit : the last time that it can give at all [ns]
-    steps, evaluations : counts
-    start : from where it moves
-    reached_ns : the last time that `states` can give without further steps [ns]
-    closed_form : the closed form; None where doubles cannot hold it
-
-    `SteppedMotion` says what its other members do.
-    """
-
-    top: Top
-    ns_limit: int
-    steps: int
-    evaluations: int
-
-    @property
-    def start(self) -> State: ...
-
-    @property
-    def reached_ns(self) -> int: ...
-
-    @property
-    def closed_form(self) -> ClosedForm | None: ...
-
-    def reach(self, ns: int, max_steps: int | None = None) -> bool: ...
-
-    def release(self, before_ns: int) -> None: ...
-
-    def states(self, times_ns: NDArray[np.int64] | range) -> States: ...
-
-    def states_at_seconds(self, t: Column) -> States: ...
+# A motion from its start at t = 0; `SteppedMotion` says what the members do.
+Motion = ClosedForm | SteppedMotion
 
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',

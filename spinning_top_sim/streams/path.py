@@ -16,7 +16,7 @@ from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.pivot import REST, Kinematics, Piece, kinematics
 from spinning_top_sim.physics.states import Point, States
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import Top
 from spinning_top_sim.physics.world_states import WorldStates
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ClosedForm
@@ -64,20 +64,9 @@ class Segment:
     def __init__(self, motion: Motion, start_ns: int, ride: Ride | None = None, *,
                  jumps: bool) -> None:
         self.motion, self.start_ns, self.ride, self.jumps = motion, start_ns, ride, jumps
+        self.start, self.l3, self.lz = motion.start, motion.start.l3, motion.start.lz
         self.chains = isinstance(motion, AcceleratedMotion) and motion.constants.chains
         self.filter_state: NDArray[np.float64] | None = None
-
-    @property
-    def start(self) -> State:
-        return self.motion.start
-
-    @property
-    def l3(self) -> float:
-        return self.start.l3
-
-    @property
-    def lz(self) -> float:
-        return self.start.lz
 
     @cached_property
     def _first(self) -> States:
@@ -177,10 +166,8 @@ class Segment:
 def states_of(segments: Sequence[Segment], counts: Sequence[int],
               times_ns: NDArray[np.int64]) -> States:
     """Return the states in the world in segments that chain, in each at so many times [ns]."""
-    motions, rides = [], []
-    for segment in segments:
-        motions.append(cast(AcceleratedMotion, segment.motion))
-        rides.append(cast(Ride, segment.ride))
+    motions = [cast(AcceleratedMotion, segment.motion) for segment in segments]
+    rides = [cast(Ride, segment.ride) for segment in segments]
     since_ns = times_ns - np.repeat([segment.start_ns for segment in segments], counts)
     x, y, z, w = np.repeat(np.hstack([ride.vertical.rows for ride in rides]), counts, axis=1)
     states = AcceleratedStates(motions, counts, Times.from_ns(since_ns))
@@ -201,18 +188,18 @@ class Path:
                  carry: Callable[[Segment, Segment], None], *, keep_ns: int,
                  keep_steps_ns: int) -> None:
         self._segments, self._follow, self._carry = [first], follow, carry
-        self._gone_steps = self._gone_evaluations = 0       # of segments that are forgotten
+        self.gone_steps = self.gone_evaluations = 0         # of segments that are forgotten
         self._keep_ns, self.keep_steps_ns = keep_ns, keep_steps_ns
 
     @property
     def steps(self) -> int:
         """Integration steps taken so far."""
-        return self._gone_steps + sum(one.motion.steps for one in self._segments)
+        return self.gone_steps + sum(one.motion.steps for one in self._segments)
 
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side so far."""
-        return self._gone_evaluations + sum(one.motion.evaluations for one in self._segments)
+        return self.gone_evaluations + sum(one.motion.evaluations for one in self._segments)
 
     def after(self, t_ns: int) -> Segment:
         """
@@ -249,8 +236,8 @@ class Path:
     def _forget(self, segments: list[Segment]) -> None:
         for one in segments:
             self._segments.remove(one)
-            self._gone_steps += one.motion.steps
-            self._gone_evaluations += one.motion.evaluations
+            self.gone_steps += one.motion.steps
+            self.gone_evaluations += one.motion.evaluations
 
     def release(self, now_ns: int) -> None:
         """Forget the segments and integration steps that only times before this one [ns] need."""

@@ -68,7 +68,6 @@ class Simulation:
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         self.version = 0
-        self._steps_before = self._evaluations_before = 0
         self.epoch_ns = epoch_ns
         self._load(values)
 
@@ -78,9 +77,9 @@ class Simulation:
 
         Raises ValueError where there is no motion from there; then the present one goes on.
         """
-        counts = self.steps, self.evaluations
+        before = self.path
         self._load(values)
-        self._steps_before, self._evaluations_before = counts
+        self.path.gone_steps, self.path.gone_evaluations = before.steps, before.evaluations
 
     def _load(self, values: Mapping[str, Any]) -> None:
         # Whatever may be refused comes first, before anything changes.
@@ -115,11 +114,11 @@ class Simulation:
 
     @property
     def steps(self) -> int:
-        return self._steps_before + self.path.steps
+        return self.path.steps
 
     @property
     def evaluations(self) -> int:
-        return self._evaluations_before + self.path.evaluations
+        return self.path.evaluations
 
     def state(self) -> States:
         """Return the state (n = 1) at `now_ns`, or at the start before the first sample."""
