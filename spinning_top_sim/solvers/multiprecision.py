@@ -35,6 +35,12 @@ def atan2(y: mpfr, x: mpfr) -> mpfr:
     return gmpy2.atan2(y + ZERO, x + ZERO)
 
 
+def phase(angle: mpfr) -> mpc:
+    """Return exp(i angle)."""
+    sine, cosine = gmpy2.sin_cos(angle)
+    return cosine + IMAGINARY * sine
+
+
 def half_turns(radians: float) -> mpfr:
     """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
     sine, cosine = gmpy2.sin_cos(mpfr(radians) / 2)

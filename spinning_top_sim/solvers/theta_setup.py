@@ -52,14 +52,7 @@ from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.cubic import Roots, RootsTooCloseError, cubic_roots
 from spinning_top_sim.solvers.elliptic import GaussMean
-from spinning_top_sim.solvers.multiprecision import (
-    BITS,
-    ONE,
-    ZERO,
-    atan2,
-    half_turns,
-    precision,
-)
+from spinning_top_sim.solvers.multiprecision import BITS, ONE, ZERO, atan2, half_turns, precision
 from spinning_top_sim.solvers.theta_series import (
     COS_EVEN,
     MOST_TERMS,

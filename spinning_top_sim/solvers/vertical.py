@@ -17,28 +17,16 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from gmpy2 import const_pi, mpc, mpfr, norm, rint, sin_cos, sinh, sqrt
+from gmpy2 import mpc, mpfr, norm, sin_cos, sqrt
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.pivot import Fractions
-from spinning_top_sim.physics.regimes import precession_momentum
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
-from spinning_top_sim.solvers.multiprecision import (
-    BITS,
-    IMAGINARY,
-    ONE,
-    ZERO,
-    precision,
-)
-from spinning_top_sim.solvers.theta_series import SIN_ODD
-from spinning_top_sim.solvers.theta_setup import (
-    Factor,
-    PreciseState,
-    ThetaMotion,
-    set_up,
-)
+from spinning_top_sim.solvers.multiprecision import BITS, IMAGINARY, ONE, ZERO, phase, precision
+from spinning_top_sim.solvers.theta_point import cayley_klein, transverse_velocity
+from spinning_top_sim.solvers.theta_setup import PreciseState, set_up
 from spinning_top_sim.solvers.theta_values import ConstantArrays
 from spinning_top_sim.solvers.times import Times
 
@@ -150,10 +138,9 @@ class AcceleratedMotion(ClosedForm):
         if not ns:                  # perhaps at a pole, where the axis does not tell its rates
             return self._posture
         with precision(BITS):
-            vertical = self.vertical
-            alpha, beta, u_dot = _cayley_klein(self._motion, mpfr(ns) / 10 ** 9)
-            transverse = _transverse(mpfr(self.top.lambda1), self.precise_start, alpha, beta,
-                                     u_dot)
+            vertical, lambda1 = self.vertical, mpfr(self.top.lambda1)
+            alpha, beta, u_dot = cayley_klein(self._motion, mpfr(ns) / 10 ** 9)
+            transverse = transverse_velocity(lambda1, self.precise_start, alpha, beta, u_dot)
             alpha, beta = _product(vertical.alpha, vertical.beta, alpha, beta)
             return Posture(alpha, beta, transverse, self._posture.l3)
 
@@ -230,7 +217,7 @@ def posture_of(top: Top, state: State) -> Posture:
     """Return the posture of a state about the vertical of the world."""
     with precision(BITS):
         sine, cosine = sin_cos(mpfr(state.theta) / 2)
-        half_phi, half_psi = (_phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
+        half_phi, half_psi = (phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
         back = half_psi.conjugate()
         l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * mpfr(top.lambda1)
         across = ZERO               # phi' sin(theta)
@@ -247,48 +234,6 @@ def posture_at(states: States) -> Posture:
     x, y, z, w, o1, o2 = (float(part[0]) for part in (
         *states.rows_quaternion, *states.transverse_velocity))
     return Posture(mpc(complex(w, z)), mpc(complex(y, -x)), mpc(complex(o1, o2)), states.start.l3)
-
-
-def _cayley_klein(motion: ThetaMotion, t: mpfr) -> tuple[mpc, mpc, mpfr]:
-    """Return alpha, beta and cos(theta)' at t [s] in the frame of a motion."""
-    quarters = motion.quarter0 + motion.offset0 + motion.quarter_rate * t
-    whole = int(rint(quarters))
-    rest = (motion.quarter0 - whole) + motion.quarter_rate * t + motion.offset0
-    y = const_pi() / 2 * rest
-    if motion.stretch:
-        sine = sinh(motion.stretch * y)
-        xi = -sine * sine
-    else:
-        sine, _ = sin_cos(y)
-        xi = sine * sine
-    cosine = sqrt(1 - xi)
-    point = sine, cosine, xi
-    alpha, beta = (_value(factor, whole, y, t, point) for factor in (motion.alpha, motion.beta))
-    size2 = norm(alpha) + norm(beta)
-    slope = motion.u_dot_series.at(2 * sine * cosine, 1 - 2 * xi, 4 * xi * (1 - xi))
-    u_dot = motion.u_dot[whole % 2] * slope / (size2 * size2)
-    scale = 1 / sqrt(size2)
-    return scale * alpha, scale * beta, u_dot
-
-
-def _value(factor: Factor, whole: int, y: mpfr, t: mpfr,
-           point: tuple[mpfr, mpfr, mpfr]) -> mpc:
-    """Return alpha D or beta D; `whole`, y, `point`: N, y and the arguments of `Series.at`."""
-    parts, scale = factor.parts[whole % 2], factor.scales[whole % 2]
-    real, imag = (scale * part.at(*point) for part in parts)
-    if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
-        real = -real                # it passes a pole
-    turn = factor.rate * t + 2 * const_pi() * factor.phase_turns + factor.drift * y
-    return (real + IMAGINARY * imag) * _phase(turn)
-
-
-def _transverse(lambda1: mpfr, start: PreciseState, alpha: mpc, beta: mpc, u_dot: mpfr) -> mpc:
-    """Return omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta))."""
-    cosine2, sine2 = norm(alpha), norm(beta)
-    if not (cosine2 and sine2):
-        return mpc(0)               # it rests at a pole
-    momentum = precession_momentum(start.l3, start.lz, sine2, cosine2)
-    return -(momentum / lambda1 + IMAGINARY * u_dot) / (2 * alpha * beta.conjugate())
 
 
 def _least_rotation(x: mpfr, y: mpfr, z: mpfr) -> tuple[mpc, mpc]:
@@ -308,8 +253,3 @@ def _least_rotation(x: mpfr, y: mpfr, z: mpfr) -> tuple[mpc, mpc]:
 def _product(a: mpc, b: mpc, c: mpc, d: mpc) -> tuple[mpc, mpc]:
     """Return the Cayley-Klein parameters of two rotations: (a, b) after (c, d)."""
     return a * c - b * d.conjugate(), a * d + b * c.conjugate()
-
-
-def _phase(angle: mpfr) -> mpc:
-    sine, cosine = sin_cos(angle)
-    return cosine + IMAGINARY * sine
