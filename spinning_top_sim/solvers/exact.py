@@ -20,7 +20,7 @@ from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import TIMES_TOGETHER, States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.multiprecision import BITS, precision
+from spinning_top_sim.solvers.multiprecision import BITS, as_mpfr, precision
 from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import (
     LARGEST_NUMBER,
@@ -54,11 +54,11 @@ class ClosedForm:
     def __init__(self, top: Top, motion: ThetaMotion, l3: mpfr, lz: mpfr) -> None:
         self.top = top
         with precision(BITS):
-            alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * mpfr(top.lambda1)
+            alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * as_mpfr(top.lambda1)
             bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
             in_range('the fastest rate', max(map(abs, (
                 motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
-                l3 / mpfr(top.lambda3)))))
+                l3 / as_mpfr(top.lambda3)))))
             self.bottom_rate, self.top_rate = float(bottom_rate), float(top_rate)
             self.constants = MotionConstants(motion)
             fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * const_pi()),
@@ -144,7 +144,7 @@ class ExactSolution(ClosedForm):
             l3=start.l3, lz=start.lz)
         phi, psi = self.start.phi, self.start.psi
         with precision(BITS):
-            motion = set_up(top, mpfr(top.gravity), self.start)
+            motion = set_up(top, as_mpfr(top.gravity), self.start)
             super().__init__(top, motion, mpfr(start.l3), mpfr(start.lz))
             alpha, beta, self.m, self.m1 = (
                 motion.alpha, motion.beta, float(motion.m), float(motion.m1))

@@ -8,6 +8,7 @@ ACM Trans. Math. Softw. 33 (2007), 13.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 
 import gmpy2
 from gmpy2 import mpc, mpfr
@@ -17,6 +18,8 @@ BITS = 192
 # An infinity or a NaN raises ArithmeticError.
 TRAPS = {f'trap_{name}': True for name in ('divzero', 'invalid', 'overflow')}
 ZERO, ONE, IMAGINARY = mpfr(0), mpfr(1), mpc(1j)
+# A double as it is, where 53 bits or more are set.  The constants of a top come again and again.
+as_mpfr = lru_cache(64)(mpfr)
 
 
 @contextmanager

@@ -52,7 +52,15 @@ from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.cubic import Roots, RootsTooCloseError, cubic_roots
 from spinning_top_sim.solvers.elliptic import GaussMean
-from spinning_top_sim.solvers.multiprecision import BITS, ONE, ZERO, atan2, half_turns, precision
+from spinning_top_sim.solvers.multiprecision import (
+    BITS,
+    ONE,
+    ZERO,
+    as_mpfr,
+    atan2,
+    half_turns,
+    precision,
+)
 from spinning_top_sim.solvers.theta_series import (
     COS_EVEN,
     MOST_TERMS,
@@ -179,8 +187,8 @@ class _Side(NamedTuple):
 
 
 def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
-    torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
-    lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
+    torque = as_mpfr(top.mass) * gravity * as_mpfr(top.com_distance)
+    lambda1, lambda3 = as_mpfr(top.lambda1), as_mpfr(top.lambda3)
     alpha_turns, beta_turns, alpha, beta = ZERO, ZERO, mpc(1), mpc(1)
     if isinstance(start, PreciseState):
         sin_half, cos_half, theta_dot, alpha, beta, l3, lz = start

@@ -24,7 +24,15 @@ from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
-from spinning_top_sim.solvers.multiprecision import BITS, IMAGINARY, ONE, ZERO, phase, precision
+from spinning_top_sim.solvers.multiprecision import (
+    BITS,
+    IMAGINARY,
+    ONE,
+    ZERO,
+    as_mpfr,
+    phase,
+    precision,
+)
 from spinning_top_sim.solvers.theta_point import cayley_klein, transverse_velocity
 from spinning_top_sim.solvers.theta_setup import PreciseState, set_up
 from spinning_top_sim.solvers.theta_values import ConstantArrays
@@ -88,11 +96,11 @@ class Vertical(NamedTuple):
         # + i theta') exp(-i psi)
         rates = transverse * (alpha * beta.conjugate())
         half_tilt = cosine * sine
-        tilt, unit, lambda1 = 2 * half_tilt, half_tilt * size2, mpfr(top.lambda1)
+        tilt, unit, lambda1 = 2 * half_tilt, half_tilt * size2, as_mpfr(top.lambda1)
         lz = (1 - 2 * sine * sine) * l3 - lambda1 * rates.real / unit * tilt
         most2 = THROUGH ** 2 * tilt * tilt * (l3 * l3 * tilt * tilt + lambda1 * (
             lambda1 * norm(transverse)
-            + abs(self.gravity * mpfr(top.mass) * mpfr(top.com_distance))))
+            + abs(self.gravity * as_mpfr(top.mass) * as_mpfr(top.com_distance))))
         for pole in (l3, -l3):
             if (lz - pole) ** 2 <= most2:
                 lz = pole or ZERO
@@ -138,7 +146,7 @@ class AcceleratedMotion(ClosedForm):
         if not ns:                  # perhaps at a pole, where the axis does not tell its rates
             return self._posture
         with precision(BITS):
-            vertical, lambda1 = self.vertical, mpfr(self.top.lambda1)
+            vertical, lambda1 = self.vertical, as_mpfr(self.top.lambda1)
             alpha, beta, u_dot = cayley_klein(self._motion, mpfr(ns) / 10 ** 9)
             transverse = transverse_velocity(lambda1, self.precise_start, alpha, beta, u_dot)
             alpha, beta = _product(vertical.alpha, vertical.beta, alpha, beta)
@@ -219,7 +227,7 @@ def posture_of(top: Top, state: State) -> Posture:
         sine, cosine = sin_cos(mpfr(state.theta) / 2)
         half_phi, half_psi = (phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
         back = half_psi.conjugate()
-        l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * mpfr(top.lambda1)
+        l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * as_mpfr(top.lambda1)
         across = ZERO               # phi' sin(theta)
         if lz + l3:
             across += (lz + l3) / two_lambda1 * sine / cosine
