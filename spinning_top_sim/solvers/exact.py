@@ -20,7 +20,7 @@ from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import TIMES_TOGETHER, States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.multiprecision import BITS, as_mpfr, precision
+from spinning_top_sim.solvers.multiprecision import as_mpfr, precision
 from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import (
     LARGEST_NUMBER,
@@ -53,7 +53,7 @@ class ClosedForm:
 
     def __init__(self, top: Top, motion: ThetaMotion, l3: mpfr, lz: mpfr) -> None:
         self.top = top
-        with precision(BITS):
+        with precision():
             alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * as_mpfr(top.lambda1)
             bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
             in_range('the fastest rate', max(map(abs, (
@@ -143,7 +143,7 @@ class ExactSolution(ClosedForm):
             phi=start.phi + half_turn, psi=start.psi - half_turn,
             l3=start.l3, lz=start.lz)
         phi, psi = self.start.phi, self.start.psi
-        with precision(BITS):
+        with precision():
             motion = set_up(top, as_mpfr(top.gravity), self.start)
             super().__init__(top, motion, mpfr(start.l3), mpfr(start.lz))
             alpha, beta, self.m, self.m1 = (

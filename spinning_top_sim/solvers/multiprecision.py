@@ -23,7 +23,7 @@ as_mpfr = lru_cache(64)(mpfr)
 
 
 @contextmanager
-def precision(bits: int) -> Iterator[None]:
+def precision(bits: int = BITS) -> Iterator[None]:
     """Set the precision of results [bits] within a `with` statement, in this thread."""
     before = gmpy2.get_context()
     gmpy2.set_context(gmpy2.context(precision=bits, **TRAPS))
@@ -42,12 +42,6 @@ def phase(angle: mpfr) -> mpc:
     """Return exp(i angle)."""
     sine, cosine = gmpy2.sin_cos(angle)
     return cosine + IMAGINARY * sine
-
-
-def half_turns(radians: float) -> mpfr:
-    """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
-    sine, cosine = gmpy2.sin_cos(mpfr(radians) / 2)
-    return atan2(sine, cosine) / (2 * gmpy2.const_pi())
 
 
 def double_double(x: mpfr) -> tuple[float, float]:

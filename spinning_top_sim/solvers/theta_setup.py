@@ -52,15 +52,7 @@ from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.cubic import Roots, RootsTooCloseError, cubic_roots
 from spinning_top_sim.solvers.elliptic import GaussMean
-from spinning_top_sim.solvers.multiprecision import (
-    BITS,
-    ONE,
-    ZERO,
-    as_mpfr,
-    atan2,
-    half_turns,
-    precision,
-)
+from spinning_top_sim.solvers.multiprecision import BITS, ONE, ZERO, as_mpfr, atan2, precision
 from spinning_top_sim.solvers.theta_series import (
     COS_EVEN,
     MOST_TERMS,
@@ -72,7 +64,7 @@ from spinning_top_sim.solvers.theta_series import (
 )
 
 BITS_TO_TRY = BITS, 2 * BITS, 4 * BITS, 8 * BITS
-with precision(BITS):
+with precision():
     NO_GRAVITY = mpfr('1e-1000')    # so small that u3 is infinite to all bits
 
 
@@ -194,7 +186,7 @@ def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion
         sin_half, cos_half, theta_dot, alpha, beta, l3, lz = start
     else:
         theta, theta_dot, l3, lz = map(mpfr, (start.theta, start.theta_dot, start.l3, start.lz))
-        phi, psi = half_turns(start.phi), half_turns(start.psi)
+        phi, psi = _half_turns(start.phi), _half_turns(start.psi)
         alpha_turns, beta_turns = phi + psi, phi - psi
         sin_half, cos_half = sin_cos(theta / 2)
     spin = l3 * (1 / lambda3 - 1 / lambda1)
@@ -208,6 +200,12 @@ def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion
     return _nutating(
         sides[::mirror], lambda1, mirror, l3, lz - l3 + 2 * l3 * sin_half ** 2,
         (f0, mirror * f1, f2, mirror * f3 or NO_GRAVITY * abs(f2)), falling=mirror * theta_dot > 0)
+
+
+def _half_turns(radians: float) -> mpfr:
+    """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
+    sine, cosine = sin_cos(mpfr(radians) / 2)
+    return atan2(sine, cosine) / (2 * const_pi())
 
 
 def _resting(side: _Side, lambda1: mpfr) -> Factor:

@@ -23,7 +23,7 @@ from gmpy2 import const_pi, mpfr, rint
 from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.solvers.multiprecision import BITS, double_double, precision
+from spinning_top_sim.solvers.multiprecision import double_double, precision
 from spinning_top_sim.solvers.theta_series import SIN_ODD
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import UNITS, Times, halves, products
@@ -122,7 +122,10 @@ class ConstantArrays:
         self.drifts = self.columns([one.drifts for one in motions])
         (stretch,) = self.columns([(one.stretch,) for one in motions])
         self.stretch = stretch if np.any(stretch) else None
-        self.prefactors = _prefactors(motions)
+        self.prefactors = present.prefactors
+        if any(one.prefactors != present.prefactors for one in motions):
+            self.prefactors = [sum(rows, ()) for rows in zip(
+                *(one.prefactors for one in motions), strict=True)]
         self.coefficients = _side_by_side(
             [*chain.from_iterable(chain.from_iterable(zip(*(
                 one.polynomials for one in motions), strict=True)))]
@@ -146,7 +149,7 @@ class ConstantArrays:
     def turned(self, times: Times) -> tuple[Matrix, Matrix]:
         """Return what the three phases have grown by (3, n), as two doubles each."""
         if times.unit not in self._rates:
-            with precision(BITS):
+            with precision():
                 rate, rest = map(self.columns, np.array([
                     [double_double(x / UNITS[times.unit]) for x in one.rates]
                     for one in self._motions]).transpose(2, 0, 1))
@@ -179,13 +182,6 @@ class ConstantArrays:
         quarter0 = int(self.start_whole[0, 0])
         start = (first + slope * quarter0 + 1.0) % 4.0 - 1.0
         return start - slope * quarter0, slope
-
-
-def _prefactors(motions: Sequence[MotionConstants]) -> list[tuple[int, ...]]:
-    present = motions[0].prefactors
-    if all(one.prefactors == present for one in motions):
-        return present
-    return [sum(rows, ()) for rows in zip(*(one.prefactors for one in motions), strict=True)]
 
 
 class ThetaValues:

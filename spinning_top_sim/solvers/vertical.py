@@ -24,15 +24,7 @@ from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
-from spinning_top_sim.solvers.multiprecision import (
-    BITS,
-    IMAGINARY,
-    ONE,
-    ZERO,
-    as_mpfr,
-    phase,
-    precision,
-)
+from spinning_top_sim.solvers.multiprecision import IMAGINARY, ONE, ZERO, as_mpfr, phase, precision
 from spinning_top_sim.solvers.theta_point import cayley_klein, transverse_velocity
 from spinning_top_sim.solvers.theta_setup import PreciseState, set_up
 from spinning_top_sim.solvers.theta_values import ConstantArrays
@@ -145,7 +137,7 @@ class AcceleratedMotion(ClosedForm):
         """
         if not ns:                  # perhaps at a pole, where the axis does not tell its rates
             return self._posture
-        with precision(BITS):
+        with precision():
             vertical, lambda1 = self.vertical, as_mpfr(self.top.lambda1)
             alpha, beta, u_dot = cayley_klein(self._motion, mpfr(ns) / 10 ** 9)
             transverse = transverse_velocity(lambda1, self.precise_start, alpha, beta, u_dot)
@@ -202,7 +194,7 @@ def _upright(top: Top, gravity: mpfr, x: mpfr, y: mpfr, z: mpfr) -> Vertical:
 def about_vertical(top: Top, posture: Posture, acceleration: Fractions,
                    ) -> tuple[Vertical, PreciseState]:
     """Return the vertical while the pivot accelerates so, and the state there."""
-    with precision(BITS):
+    with precision():
         (x, y, z), up, down = _verticals(top, acceleration)
         # The axis is (2 alpha beta, |alpha|^2 - |beta|^2).
         level = 2 * posture.alpha * posture.beta
@@ -223,7 +215,7 @@ def rounded(start: PreciseState) -> State:
 
 def posture_of(top: Top, state: State) -> Posture:
     """Return the posture of a state about the vertical of the world."""
-    with precision(BITS):
+    with precision():
         sine, cosine = sin_cos(mpfr(state.theta) / 2)
         half_phi, half_psi = (phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
         back = half_psi.conjugate()

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The errors of an inertial sensor, by kalibr's model, with its names and units.
-
-docs/sensor.md describes the whole chain.
-"""
+"""The errors of an IMU, with kalibr's names and units; docs/sensor.md describes the chain."""
 
 import itertools
 import math

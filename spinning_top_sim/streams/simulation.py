@@ -143,11 +143,7 @@ class Simulation:
         return float(self.segment.orientation_error(self.state(), self._now())[0])
 
     def describe(self) -> Description | None:
-        """
-        Return the present motion in numbers.
-
-        None where the closed form cannot hold it, or the pivot moves.
-        """
+        """Return the motion in numbers; None if it has no closed form or the pivot moves."""
         solution = self.segment.closed_form
         if self.segment.ride or not isinstance(solution, ExactSolution):
             return None

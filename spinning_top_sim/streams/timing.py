@@ -18,11 +18,7 @@ FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_r
 
 
 class Timing:
-    """
-    What the clock and the driver of an IMU do to its samples.
-
-    Offset, drift and jitter depend on the seed, the number of the sample and its time alone.
-    """
+    """Offset, drift and jitter depend on the seed, the number of the sample and its time alone."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._seed = values['seed']
