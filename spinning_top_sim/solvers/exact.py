@@ -145,7 +145,7 @@ class ExactSolution(ClosedForm):
         phi, psi = self.start.phi, self.start.psi
         with precision():
             motion = set_up(top, as_mpfr(top.gravity), self.start)
-            super().__init__(top, motion, mpfr(start.l3), mpfr(start.lz))
+            super().__init__(top, motion, as_mpfr(start.l3), as_mpfr(start.lz))
             alpha, beta, self.m, self.m1 = (
                 motion.alpha, motion.beta, float(motion.m), float(motion.m1))
             # 2 K/w, two quarter periods
