@@ -8,6 +8,7 @@ from pathlib import Path
 from spinning_top_sim.nodes.publishers import THROTTLED, THROTTLED_RATE
 from spinning_top_sim.nodes.tick_loop import LoopState
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING, all_streams
 
 HEAD = """<!-- Written by docs/interface.py from the code. -->
@@ -95,8 +96,8 @@ AFTER_PARAMETERS = """
 The help of each executable, in the site. `ros2 run spinning_top_sim NAME` runs the same.
 """
 
-EFFECTS = {parameters.Effect.NOW: 'at once', parameters.Effect.RESET: 'reset',
-           parameters.Effect.RECORDING: 'next recording', parameters.Effect.START: 'start'}
+EFFECTS = {Effect.NOW: 'at once', Effect.RESET: 'reset',
+           Effect.RECORDING: 'next recording', Effect.START: 'start'}
 
 
 def page() -> str:

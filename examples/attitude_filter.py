@@ -357,7 +357,7 @@ def compare(path: Path, names: Sequence[str], namespace: str = '/',
     from rosbags.typesys import Stores, get_typestore
 
     from spinning_top_sim.recording.reader import LogReader
-    from spinning_top_sim.streams.journal import resolve_topic
+    from spinning_top_sim.streams.topics import resolve_topic
 
     typestore = get_typestore(Stores.ROS2_JAZZY)
     topics = [resolve_topic(topic, namespace) for topic in _topics(names)]

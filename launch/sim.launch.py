@@ -18,7 +18,7 @@ from launch_ros.actions import Node
 
 from spinning_top_sim.nodes import launch_helpers
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.journal import resolve_topic
+from spinning_top_sim.streams.topics import resolve_topic
 from spinning_top_sim.tools.scene_file import is_of_ros, parse_assignment, read_scene
 
 SHARE = Path(get_package_share_directory('spinning_top_sim'))

@@ -27,7 +27,7 @@ from spinning_top_sim.physics.states import TIMES_TOGETHER
 from spinning_top_sim.solvers import propagator
 from spinning_top_sim.solvers.cubic import RootsTooCloseError, cubic_roots
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.multiprecision import BITS, exact, precision
+from spinning_top_sim.solvers.multiprecision import BITS, precision
 
 BOUND = 5e-15
 G = 9.81
@@ -314,7 +314,6 @@ def test_the_precision_of_the_caller_does_not_matter():
     expected = columns(ExactSolution(*REGIMES['cusp']).states(times))
     with precision(10):
         get_context().trap_inexact = True
-        assert exact(1e300 / 3) == 1e300 / 3
         found = columns(ExactSolution(*REGIMES['cusp']).states(times))
     assert (found == expected).all() and get_context().precision == 53
 

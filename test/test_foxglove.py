@@ -8,14 +8,12 @@ import pytest
 from helpers.reference import ROOT
 
 from spinning_top_sim.nodes.replayer import message_class
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.journal import NODE_NAME, resolve_topic
-from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, all_streams
+from spinning_top_sim.streams import parameters, topics
 
 LAYOUT = json.loads((ROOT / 'foxglove/spinning_top_sim.json').read_text())
 PANELS = LAYOUT['configById']
-TYPES = {resolve_topic(stream.topic, ''): stream.type_name
-         for stream in all_streams(parameters.checked({}))}
+TYPES = {topics.resolve_topic(stream.topic, ''): stream.type_name
+         for stream in topics.all_streams(parameters.checked({}))}
 TYPES['/diagnostics'] = 'diagnostic_msgs/msg/DiagnosticArray'
 # Of robot_state_publisher, which the launch files start.
 TYPES['/robot_description'] = 'std_msgs/msg/String'
@@ -45,10 +43,10 @@ def test_a_path_is_a_field_of_a_topic(path):
     if path['timestampMethod'] == 'headerStamp':
         assert 'header' in message_class(TYPES[topic]).get_fields_and_field_types()
     index = parts[-1][1]
-    if topic == f'/{NODE_NAME}/invariants':
-        assert INVARIANTS[int(index)].replace('_', ' ') == path['label']
+    if topic == f'/{topics.NODE_NAME}/invariants':
+        assert topics.INVARIANTS[int(index)].replace('_', ' ') == path['label']
     if topic == '/joint_states':
-        assert JOINTS[int(index)] == {'θ': 'nutation_joint', "φ'": 'precession_joint'}[
+        assert topics.JOINTS[int(index)] == {'θ': 'nutation_joint', "φ'": 'precession_joint'}[
             path['label']]
 
 

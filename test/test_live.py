@@ -28,11 +28,8 @@ from helpers.simulations import (
 
 from spinning_top_sim import solve
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.live import (
-    LARGEST_BLOCK,
-    LONGEST_AHEAD_NS,
-    MOST_STEPS,
-)
+from spinning_top_sim.streams.live import LARGEST_BLOCK, LONGEST_AHEAD_NS, MOST_STEPS
+from spinning_top_sim.streams.parameter import Effect
 
 PERIOD_NS = 10 * MILLISECOND        # of most streams
 
@@ -239,7 +236,7 @@ def test_a_change_of_rates_reaches_every_stream():
     at_once = {stream.rate_parameter for stream in simulation.streams}
     assert at_once == {name for name in parameters.BY_NAME if name.endswith('.rate')
                        and not name.startswith('imu.vibration')}
-    assert all(parameters.BY_NAME[name].effect is parameters.Effect.NOW for name in at_once)
+    assert all(parameters.BY_NAME[name].effect is Effect.NOW for name in at_once)
     simulation.apply({'imu.rate': 100.0})
     simulation.advance(SECOND)
     simulation.apply({**dict.fromkeys(at_once, 50.0), 'tick_rate': 100.0})
@@ -256,7 +253,7 @@ def test_what_takes_effect_at_once_acts_on_the_samples_or_is_named_in_the_node()
     node = ''.join(path.read_text() for path in (ROOT / 'spinning_top_sim/nodes').glob('*.py'))
     before = play(simulate(), SECOND // 2)
     for parameter in parameters.TABLE:
-        if (parameter.effect is parameters.Effect.NOW and f"'{parameter.name}'" not in node
+        if (parameter.effect is Effect.NOW and f"'{parameter.name}'" not in node
                 and not parameter.name.endswith('.enabled')):
             simulation = simulate()
             simulation.apply({parameter.name: parameter.check(0.5 * parameter.default)})

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spinning_top_sim import State, Top
-from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics import attitude, pivot
 from spinning_top_sim.physics.pivot import Kinematics, PivotPath
 from spinning_top_sim.solvers.multiprecision import BITS, precision
 from spinning_top_sim.solvers.vertical import AcceleratedMotion, posture_of
@@ -37,16 +37,17 @@ REST, NOWHERE = (Fraction(0),) * 3, (0.0, 0.0, 0.0)
 
 def kinematics(path, times_ns):
     """Return position, velocity and acceleration (n, 3) of a pivot at times [ns]."""
-    rows = [path.piece(int(t)).at(np.array([t])) for t in times_ns]
-    return Kinematics(*(np.concatenate(part, axis=1).T for part in zip(*rows, strict=True)))
+    pieces = [path.piece(int(t)) for t in times_ns]
+    found = pivot.kinematics(pieces, len(pieces) * [1], np.array(times_ns))
+    return Kinematics(*(part.T for part in found))
 
 
 def sample(segment, t_ns, point):
     """Return attitude w x y z, omega and alpha in the body, and where a point is at a time."""
-    states, pivot = segment.states(range(t_ns, t_ns + 1)), segment.pivot(np.array([t_ns]))
+    states, place = segment.states(range(t_ns, t_ns + 1)), segment.pivot(np.array([t_ns]))
     arm = np.stack(attitude.rotated(states.rows_quaternion, point))
     return (np.roll(states.quaternion[0], 1), states.angular_velocity[0],
-            states.angular_acceleration[0], (pivot.position + arm)[:, 0])
+            states.angular_acceleration[0], (place.position + arm)[:, 0])
 
 
 def errors(path, case):

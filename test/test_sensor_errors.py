@@ -19,7 +19,7 @@ from stress import sensor as statistics
 
 from spinning_top_sim.physics.attitude import rotation_vector
 from spinning_top_sim.streams import noise, parameters
-from spinning_top_sim.streams.imu import Sensor
+from spinning_top_sim.streams.inertial_sensor import Sensor
 from spinning_top_sim.streams.magnetometer import Magnetometer
 
 ALL_BIASES = {f'imu.{kind}_{name}': value for kind in ('gyroscope', 'accelerometer')

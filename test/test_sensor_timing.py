@@ -11,7 +11,7 @@ from helpers.simulations import EPOCH_NS, SECOND
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.stream import Timing
+from spinning_top_sim.streams.timing import Timing
 from spinning_top_sim.tools.simulate import main as simulate_to_log
 from spinning_top_sim.tools.survey import survey
 

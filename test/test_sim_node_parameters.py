@@ -13,6 +13,7 @@ from helpers.node_logs import commands_in, log_of, verified
 from helpers.own_node import OwnNode
 
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.topics import INVARIANTS
 
 
@@ -137,7 +138,7 @@ def test_parameters_are_described(node):
         assert f'[{parameter.unit}]' in descriptor.description or not parameter.unit
         assert parameter.effect.value in descriptor.description
         assert 'must' not in descriptor.description, 'what is allowed is a constraint'
-        assert descriptor.read_only == (parameter.effect is parameters.Effect.START)
+        assert descriptor.read_only == (parameter.effect is Effect.START)
         bounded = [bound for bound in (parameter.minimum, parameter.above, parameter.maximum)
                    if bound is not None]
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]

@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.tools import recorded_run
 
 
@@ -94,7 +95,7 @@ def test_each_change_that_takes_effect_at_once_is_replayed(short):
         event = recorded_run.Event('parameters', run.epoch_ns + 1, 1, 1, change)
         events = [event for _, event in recorded_run.rerun(
             dataclasses.replace(run, events=[event]), run.epoch_ns + 2)]
-        assert (event in events) is (parameter.effect is parameters.Effect.NOW), parameter.name
+        assert (event in events) is (parameter.effect is Effect.NOW), parameter.name
 
 
 def test_another_machine_is_warned_of(short, capsys, monkeypatch):

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
 from spinning_top_sim.installation import parameter_files
-from spinning_top_sim.physics.regimes import SENTENCES
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
@@ -216,7 +215,7 @@ def test_every_scene_has_words_and_plots(scene):
         track.detect_motion()
     (motion,) = track.motions
     words = text.words(track, motion, 0, 0)
-    assert SENTENCES[motion.description.name] in words and 'nan' not in words
+    assert text.SENTENCES[motion.description.name] in words and 'nan' not in words
     for plot in plots.motion_plots([plots.Plotted(track, 0, 0, NANOSECONDS, 0)]):
         ElementTree.fromstring(svg.draw(plot))
         assert 'nan' not in svg.draw(plot)

@@ -21,7 +21,7 @@ from spinning_top_sim.exam.scenarios import GRAVITY, Reals, Run
 from spinning_top_sim.exam.scored import ScoredRun, report_of
 from spinning_top_sim.exam.trial import Feed, MakeFilter
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.inertial_sensor import Sensor
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.vibration import Vibration
 
@@ -183,4 +183,4 @@ def _readings(values: Mapping[str, Any], turns: Rotation, rates: Reals, force: R
         magnetometer.true((x, y, z, w)), (x, y, z, w), lambda of_body: of_body, t_ns[late]), steps)
     felt = signals[:3, 1::2], signals[3:, 1::2]
     return [np.stack(reading, axis=1) for reading in (
-        *Imu(values).sensor(PERIOD_NS).read(felt, steps), field)]
+        *Sensor(values, PERIOD_NS).read(felt, steps), field)]

@@ -163,7 +163,7 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
         # Simpson's rule.
         mean = (signals[:3, :-2:2] + 4.0 * signals[:3, 1::2] + ends[:3]) / 6.0
         parts.append(np.stack([
-            *itertools.chain(*device.sensor(period_ns).read((mean, ends[3:6]), steps)),
+            *itertools.chain(*device.sensor.read((mean, ends[3:6]), steps)),
             *magnetometer.read(magnetometer.true(ends[6:]), steps), *ends[6:], *ends[:3]]))
         simulation.now_ns = begin_ns = end_ns
         if end < scenario.duration:

@@ -11,7 +11,7 @@ from launch.actions import LogInfo
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from spinning_top_sim.streams.journal import resolve_topic
+from spinning_top_sim.streams.topics import resolve_topic
 from spinning_top_sim.tools.urdf import inertia_fault, robot_description
 
 STATE_PUBLISHER = 'robot_state_publisher'

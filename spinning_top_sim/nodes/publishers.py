@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from spinning_top_sim.nodes.recording_session import Topic
-from spinning_top_sim.streams import journal
+from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.live import Output
 from spinning_top_sim.streams.stream import Stream
 
@@ -74,7 +74,7 @@ class StreamPublishers:
         """Raise ValueError for an enabled stream whose message package is not installed."""
         for output in outputs:
             package, parameter = output.stream.type_name.split('/')[0], output.stream.parameter
-            if journal.is_enabled(parameter, values) and find_spec(package) is None:
+            if parameters.is_enabled(parameter, values) and find_spec(package) is None:
                 raise ValueError(f'{parameter}.enabled: needs the ROS package {package}, which is '
                                  'not installed')
 
@@ -82,7 +82,7 @@ class StreamPublishers:
         """Create the publishers of enabled streams, and destroy those of disabled ones."""
         for output in outputs:
             stream = output.stream
-            topic, enabled = stream.topic, journal.is_enabled(stream.parameter, values)
+            topic, enabled = stream.topic, parameters.is_enabled(stream.parameter, values)
             if enabled and topic not in self.by_topic:
                 package, _, name = stream.type_name.split('/')
                 message_class = getattr(importlib.import_module(f'{package}.msg'), name)

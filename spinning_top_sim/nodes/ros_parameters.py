@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.parameters import Parameter
+from spinning_top_sim.streams.parameter import Effect, Parameter
 from spinning_top_sim.tools.scene_file import likely_name, parse_yaml
 
 SPIN = ('spin.l3', 'spin.lz')
@@ -85,7 +85,7 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows.  Types are dynamic: `Parameter.check` decides."""
     result = ParameterDescriptor(
         name=parameter.name, description=parameter.describe(range_too=False), dynamic_typing=True,
-        read_only=parameter.effect is parameters.Effect.START,
+        read_only=parameter.effect is Effect.START,
         additional_constraints=parameter.allowed)
     lowest = parameter.minimum if parameter.above is None else parameter.above
     if lowest is None or parameter.maximum is None:

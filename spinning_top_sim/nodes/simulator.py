@@ -30,9 +30,10 @@ from spinning_top_sim.nodes.stamp_clock import StampClock
 from spinning_top_sim.nodes.terminal import Terminal
 from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop, next_epoch
 from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.streams.parameter import Effect
 
 LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
 
@@ -58,7 +59,7 @@ class Simulator(Node):
         self.values = {**values, 'spin.lz': simulation.lz}
         self.add_pre_set_parameters_callback(ros_parameters.with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self._date = StampClock(self, journal.is_enabled('clock', values))
+        self._date = StampClock(self, parameters.is_enabled('clock', values))
         self.lock = FairLock()
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self.lock, self._outputs.topics_to_record)
@@ -95,7 +96,7 @@ class Simulator(Node):
         if self._date.now_ns() == 0:
             return
         if self.values['max_error'] > 0.0:
-            _ = self.simulation.segment.exact    # its modules take a while to import
+            _ = self.simulation.segment.closed_form  # its modules take a while to import
         now_ns = self._date.first_ns()
         try:
             self.simulation.epoch_ns = next_epoch(now_ns)
@@ -215,7 +216,7 @@ class Simulator(Node):
                 self.simulation.apply(changed)
                 self._open_outputs(values)
                 self.loop.set_pace(values)
-        for effect in (parameters.Effect.RESET, parameters.Effect.RECORDING):
+        for effect in (Effect.RESET, Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
                      and values[name] != self.values[name]]
             if names:
@@ -223,7 +224,7 @@ class Simulator(Node):
         self.values, self._start_spin = values, start_spin
 
     def _check_context(self, values: Mapping[str, Any]) -> None:
-        if self._date.follows and journal.is_enabled('clock', values):
+        if self._date.follows and parameters.is_enabled('clock', values):
             raise ValueError('clock.enabled, publish_clock: must be false while this node follows '
                              'another /clock (use_sim_time)')
         self._outputs.check(self.simulation.outputs, values)
@@ -340,7 +341,7 @@ class Simulator(Node):
         if self.values['max_error'] > 0.0:
             with self.lock:
                 segment = self.simulation.segment
-            _ = segment.exact       # it takes milliseconds: with the lock, ticks would wait
+            _ = segment.closed_form     # it takes milliseconds: with the lock, ticks would wait
         with self.lock:
             message = self._report.diagnostics(
                 self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),

@@ -102,6 +102,16 @@ def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
     return 0.25 / top.lambda1 * (bottom + upright)
 
 
+def transverse(theta_dot: Column, across: Column, cos_psi: Column, sin_psi: Column,
+               ) -> tuple[Column, Column]:
+    """
+    Return omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top".
+
+    omega_1 + i omega_2 = (-phi' sin(theta) + i theta') exp(-i psi); across: phi' sin(theta).
+    """
+    return theta_dot * sin_psi - across * cos_psi, theta_dot * cos_psi + across * sin_psi
+
+
 def angle_between(p: Quaternion, q: Quaternion) -> Column:
     """Return the angle [rad] of the rotation from one attitude to another, accurate near 0."""
     apart = sum((a - b) * (a - b) for a, b in zip(p, q, strict=True))

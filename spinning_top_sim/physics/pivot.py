@@ -22,9 +22,9 @@ from spinning_top_sim.physics.top import shown
 NANOSECONDS = 1_000_000_000
 NEVER_NS = 2 ** 63 - 1
 # x, y, z in the world; doubles are fractions, too.
-Exact = tuple[Fraction, Fraction, Fraction]
+Fractions = tuple[Fraction, Fraction, Fraction]
 Given = Sequence[float | Fraction]
-ZERO: Exact = (Fraction(0), Fraction(0), Fraction(0))
+ZERO: Fractions = (Fraction(0), Fraction(0), Fraction(0))
 SHORTEST_S = 1e-3               # mean time of the pieces of a path that is repeated
 ROUNDING = 1e-12                # of velocities, relative
 
@@ -48,12 +48,11 @@ class Piece(NamedTuple):
 
     start_ns: int
     end_ns: int
-    acceleration: Exact
+    acceleration: Fractions
     begins: NDArray[np.float64]
 
-    def at(self, times_ns: NDArray[np.int64]) -> Kinematics:
-        """Return what the pivot does at times (n,) [ns]."""
-        return kinematics([self], [len(times_ns)], times_ns)
+
+REST = Piece(0, NEVER_NS, ZERO, np.zeros(9))
 
 
 def kinematics(pieces: Sequence[Piece], counts: Sequence[int],
@@ -96,8 +95,8 @@ class PivotPath:
                  position: Given = ZERO, velocity: Given = ZERO, start_ns: int = 0) -> None:
         self.start_ns = start_ns
         self._starts, self._accelerations = [0], []
-        places, velocities = [_exact(position)], [_exact(velocity)]
-        steps = [(duration_ns, _exact(given)) for duration_ns, given in pieces]
+        places, velocities = [_fractions(position)], [_fractions(velocity)]
+        steps = [(duration_ns, _fractions(given)) for duration_ns, given in pieces]
         for duration_ns, acceleration in _closed(steps) if repeat else steps:
             t = Fraction(duration_ns, NANOSECONDS)
             v = velocities[-1]
@@ -140,7 +139,7 @@ class PivotPath:
         repeat : bool, default False
             Whether the path leads from the last waypoint to the first, and goes on for ever.
         """
-        points = [_exact(point) for point in waypoints]
+        points = [_fractions(point) for point in waypoints]
         if len(set(points)) < 2:
             raise ValueError(f'waypoints = {shown(waypoints)}: must be two different points or '
                              'more')
@@ -169,7 +168,7 @@ class PivotPath:
         stop_ns : int
             When the pivot begins to brake, even if it has not reached the target [ns].
         """
-        goal, now = _exact(target), _exact(velocity)
+        goal, now = _fractions(target), _fractions(velocity)
         pieces = list(_ramp(now, goal, most_acceleration))
         left_ns = stop_ns - start_ns - sum(duration_ns for duration_ns, _ in pieces)
         if stop_ns < NEVER_NS:
@@ -206,7 +205,7 @@ class PivotPath:
         return piece
 
 
-def _closed(steps: Sequence[tuple[int, Exact]]) -> Sequence[tuple[int, Exact]]:
+def _closed(steps: Sequence[tuple[int, Fractions]]) -> Sequence[tuple[int, Fractions]]:
     """Return the steps; the last one cancels a change of the velocity by rounding errors."""
     changes = [_sum((Fraction(duration_ns, NANOSECONDS), a)) for duration_ns, a in steps]
     change = _sum(*((1, one) for one in changes))
@@ -218,7 +217,8 @@ def _closed(steps: Sequence[tuple[int, Exact]]) -> Sequence[tuple[int, Exact]]:
                                                        change))), *steps[last + 1:]]
 
 
-def _ramp(begin: Exact, end: Exact, most_acceleration: float) -> Iterator[tuple[int, Exact]]:
+def _ramp(begin: Fractions, end: Fractions,
+          most_acceleration: float) -> Iterator[tuple[int, Fractions]]:
     """Yield the piece that leads from one velocity to another, none if they are equal."""
     change = _sum((1, end), (-1, begin))
     if any(change):
@@ -226,7 +226,7 @@ def _ramp(begin: Exact, end: Exact, most_acceleration: float) -> Iterator[tuple[
         yield duration_ns, _sum((Fraction(NANOSECONDS, duration_ns), change))
 
 
-def _leg(way: Exact, speed: float, acceleration: float) -> list[tuple[int, Given]]:
+def _leg(way: Fractions, speed: float, acceleration: float) -> list[tuple[int, Given]]:
     """Return the pieces that lead a pivot at rest to rest again, displaced by `way`."""
     length = _length(way)
     ramp = min(speed / acceleration, math.sqrt(length / acceleration))
@@ -248,20 +248,20 @@ def _whole_ns(seconds: float) -> int:
     return max(1, math.ceil(seconds * 1e9))
 
 
-def _length(v: Exact) -> float:
+def _length(v: Fractions) -> float:
     return math.hypot(*(float(x) for x in v))
 
 
-def _sum(*terms: tuple[int | Fraction, Exact]) -> Exact:
+def _sum(*terms: tuple[int | Fraction, Fractions]) -> Fractions:
     """Return the sum of factor * vector."""
     x, y, z = (sum((factor * v[k] for factor, v in terms), Fraction(0)) for k in range(3))
     return x, y, z
 
 
-def _exact(given: Given) -> Exact:
+def _fractions(given: Given) -> Fractions:
     x, y, z = (Fraction(value) for value in given)
     return x, y, z
 
 
-def _doubles(vectors: Sequence[Exact]) -> NDArray[np.float64]:
+def _doubles(vectors: Sequence[Fractions]) -> NDArray[np.float64]:
     return np.array([[float(x) for x in v] for v in vectors]).reshape(-1, 3)

@@ -13,7 +13,7 @@ Reals = NDArray[np.float64]
 # An axis nearer to a vertical than this [rad] counts as vertical.  The rounding of Lz changes the
 # angular velocity of a tilted axis by some 1e-16 L3/(lambda1 theta), relative to L3/lambda1 here
 # as much as the tilt that is left out.
-POLE = 1.5e-8
+POLE_IN_DOUBLES = 1.5e-8
 
 
 def state_of(top: Top, quaternion: Reals, angular_velocity: Reals) -> State:
@@ -37,7 +37,7 @@ def state_of(top: Top, quaternion: Reals, angular_velocity: Reals) -> State:
     wx, wy, wz = angular_velocity.tolist()
     theta = 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w))
     half_sum, half_difference = math.atan2(z, w), math.atan2(-x, y)
-    if math.sin(theta) < POLE:
+    if math.sin(theta) < POLE_IN_DOUBLES:
         phi = math.atan2(-wx, wy) if wx or wy else 0.0
         if theta < 1.0:
             theta, psi, sign = 0.0, 2.0 * half_sum - phi, 1.0

@@ -21,28 +21,6 @@ from spinning_top_sim.physics.top import State, Top
 Real = Any              # float, or a multiprecision number
 # Relative distance below which two roots, or a root and Lz/L3, are said to coincide.
 COINCIDE = 1e-12
-# What one sees of each motion, by its name.
-SENTENCES = {
-    'at rest': 'Nothing turns: the axis stays where it is.',
-    'cusps': 'Released without a push: the axis falls, is turned aside, and rises to stand still '
-             'for an instant.',
-    'free top': 'No torque acts: the axis goes round a fixed direction, that of the angular '
-                'momentum.',
-    'hanging': 'The axis hangs straight down, and the body only spins.',
-    'loops': 'Pushed backwards at the start: where the axis is highest it moves backwards, and '
-             'draws loops.',
-    'planar pendulum, rotating': 'Without spin: the axis goes over the top in one vertical plane.',
-    'planar pendulum, swinging': 'Without spin: the axis swings in one vertical plane.',
-    'sleeping': 'The axis stands upright and the spin is fast enough to hold it there.',
-    'sleeping, unstable': 'The axis stands upright, but the spin is too slow: a touch makes it '
-                          'fall.',
-    'spherical pendulum': 'Without spin: the axis swings round the vertical like a weight on a '
-                          'string.',
-    'steady precession': 'The axis goes round the vertical at one tilt and one speed.',
-    'through the bottom': 'The axis passes through the straight-down position in each nutation.',
-    'through the top': 'The axis passes through the upright position in each nutation.',
-    'waves': 'The axis nods up and down while it always goes round the same way.',
-}
 
 
 def natural_momentum(top: Top) -> float:
@@ -141,15 +119,21 @@ def nutation_cubic(lambda1: Real, torque: Real, l3: Real, lz: Real, theta_dot: R
     """
     s0, c0 = sin_half * sin_half, cos_half * cos_half
     u0, sine = c0 - s0, 2 * sin_half * cos_half
-    # Lz - L3 u0, and phi' sin(theta).
-    momentum = (lz - l3) + 2 * l3 * s0 if s0 < c0 else (lz + l3) - 2 * l3 * c0
-    across = momentum / lambda1 / sine if sine else 0 * sine
+    momentum = precession_momentum(l3, lz, s0, c0)
+    across = momentum / lambda1 / sine if sine else 0 * sine    # phi' sin(theta)
     kinetic = lambda1 * (theta_dot * theta_dot + across * across) / 2     # of the axis
     return (sine * sine * theta_dot * theta_dot,
             2 * momentum * l3 / lambda1 / lambda1
             - 2 / lambda1 * (2 * u0 * kinetic + torque * sine * sine),
             2 / lambda1 * (2 * u0 * torque - kinetic) - (l3 / lambda1) * (l3 / lambda1),
             2 * torque / lambda1)
+
+
+def precession_momentum(l3: Real, lz: Real, sin2_half: Real, cos2_half: Real) -> Real:
+    """Return Lz - L3 cos(theta), without cancellation at either pole."""
+    if sin2_half < cos2_half:
+        return (lz - l3) + 2 * l3 * sin2_half
+    return (lz + l3) - 2 * l3 * cos2_half
 
 
 def _bisect(f0: float, f1: float, f2: float, f3: float, end: float) -> float:

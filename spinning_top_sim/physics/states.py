@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from importlib import import_module
-from types import ModuleType
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -259,7 +257,9 @@ class States:
         matplotlib.figure.Figure
             A notebook with `%matplotlib inline` shows it; `savefig` writes it to a file.
         """
-        return cast('Figure', _pictures().plot(self))
+        with needed('a picture', 'plot'):
+            from spinning_top_sim.physics import pictures  # noqa: PLC0415 - matplotlib is slow
+        return pictures.plot(self)
 
     def animate(self, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
         """
@@ -277,10 +277,6 @@ class States:
         matplotlib.animation.FuncAnimation
             `to_jshtml` makes it a part of a notebook, `save` a file.
         """
-        return cast('FuncAnimation', _pictures().animate(self, fps, speed))
-
-
-def _pictures() -> ModuleType:
-    """Import matplotlib only where something is drawn: it takes long to start."""
-    with needed('a picture', 'plot'):
-        return import_module('spinning_top_sim.physics.pictures')
+        with needed('a picture', 'plot'):
+            from spinning_top_sim.physics import pictures  # noqa: PLC0415 - matplotlib is slow
+        return pictures.animate(self, fps, speed)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from operator import attrgetter
 
 import numpy as np
 
@@ -31,13 +32,15 @@ class WorldStates(States):
         q(world <- frame) as x, y, z, w.
     """
 
+    # What is the same.
+    t, energy, l3, lz = (cached_property(attrgetter(f'_moved.{name}')) for name in (
+        't', 'energy', 'l3', 'lz'))
+    transverse_velocity = cached_property(attrgetter('_moved.transverse_velocity'))
+    rows_angular_acceleration = cached_property(attrgetter('_moved.rows_angular_acceleration'))
+
     def __init__(self, top: Top, moved: States, rotation: Quaternion) -> None:
         super().__init__(top, moved.start, len(moved))
         self.method, self._moved, self._rotation = moved.method, moved, rotation
-
-    @cached_property
-    def t(self) -> Column:
-        return self._moved.t
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
@@ -47,14 +50,6 @@ class WorldStates(States):
         x, y, z, w = (part + 0.0 for part in (
             moved if is_identity else attitude.product(self._rotation, moved)))
         return x, y, z, w
-
-    @cached_property
-    def transverse_velocity(self) -> tuple[Column, Column]:
-        return self._moved.transverse_velocity
-
-    @cached_property
-    def rows_angular_acceleration(self) -> Vector:
-        return self._moved.rows_angular_acceleration
 
     def specific_force(self, point: Point) -> Vector:
         return self._moved.specific_force(point)
@@ -89,15 +84,3 @@ class WorldStates(States):
         (w1, w2), (cosine, sine, half) = self.transverse_velocity, self._meridian
         tilts = half > 0.0
         return np.where(tilts, 0.5 * (w2 * sine - w1 * cosine) / np.where(tilts, half, 1.0), 0.0)
-
-    @cached_property
-    def energy(self) -> Column:
-        return self._moved.energy
-
-    @cached_property
-    def l3(self) -> Column:
-        return self._moved.l3
-
-    @cached_property
-    def lz(self) -> Column:
-        return self._moved.lz

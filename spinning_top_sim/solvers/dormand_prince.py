@@ -120,7 +120,13 @@ def components(vectors: Sequence[float] | Sequence[Vector]) -> Rows:
 
 class SteppedMotion(ABC):
     """
-    A `Motion` by steps of equations y' = f(y).
+    A motion from its start at t = 0, by steps of equations y' = f(y).
+
+    top, start : what moves, and from where
+    ns_limit : the last time that it can give at all [ns]
+    reached_ns : the last time that `states` can give without further steps [ns]
+    steps, evaluations : counts
+    closed_form : the same motion; None where doubles cannot hold it
 
     A subclass has the equations: f, its derivative, the error that is tolerated, and the states.
 
@@ -130,7 +136,6 @@ class SteppedMotion(ABC):
 
     derivative: Callable[..., Vector]   # f of the unknowns, which it takes one by one
     ns_limit = 2 ** 63 - 1              # steps go on for ever
-    chains = False
 
     def __init__(self, top: Top, start: State, y: Vector, tolerance: float,
                  fastest_rate: float) -> None:
@@ -189,17 +194,13 @@ class SteppedMotion(ABC):
         self._kept.append(Step(t, y, derivative, end, y_new, derivative_new))
 
     @functools.cached_property
-    def exact(self) -> ExactSolution | None:
+    def closed_form(self) -> ExactSolution | None:
         with suppress(ValueError):
             return ExactSolution(self.top, self.start)
         return None
 
-    def posture(self, ns: int) -> None:
-        return None
-
     @property
     def reached_ns(self) -> int:
-        """The last time that `states` can give without further steps [ns]."""
         end = self._kept[-1].t1
         ns = math.floor(end * NANOSECONDS)
         return ns if ns / NANOSECONDS <= end else ns - 1

@@ -54,14 +54,14 @@ class GaussMean:
             total = total * power + coefficient
         return small * total
 
-    def amplitude(self, square: mpfr, sense: int) -> mpfr:
+    def amplitude(self, square: mpfr, sign: int) -> mpfr:
         """
         Return sin(pi u/(2K)) from sn^2(u), or sinh(pi u/(2K)) from -sn^2(iu).
 
         By descending Gauss transformations [DLMF 19.8.18], which leave u/K as it is and end at
         k = 0.  In terms of h = a/sin or a/sinh of the amplitude a step is a mean too.
 
-        square : sn^2(u) in [0, 1] with sense -1; -sn^2(iu) >= 0 with sense 1
+        square : sn^2(u) in [0, 1] with sign -1; -sn^2(iu) >= 0 with sign 1
         """
         if not square:
             return ZERO
@@ -69,8 +69,8 @@ class GaussMean:
         for c2 in self._squares:
             # Two terms of the root are enough where c is small.
             h2 = h * h
-            h = (h + sense * c2 / (4 * h) if c2 < h2 * NEGLIGIBLE
-                 else (h + sqrt(h2 + sense * c2)) / 2)
+            h = (h + sign * c2 / (4 * h) if c2 < h2 * NEGLIGIBLE
+                 else (h + sqrt(h2 + sign * c2)) / 2)
         amplitude = self.mean / h
         # The square may be 1 but for rounding: the sine is then 1.
-        return min(amplitude, ONE) if sense < 0 else amplitude
+        return min(amplitude, ONE) if sign < 0 else amplitude

@@ -95,7 +95,5 @@ class _EulerStates(States):
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        """omega_1 + i omega_2 = (-phi' sin(theta) + i theta') exp(-i psi), eq. (4)."""
-        across = self.phi_dot * np.sin(self.theta)
-        cosine, sine = np.cos(self.psi), np.sin(self.psi)
-        return self.theta_dot * sine - across * cosine, self.theta_dot * cosine + across * sine
+        return attitude.transverse(self.theta_dot, self.phi_dot * np.sin(self.theta),
+                                   np.cos(self.psi), np.sin(self.psi))

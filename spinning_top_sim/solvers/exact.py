@@ -15,16 +15,17 @@ import numpy as np
 from gmpy2 import const_pi, mpfr
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Number, Quaternion
 from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
 from spinning_top_sim.physics.states import TIMES_TOGETHER, States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.multiprecision import BITS, exact, precision
-from spinning_top_sim.solvers.theta_setup import Posture, ThetaMotion, set_up
+from spinning_top_sim.solvers.multiprecision import as_mpfr, precision
+from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
 from spinning_top_sim.solvers.theta_values import (
     LARGEST_NUMBER,
-    Constants,
-    ThetaFunctions,
+    ConstantArrays,
+    MotionConstants,
     ThetaValues,
     in_range,
 )
@@ -48,37 +49,30 @@ class ClosedForm:
 
     steps = evaluations = 0
     reached_ns = LARGEST_NS
-    chains = False
     start: State
 
     def __init__(self, top: Top, motion: ThetaMotion, l3: mpfr, lz: mpfr) -> None:
         self.top = top
-        with precision(BITS):
-            alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * exact(top.lambda1)
+        with precision():
+            alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * as_mpfr(top.lambda1)
             bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
             in_range('the fastest rate', max(map(abs, (
                 motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
-                l3 / exact(top.lambda3)))))
+                l3 / as_mpfr(top.lambda3)))))
             self.bottom_rate, self.top_rate = float(bottom_rate), float(top_rate)
-            self.constants = Constants(motion)
+            self.constants = MotionConstants(motion)
             fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * const_pi()),
                           abs(beta.rate) / (2 * const_pi()), 1e-300)
             limit = min(MOST_TURNS / fastest, LARGEST_NUMBER)
             self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
 
     @cached_property
-    def theta(self) -> ThetaFunctions:
-        return ThetaFunctions([self.constants])
+    def arrays(self) -> ConstantArrays:
+        return ConstantArrays([self.constants])
 
     @property
-    def exact(self) -> Self:
+    def closed_form(self) -> Self:
         return self
-
-    def describe(self) -> Description | None:
-        return None
-
-    def posture(self, ns: int) -> Posture | None:
-        return None
 
     def reach(self, ns: int, max_steps: int | None = None) -> bool:
         return True                     # there are no steps to take
@@ -148,11 +142,12 @@ class ExactSolution(ClosedForm):
             theta=min(abs(theta), math.pi), theta_dot=self.sign * start.theta_dot,
             phi=start.phi + half_turn, psi=start.psi - half_turn,
             l3=start.l3, lz=start.lz)
-        motion = set_up(top, exact(top.gravity), self.start)
-        super().__init__(top, motion, exact(start.l3), exact(start.lz))
-        alpha, beta, phi, psi = motion.alpha, motion.beta, self.start.phi, self.start.psi
-        self.m, self.m1 = float(motion.m), float(motion.m1)
-        with precision(BITS):
+        phi, psi = self.start.phi, self.start.psi
+        with precision():
+            motion = set_up(top, as_mpfr(top.gravity), self.start)
+            super().__init__(top, motion, as_mpfr(start.l3), as_mpfr(start.lz))
+            alpha, beta, self.m, self.m1 = (
+                motion.alpha, motion.beta, float(motion.m), float(motion.m1))
             # 2 K/w, two quarter periods
             self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
             self.mean_precession_rate = float(alpha.rate + beta.rate)
@@ -182,15 +177,15 @@ class ExactSolution(ClosedForm):
 
     @cached_property
     def at_start(self) -> ThetaValues:
-        return ThetaValues(self.theta, Times.from_ns(range(1)))
+        return ThetaValues(self.arrays, Times.from_ns(range(1)))
 
     @property
     def theta_min(self) -> float:
-        return self.theta.bounds[0]
+        return self.arrays.bounds[0]
 
     @property
     def theta_max(self) -> float:
-        return self.theta.bounds[1]
+        return self.arrays.bounds[1]
 
     def describe(self) -> Description:
         top, start = self.top, self.start
@@ -234,10 +229,10 @@ class ThetaStates(States):
 
     method = 'exact'
 
-    def __init__(self, top: Top, start: State, theta: ThetaFunctions, times: Times,
+    def __init__(self, top: Top, start: State, arrays: ConstantArrays, times: Times,
                  **columns: Column) -> None:
         super().__init__(top, start, len(times), **columns)
-        self._theta, self._times = theta, times
+        self._arrays, self._times = arrays, times
 
     @cached_property
     def t(self) -> Column:
@@ -245,12 +240,12 @@ class ThetaStates(States):
 
     @cached_property
     def _block(self) -> ThetaValues:
-        return ThetaValues(self._theta, self._times)
+        return ThetaValues(self._arrays, self._times)
 
     def _rows(self, name: str) -> NDArray[np.float64]:
         """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
         blocks = (self._block,) if len(self) <= TIMES_TOGETHER else (
-            ThetaValues(self._theta, self._times[first:first + TIMES_TOGETHER])
+            ThetaValues(self._arrays, self._times[first:first + TIMES_TOGETHER])
             for first in range(0, len(self), TIMES_TOGETHER))
         rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
         return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
@@ -276,24 +271,22 @@ class ThetaStates(States):
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        """omega_1 and omega_2 [rad/s], eq. (4) of "Analysis of Symmetric Spinning Top"."""
         theta_dot, cos_psi, sin_psi = self._axis_rates
-        across = self._across()
-        return theta_dot * sin_psi - across * cos_psi, theta_dot * cos_psi + across * sin_psi
+        return attitude.transverse(theta_dot, self._across(), cos_psi, sin_psi)
 
 
 class _ExactStates(ThetaStates):
     """The states of an exact solution, on the branch of its start."""
 
     def __init__(self, solution: ExactSolution, times: Times) -> None:
-        super().__init__(solution.top, solution.start, solution.theta, times)
+        super().__init__(solution.top, solution.start, solution.arrays, times)
         self._solution = solution
 
     @cached_property
     def _block(self) -> ThetaValues:
         if len(self) == 1 and not self._times.latest:
             return self._solution.at_start
-        return ThetaValues(self._theta, self._times)
+        return ThetaValues(self._arrays, self._times)
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:

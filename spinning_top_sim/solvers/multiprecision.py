@@ -18,10 +18,12 @@ BITS = 192
 # An infinity or a NaN raises ArithmeticError.
 TRAPS = {f'trap_{name}': True for name in ('divzero', 'invalid', 'overflow')}
 ZERO, ONE, IMAGINARY = mpfr(0), mpfr(1), mpc(1j)
+# A double as it is, where 53 bits or more are set.  The constants of a top come again and again.
+as_mpfr = lru_cache(64)(mpfr)
 
 
 @contextmanager
-def precision(bits: int) -> Iterator[None]:
+def precision(bits: int = BITS) -> Iterator[None]:
     """Set the precision of results [bits] within a `with` statement, in this thread."""
     before = gmpy2.get_context()
     gmpy2.set_context(gmpy2.context(precision=bits, **TRAPS))
@@ -31,22 +33,15 @@ def precision(bits: int) -> Iterator[None]:
         gmpy2.set_context(before)       # which `with gmpy2.context` of gmpy2 2.1 does not
 
 
-@lru_cache(64)
-def exact(x: float) -> mpfr:
-    """Return a double without rounding, whatever the precision that is set."""
-    with precision(53):
-        return mpfr(x)
-
-
 def atan2(y: mpfr, x: mpfr) -> mpfr:
     """Return the argument of x + iy in (-pi, pi]; 0 at the origin, whatever the signs of zeros."""
     return gmpy2.atan2(y + ZERO, x + ZERO)
 
 
-def half_turns(radians: float) -> mpfr:
-    """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
-    sine, cosine = gmpy2.sin_cos(mpfr(radians) / 2)
-    return atan2(sine, cosine) / (2 * gmpy2.const_pi())
+def phase(angle: mpfr) -> mpc:
+    """Return exp(i angle)."""
+    sine, cosine = gmpy2.sin_cos(angle)
+    return cosine + IMAGINARY * sine
 
 
 def double_double(x: mpfr) -> tuple[float, float]:

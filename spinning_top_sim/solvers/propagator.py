@@ -4,65 +4,33 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
+from spinning_top_sim.solvers.dormand_prince import SteppedMotion
 from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ClosedForm, ExactSolution
-from spinning_top_sim.solvers.theta_setup import Posture
 from spinning_top_sim.solvers.theta_values import LARGEST_NUMBER
 from spinning_top_sim.solvers.transport import TransportMotion
+from spinning_top_sim.solvers.vertical import (
+    AcceleratedMotion,
+    Posture,
+    Vertical,
+    about_vertical,
+    posture_of,
+    rounded,
+)
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
-
-
-class Motion(Protocol):
-    """
-    A motion from its start at t = 0; every time counts from there.
-
-    top : what moves
-    ns_limit : the last time that it can give at all [ns]
-    steps, evaluations : counts
-    chains : whether it is an `AcceleratedMotion` that can be read together with others
-    start : from where it moves
-    reached_ns : the last time that `states` can give without further steps [ns]
-    exact : the closed form; None where doubles cannot hold it
-
-    `SteppedMotion` says what its other members do.  `posture` returns attitude and angular
-    velocity in the world at a time [ns], or None if they are known in doubles only.
-    """
-
-    top: Top
-    ns_limit: int
-    steps: int
-    evaluations: int
-    chains: bool
-
-    @property
-    def start(self) -> State: ...
-
-    @property
-    def reached_ns(self) -> int: ...
-
-    @property
-    def exact(self) -> ClosedForm | None: ...
-
-    def posture(self, ns: int) -> Posture | None: ...
-
-    def reach(self, ns: int, max_steps: int | None = None) -> bool: ...
-
-    def release(self, before_ns: int) -> None: ...
-
-    def states(self, times_ns: NDArray[np.int64] | range) -> States: ...
-
-    def states_at_seconds(self, t: Column) -> States: ...
+# A motion from its start at t = 0; `SteppedMotion` says what the members do.
+Motion = ClosedForm | SteppedMotion
 
 
 def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',
@@ -99,6 +67,22 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
         raise ValueError(f'{top} from {start}: the constants are too far apart in size for '
                          'doubles to hold the motion')
     return motion
+
+
+def accelerated(top: Top, start: State | Posture, acceleration: Fractions, *, method: str,
+                **settings: Any) -> tuple[Motion, Vertical]:
+    """
+    Return the motion while the pivot accelerates uniformly, and the vertical that it is about.
+
+    acceleration : of the pivot in the world [m/s^2]
+    method, settings : as of `propagate`
+    """
+    posture = posture_of(top, start) if isinstance(start, State) else start
+    if method == 'exact':
+        motion = AcceleratedMotion(top, posture, acceleration)
+        return motion, motion.vertical
+    vertical, halves = about_vertical(top, posture, acceleration)
+    return propagate(vertical.top, rounded(halves), method=method, **settings), vertical
 
 
 def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -> Motion:

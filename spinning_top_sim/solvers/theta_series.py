@@ -134,13 +134,13 @@ class ThetaForm:
 
     def shifted(self, amplitude: mpfr, sense: int) -> tuple[Parts, Parts]:
         """
-        Return the parts R and s J of i s theta1(y - i s A) and of theta2(y - i s A).
+        Return the parts R and s J of i s theta1(y - i s a) and of theta2(y - i s a).
 
-        amplitude : sinh A, or, in the imaginary form, sin of its transform pi a/(2K')
+        amplitude : sinh a, or, in the imaginary form, sin of its transform a K/K'
         sense : s
         """
         square = -amplitude * amplitude if self.imaginary else amplitude * amplitude
-        other, twice = sqrt(1 + square), 2 + 4 * square      # twice: 2 cosh 2A, or 2 cos 2A
+        other, twice = sqrt(1 + square), 2 + 4 * square      # twice: 2 cosh 2a, or 2 cos 2a
         sines = _weighted(self._odd, -amplitude, amplitude, twice)
         cosines = _weighted(self._odd, other, other, twice)
         theta1 = (Series(COS_ODD, _alternating(sines)),
@@ -163,7 +163,7 @@ def _signed(sign: int, weights: Sequence[mpfr]) -> Sequence[mpfr]:
 
 def _weighted(weights: Sequence[mpfr], before: mpfr, value: mpfr,
               twice: mpfr) -> list[mpfr]:
-    """Return weights times sines or cosines of A, 3A ..., or of 0, 2A ..., from two of them."""
+    """Return weights times sines or cosines of a, 3a ..., or of 0, 2a ..., from two of them."""
     products = []
     for weight in weights:
         products.append(weight * value)

@@ -7,31 +7,31 @@ E. T. Whittaker, *Analytical Dynamics*, 4th ed., sect. 71 and 72; theta function
 Watson, *Modern Analysis*, ch. XXI; D. F. Lawden, *Elliptic Functions and Applications*; DLMF,
 https://dlmf.nist.gov, ch. 19, 20 and 22.
 
-docs/theta_functions.md derives steps 1, 2 and 4.  Its a and b are A and B here, and its r is
-r - s pi w/(2 K) here.
+docs/theta_functions.md derives steps 1, 2 and 4.  r is the mean rate, r+- + s+- pi w/(2K) there.
 
 1. *Nutation.*  u = cos(theta) = u1 + (u2 - u1) sn^2(chi) [DLMF 22.13(i)], where chi grows at the
    constant rate w, w^2 = P (u3 - u1)/(2 lambda1), P = M g R, with the parameter
    m = (u2 - u1)/(u3 - u1); m1 = 1 - m.  K = K(m) and K' = K(m1) are the quarter periods.
 
-2. *Attitude.*  alpha vanishes where u = -1, at chi = ia; beta where u = 1, at chi = K + ib, with
-   real a and b [DLMF 22.6(iv)].  A quotient of theta functions with these zeros and the poles of u
-   differs from alpha or beta by a factor exp(constant + constant * t).
+2. *Attitude.*  alpha vanishes where u = -1, at chi = i (2K/pi) a; beta where u = 1, at
+   chi = K + i (2K/pi) b, with real a and b [DLMF 22.6(iv)].  A quotient of theta functions with
+   these zeros and the poles of u differs from alpha or beta by a factor
+   exp(constant + constant * t).
 
 3. *Phase.*  Z = chi/K counts quarter periods.  N is the nearest integer and y = (pi/2) (Z - N), so
    |y| <= pi/4.  By step 2, with the signs s of Lz + L3 for alpha and of Lz - L3 for beta,
 
        alpha = X(y)/D(y) exp i(r t + c + kappa y),   X = R + i s J,   beta likewise.
 
-   D is theta4(y) at even N (u near u1) and theta3(y) at odd N (u near u2).  With A = pi a/(2K),
-   X is i s theta1(y - i s A) at even and theta2(y - i s A) at odd N for alpha; for beta, with b
-   for a, it is the other way round [DLMF 20.2(i), 20.2(iii)].
+   D is theta4(y) at even N (u near u1) and theta3(y) at odd N (u near u2).  X is
+   i s theta1(y - i s a) at even and theta2(y - i s a) at odd N for alpha; for beta, with b for a,
+   it is the other way round [DLMF 20.2(i), 20.2(iii)].
 
 4. *Rates.*  The argument of alpha has the rate Omega/2 + (Lz + L3)/(2 lambda1 (1 + u)), that of
    beta -Omega/2 + (Lz - L3)/(2 lambda1 (1 - u)), Omega = L3/lambda3 - L3/lambda1.  r follows where
    X is theta2 and y = 0, at u2 for alpha and at u1 for beta.  X(y) turns by a quarter turn from
    one N to the next, which r t contains already: kappa = -s takes it out again.  The imaginary
-   form has kappa = s (a/K' - 1) [DLMF 20.7(viii)].
+   form has kappa = s (2 K a/(pi K') - 1) [DLMF 20.7(viii)].
 
 5. *Poles.*  s = 0 means that the axis passes a pole exactly.  Then X is real and changes its sign
    there.  If Lz = L3 and u3 = 1, beta has no zero: it is proportional to dn(chi), with theta4 and
@@ -52,15 +52,7 @@ from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.cubic import Roots, RootsTooCloseError, cubic_roots
 from spinning_top_sim.solvers.elliptic import GaussMean
-from spinning_top_sim.solvers.multiprecision import (
-    BITS,
-    ONE,
-    ZERO,
-    atan2,
-    exact,
-    half_turns,
-    precision,
-)
+from spinning_top_sim.solvers.multiprecision import BITS, ONE, ZERO, as_mpfr, atan2, precision
 from spinning_top_sim.solvers.theta_series import (
     COS_EVEN,
     MOST_TERMS,
@@ -72,7 +64,7 @@ from spinning_top_sim.solvers.theta_series import (
 )
 
 BITS_TO_TRY = BITS, 2 * BITS, 4 * BITS, 8 * BITS
-with precision(BITS):
+with precision():
     NO_GRAVITY = mpfr('1e-1000')    # so small that u3 is infinite to all bits
 
 
@@ -108,7 +100,8 @@ class ThetaMotion(NamedTuple):
     quarter0, offset0 : N and 2y/pi at t = 0, offset0 accurate relative to itself
     size : coefficients of each polynomial that doubles need
     u_dot, u_dot_series : c at even and at odd N, and theta1, of u' = c theta1(2y)/D^4
-    momentum, swing : p and q at even and at odd N, of (Lz - L3 u)/lambda1 = p + q theta1(y)^2/D^2
+    precession0, precession_swing : p and q at even and at odd N, of
+        (Lz - L3 u)/lambda1 = p + q theta1(y)^2/D^2
     """
 
     alpha: Factor
@@ -119,29 +112,14 @@ class ThetaMotion(NamedTuple):
     offset0: mpfr = ZERO
     u_dot: tuple[mpfr, mpfr] = (ZERO, ZERO)
     u_dot_series: Series = NOTHING
-    momentum: tuple[mpfr, mpfr] = (ZERO, ZERO)
-    swing: tuple[mpfr, mpfr] = (ZERO, ZERO)
+    precession0: tuple[mpfr, mpfr] = (ZERO, ZERO)
+    precession_swing: tuple[mpfr, mpfr] = (ZERO, ZERO)
     m: mpfr = ZERO
     m1: mpfr = ONE
     size: int = MOST_TERMS
 
 
-class Posture(NamedTuple):
-    """
-    Attitude and angular velocity of a top at one instant, in multiprecision.
-
-    alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
-    across : omega_1 + i omega_2 in the body [rad/s]
-    l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
-    """
-
-    alpha: mpc
-    beta: mpc
-    across: mpc
-    l3: float
-
-
-class HalfAngles(NamedTuple):
+class PreciseState(NamedTuple):
     """
     A state in multiprecision; theta is in [0, pi/2].
 
@@ -159,7 +137,7 @@ class HalfAngles(NamedTuple):
     lz: mpfr
 
 
-def set_up(top: Top, gravity: mpfr, start: State | HalfAngles) -> ThetaMotion:
+def set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the numbers as they are.
 
@@ -200,15 +178,15 @@ class _Side(NamedTuple):
     slope: mpfr
 
 
-def _set_up(top: Top, gravity: mpfr, start: State | HalfAngles) -> ThetaMotion:
-    torque = exact(top.mass) * gravity * exact(top.com_distance)
-    lambda1, lambda3 = exact(top.lambda1), exact(top.lambda3)
+def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
+    torque = as_mpfr(top.mass) * gravity * as_mpfr(top.com_distance)
+    lambda1, lambda3 = as_mpfr(top.lambda1), as_mpfr(top.lambda3)
     alpha_turns, beta_turns, alpha, beta = ZERO, ZERO, mpc(1), mpc(1)
-    if isinstance(start, HalfAngles):
+    if isinstance(start, PreciseState):
         sin_half, cos_half, theta_dot, alpha, beta, l3, lz = start
     else:
         theta, theta_dot, l3, lz = map(mpfr, (start.theta, start.theta_dot, start.l3, start.lz))
-        phi, psi = half_turns(start.phi), half_turns(start.psi)
+        phi, psi = _half_turns(start.phi), _half_turns(start.psi)
         alpha_turns, beta_turns = phi + psi, phi - psi
         sin_half, cos_half = sin_cos(theta / 2)
     spin = l3 * (1 / lambda3 - 1 / lambda1)
@@ -218,10 +196,16 @@ def _set_up(top: Top, gravity: mpfr, start: State | HalfAngles) -> ThetaMotion:
     if not f0 and not f1:
         return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
     # theta -> pi - theta leaves P >= 0, and exchanges alpha and beta.
-    sense = -1 if torque < 0 else 1
-    return _nutating(sides[::sense], lambda1, sense, l3, lz - l3 + 2 * l3 * sin_half ** 2, (
-        f0, sense * f1, f2, sense * f3 or NO_GRAVITY * abs(f2)),
-        falling=sense * theta_dot > 0)
+    mirror = -1 if torque < 0 else 1
+    return _nutating(
+        sides[::mirror], lambda1, mirror, l3, lz - l3 + 2 * l3 * sin_half ** 2,
+        (f0, mirror * f1, f2, mirror * f3 or NO_GRAVITY * abs(f2)), falling=mirror * theta_dot > 0)
+
+
+def _half_turns(radians: float) -> mpfr:
+    """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
+    sine, cosine = sin_cos(mpfr(radians) / 2)
+    return atan2(sine, cosine) / (2 * const_pi())
 
 
 def _resting(side: _Side, lambda1: mpfr) -> Factor:
@@ -235,12 +219,13 @@ def _resting(side: _Side, lambda1: mpfr) -> Factor:
                   (side.modulus, side.modulus), 0, argument)
 
 
-def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, sense: int, l3: mpfr,
+def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
               momentum: mpfr, cubic: tuple[mpfr, mpfr, mpfr, mpfr], falling: bool,
               ) -> ThetaMotion:
     """
-    Return a motion with P >= 0; with sense -1 that of which this is the mirror image.
+    Return a motion with P >= 0, or that of which this is the mirror image.
 
+    mirror : 1, or -1 for the latter
     momentum : Lz - L3 u at the start of the motion itself
     """
     roots, f3 = cubic_roots(*cubic), cubic[3]
@@ -261,18 +246,18 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, sense: int, l3: mpfr,
     factors = [_quotient(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, quarter0,
                          y0, (direction * sin, cos, xi))
                for side, pole in zip(sides, poles, strict=True)]
-    scale *= sense * a / 2 * roots.gap21         # w (u2 - u1)
+    scale *= mirror * a / 2 * roots.gap21        # w (u2 - u1)
     even, odd = form.slopes_of_sn2()
-    turn = sense * l3 / lambda1
+    turn = mirror * l3 / lambda1
     swing = turn * roots.gap21 * (form.mean.quarter_period / form.slope1) ** 2
-    alpha, beta = factors[::sense]
+    alpha, beta = factors[::mirror]
     return ThetaMotion(
         alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / const_pi(), quarter0=quarter0,
         offset0=y0 * 2 / const_pi(),
         u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
-        momentum=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
-        swing=(-swing * form.middle4 ** 2,
-               swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
+        precession0=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
+        precession_swing=(-swing * form.middle4 ** 2,
+                          swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
         m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31, size=form.size)
 
 
@@ -282,8 +267,8 @@ class _Pole(NamedTuple):
 
     is_beta : whether it is the one at u = 1
     x1, x2 : its distances from u1 and u2, as x of `_Side`
-    zero : sn^2(a, m1) in the imaginary form, -sn^2(ia, m) in the real one, or the same of b; None
-        if there is no zero
+    zero : sn^2(c, m1) in the imaginary form, -sn^2(ic, m) in the real one, with c = (2K/pi) a or
+        (2K/pi) b; None if there is no zero
     """
 
     is_beta: bool
@@ -326,12 +311,12 @@ def _nearest_quarter(roots: Roots, complement: mpfr, falling: bool,
 
     complement : sqrt(m1)
     """
-    sense = -1 if falling else 1
+    sign = -1 if falling else 1
     low, high = -roots.y1, roots.y2         # u0 - u1 and u2 - u0
     # sn^2 = low/gap21, and sn(K - chi) = cn/dn.  They are equal at sn^2 (1 + sqrt(m1)) = 1.
     if low * complement < high:
-        return 0, sense, low / (high if imaginary else roots.gap21)
-    return (sense, -sense, high * roots.gap31 / (
+        return 0, sign, low / (high if imaginary else roots.gap21)
+    return (sign, -sign, high * roots.gap31 / (
         low * roots.gap32 if imaginary else roots.gap21 * roots.y3))
 
 

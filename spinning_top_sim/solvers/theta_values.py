@@ -23,7 +23,7 @@ from gmpy2 import const_pi, mpfr, rint
 from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.solvers.multiprecision import BITS, double_double, precision
+from spinning_top_sim.solvers.multiprecision import double_double, precision
 from spinning_top_sim.solvers.theta_series import SIN_ODD
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import UNITS, Times, halves, products
@@ -40,7 +40,7 @@ HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the thr
 LEAST_AMPLITUDE, LARGEST_NUMBER = 1e-145, 1e290
 
 
-class Constants:
+class MotionConstants:
     """
     The constants of one motion in doubles.
 
@@ -54,7 +54,7 @@ class Constants:
         and beta; the coefficients of 1, xi, xi^2 ...
     senses : s of alpha and beta
     u_dot, u_dot_polynomial : of u'
-    momentum, swing : of (Lz - L3 u)/lambda1
+    precession0, precession_swing : of (Lz - L3 u)/lambda1
     """
 
     def __init__(self, motion: ThetaMotion) -> None:
@@ -78,8 +78,8 @@ class Constants:
         _check_amplitude('beta', motion.beta)
         self.u_dot = [in_range("cos(theta)'", x) for x in motion.u_dot]
         self.u_dot_polynomial = [*map(float, motion.u_dot_series.polynomial(motion.size))]
-        self.momentum, self.swing = ([*map(float, pair)] for pair in (
-            motion.momentum, motion.swing))
+        self.precession0, self.precession_swing = ([*map(float, pair)] for pair in (
+            motion.precession0, motion.precession_swing))
 
     @property
     def chains(self) -> bool:
@@ -96,23 +96,24 @@ def _check_amplitude(name: str, factor: Factor) -> None:
                 f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
 
 
-class ThetaFunctions:
+class ConstantArrays:
     """
-    The `Constants` of a motion in arrays, or those of several motions, each for so many times.
+    The constants of a motion in arrays, or those of several motions, each for so many times.
 
     Columns are (k, 1) or (k, n).  `coefficients` (k, 4, 2 motions), highest power first, `u_dot`,
-    `momentum` and `swing` have those of all motions at even and at odd N.
+    `precession0` and `precession_swing` have those of all motions at even and at odd N.
 
     stretch : None if there is no imaginary form
-    prefactors : of the rows of `Constants`: at even N, at odd N; where the motions of a chain
-        differ, those of the first motion, then of the second, ...
-    real : the numbers, 0 for alpha and 1 for beta, of those that have s = 0
+    prefactors : of the rows of `MotionConstants`: at even N, at odd N; where the motions of a
+        chain differ, those of the first motion, then of the second, ...
+    on_line : the numbers, 0 for alpha and 1 for beta, of those that have s = 0
     zeros : by the same number, of those that pass their pole exactly: whether R = 0 at y = 0 is
         at even N (0) or at odd N (1)
     first : of a chain, the place of each time's constants at even N in the last axis, (n,)
     """
 
-    def __init__(self, motions: Sequence[Constants], counts: Sequence[int] | None = None) -> None:
+    def __init__(self, motions: Sequence[MotionConstants],
+                 counts: Sequence[int] | None = None) -> None:
         self._motions, self._counts, present = motions, counts, motions[0]
         self._rates: dict[str, tuple[Matrix, Matrix, Matrix, Matrix]] = {}
         self.start_whole = self.columns([one.start_whole for one in motions])
@@ -121,16 +122,19 @@ class ThetaFunctions:
         self.drifts = self.columns([one.drifts for one in motions])
         (stretch,) = self.columns([(one.stretch,) for one in motions])
         self.stretch = stretch if np.any(stretch) else None
-        self.prefactors = _prefactors(motions)
+        self.prefactors = present.prefactors
+        if any(one.prefactors != present.prefactors for one in motions):
+            self.prefactors = [sum(rows, ()) for rows in zip(
+                *(one.prefactors for one in motions), strict=True)]
         self.coefficients = _side_by_side(
             [*chain.from_iterable(chain.from_iterable(zip(*(
                 one.polynomials for one in motions), strict=True)))]
             ).reshape(-1, 4, 2 * len(motions))
-        self.real = [k for k, sense in enumerate(present.senses) if not sense]
+        self.on_line = [k for k, sense in enumerate(present.senses) if not sense]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(present.prefactors[:2])
                       if SIN_ODD in pair}
-        self.u_dot, self.momentum, self.swing = np.array([
-            (one.u_dot, one.momentum, one.swing) for one in motions]
+        self.u_dot, self.precession0, self.precession_swing = np.array([
+            (one.u_dot, one.precession0, one.precession_swing) for one in motions]
             ).transpose(1, 0, 2).reshape(3, -1)
         self.u_dot_coefficients = self.columns(
             _side_by_side([one.u_dot_polynomial for one in motions]).T)
@@ -145,7 +149,7 @@ class ThetaFunctions:
     def turned(self, times: Times) -> tuple[Matrix, Matrix]:
         """Return what the three phases have grown by (3, n), as two doubles each."""
         if times.unit not in self._rates:
-            with precision(BITS):
+            with precision():
                 rate, rest = map(self.columns, np.array([
                     [double_double(x / UNITS[times.unit]) for x in one.rates]
                     for one in self._motions]).transpose(2, 0, 1))
@@ -180,36 +184,29 @@ class ThetaFunctions:
         return start - slope * quarter0, slope
 
 
-def _prefactors(motions: Sequence[Constants]) -> list[tuple[int, ...]]:
-    present = motions[0].prefactors
-    if all(one.prefactors == present for one in motions):
-        return present
-    return [sum(rows, ()) for rows in zip(*(one.prefactors for one in motions), strict=True)]
-
-
 class ThetaValues:
     """The motion at n times, in columns that are computed when they are first asked for."""
 
-    def __init__(self, constants: ThetaFunctions, times: Times) -> None:
-        self._constants = constants
-        self._turned, self._turned_rest = high, rest = constants.turned(times)
+    def __init__(self, arrays: ConstantArrays, times: Times) -> None:
+        self._arrays = arrays
+        self._turned, self._turned_rest = high, rest = arrays.turned(times)
         whole = np.rint(high)
         part = high - whole
-        shift = part + constants.offset
+        shift = part + arrays.offset
         shift += rest
         np.rint(shift, out=shift)
         # No difference rounds where the result is small: its terms are within a factor of two of
         # each other then (Sterbenz).
         half = 0.5 * shift
         part -= half
-        half -= constants.offset
+        half -= arrays.offset
         part -= half
-        part += rest + constants.offset_rest
+        part += rest + arrays.offset_rest
         self._whole = whole.astype(np.int64)
-        shift += constants.start_whole
+        shift += arrays.start_whole
         self._whole += shift.astype(np.int64)
         self._offset = part[0].copy()
-        part[1:] += constants.drifts * self._offset
+        part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
         part *= HALF_ANGLES
         tangent = np.tan(part, out=part)
@@ -223,27 +220,27 @@ class ThetaValues:
 
     def _evaluate(self) -> None:
         """Compute R and s J of alpha and beta, (2, n) each."""
-        constants, quarters = self._constants, self._whole[0]
+        arrays, quarters = self._arrays, self._whole[0]
         sin = self._sin[0]
-        if constants.stretch is None:
+        if arrays.stretch is None:
             xi = sin * sin
         else:
-            is_real = np.equal(constants.stretch, 0.0)      # of some motions of a chain
-            sinh = np.sinh(constants.stretch * self._offset)
+            is_real = np.equal(arrays.stretch, 0.0)     # of some motions of a chain
+            sinh = np.sinh(arrays.stretch * self._offset)
             sin = np.where(is_real, sin, sinh) if np.any(is_real) else sinh
             xi = np.where(is_real, 1.0, -1.0) * sin * sin
         cos = np.sqrt(1.0 - xi)
         self._parity, self._xi = quarters & 1, xi
         odd = self._parity.astype(bool)
-        self._place = self._parity if constants.first is None else self._parity + constants.first
-        rows = _horner(constants.coefficients.take(self._place, axis=2), xi)
-        for k in constants.zeros:           # the sign is (-1)^floor(N/2)
+        self._place = self._parity if arrays.first is None else self._parity + arrays.first
+        rows = _horner(arrays.coefficients.take(self._place, axis=2), xi)
+        for k in arrays.zeros:          # the sign is (-1)^floor(N/2)
             rows[k] *= 1 - (quarters & 2)
-        self._without_zero = {k: rows[k].copy() for k in constants.zeros}
+        self._without_zero = {k: rows[k].copy() for k in arrays.zeros}
         bases = 1.0, cos, sin, sin * cos
-        for k, (one, other, *more) in enumerate(constants.prefactors):
+        for k, (one, other, *more) in enumerate(arrays.prefactors):
             if more:
-                rows[k] *= np.choose(np.take(constants.prefactors[k], self._place), bases)
+                rows[k] *= np.choose(np.take(arrays.prefactors[k], self._place), bases)
             else:
                 rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
         self._real, self._imag = rows[:2], rows[2:]
@@ -254,7 +251,7 @@ class ThetaValues:
         """|alpha| D and |beta| D, (2, n); signed, not absolute, where s = 0."""
         # The squares may be too small for a double.
         moduli: Matrix = np.hypot(self._real, self._imag)
-        for k in self._constants.real:
+        for k in self._arrays.on_line:
             moduli[k] = self._real[k]
         return moduli
 
@@ -297,11 +294,11 @@ class ThetaValues:
         """
         (_, alpha, beta), (_, alpha_rest, beta_rest) = self._turned, self._turned_rest
         arguments = np.arctan2(self._imag, self._real)
-        arguments += (math.pi * self._constants.drifts) * self._offset
-        arguments[self._constants.real] = 0.0
+        arguments += (math.pi * self._arrays.drifts) * self._offset
+        arguments[self._arrays.on_line] = 0.0
         half = np.arctan2(self.moduli[1], self.moduli[0])
-        if self._constants.planar_rotation:
-            i, j = self._constants.planar_rotation
+        if self._arrays.planar_rotation:
+            i, j = self._arrays.planar_rotation
             half += math.tau * np.rint((QUARTER * (i + j * self._whole[0]) - half) / math.tau)
         found = np.empty((5, len(half)))
         found[0] = math.pi * ((alpha + beta) + (alpha_rest + beta_rest))
@@ -314,29 +311,29 @@ class ThetaValues:
     @cached_property
     def theta_dot(self) -> Column:
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.
-        constants, xi, (alpha, beta) = self._constants, self._xi, self.moduli
-        if not constants.u_dot.any():
+        arrays, xi, (alpha, beta) = self._arrays, self._xi, self.moduli
+        if not arrays.u_dot.any():
             return np.zeros(len(xi))        # at rest, perhaps at a pole
         size, prefactor, without = alpha * alpha + beta * beta, self._sin_cos, [alpha, beta]
-        for k, parity in constants.zeros.items():       # there sin y is divided out
+        for k, parity in arrays.zeros.items():    # there sin y is divided out
             here = self._parity == parity
             prefactor = np.where(here, self._cos_y, prefactor)
             without[k] = np.where(here, self._without_zero[k], without[k])
-        series = prefactor * _horner(constants.u_dot_coefficients, 4.0 * xi * (1.0 - xi))
+        series = prefactor * _horner(arrays.u_dot_coefficients, 4.0 * xi * (1.0 - xi))
         # In this order nothing overflows on the separatrix, where all grow like cosh x.
-        theta_dot: Column = -constants.u_dot.take(self._place) * (series / size) / (
+        theta_dot: Column = -arrays.u_dot.take(self._place) * (series / size) / (
             without[0] * without[1])
         return theta_dot
 
     @cached_property
-    def across(self) -> Matrix:
+    def across_terms(self) -> Matrix:
         """The two terms of phi' sin(theta) [rad/s] if no pole is passed exactly, (2, n)."""
-        constants, (alpha, beta) = self._constants, self.moduli
-        series = self._sin_y * _horner(constants.u_dot_coefficients, self._xi)
+        arrays, (alpha, beta) = self._arrays, self.moduli
+        series = self._sin_y * _horner(arrays.u_dot_coefficients, self._xi)
         half: Column = 0.5 / (alpha * beta)
         return np.stack((
-            constants.momentum.take(self._place) * ((alpha * alpha + beta * beta) * half),
-            constants.swing.take(self._place) * (series * series * half)))
+            arrays.precession0.take(self._place) * ((alpha * alpha + beta * beta) * half),
+            arrays.precession_swing.take(self._place) * (series * series * half)))
 
     @cached_property
     def rates(self) -> Matrix:
@@ -344,9 +341,9 @@ class ThetaValues:
         # psi is the argument of alpha less that of beta.
         real, imag = self._alpha_beta
         moduli = self.moduli.copy()
-        moduli[self._constants.real] = 1.0  # it may be 0, and its sign is in theta
+        moduli[self._arrays.on_line] = 1.0  # it may be 0, and its sign is in theta
         cos, sin = real / moduli, imag / moduli
-        for k in self._constants.real:
+        for k in self._arrays.on_line:
             cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
         return np.stack((self.theta_dot, cos[0] * cos[1] + sin[0] * sin[1],
                          sin[0] * cos[1] - cos[0] * sin[1]))

@@ -5,7 +5,7 @@ import cmath
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,24 +20,13 @@ from spinning_top_sim.solvers.dormand_prince import Rows, SteppedMotion, Vector,
 NUTATION_SHARE = 1e-6
 # (sin(theta)/2)^2 below which rounding in L.e3 would spoil the momentum more than it mends it.
 POLE_SHARE = 1e-4
-
-
 # Real and imaginary parts of alpha, beta and m.
 Parts = Sequence[Column]
-
-
-class _Functions(NamedTuple):
-    """What a projection computes with."""
-
-    sqrt: Callable[..., Any]
-    copysign: Callable[..., Any]
-    where: Callable[..., Any]
-
-
-COLUMNS = _Functions(sqrt=np.sqrt, copysign=np.copysign, where=np.where)
+# What a projection computes with: sqrt, copysign and where.
+Functions = tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]
+COLUMNS: Functions = np.sqrt, np.copysign, np.where
 # Of one state: numpy would take ten times as long.
-ONE_STATE = _Functions(sqrt=math.sqrt, copysign=math.copysign,
-                       where=lambda condition, x, y: x if condition else y)
+ONE_STATE: Functions = math.sqrt, math.copysign, lambda condition, x, y: x if condition else y
 
 
 class TransportMotion(SteppedMotion):
@@ -54,8 +43,7 @@ class TransportMotion(SteppedMotion):
     with c the part of L3 that these equations carry.  They are those of a frame that turns about
     e3 with the body, less a known uniform rate chi = L3/lambda3 - (L3 - c)/lambda1.  The factor
     exp(+-i chi t/2) is put on when a state is read, so the step size follows the nutation and not
-    the spin.  With c = L3/2 the spectrum of alpha and beta is centred about zero;
-    docs/accuracy.md has the reasons for this choice.
+    the spin.  With c = L3/2 the spectrum of alpha and beta is centred about zero.
 
     The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each
     sample (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
@@ -154,7 +142,7 @@ class TransportMotion(SteppedMotion):
         return complex(*projected[:2]), complex(*projected[2:4]), complex(*projected[4:])
 
     def project(self, y: Sequence[Any], pole_share: float,
-                functions: _Functions = COLUMNS) -> tuple[Any, ...]:
+                functions: Functions = COLUMNS) -> tuple[Any, ...]:
         """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
         # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows
         # from L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.

@@ -17,38 +17,40 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from gmpy2 import const_pi, mpc, mpfr, norm, rint, sin_cos, sinh, sqrt
+from gmpy2 import mpc, mpfr, norm, sin_cos, sqrt
 
 from spinning_top_sim.physics.attitude import Column, Quaternion
-from spinning_top_sim.physics.pivot import Exact
+from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
-from spinning_top_sim.solvers.multiprecision import (
-    BITS,
-    IMAGINARY,
-    ONE,
-    ZERO,
-    exact,
-    precision,
-)
-from spinning_top_sim.solvers.theta_series import SIN_ODD
-from spinning_top_sim.solvers.theta_setup import (
-    Factor,
-    HalfAngles,
-    Posture,
-    ThetaMotion,
-    set_up,
-)
-from spinning_top_sim.solvers.theta_values import ThetaFunctions
+from spinning_top_sim.solvers.multiprecision import IMAGINARY, ONE, ZERO, as_mpfr, phase, precision
+from spinning_top_sim.solvers.theta_point import cayley_klein, transverse_velocity
+from spinning_top_sim.solvers.theta_setup import PreciseState, set_up
+from spinning_top_sim.solvers.theta_values import ConstantArrays
 from spinning_top_sim.solvers.times import Times
 
 # An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
 # as this has zeros.
-POLE = 1e-30
+POLE_IN_BITS = 1e-30
 # If the distance by which a motion misses a pole is less than this share of the largest possible,
 # it passes exactly: the set-up squares the share, and keeps some 40 digits.
 THROUGH = 1e-19
+
+
+class Posture(NamedTuple):
+    """
+    Attitude and angular velocity of a top at one instant, in multiprecision.
+
+    alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
+    transverse : omega_1 + i omega_2 in the body [rad/s]
+    l3 : angular momentum along the axis [kg m^2/s], which no force on the pivot changes
+    """
+
+    alpha: mpc
+    beta: mpc
+    transverse: mpc
+    l3: float
 
 
 class Vertical(NamedTuple):
@@ -71,30 +73,30 @@ class Vertical(NamedTuple):
     beta: mpc
     rows: Quaternion
 
-    def start(self, posture: Posture) -> HalfAngles:
+    def start(self, posture: Posture) -> PreciseState:
         """Return a posture as a state in this frame."""
-        top, across = self.top, posture.across
+        top, transverse = self.top, posture.transverse
         alpha, beta = _product(self.alpha.conjugate(), -self.beta, posture.alpha, posture.beta)
         cosine2, sine2 = norm(alpha), norm(beta)
         size2, l3 = cosine2 + sine2, mpfr(posture.l3)
         cosine, sine = sqrt(cosine2 / size2), sqrt(sine2 / size2)
-        if 2 * sine < POLE:         # all the motion of the axis is nutation: psi from omega
-            theta_dot = abs(across)
-            beta = alpha * (-IMAGINARY * across) if theta_dot else alpha
-            return HalfAngles(ZERO, ONE, theta_dot, alpha, beta, l3, l3)
+        if 2 * sine < POLE_IN_BITS:     # all the motion of the axis is nutation: psi from omega
+            theta_dot = abs(transverse)
+            beta = alpha * (-IMAGINARY * transverse) if theta_dot else alpha
+            return PreciseState(ZERO, ONE, theta_dot, alpha, beta, l3, l3)
         # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
         # + i theta') exp(-i psi)
-        rates = across * (alpha * beta.conjugate())
+        rates = transverse * (alpha * beta.conjugate())
         half_tilt = cosine * sine
-        tilt, unit, lambda1 = 2 * half_tilt, half_tilt * size2, exact(top.lambda1)
+        tilt, unit, lambda1 = 2 * half_tilt, half_tilt * size2, as_mpfr(top.lambda1)
         lz = (1 - 2 * sine * sine) * l3 - lambda1 * rates.real / unit * tilt
         most2 = THROUGH ** 2 * tilt * tilt * (l3 * l3 * tilt * tilt + lambda1 * (
-            lambda1 * norm(across)
-            + abs(self.gravity * exact(top.mass) * exact(top.com_distance))))
+            lambda1 * norm(transverse)
+            + abs(self.gravity * as_mpfr(top.mass) * as_mpfr(top.com_distance))))
         for pole in (l3, -l3):
             if (lz - pole) ** 2 <= most2:
                 lz = pole or ZERO
-        return HalfAngles(sine, cosine, rates.imag / unit, alpha, beta, l3, lz)
+        return PreciseState(sine, cosine, rates.imag / unit, alpha, beta, l3, lz)
 
 
 class AcceleratedMotion(ClosedForm):
@@ -114,16 +116,15 @@ class AcceleratedMotion(ClosedForm):
         Of the pivot in the world [m/s^2].
     """
 
-    def __init__(self, top: Top, posture: Posture, acceleration: Exact) -> None:
-        self.vertical, self.halves = about_vertical(top, posture, acceleration)
-        self._posture = posture
-        self._motion = set_up(top, self.vertical.gravity, self.halves)
-        super().__init__(self.vertical.top, self._motion, *self.halves[-2:])
-        self.chains = self.constants.chains
+    def __init__(self, top: Top, posture: Posture, acceleration: Fractions) -> None:
+        self.vertical, precise_start = about_vertical(top, posture, acceleration)
+        self._posture, self.precise_start = posture, precise_start
+        self._motion = set_up(top, self.vertical.gravity, precise_start)
+        super().__init__(self.vertical.top, self._motion, precise_start.l3, precise_start.lz)
 
     @cached_property
     def start(self) -> State:       # type: ignore[override]
-        return rounded(self.halves)
+        return rounded(self.precise_start)
 
     def _states_at(self, times: Times) -> States:
         return AcceleratedStates([self], None, times)
@@ -136,12 +137,12 @@ class AcceleratedMotion(ClosedForm):
         """
         if not ns:                  # perhaps at a pole, where the axis does not tell its rates
             return self._posture
-        with precision(BITS):
-            vertical = self.vertical
-            alpha, beta, u_dot = _cayley_klein(self._motion, mpfr(ns) / 10 ** 9)
-            across = _across(exact(self.top.lambda1), *self.halves[-2:], alpha, beta, u_dot)
+        with precision():
+            vertical, lambda1 = self.vertical, as_mpfr(self.top.lambda1)
+            alpha, beta, u_dot = cayley_klein(self._motion, mpfr(ns) / 10 ** 9)
+            transverse = transverse_velocity(lambda1, self.precise_start, alpha, beta, u_dot)
             alpha, beta = _product(vertical.alpha, vertical.beta, alpha, beta)
-            return Posture(alpha, beta, across, self._posture.l3)
+            return Posture(alpha, beta, transverse, self._posture.l3)
 
 
 class AcceleratedStates(ThetaStates):
@@ -150,21 +151,21 @@ class AcceleratedStates(ThetaStates):
     def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int] | None,
                  times: Times) -> None:
         first = motions[0]
-        theta = first.theta if counts is None else ThetaFunctions(
+        arrays = first.arrays if counts is None else ConstantArrays(
             [one.constants for one in motions], counts)
-        lz, gravity, torque, *self._rates = theta.columns([
-            (float(one.halves.lz), one.top.gravity, one.top.gravity_torque, one.bottom_rate,
+        lz, gravity, torque, *self._rates = arrays.columns([
+            (float(one.precise_start.lz), one.top.gravity, one.top.gravity_torque, one.bottom_rate,
              one.top_rate) for one in motions])
-        super().__init__(first.top, first.start, theta, times, lz=lz, gravity=gravity,
+        super().__init__(first.top, first.start, arrays, times, lz=lz, gravity=gravity,
                          torque=torque)
 
     def _across(self) -> Column:
         (cosine, sine), (bottom_rate, top_rate) = self._rows('half_theta'), self._rates
-        if self._theta.real or not self._theta.u_dot.any():
+        if self._arrays.on_line or not self._arrays.u_dot.any():
             return axis_rate(float(bottom_rate[0]), float(top_rate[0]), cosine, sine)
         # Of two sums that may cancel, the one with the smaller terms.  The usual one cancels
         # where a fast top hardly precesses.
-        one, two = self._rows('across')
+        one, two = self._rows('across_terms')
         tangent: Column = sine / cosine
         bottom, top = bottom_rate * tangent, top_rate / tangent
         cancels = np.abs(bottom) + np.abs(top) > np.abs(one) + np.abs(two)
@@ -173,7 +174,7 @@ class AcceleratedStates(ThetaStates):
 
 
 @lru_cache(64)
-def _verticals(top: Top, acceleration: Exact,
+def _verticals(top: Top, acceleration: Fractions,
                ) -> tuple[tuple[mpfr, mpfr, mpfr], Vertical, Vertical]:
     """Return the upward line of effective gravity, and the verticals along and against it."""
     x, y, z = (mpfr(a.numerator) / a.denominator for a in acceleration)
@@ -190,19 +191,19 @@ def _upright(top: Top, gravity: mpfr, x: mpfr, y: mpfr, z: mpfr) -> Vertical:
     return Vertical(gravity, replace(top, gravity=float(gravity)), alpha, beta, (qx, qy, qz, qw))
 
 
-def about_vertical(top: Top, posture: Posture, acceleration: Exact,
-                   ) -> tuple[Vertical, HalfAngles]:
+def about_vertical(top: Top, posture: Posture, acceleration: Fractions,
+                   ) -> tuple[Vertical, PreciseState]:
     """Return the vertical while the pivot accelerates so, and the state there."""
-    with precision(BITS):
+    with precision():
         (x, y, z), up, down = _verticals(top, acceleration)
         # The axis is (2 alpha beta, |alpha|^2 - |beta|^2).
-        across = 2 * posture.alpha * posture.beta
+        level = 2 * posture.alpha * posture.beta
         height = norm(posture.alpha) - norm(posture.beta)
-        vertical = up if x * across.real + y * across.imag + z * height >= 0 else down
+        vertical = up if x * level.real + y * level.imag + z * height >= 0 else down
         return vertical, vertical.start(posture)
 
 
-def rounded(start: HalfAngles) -> State:
+def rounded(start: PreciseState) -> State:
     """Return a state in doubles."""
     alpha, beta = (math.atan2(float(x.imag), float(x.real)) for x in (start.alpha, start.beta))
     l3 = float(start.l3)
@@ -214,18 +215,18 @@ def rounded(start: HalfAngles) -> State:
 
 def posture_of(top: Top, state: State) -> Posture:
     """Return the posture of a state about the vertical of the world."""
-    with precision(BITS):
+    with precision():
         sine, cosine = sin_cos(mpfr(state.theta) / 2)
-        half_phi, half_psi = (_phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
+        half_phi, half_psi = (phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
         back = half_psi.conjugate()
-        l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * exact(top.lambda1)
-        swing = ZERO                # phi' sin(theta)
+        l3, lz, two_lambda1 = mpfr(state.l3), mpfr(state.lz), 2 * as_mpfr(top.lambda1)
+        across = ZERO               # phi' sin(theta)
         if lz + l3:
-            swing += (lz + l3) / two_lambda1 * sine / cosine
+            across += (lz + l3) / two_lambda1 * sine / cosine
         if lz - l3:
-            swing += (lz - l3) / two_lambda1 * cosine / sine
+            across += (lz - l3) / two_lambda1 * cosine / sine
         return Posture(cosine * (half_phi * half_psi), sine * (half_phi * back),
-                       (IMAGINARY * mpfr(state.theta_dot) - swing) * (back * back), state.l3)
+                       (IMAGINARY * mpfr(state.theta_dot) - across) * (back * back), state.l3)
 
 
 def posture_at(states: States) -> Posture:
@@ -235,69 +236,20 @@ def posture_at(states: States) -> Posture:
     return Posture(mpc(complex(w, z)), mpc(complex(y, -x)), mpc(complex(o1, o2)), states.start.l3)
 
 
-def _cayley_klein(motion: ThetaMotion, t: mpfr) -> tuple[mpc, mpc, mpfr]:
-    """Return alpha, beta and cos(theta)' at t [s] in the frame of a motion."""
-    quarters = motion.quarter0 + motion.offset0 + motion.quarter_rate * t
-    whole = int(rint(quarters))
-    rest = (motion.quarter0 - whole) + motion.quarter_rate * t + motion.offset0
-    y = const_pi() / 2 * rest
-    if motion.stretch:
-        sine = sinh(motion.stretch * y)
-        xi = -sine * sine
-    else:
-        sine, _ = sin_cos(y)
-        xi = sine * sine
-    cosine = sqrt(1 - xi)
-    point = sine, cosine, xi
-    alpha, beta = (_value(factor, whole, y, t, point) for factor in (motion.alpha, motion.beta))
-    size2 = norm(alpha) + norm(beta)
-    slope = motion.u_dot_series.at(2 * sine * cosine, 1 - 2 * xi, 4 * xi * (1 - xi))
-    u_dot = motion.u_dot[whole % 2] * slope / (size2 * size2)
-    scale = 1 / sqrt(size2)
-    return scale * alpha, scale * beta, u_dot
-
-
-def _value(factor: Factor, whole: int, y: mpfr, t: mpfr,
-           point: tuple[mpfr, mpfr, mpfr]) -> mpc:
-    """Return alpha D or beta D; `whole`, y, `point`: N, y and the arguments of `Series.at`."""
-    parts, scale = factor.parts[whole % 2], factor.scales[whole % 2]
-    real, imag = (scale * part.at(*point) for part in parts)
-    if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
-        real = -real                # it passes a pole
-    turn = factor.rate * t + 2 * const_pi() * factor.phase_turns + factor.drift * y
-    return (real + IMAGINARY * imag) * _phase(turn)
-
-
-def _across(lambda1: mpfr, l3: mpfr, lz: mpfr, alpha: mpc, beta: mpc, u_dot: mpfr) -> mpc:
-    """Return omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta))."""
-    cosine2, sine2 = norm(alpha), norm(beta)
-    if not (cosine2 and sine2):
-        return mpc(0)               # it rests at a pole
-    # Lz - L3 u, without cancellation at either pole
-    momentum = ((lz - l3) + 2 * l3 * sine2 if sine2 < cosine2
-                else (lz + l3) - 2 * l3 * cosine2)
-    return -(momentum / lambda1 + IMAGINARY * u_dot) / (2 * alpha * beta.conjugate())
-
-
 def _least_rotation(x: mpfr, y: mpfr, z: mpfr) -> tuple[mpc, mpc]:
     """Return the Cayley-Klein parameters of the least rotation of (0, 0, 1) to a unit vector."""
-    across = sqrt(x * x + y * y)
-    if not across:                  # perhaps a half turn, about the x axis
+    level = sqrt(x * x + y * y)
+    if not level:                   # perhaps a half turn, about the x axis
         return (mpc(1), mpc(0)) if z > 0 else (mpc(0), -IMAGINARY)
     if z > 0:
         cosine = sqrt((1 + z) / 2)
-        sine = across / (2 * cosine)
+        sine = level / (2 * cosine)
     else:
         sine = sqrt((1 - z) / 2)
-        cosine = across / (2 * sine)
-    return mpc(cosine), sine / across * (x + IMAGINARY * y)
+        cosine = level / (2 * sine)
+    return mpc(cosine), sine / level * (x + IMAGINARY * y)
 
 
 def _product(a: mpc, b: mpc, c: mpc, d: mpc) -> tuple[mpc, mpc]:
     """Return the Cayley-Klein parameters of two rotations: (a, b) after (c, d)."""
     return a * c - b * d.conjugate(), a * d + b * c.conjugate()
-
-
-def _phase(angle: mpfr) -> mpc:
-    sine, cosine = sin_cos(angle)
-    return cosine + IMAGINARY * sine

@@ -9,11 +9,11 @@ with the state of the filter there, so a reading depends on its own time only.
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.integrals import fastest_rate
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.path import Segment
 
@@ -70,9 +70,8 @@ class LowPass:
 
     def _edges(self, segment: Segment) -> NDArray[np.float64]:
         """Return how long before a sample the panels begin and end [ns], (panels + 1, 1)."""
-        rate = fastest_rate(segment.motion.top, segment.l3, segment.energy)
         # A specific force has squares of rates, thus twice their frequency.
-        seconds = ANGLE / (self._corner + 2.0 * rate)
+        seconds = ANGLE / (self._corner + 2.0 * segment.fastest_rate)
         panels = min(math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS)
         return np.linspace(0.0, self.memory_ns, panels + 1)[:, np.newaxis]
 
@@ -86,16 +85,8 @@ class LowPass:
 
         t_ns : within the segment, all less than `memory_ns` after its start, or none of them
         """
-        back_ns = np.minimum(t_ns - segment.start_ns, self.memory_ns)
         carried = segment.filter_state if t_ns[0] < segment.start_ns + self.memory_ns else None
-        if back_ns.min() == self.memory_ns:     # the same for all samples
-            back_ns = back_ns[:1]
-        edges = self._edges(segment)
-        edges = np.minimum(edges[:1 + np.searchsorted(edges[:, 0], back_ns.max())], back_ns)
-        lengths = np.diff(edges, axis=0)[:, np.newaxis]
-        before = (edges[:-1, np.newaxis] + lengths * self._nodes[:, np.newaxis]).reshape(
-            -1, len(back_ns))
-        weights = 1e-9 * (lengths * self._weights[:, np.newaxis]).reshape(before.shape)
+        before, weights, back_ns = self._panels(segment, t_ns)
         kernels = [weights * part for part in self._kernel(1e-9 * before)[-components:]]
         at_ns = t_ns - np.rint(np.vstack((before, back_ns))).astype(np.int64)
         unique, places = np.unique(at_ns, return_inverse=True)
@@ -111,6 +102,24 @@ class LowPass:
             totals = [total + kernel[node] * values[:, node]
                       for total, kernel in zip(totals, kernels, strict=True)]
         return np.stack(totals)
+
+    def _panels(self, segment: Segment, t_ns: NDArray[np.int64],
+                ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
+        """
+        Return nodes [ns before the times] and weights [s], (nodes, n), and how far back they go.
+
+        Times that see this segment alone share one column.
+        """
+        back_ns = np.minimum(t_ns - segment.start_ns, self.memory_ns)
+        if back_ns.min() == self.memory_ns:
+            back_ns = back_ns[:1]
+        edges = self._edges(segment)
+        edges = np.minimum(edges[:1 + np.searchsorted(edges[:, 0], back_ns.max())], back_ns)
+        lengths = np.diff(edges, axis=0)[:, np.newaxis]
+        before = (edges[:-1, np.newaxis] + lengths * self._nodes[:, np.newaxis]).reshape(
+            -1, len(back_ns))
+        weights = 1e-9 * (lengths * self._weights[:, np.newaxis]).reshape(before.shape)
+        return before, weights, back_ns
 
     def _kernel(self, seconds: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Return real and, of second order, imaginary part of exp(p t)."""

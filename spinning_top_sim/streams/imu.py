@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The inertial measurement unit (IMU): its ideal readings, and the errors of the sensor.
+The inertial measurement unit (IMU) on the body: what its sensor feels, and its increments.
 
-The errors follow kalibr's model, with its names and units.  Conventions: REP-145 (at rest an
-accelerometer reads +g upwards), REP-103 (x, y, z right-handed), URDF roll-pitch-yaw.
-docs/sensor.md describes the whole chain.
+Conventions: REP-145 (at rest an accelerometer reads +g upwards), REP-103 (x, y, z right-handed),
+URDF roll-pitch-yaw.
 """
 
 import itertools
-import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,27 +17,23 @@ from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.bandwidth import LowPass
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.parameters import BY_NAME, IDENTITY, LOWEST_RATE_OF_INTERVALS
+from spinning_top_sim.streams.inertial_sensor import Sensor
+from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
 from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Samples, period_ns
 from spinning_top_sim.streams.vibration import Vibration
 
 # The longest interval over which means and increments are taken [ns].
 LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
-KINDS = ('gyroscope', 'accelerometer')
-# Parameters of the errors that both kinds of axes have.
-ERRORS = ('M', 'noise_density', 'turn_on_bias', 'random_walk', 'bias_stddev', 'bias_instability',
-          'resolution', 'range')
 
 
 class Imu:
     """
     An ideal IMU at `imu.lever_arm` [m] with orientation `imu.rpy` [rad] on the body.
 
-    sensor : returns the `Sensor` for a sample period [ns], which adds the errors
+    sensor : adds the errors
     takes_means : whether a sample is the mean over the interval before it (`imu.sampling`)
     length_ns : period of its samples [ns]
 
@@ -53,9 +46,9 @@ class Imu:
         self._lever_arm: tuple[float, float, float] = values['imu.lever_arm']
         self._is_rotated = any(values['imu.rpy'])
         self._mounting = _quaternion(*values['imu.rpy'])
-        self.sensor: Callable[[int], Sensor] = lru_cache(4)(partial(Sensor, values))
         self.takes_means = values['imu.sampling'] == 'mean'
-        self.length_ns = period_ns(values['imu.rate'])
+        self._values, self.length_ns = values, period_ns(values['imu.rate'])
+        self.sensor = Sensor(values, self.length_ns)
         # When this rate began, and where the first interval after that begins [ns].
         self._since_ns = self._first_begin_ns = 0
         bandwidth = values['imu.bandwidth']
@@ -70,10 +63,6 @@ class Imu:
         interval_ns = min(self.length_ns, LONGEST_NS) + self._since_ns - self._first_begin_ns
         return max(interval_ns, self._low_pass.memory_ns if self._low_pass else 0)
 
-    @property
-    def present_sensor(self) -> 'Sensor':
-        return self.sensor(self.length_ns)
-
     def set_rate(self, rate: float, now_ns: int) -> bool:
         """Take samples at this rate [Hz] after `now_ns`; return whether the period changes."""
         length_ns = period_ns(rate)
@@ -83,6 +72,7 @@ class Imu:
         if last_ns <= self._since_ns:       # no sample since the change before this one
             last_ns = self._first_begin_ns
         self.length_ns, self._since_ns = length_ns, now_ns
+        self.sensor = Sensor(self._values, length_ns)
         self._first_begin_ns = max(last_ns, now_ns - LONGEST_NS)
         return True
 
@@ -154,7 +144,7 @@ class Imu:
 
     def measured_increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
         """Return `increments` with the errors of the sensor and its vibration."""
-        exact, sensor = self.increments(samples), self.present_sensor
+        exact, sensor = self.increments(samples), self.sensor
         if sensor.is_perfect and self._vibration.is_off:
             return exact
         means, seconds = samples.once(self.means), self._lengths(samples.times)
@@ -200,148 +190,6 @@ class Imu:
 
     def from_body(self, vector: Vector) -> Vector:
         return attitude.rotated_back(self._mounting, vector) if self._is_rotated else vector
-
-
-class Sensor:
-    """
-    The errors of an IMU that takes a sample every `period_ns`.
-
-    White noise is numbered by sample: it depends on the seed and the number alone.  The bias is a
-    path in time that depends on the seed alone: a change of the rate does not change it.  A
-    reading between two samples has the white noise of the one before, as from a driver that
-    repeats the newest sample.  So all streams agree at the times that they have in common.
-
-    rate_variance, force_variance : variances of white noise and rounding together
-    orientation_variances : about the axes of the IMU [rad^2]
-    is_perfect : whether the readings are exact
-
-    (kalibr, "IMU Noise Model"; N. Trawny, S. Roumeliotis, "Indirect Kalman filter for 3D attitude
-    estimation", 2005, eqs. 133, 140; for the matrices J. Rehder et al., "Extending kalibr", ICRA
-    2016)
-    """
-
-    def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
-        self._rate_matrix, self._force_matrix = (values[f'imu.{kind}_M'] for kind in KINDS)
-        self._g_sensitivity = values['imu.gyroscope_A']
-        self.is_perfect = not any(self._g_sensitivity) and all(
-            values[name] == BY_NAME[name].default
-            for name in (f'imu.{kind}_{error}' for kind in KINDS for error in ERRORS))
-        self._resolutions, self._ranges = _six(values, 'resolution'), _six(values, 'range')
-        white = np.array(_six(values, 'noise_density')) / math.sqrt(period_ns * 1e-9)
-        variances = (white ** 2 + np.array(self._resolutions) ** 2 / 12.0).tolist()
-        self.rate_variance, self.force_variance = variances[0], variances[3]
-        turn_on_bias = np.array(_six(values, 'turn_on_bias'))[:, np.newaxis]
-        if turn_on_bias.any():
-            turn_on_bias *= noise.constants(values['seed'], noise.Purpose.TURN_ON, 6)
-        self._noise = noise.SensorNoise(
-            values['seed'], noise.Purpose.WHITE, period_ns, white[:, np.newaxis], turn_on_bias,
-            _bias_paths(values))
-        deviations = values['imu.orientation_stddev']
-        self.orientation_variances = tuple(deviation ** 2 for deviation in deviations)
-        self._orientation_noise = noise.SensorNoise(
-            values['seed'], noise.Purpose.ORIENTATION, period_ns,
-            np.array(deviations)[:, np.newaxis], np.zeros((3, 1)))
-
-    def read(self, exact: tuple[Vector, Vector], times: range) -> tuple[Vector, Vector]:
-        """Return the readings [rad/s], [m/s^2] of `exact`, the true values at these times [ns]."""
-        if self.is_perfect:
-            return exact
-        white, bias = self._noise.at(times)
-        # The chain of docs/sensor.md: matrices, g-sensitivity, bias, noise, rounding, range.
-        rates, force = exact
-        rates = transformed(self._rate_matrix, rates)
-        if any(self._g_sensitivity):
-            x, y, z = transformed(self._g_sensitivity, force)
-            rates = rates[0] + x, rates[1] + y, rates[2] + z
-        w1, w2, w3, f1, f2, f3 = (
-            converted(value + one_bias + one_white, resolution, largest)
-            for value, one_bias, one_white, resolution, largest in zip(
-                (*rates, *transformed(self._force_matrix, force)), bias, white, self._resolutions,
-                self._ranges, strict=True))
-        return (w1, w2, w3), (f1, f2, f3)
-
-    def orientation(self, exact: Quaternion, times: range) -> Quaternion:
-        """Return the orientation that the IMU estimates; its error is in the IMU's frame."""
-        if not any(self.orientation_variances):
-            return exact
-        (x, y, z), _ = self._orientation_noise.at(times)
-        return attitude.product(exact, attitude.quaternion_of_vector((x, y, z)))
-
-    def disturb(self, exact: tuple[Quaternion, Vector], means: tuple[Vector, Vector],
-                readings: tuple[Vector, Vector], seconds: Column,
-                ) -> tuple[Quaternion, Vector]:
-        """
-        Return the measured increments over intervals.
-
-        The error of the mean readings acts throughout the interval, in the frame of the sensor:
-        it adds to the rotation vector, and to the velocity half-way through the rotation.
-
-        exact : the true increments
-        means : the true mean rates [rad/s] and forces [m/s^2]
-        readings : those of the sensor, of the same
-        seconds : lengths of the intervals (n,) [s]
-        """
-        rotation, (v1, v2, v3) = exact
-        r1, r2, r3, *force = (
-            seconds * (reading - mean) for reading, mean in zip(
-                itertools.chain(*readings), itertools.chain(*means), strict=True))
-        x, y, z = attitude.rotation_vector(rotation)
-        f1, f2, f3 = attitude.rotated_back(
-            attitude.quaternion_of_vector((-0.5 * x, -0.5 * y, -0.5 * z)),
-            (force[0], force[1], force[2]))
-        return (attitude.quaternion_of_vector((x + r1, y + r2, z + r3)),
-                (v1 + f1, v2 + f2, v3 + f3))
-
-    def bias(self, times: range) -> tuple[Vector, Vector]:
-        _, (w1, w2, w3, f1, f2, f3) = self._noise.at(times)
-        return (w1, w2, w3), (f1, f2, f3)
-
-
-def _six(values: Mapping[str, Any], error: str) -> tuple[float, ...]:
-    """Return a parameter for the three axes of the gyroscope and those of the accelerometer."""
-    rate, force = (values[f'imu.{kind}_{error}'] for kind in KINDS)
-    return 3 * (rate,) + 3 * (force,)
-
-
-def _bias_paths(values: Mapping[str, Any]) -> list[noise.RandomPath]:
-    """Return the parts of the bias that vary with time."""
-    path, paths = partial(noise.RandomPath, values['seed']), []
-    if any(walk := _six(values, 'random_walk')):
-        paths.append(path(noise.Purpose.WALK, (6 * (math.inf,),), (walk,)))
-    if any(deviation := _six(values, 'bias_stddev')):
-        paths.append(path(noise.Purpose.GAUSS_MARKOV, (_six(values, 'bias_correlation_time'),),
-                          (deviation,)))
-    if any(flat := _six(values, 'bias_instability')):
-        parts = noise.flicker_parts(*values['imu.bias_instability_band'])
-        paths.append(path(noise.Purpose.FLICKER, tuple(6 * (time,) for time, _ in parts),
-                          tuple(tuple(part * one for one in flat) for _, part in parts)))
-    return paths
-
-
-def converted(value: Column, resolution: float, largest: float) -> Column:
-    """
-    Return readings (n,) of an analog-to-digital converter: rounded, then clipped to a range.
-
-    The limits are the largest multiples of the resolution within the range.  A resolution or a
-    range of 0 means none.
-    """
-    limit = largest or math.inf
-    if resolution:
-        if largest:
-            steps = math.floor(largest / resolution)
-            limit = (steps if steps * resolution <= largest else steps - 1) * resolution
-        # Adding 0.0 turns -0.0 into 0.0.
-        value = (np.rint(value / resolution) + 0.0) * resolution
-    return np.clip(value, -limit, limit)
-
-
-def transformed(matrix: Sequence[float], vector: Vector) -> Vector:
-    """Return a row-major matrix times a vector; the identity returns the vector unchanged."""
-    if tuple(matrix) == IDENTITY:
-        return vector
-    x, y, z = vector
-    a, b, c, d, e, f, g, h, i = matrix
-    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:

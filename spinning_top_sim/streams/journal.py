@@ -9,10 +9,9 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from spinning_top_sim.streams import messages
+from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.stream import Stream
 
-NODE_NAME = 'spinning_top'
 COMMANDS, EVENTS = '~/commands', '~/events'
 # Topics and types, recorded behind the streams, in this order.
 TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/String'}
@@ -26,21 +25,7 @@ def recorded_streams(streams: Sequence[Stream], values: Mapping[str, Any]) -> li
 def is_recorded(parameter: str, values: Mapping[str, Any]) -> bool:
     """Return whether a stream is switched on and `record.streams` chooses it."""
     chosen = values['record.streams']
-    return is_enabled(parameter, values) and ('all' in chosen or parameter in chosen)
-
-
-def resolve_topic(topic: str, namespace: str) -> str:
-    """Return the full name of a topic, as ROS resolves it for the node in this namespace."""
-    if topic.startswith('/'):
-        return topic
-    parts = [namespace.strip('/'), topic.replace('~', NODE_NAME, 1)]
-    return '/' + '/'.join(filter(None, parts))
-
-
-def is_enabled(parameter: str, values: Mapping[str, Any]) -> bool:
-    """Return whether a stream is switched on; some have two switches."""
-    other = {'clock': 'publish_clock', 'ground_truth_imu_odom': 'increments.enabled'}
-    return bool(values[f'{parameter}.enabled'] or values.get(other.get(parameter, '')))
+    return parameters.is_enabled(parameter, values) and ('all' in chosen or parameter in chosen)
 
 
 def command(l3: float, lz: float) -> bytes:

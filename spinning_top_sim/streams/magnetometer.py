@@ -13,7 +13,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Quaternion, Vector
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.imu import converted, transformed
+from spinning_top_sim.streams.inertial_sensor import converted, transformed
 
 
 class Magnetometer:
@@ -45,27 +45,27 @@ class Magnetometer:
         """Return the field [T] in frames with these orientations in the world."""
         return attitude.rotated_back(orientation, self._field)
 
-    def disturbed(self, exact: Vector, orientation: Quaternion,
+    def disturbed(self, true: Vector, orientation: Quaternion,
                   from_body: Callable[[Vector], Vector], t_ns: NDArray[np.int64]) -> Vector:
         """
-        Return the field `exact` [T] with the disturbances at these times (n,) [ns].
+        Return the field `true` [T] with the disturbances at these times (n,) [ns].
 
         orientation : of the IMU in the world
         from_body : returns a vector of the body in the frame of the IMU
         """
         if not self._is_disturbed:
-            return exact
+            return true
         world, body = (_at(events, t_ns) for events in self._events)
         x, y, z = (one + outside + magnet for one, outside, magnet in zip(
-            exact, attitude.rotated_back(orientation, world), from_body(body), strict=True))
+            true, attitude.rotated_back(orientation, world), from_body(body), strict=True))
         return x, y, z
 
-    def read(self, exact: Vector, times: range) -> Vector:
-        """Return the readings [T] of the field `exact` at these times [ns]."""
+    def read(self, true: Vector, times: range) -> Vector:
+        """Return the readings [T] of the field `true` at these times [ns]."""
         white, bias = self._noise.at(times)
         x, y, z = (converted(value + one_bias + one_white, self._resolution, self._range)
                    for value, one_bias, one_white in zip(
-                       transformed(self._soft_iron, exact), bias, white, strict=True))
+                       transformed(self._soft_iron, true), bias, white, strict=True))
         return x, y, z
 
 

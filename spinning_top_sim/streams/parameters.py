@@ -6,11 +6,8 @@ The node (descriptors, validation), the command line and the documentation use t
 The defaults describe the cusp scene: a bicycle wheel on a pivot, spun about its axis and let go.
 """
 
-import contextlib
-import enum
 import math
-from collections.abc import Iterable, Iterator, Mapping, Set
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from importlib.util import find_spec
 from itertools import pairwise
@@ -20,102 +17,7 @@ from spinning_top_sim.installation import remedy
 from spinning_top_sim.physics.pivot import SHORTEST_S, PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
-
-
-class Effect(enum.Enum):
-    """When a changed value is used."""
-
-    NOW = 'a change takes effect at once'
-    RESET = 'a change takes effect at the next ~/reset'
-    RECORDING = 'a change takes effect at the next start of a recording'
-    START = 'cannot be changed while the node runs'
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """
-    One parameter.  Its type is the type of the default; a default of None is an unset double.
-
-    minimum, maximum : bounds of a number, or of each number in a list
-    above : exclusive lower bound
-    smallest : smallest number that is allowed besides 0
-    choices : allowed strings
-    is_repeated : whether a list may have several times as many numbers as the default
-    """
-
-    name: str
-    default: Any
-    text: str
-    unit: str = ''
-    minimum: float | None = None
-    maximum: float | None = None
-    above: float | None = None
-    smallest: float | None = None
-    choices: tuple[str, ...] = ()
-    is_repeated: bool = False
-    effect: Effect = field(kw_only=True)
-
-    @property
-    def is_double(self) -> bool:
-        """Whether the value is a double; an integer is converted."""
-        return self.default is None or isinstance(self.default, float)
-
-    def describe(self, range_too: bool = True) -> str:
-        return '; '.join(filter(None, (
-            self.text + (f' [{self.unit}]' if self.unit else ''),
-            self.allowed if range_too and (self.choices or self._bounds()) else '',
-            self.effect.value)))
-
-    def _bounds(self) -> str:
-        bounds = (('0 or >=', self.smallest) if self.smallest else ('>=', self.minimum),
-                  ('>', self.above), ('<=', self.maximum))
-        return ' and '.join(f'{sign} {bound:g}' for sign, bound in bounds if bound is not None)
-
-    @property
-    def allowed(self) -> str:
-        if self.choices:
-            return f'must be one of {", ".join(self.choices)}'
-        kind = {bool: 'true or false', int: 'an integer', str: 'a string'}.get(
-            type(self.default), 'a number')
-        if isinstance(self.default, tuple):
-            kind = ('a list of strings' if isinstance(self.default[0], str)
-                    else f'a list of {len(self.default)} numbers'
-                    + (', or a multiple of that,' if self.is_repeated else ''))
-        return f'must be {kind} {self._bounds()}'.rstrip()
-
-    def check(self, value: Any) -> Any:
-        """Return the value in the type of the default.  Raises ValueError if it is not allowed."""
-        if value is None and self.default is None:
-            return None
-        with contextlib.suppress(TypeError, OverflowError):
-            if self._is_allowed(value):
-                if isinstance(self.default, tuple):
-                    kind = type(self.default[0])
-                    return tuple(map(kind, value))
-                return float(value) if self.is_double else value
-        raise ValueError(f'{self.name} = {shown(value)}: {self.allowed}')
-
-    def _is_allowed(self, value: Any) -> bool:
-        default = self.default
-        if isinstance(default, tuple):
-            if isinstance(value, str | bytes | Mapping | Set):       # iterable, but not lists
-                return False
-            if isinstance(default[0], str):
-                return all(isinstance(item, str) for item in value)
-            count = len(value) // len(default) if self.is_repeated else 1
-            return len(value) == max(count, 1) * len(default) and all(
-                map(self._is_in_range, value))
-        if isinstance(default, bool | str):
-            return isinstance(value, type(default)) and (not self.choices or value in self.choices)
-        return (self.is_double or isinstance(value, int)) and self._is_in_range(value)
-
-    def _is_in_range(self, number: Any) -> bool:
-        return (isinstance(number, int | float) and not isinstance(number, bool)
-                and math.isfinite(number) and (self.above is None or number > self.above)
-                and (self.minimum is None or number >= self.minimum)
-                and (self.maximum is None or number <= self.maximum)
-                and not (self.smallest and 0 < number < self.smallest))
-
+from spinning_top_sim.streams.parameter import Effect, Parameter
 
 # Name, default rate [Hz], on by default, description.  Streams with None have the rate `imu.rate`.
 STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
@@ -137,6 +39,8 @@ STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
     ('markers', 20.0, False, 'markers (visualization_msgs/MarkerArray)'),
     ('clock', 100.0, False, '/clock (rosgraph_msgs/Clock)'),
 )
+# Of streams that have two switches.
+OTHER_SWITCH = {'clock': 'publish_clock', 'ground_truth_imu_odom': 'increments.enabled'}
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HIGHEST_RATE = 10_000.0
 LOWEST_RATE_OF_INTERVALS = 1.0      # of increments and means: the motion is kept for a second
@@ -209,7 +113,7 @@ TABLE: tuple[Parameter, ...] = (
               '0 = never', 's', 0.0, LONGEST, smallest=1e-3),
     # No range: the limit depends on the motion.
     _at_once('spin.l3', 1.6, 'Angular momentum along the axis; a change is a command',
-              'kg m^2/s'),
+             'kg m^2/s'),
     _at_once('spin.lz', None, 'Angular momentum along the vertical; a change is a command; unset: '
              'L3 cos(initial.theta), the cusp', 'kg m^2/s'),
     _at_reset('solver.method', 'rk45', 'Dormand-Prince steps or the closed form', choices=METHODS),
@@ -219,7 +123,7 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', '', 1e-14, 1e-2),
     _at_reset('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2),
     _at_once('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
-              'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
+             'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
     _at_once('tick_rate', 200.0, 'How often due samples are sent; 4 Hz at least', 'Hz', 1e-2,
              HIGHEST_RATE),
     _at_once('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
@@ -303,7 +207,7 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('markers.trace_points', 200, 'Points of the trace, evenly spaced in time', '', 1,
               10_000),
     _at_once('duration', 0.0, 'End after this much simulated time, 0 = never', 's', 0.0,
-              LONGEST, smallest=1e-9),
+             LONGEST, smallest=1e-9),
     _at_start('record.enabled', False, 'Record from the start'),
     _at_recording('record.uri', '', 'File or folder of a recording; empty: '
                   'spinning_top_<date>_<time>.mcap here'),
@@ -318,7 +222,7 @@ TABLE: tuple[Parameter, ...] = (
     _at_once('step.count', 1, 'Steps of one ~/step', '', 1, 1_000_000),
     _at_once('step.dt', 0.01, 'Simulated time of one step', 's', 1e-6, 1e3),
     _at_once('status_period', 1.0, 'Period of the status line on the terminal, 0 = none', 's', 0.0,
-              LONGEST, smallest=0.01),
+             LONGEST, smallest=0.01),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
 
@@ -382,6 +286,12 @@ def _check_together(values: Mapping[str, Any]) -> None:
 
 def _ascend(numbers: Iterable[float]) -> bool:
     return all(one < next_one for one, next_one in pairwise(numbers))
+
+
+def is_enabled(stream: str, values: Mapping[str, Any]) -> bool:
+    """Return whether the streams with this prefix of their parameters are switched on."""
+    other = OTHER_SWITCH.get(stream)
+    return bool(values[f'{stream}.enabled'] or (other and values[other]))
 
 
 def top_of(values: Mapping[str, Any]) -> Top:

@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.integrals import Increments
-from spinning_top_sim.physics.pivot import NEVER_NS, Kinematics, Piece
+from spinning_top_sim.physics.pivot import REST, Kinematics, Piece, kinematics
 from spinning_top_sim.physics.states import Point, States
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import Top
 from spinning_top_sim.physics.world_states import WorldStates
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ClosedForm
 from spinning_top_sim.solvers.propagator import Motion
-from spinning_top_sim.solvers.theta_setup import Posture
 from spinning_top_sim.solvers.times import Times
 from spinning_top_sim.solvers.vertical import (
     AcceleratedMotion,
     AcceleratedStates,
+    Posture,
     Vertical,
     posture_at,
 )
@@ -51,7 +51,7 @@ class Segment:
     A motion from its start, or from a command, until the next command or change of the pivot's.
 
     Times are simulated times [ns]; those of `motion` count from `start_ns`.  Where the pivot
-    moves, `motion`, `exact`, `start` and the constants are about the effective vertical.
+    moves, `motion`, `closed_form`, `start` and the constants are about the effective vertical.
 
     ride : what the pivot does; None while it rests at the origin
     jumps : whether the angular velocity jumps at its start, as by a command
@@ -64,20 +64,9 @@ class Segment:
     def __init__(self, motion: Motion, start_ns: int, ride: Ride | None = None, *,
                  jumps: bool) -> None:
         self.motion, self.start_ns, self.ride, self.jumps = motion, start_ns, ride, jumps
-        self.chains, self.reached_ns = motion.chains, start_ns + motion.reached_ns
+        self.start, self.l3, self.lz = motion.start, motion.start.l3, motion.start.lz
+        self.chains = isinstance(motion, AcceleratedMotion) and motion.constants.chains
         self.filter_state: NDArray[np.float64] | None = None
-
-    @property
-    def start(self) -> State:
-        return self.motion.start
-
-    @property
-    def l3(self) -> float:
-        return self.start.l3
-
-    @property
-    def lz(self) -> float:
-        return self.start.lz
 
     @cached_property
     def _first(self) -> States:
@@ -85,34 +74,45 @@ class Segment:
 
     @cached_property
     def energy(self) -> float:
-        posture, top, start = self.motion.posture(0), self.motion.top, self.start
-        if posture is None:
+        motion, start = self.motion, self.start
+        if not isinstance(motion, AcceleratedMotion):
             return float(self._first.energy[0])
-        o1, o2 = float(posture.across.real), float(posture.across.imag)  # evaluates no states
+        top, omega = motion.top, motion.posture(0).transverse       # evaluates no states
+        o1, o2 = float(omega.real), float(omega.imag)
         return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
                 + top.gravity_torque * math.cos(start.theta))
 
+    @cached_property
+    def fastest_rate(self) -> float:
+        return integrals.fastest_rate(self.motion.top, self.l3, self.energy)
+
     @property
-    def exact(self) -> ClosedForm | None:
-        """The closed form; None where doubles cannot hold it, or not up to the last stamp."""
-        exact = self.motion.exact
-        return exact if exact is not None and exact.ns_limit >= LAST_STAMP_NS else None
+    def closed_form(self) -> ClosedForm | None:
+        """That of the motion; None where doubles cannot hold it, or not up to the last stamp."""
+        form = self.motion.closed_form
+        return form if form is not None and form.ns_limit >= LAST_STAMP_NS else None
+
+    @property
+    def piece(self) -> Piece:
+        """The piece of the path of the pivot."""
+        return self.ride.piece if self.ride else REST
 
     @property
     def end_ns(self) -> int:
         """When the acceleration of the pivot changes [ns]."""
-        return self.ride.piece.end_ns if self.ride else NEVER_NS
+        return self.piece.end_ns
 
-    def reach(self, t_ns: int, max_steps: int) -> bool:
+    @property
+    def reached_ns(self) -> int:
+        return self.start_ns + self.motion.reached_ns
+
+    def reach(self, t_ns: int, max_steps: int | None = None) -> bool:
         """
         Let the motion step up to a time [ns]; return False if that takes more steps.
 
         Raises IntegrationError if the equations cannot go on; `reached_ns` tells where they stop.
         """
-        try:
-            return self.motion.reach(t_ns - self.start_ns, max_steps)
-        finally:
-            self.reached_ns = self.start_ns + self.motion.reached_ns
+        return self.motion.reach(t_ns - self.start_ns, max_steps)
 
     def states(self, times: range | NDArray[np.int64]) -> States:
         """Return the states in the world at ascending times [ns]."""
@@ -128,14 +128,13 @@ class Segment:
 
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time [ns]."""
-        return (self.motion.posture(t_ns - self.start_ns)
-                or posture_at(self.states(range(t_ns, t_ns + 1))))
+        if isinstance(self.motion, AcceleratedMotion):
+            return self.motion.posture(t_ns - self.start_ns)
+        return posture_at(self.states(range(t_ns, t_ns + 1)))
 
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at times (n,) [ns]."""
-        if self.ride:
-            return self.ride.piece.at(times_ns)
-        return Kinematics(*np.zeros((3, 3, len(times_ns))))
+        return kinematics([self.piece], [len(times_ns)], times_ns)
 
     def _since_start(self, times: range | NDArray[np.int64]) -> range | NDArray[np.int64]:
         if isinstance(times, np.ndarray):
@@ -144,17 +143,17 @@ class Segment:
 
     def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
         """Return the angles (n,) [rad] to the exact attitudes, NaN where these are not known."""
-        if self.exact is self.motion:
+        if self.closed_form is self.motion:
             return np.zeros(len(times))
-        if self.exact is None:
+        if self.closed_form is None:
             return np.full(len(times), math.nan)
-        truth = self._in_world(self.exact.states(self._since_start(times))).rows_quaternion
+        truth = self._in_world(self.closed_form.states(self._since_start(times))).rows_quaternion
         return attitude.angle_between(states.rows_quaternion, truth)
 
     def exact_point(self, times_ns: NDArray[np.int64], along: float) -> attitude.Vector:
         """Return where a point of the axis is at times (n,) [ns]; the start's where not known."""
-        states = (self._first if self.exact is None
-                  else self.exact.states(times_ns - self.start_ns))
+        states = (self._first if self.closed_form is None
+                  else self.closed_form.states(times_ns - self.start_ns))
         # Of the first state alone, one value for all times.
         x, y, z = (along * np.broadcast_to(part, times_ns.shape)
                    for part in self._in_world(states).rows_axis)
@@ -167,10 +166,8 @@ class Segment:
 def states_of(segments: Sequence[Segment], counts: Sequence[int],
               times_ns: NDArray[np.int64]) -> States:
     """Return the states in the world in segments that chain, in each at so many times [ns]."""
-    motions, rides = [], []
-    for segment in segments:
-        motions.append(cast(AcceleratedMotion, segment.motion))
-        rides.append(cast(Ride, segment.ride))
+    motions = [cast(AcceleratedMotion, segment.motion) for segment in segments]
+    rides = [cast(Ride, segment.ride) for segment in segments]
     since_ns = times_ns - np.repeat([segment.start_ns for segment in segments], counts)
     x, y, z, w = np.repeat(np.hstack([ride.vertical.rows for ride in rides]), counts, axis=1)
     states = AcceleratedStates(motions, counts, Times.from_ns(since_ns))
@@ -191,18 +188,18 @@ class Path:
                  carry: Callable[[Segment, Segment], None], *, keep_ns: int,
                  keep_steps_ns: int) -> None:
         self._segments, self._follow, self._carry = [first], follow, carry
-        self._gone_steps = self._gone_evaluations = 0       # of segments that are forgotten
+        self.gone_steps = self.gone_evaluations = 0         # of segments that are forgotten
         self._keep_ns, self.keep_steps_ns = keep_ns, keep_steps_ns
 
     @property
     def steps(self) -> int:
         """Integration steps taken so far."""
-        return self._gone_steps + sum(one.motion.steps for one in self._segments)
+        return self.gone_steps + sum(one.motion.steps for one in self._segments)
 
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side so far."""
-        return self._gone_evaluations + sum(one.motion.evaluations for one in self._segments)
+        return self.gone_evaluations + sum(one.motion.evaluations for one in self._segments)
 
     def after(self, t_ns: int) -> Segment:
         """
@@ -239,8 +236,8 @@ class Path:
     def _forget(self, segments: list[Segment]) -> None:
         for one in segments:
             self._segments.remove(one)
-            self._gone_steps += one.motion.steps
-            self._gone_evaluations += one.motion.evaluations
+            self.gone_steps += one.motion.steps
+            self.gone_evaluations += one.motion.evaluations
 
     def release(self, now_ns: int) -> None:
         """Forget the segments and integration steps that only times before this one [ns] need."""
@@ -264,8 +261,8 @@ class Path:
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at ascending times (n,) [ns], those before now too."""
         shares = self._shares(times_ns) or [(self._segments[-1], times_ns)]
-        return Kinematics(*(np.concatenate(parts, axis=1) for parts in zip(*(
-            segment.pivot(times) for segment, times in shares), strict=True)))
+        return kinematics([segment.piece for segment, _ in shares],
+                          [len(times) for _, times in shares], times_ns)
 
     def increments(self, begin_ns: int, end_ns: int, point: Point, count: int = 1,
                    step_ns: int = 1) -> Increments:
@@ -296,9 +293,8 @@ class Path:
 
 def _within(segment: Segment, begins: range, length_ns: int, point: Point) -> list[Increments]:
     """Return the increments over consecutive panels of intervals within a segment."""
-    rate = integrals.fastest_rate(segment.motion.top, segment.l3, segment.energy)
-    count = integrals.panels(rate, length_ns)
+    count = integrals.panels(segment.fastest_rate, length_ns)
     edges = [length_ns * k // count for k in range(count + 1)]
     return [integrals.increments(
         segment.own_states, range(begins.start + begin, begins.stop + begin, begins.step),
-        end - begin, point, rate) for begin, end in pairwise(edges)]
+        end - begin, point, segment.fastest_rate) for begin, end in pairwise(edges)]

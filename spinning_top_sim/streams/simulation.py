@@ -13,15 +13,9 @@ from spinning_top_sim.physics.pivot import NEVER_NS, PivotPath
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
-from spinning_top_sim.solvers.exact import MOST_TURNS
-from spinning_top_sim.solvers.propagator import Motion, propagate
-from spinning_top_sim.solvers.theta_setup import Posture
-from spinning_top_sim.solvers.vertical import (
-    AcceleratedMotion,
-    about_vertical,
-    posture_of,
-    rounded,
-)
+from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
+from spinning_top_sim.solvers.propagator import accelerated, propagate
+from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
@@ -38,33 +32,6 @@ LONGEST_OFFLINE_NS = 100 * NANOSECONDS      # for the sake of progress
 MOST_BLOCKS = 20_000            # of a run; then they are longer
 # Turns a second whose phases doubles hold up to the last stamp.
 MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
-
-
-class Command(NamedTuple):
-    """Momenta that were commanded [kg m^2/s], and when [ns]."""
-
-    t_ns: int
-    l3: float
-    lz: float
-
-
-class NewState(NamedTuple):
-    """A `State` that was set, and when [ns]."""
-
-    t_ns: int
-    theta: float
-    theta_dot: float
-    phi: float
-    psi: float
-    l3: float
-    lz: float
-
-
-class ImuRate(NamedTuple):
-    """Another `imu.rate` [Hz], and from when on [ns]."""
-
-    t_ns: int
-    rate: float
 
 
 class Drive(NamedTuple):
@@ -85,12 +52,14 @@ class Simulation:
     top : the top that they describe
     streams : every stream, whether it is switched on or not
     path : the motion
-    now_ns : every sample up to here is done (-1: not even that of t = 0); may be set
-    history : what was applied since the start
+    now_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
+    history : what was applied since the start: time [ns], then L3 and Lz of a command, the fields
+        of a `State`, the rate of the IMU [Hz], or those of a `Drive`
     pivot_path : of the pivot; None while it rests at the origin
     lz : as last commanded, about the vertical of the world [kg m^2/s]
     epoch_ns : stamp of t = 0 [ns]
-    version : changes with all but `epoch_ns` that makes samples after `now_ns` other ones
+    version : counts changes that make samples after `now_ns` other than they would have been; a
+        change of `epoch_ns` is not counted
 
     Raises ValueError where there is no motion from the start state.
     """
@@ -99,7 +68,6 @@ class Simulation:
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         self.version = 0
-        self._steps_before = self._evaluations_before = 0
         self.epoch_ns = epoch_ns
         self._load(values)
 
@@ -109,9 +77,9 @@ class Simulation:
 
         Raises ValueError where there is no motion from there; then the present one goes on.
         """
-        counts = self.steps, self.evaluations
+        before = self.path
         self._load(values)
-        self._steps_before, self._evaluations_before = counts
+        self.path.gone_steps, self.path.gone_evaluations = before.steps, before.evaluations
 
     def _load(self, values: Mapping[str, Any]) -> None:
         # Whatever may be refused comes first, before anything changes.
@@ -125,14 +93,13 @@ class Simulation:
         self.imu = Imu(values)
         self.values, self.top = dict(values), top
         self.streams = all_streams(values, self.imu)
-        self.history: list[Command | NewState | ImuRate | Drive] = []
+        self.history: list[tuple[int, *tuple[float, ...]]] = []
         self.now_ns = -1
         # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
         trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
         self.pivot_path, self.lz = pivot, start.lz
         self.path = Path(segment, self._follow, self.imu.carry,
-                         keep_ns=max(trace_ns, LONGEST_NS, self.imu.keep_ns),
-                         keep_steps_ns=self.imu.keep_ns)
+                         keep_ns=max(trace_ns, LONGEST_NS), keep_steps_ns=self.imu.keep_ns)
         self.version += 1
 
     @property
@@ -147,11 +114,11 @@ class Simulation:
 
     @property
     def steps(self) -> int:
-        return self._steps_before + self.path.steps
+        return self.path.steps
 
     @property
     def evaluations(self) -> int:
-        return self._evaluations_before + self.path.evaluations
+        return self.path.evaluations
 
     def state(self) -> States:
         """Return the state (n = 1) at `now_ns`, or at the start before the first sample."""
@@ -176,13 +143,11 @@ class Simulation:
         return float(self.segment.orientation_error(self.state(), self._now())[0])
 
     def describe(self) -> Description | None:
-        """
-        Return the present motion in numbers.
-
-        None where the closed form cannot hold it, or the pivot moves.
-        """
-        exact = None if self.segment.ride else self.segment.exact
-        return None if exact is None else exact.describe()
+        """Return the motion in numbers; None if it has no closed form or the pivot moves."""
+        solution = self.segment.closed_form
+        if self.segment.ride or not isinstance(solution, ExactSolution):
+            return None
+        return solution.describe()
 
     def play(self, streams: Sequence[Stream], until_ns: int) -> Iterator[Block]:
         """
@@ -205,7 +170,7 @@ class Simulation:
         imu, rate = self.imu, changes.get('imu.rate')
         if rate is not None and imu.set_rate(rate, max(self.now_ns, 0)):
             self.path.keep_steps_ns = imu.keep_ns
-            self.history.append(ImuRate(max(self.now_ns, 0), rate))
+            self.history.append((max(self.now_ns, 0), rate))
         for stream in self.streams:
             stream.apply(changes)
         self.version += 1
@@ -230,7 +195,7 @@ class Simulation:
         self._continue(ContinuedState(
             theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
             psi=float(now.psi[0]), l3=l3, lz=lz))
-        self.history.append(Command(self.now_ns, l3, lz))
+        self.history.append((self.now_ns, l3, lz))
 
     def set_state(self, state: State) -> None:
         """
@@ -240,7 +205,7 @@ class Simulation:
         """
         self._settle()
         self._continue(state)
-        self.history.append(NewState(self.now_ns, *astuple(state)))
+        self.history.append((self.now_ns, *astuple(state)))
 
     def drive(self, velocity: Sequence[float], stop_ns: int | None = None) -> int | None:
         """
@@ -283,8 +248,7 @@ class Simulation:
     def _settle(self) -> None:
         """Let the solver reach `now_ns`, and be at t = 0 at least."""
         self.now_ns = max(self.now_ns, 0)
-        while not self.segment.reach(self.now_ns, OFFLINE_STEPS):
-            pass
+        self.segment.reach(self.now_ns)
 
     def _continue(self, start: State | Posture, pivot: PivotPath | None = None) -> None:
         """Go on from another state, or from the present posture on another path of the pivot."""
@@ -298,8 +262,7 @@ class Simulation:
 
     def _follow(self, last: Segment) -> Segment:
         """Return the segment behind the end of one: the pivot changes its acceleration."""
-        while not last.reach(last.end_ns, OFFLINE_STEPS):
-            pass
+        last.reach(last.end_ns)
         return _segment(self.top, last.posture(last.end_ns), last.end_ns, self.values,
                         self.pivot_path)
 
@@ -343,21 +306,11 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
 
 
 def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
-           pivot: PivotPath | None) -> Segment:
-    step = partial(propagate, method=values['solver.method'],
-                   equations=values['solver.equations'], rtol=values['solver.rtol'],
-                   atol=values['solver.atol'])
+                 pivot: PivotPath | None) -> Segment:
+    settings = {name: values[f'solver.{name}'] for name in ('method', 'equations', 'rtol', 'atol')}
     if pivot is None:
         assert isinstance(start, State)
-        return Segment(step(top, start), start_ns, jumps=True)
-    posture, piece = start, pivot.lasting(start_ns)
-    if isinstance(posture, State):
-        posture = posture_of(top, posture)
-    motion: Motion
-    if values['solver.method'] == 'exact':
-        motion = accelerated = AcceleratedMotion(top, posture, piece.acceleration)
-        vertical = accelerated.vertical
-    else:
-        vertical, halves = about_vertical(top, posture, piece.acceleration)
-        motion = step(vertical.top, rounded(halves))
+        return Segment(propagate(top, start, **settings), start_ns, jumps=True)
+    piece = pivot.lasting(start_ns)
+    motion, vertical = accelerated(top, start, piece.acceleration, **settings)
     return Segment(motion, start_ns, Ride(top, vertical, piece), jumps=isinstance(start, State))

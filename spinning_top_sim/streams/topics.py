@@ -19,8 +19,10 @@ from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.gnss import Fix, Velocity
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
-from spinning_top_sim.streams.stream import Samples, Stream, Timing, faults_of
+from spinning_top_sim.streams.stream import Samples, Stream
+from spinning_top_sim.streams.timing import Timing, faults_of
 
+NODE_NAME = 'spinning_top'
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
 INVARIANTS = ('energy', 'l3', 'lz', 'energy_drift', 'l3_drift', 'lz_drift',
               'quaternion_norm_error', 'orientation_error')
@@ -56,13 +58,13 @@ def _joints(samples: Samples) -> Sequence[Field]:
 
 
 def _readings(imu: Imu, samples: Samples) -> Sequence[Field]:
-    return (messages.NO_ROTATION, *imu.present_sensor.read(samples.once(imu.felt), samples.times))
+    return (messages.NO_ROTATION, *imu.sensor.read(samples.once(imu.felt), samples.times))
 
 
 def _estimates(imu: Imu, samples: Samples) -> Sequence[Field]:
     _, *readings = _readings(imu, samples)
     exact = imu.orientation(samples.states)
-    return (imu.present_sensor.orientation(exact, samples.times), *readings)
+    return (imu.sensor.orientation(exact, samples.times), *readings)
 
 
 def _timing(timing: Timing, imu: Imu, samples: Samples) -> Sequence[Field]:
@@ -101,7 +103,7 @@ class ImuStream(Stream):
     def _template(self) -> Template:
         covariances = 3 * [messages.EXACT]
         if self._is_noisy:
-            sensor = self.imu.present_sensor
+            sensor = self.imu.sensor
             covariances = [messages.diagonal(*variances) for variances in (
                 sensor.orientation_variances, 3 * (sensor.rate_variance,),
                 3 * (sensor.force_variance,))]
@@ -200,7 +202,7 @@ def all_streams(values: Mapping[str, Any], imu: Imu | None = None) -> list[Strea
                is_noisy=True),
         of_imu('imu_data', 'imu/data', partial(_estimates, imu), is_noisy=True),
         of_imu('imu', 'ground_truth/imu_bias', has_orientation=False, fields=lambda samples: (
-            messages.NO_ROTATION, *imu.present_sensor.bias(samples.times))),
+            messages.NO_ROTATION, *imu.sensor.bias(samples.times))),
         of_imu('ground_truth_imu', 'ground_truth/imu',
                lambda samples: (imu.orientation(samples.states), *imu.sampled(samples))),
         stream('imu_timing', 'ground_truth/imu_timing', ARRAY,
@@ -227,3 +229,11 @@ def all_streams(values: Mapping[str, Any], imu: Imu | None = None) -> list[Strea
         stream('invariants', '~/invariants', ARRAY, messages.float64_multi_array(INVARIANTS),
                _invariants),
         Markers(values)]
+
+
+def resolve_topic(topic: str, namespace: str) -> str:
+    """Return the full name of a topic, as ROS resolves it for the node in this namespace."""
+    if topic.startswith('/'):
+        return topic
+    parts = [namespace.strip('/'), topic.replace('~', NODE_NAME, 1)]
+    return '/' + '/'.join(filter(None, parts))

@@ -40,7 +40,7 @@ class Vibration:
             ('rate', noise.Purpose.VIBRATION_RATE), ('force', noise.Purpose.VIBRATION_FORCE))]
         self.is_off = not any(map(len, self._kinds))
 
-    def add(self, exact: tuple[Vector, Vector], t_ns: NDArray[np.int64],
+    def add(self, true: tuple[Vector, Vector], t_ns: NDArray[np.int64],
             seconds: Column | float = 0.0) -> tuple[Vector, Vector]:
         """
         Return rates and forces (n,) with the vibration at these times [ns].
@@ -49,7 +49,7 @@ class Vibration:
         """
         middle = t_ns.astype(np.float64) * 1e-9 - 0.5 * seconds
         rates, force = (_sum(lines, middle, seconds, one)
-                        for lines, one in zip(self._kinds, exact, strict=True))
+                        for lines, one in zip(self._kinds, true, strict=True))
         return rates, force
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams.parameter import Effect, Parameter
 from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_scene
 
 DEFAULTS = {parameter.name: parameter.default for parameter in parameters.TABLE}
@@ -23,7 +24,7 @@ STREAMS = tuple(row[0] for row in parameters.STREAM_DEFAULTS if row[0] not in ('
 # many parts.  Larger parts take more memory, and are no faster.
 ROWS_IN_A_PART, LEAST_PARTS = 50_000, 50
 VALUES, PARAMS = 'values', 'params'
-_entry = partial(parameters.Parameter, text='', effect=parameters.Effect.START)
+_entry = partial(Parameter, text='', effect=Effect.START)
 ENTRIES = (
     _entry('runs', 1, minimum=1, maximum=2 ** 63 - 1),
     _entry('duration', 1.0, minimum=1e-9, maximum=parameters.LONGEST),

@@ -5,7 +5,7 @@ import contextlib
 import json
 import operator
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from spinning_top_sim.physics.top import State
@@ -16,7 +16,8 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import ENCAPSULATION
-from spinning_top_sim.streams.simulation import Command, Drive, ImuRate, NewState, Simulation
+from spinning_top_sim.streams.parameter import Effect
+from spinning_top_sim.streams.simulation import Drive, Simulation
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
@@ -26,8 +27,8 @@ LEAST_STEPS, STEPS_A_BYTE = 200_000, 20
 LEAST_SAMPLES, SAMPLES_A_BYTE = 100_000, 1
 # What entries of `Simulation.history` have after their time, by the events that record them; they
 # differ in the count of numbers.
-APPLIED = {'command': Command._fields[1:], 'state': NewState._fields[1:],
-           'parameters': ImuRate._fields[1:], 'drive': Drive._fields[1:]}
+APPLIED = {'command': ('l3', 'lz'), 'state': tuple(field.name for field in fields(State)),
+           'parameters': ('rate',), 'drive': Drive._fields[1:]}
 NEW_MOTIONS = ('command', 'state', 'drive')     # events that begin another motion at once
 
 
@@ -68,7 +69,7 @@ class RunDescription:
     def values_in_effect(self) -> dict[str, Any]:
         """The parameters of the first sample: a change that waits for a reset is not in it."""
         return {parameter.name: (
-            self.values_at_start if parameter.effect is parameters.Effect.RESET
+            self.values_at_start if parameter.effect is Effect.RESET
             else self.values_at_recording)[parameter.name] for parameter in parameters.TABLE}
 
 
@@ -204,7 +205,7 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     if samples:
         yield from play(run.begun_ns, ())
     simulation.now_ns = run.begun_ns
-    at_once = {one.name for one in parameters.TABLE if one.effect is parameters.Effect.NOW}
+    at_once = {one.name for one in parameters.TABLE if one.effect is Effect.NOW}
     simulation.apply({name: run.values_at_recording[name] for name in at_once})
     yield simulation, Event('start', run.epoch_ns, 0, simulation.now_ns, {})
 

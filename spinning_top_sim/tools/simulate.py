@@ -26,6 +26,7 @@ from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream, period_ns
+from spinning_top_sim.streams.topics import resolve_topic
 from spinning_top_sim.tools import cli, log_exports, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
 from spinning_top_sim.tools.table import RIDE_UNITS, UNITS, TrueStates, write_csv, write_parquet
@@ -163,7 +164,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     types = {stream.topic: stream.type_name for stream in streams} | journal.TOPICS
     topics = list(types)
     file = create_file(
-        path, [RecordedTopic(journal.resolve_topic(name, namespace), type_name)
+        path, [RecordedTopic(resolve_topic(name, namespace), type_name)
                for name, type_name in types.items()],
         run_metadata(values, epoch_ns, -1, (), values), compression=values['record.compression'])
     try:

@@ -212,7 +212,7 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
         for (name, largest), value in zip(drifts.items(), values, strict=True):
             drift = relative_drift(value, getattr(segment, name))
             drifts[name] = max(largest, _largest(drift))
-    if motion.exact is not None and (exact := segment.exact) is not None:
+    if motion.exact is not None and (exact := segment.closed_form) is not None:
         times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
         truth = exact.states(times_ns).rows_quaternion
         error = _largest(angle_between(data.quaternion, truth))

@@ -13,7 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.journal import NODE_NAME
+from spinning_top_sim.streams.topics import NODE_NAME
 from spinning_top_sim.tools.scene_file import read_scene
 
 ANSWER_S = 5.0                  # timeout of a service call

@@ -9,7 +9,7 @@ from string import Template
 
 import numpy as np
 
-from spinning_top_sim.physics.regimes import SENTENCES, natural_momentum
+from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.view.track import DescribedMotion, Track
@@ -21,6 +21,28 @@ PIVOT_MOVES = 'The pivot moves: where it accelerates, the top moves about anothe
 NEUTRAL = ('The body is not in this log, only its attitude: a grey disc shows it, with its axes '
            'x (red), y (green) and z (blue).')
 VERTICAL = 1e-6                 # tilt from a vertical up to which there is no precession [rad]
+# What one sees of each motion, by its name.
+SENTENCES = {
+    'at rest': 'Nothing turns: the axis stays where it is.',
+    'cusps': 'Released without a push: the axis falls, is turned aside, and rises to stand still '
+             'for an instant.',
+    'free top': 'No torque acts: the axis goes round a fixed direction, that of the angular '
+                'momentum.',
+    'hanging': 'The axis hangs straight down, and the body only spins.',
+    'loops': 'Pushed backwards at the start: where the axis is highest it moves backwards, and '
+             'draws loops.',
+    'planar pendulum, rotating': 'Without spin: the axis goes over the top in one vertical plane.',
+    'planar pendulum, swinging': 'Without spin: the axis swings in one vertical plane.',
+    'sleeping': 'The axis stands upright and the spin is fast enough to hold it there.',
+    'sleeping, unstable': 'The axis stands upright, but the spin is too slow: a touch makes it '
+                          'fall.',
+    'spherical pendulum': 'Without spin: the axis swings round the vertical like a weight on a '
+                          'string.',
+    'steady precession': 'The axis goes round the vertical at one tilt and one speed.',
+    'through the bottom': 'The axis passes through the straight-down position in each nutation.',
+    'through the top': 'The axis passes through the upright position in each nutation.',
+    'waves': 'The axis nods up and down while it always goes round the same way.',
+}
 
 
 def number(value: float) -> str:

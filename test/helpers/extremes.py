@@ -13,7 +13,7 @@ import random
 import sys
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.parameters import Parameter
+from spinning_top_sim.streams.parameter import Parameter
 
 LARGEST = sys.float_info.max
 DOUBLES = (0.0, -0.0, 5e-324, 1e-310, 1e-300, 1e-170, 1e-100, 1e-46, 1e-20, 1e-9, 1e-3, 0.5, 1.0,

@@ -5,7 +5,7 @@ import numpy as np
 
 from helpers.simulations import play, simulate, stream
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.imu import Sensor
+from spinning_top_sim.streams.inertial_sensor import Sensor
 
 STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stamps of an IMU, and the number of messages that are sent for each of its samples."""
+
+from collections.abc import Mapping
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.streams import noise
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+
+# Jitter is cut at this share of the period, so that no stamp is before that of an earlier sample.
+MOST_JITTER = 0.45
+FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_rate',
+          'imu.duplicate_rate')
+
+
+class Timing:
+    """Offset, drift and jitter depend on the seed, the number of the sample and its time alone."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._seed = values['seed']
+        self._offset_ns = round(values['imu.stamp_offset'] * NANOSECONDS)
+        self._jitter_ns = values['imu.stamp_jitter'] * NANOSECONDS
+        self._drift = values['imu.clock_drift'] * 1e-6
+        # A standard normal number is below these with the probability of the fault.
+        self._dropped_below, self._repeated_below = (
+            NormalDist().inv_cdf(rate) if rate else -np.inf
+            for rate in (values['imu.drop_rate'], values['imu.duplicate_rate']))
+
+    def stamps_ns(self, epoch_ns: int, t_ns: NDArray[np.int64], period_ns: int,
+                  ) -> NDArray[np.int64]:
+        """Return the stamps (n,) [ns] of samples at times (n,) [ns]; epoch_ns is that of t = 0."""
+        jitter, _, _ = self._draw(t_ns, period_ns)
+        most = MOST_JITTER * period_ns
+        errors = self._drift * t_ns + np.clip(self._jitter_ns * jitter, -most, most)
+        stamps: NDArray[np.int64] = (
+            epoch_ns + self._offset_ns + t_ns + np.rint(errors).astype(np.int64))
+        return np.clip(stamps, 0, LAST_STAMP_NS)
+
+    def copies(self, t_ns: NDArray[np.int64], period_ns: int) -> NDArray[np.int64]:
+        """Return how many messages are sent for each of the samples: 0, 1 or 2."""
+        _, drop, repeat = self._draw(t_ns, period_ns)
+        return np.where(drop < self._dropped_below, 0,
+                        np.where(repeat < self._repeated_below, 2, 1))
+
+    def _draw(self, t_ns: NDArray[np.int64], period_ns: int) -> NDArray[np.float64]:
+        return noise.white(self._seed, noise.Purpose.TIMING, t_ns // period_ns, 3)
+
+
+def faults_of(values: Mapping[str, Any]) -> Timing | None:
+    """Return the timing of an IMU with faults, None if it has none."""
+    return Timing(values) if any(map(values.get, FAULTS)) else None
