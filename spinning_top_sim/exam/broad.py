@@ -32,11 +32,18 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     of the errors in motion, of each trial and their means.  `invalid_output` is the only fault
     that can be found.
 
+    Parameters
+    ----------
     make_filter, subject : as for `examine`
-    folder : with files of BROAD: .mat, or .hdf5, which need h5py
-    show : is called with the number of trials that are done
+    folder : path
+        With files of BROAD: .mat, or .hdf5, which need h5py.
+    show : callable, optional
+        Is called with the number of trials that are done.
 
-    Raises ValueError if there is no folder, no trial in it, or a file is none.
+    Raises
+    ------
+    ValueError
+        If there is no folder, no trial in it, or a file is none.
     """
     return report_of(make_filter, map(read_trial, trials_in(folder)), 'data', one_line(
         subject or getattr(make_filter, '__name__', 'filter')), show=show)

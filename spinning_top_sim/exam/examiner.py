@@ -40,8 +40,12 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     """
     Examine an attitude filter.
 
-    The filter has a method ``update(gyroscope, accelerometer, magnetometer, dt)`` that returns the
-    attitude; attributes `covariance` and `bias` are optional.  `trial.Filter` says what each is.
+    The filter has a method ``update(gyroscope, accelerometer, magnetometer, dt)``: the mean
+    angular velocity over the step [rad/s], specific force [m/s^2, +g upwards at rest] and field
+    [T, or None] at its end, in the frame of the sensor, and the length of the step [s].  It
+    returns the attitude at the end of the step, q(world <- sensor) in the order x, y, z, w; x of
+    the world is east, y north and z up.  Attributes `covariance` and `bias` are optional, see
+    `trial.Filter`.
 
     Parameters
     ----------
@@ -62,6 +66,11 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         crashes or never returns then ends the exam.
     restart : bool, optional
         If False, one filter is made, in this process, and used for all runs.
+
+    Returns
+    -------
+    Report
+        Faults with their evidence, and measures.
 
     Raises
     ------

@@ -50,18 +50,37 @@ OFF = 0.05                  # rad, and of the angle turned since: another start
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted motion; `lines` tells it."""
+    """
+    A fitted motion; `lines` tells it.
 
-    top: Top                            # lambda1 is as given: attitudes tell ratios only
-    start: State                        # at the first attitude
-    mounting: tuple[float, float, float, float]     # of the IMU, as `Body` has it
+    Attributes
+    ----------
+    top, start : Top, State
+        At the first attitude.  lambda1 is as given: attitudes tell ratios only.
+    mounting, lever_arm : tuple of float
+        Of the IMU, as `Body` has them.
+    values, deviations : dict
+        Estimates and standard deviations by the names of NAMES; inf where the readings do not
+        tell the value.
+    undetermined : tuple of str
+        What the readings cannot tell apart.
+    residual, noise : float
+        Root mean square of a component of the attitude residual, and of its white part [rad].
+    reached : bool
+        Whether the fit has converged and the residuals are noise.  If not, the intervals mean
+        nothing.
+    """
+
+    top: Top
+    start: State
+    mounting: tuple[float, float, float, float]
     lever_arm: tuple[float, float, float]
-    values: Mapping[str, float]         # estimates by the names of NAMES
-    deviations: Mapping[str, float]     # standard deviations; inf: the readings do not tell it
-    undetermined: tuple[str, ...]       # what the readings cannot tell apart
-    residual: float                     # rms of a component of the attitude residual [rad]
-    noise: float                        # of its white part [rad]
-    reached: bool       # converged, and the residuals are noise; if not, intervals mean nothing
+    values: Mapping[str, float]
+    deviations: Mapping[str, float]
+    undetermined: tuple[str, ...]
+    residual: float
+    noise: float
+    reached: bool
 
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; null: not told by the readings."""
@@ -96,13 +115,21 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     """
     Fit a top and its start to attitudes, and on request the place of an IMU to its readings.
 
-    parts : times (n,), ascending [s], and values (n, k) by name, as of a `Trajectory`:
-        `attitudes`, whose third axis is that of the top; `gyroscope` and `accelerations`; `rates`
-        or `gyroscope` also tell how many whole turns the top makes between two attitudes
-    lambda1, gravity : scale of the inertia [kg m^2], gravity [m/s^2]; attitudes do not tell them
-    imu : whether mounting, lever arm and offset of the stamps of the IMU are fitted
+    Parameters
+    ----------
+    parts : mapping
+        Times (n,), ascending [s], and values (n, k) by name, as of a `Trajectory`: `attitudes`,
+        whose third axis is that of the top; `gyroscope` and `accelerations`; `rates` or
+        `gyroscope` also tell how many whole turns the top makes between two attitudes.
+    lambda1, gravity : float
+        Scale of the inertia [kg m^2] and gravity [m/s^2], which attitudes do not tell.
+    imu : bool
+        Whether mounting, lever arm and offset of the stamps of the IMU are fitted.
 
-    Raises ValueError if there are too few attitudes, or no readings.
+    Raises
+    ------
+    ValueError
+        If there are too few attitudes, or no readings.
     """
     times, attitudes = parts['attitudes']
     if len(times) < FEWEST:

@@ -30,20 +30,37 @@ class InvalidTrajectoryError(ValueError):
 
 @dataclass
 class Trajectory:
-    """A motion at n equally spaced times, as a simulator tells it."""
+    """
+    A motion at n equally spaced times, as a simulator tells it.
 
-    t: Reals                                # (n,) [s]
-    attitudes: Reals                        # q(world <- body) as w, x, y, z (n, 4)
-    rates: Reals | None = None              # angular velocity in the body frame (n, 3) [rad/s]
-    # Readings in the frame of the IMU (n, 3).
-    accelerations: Reals | None = None      # [m/s^2], +g upwards at rest
-    gyroscope: Reals | None = None          # [rad/s]
-    magnetometer: Reals | None = None       # [T]
-    # Rotation [rad] and velocity [m/s] in the frame of the IMU over the interval that ends at
-    # each time (n, 6); the first row is not used.
+    Parameters
+    ----------
+    t : (n,) array
+        Times [s].
+    attitudes : (n, 4) array
+        q(world <- body) as w, x, y, z.
+    rates : (n, 3) array, optional
+        Angular velocity in the body frame [rad/s].
+    accelerations, gyroscope, magnetometer : (n, 3) array, optional
+        Readings in the frame of the IMU [m/s^2, +g upwards at rest], [rad/s], [T].
+    increments : (n, 6) array, optional
+        Rotation [rad] and velocity [m/s] in the frame of the IMU over the interval that ends at
+        each time; the first row is not used.
+    energy : (n,) array, optional
+        Kinetic and potential energy, but for a constant [J].
+    covariance : mapping, optional
+        Covariances (3, 3) that the simulator tells of 'gyroscope' and 'accelerations'; a single
+        matrix is meant for both.
+    """
+
+    t: Reals
+    attitudes: Reals
+    rates: Reals | None = None
+    accelerations: Reals | None = None
+    gyroscope: Reals | None = None
+    magnetometer: Reals | None = None
     increments: Reals | None = None
-    energy: Reals | None = None             # kinetic and potential, but for a constant (n,) [J]
-    # Covariances (3, 3) that are told of 'gyroscope' and 'accelerations'; of both, if it is one.
+    energy: Reals | None = None
     covariance: Mapping[str, Reals] = field(default_factory=dict)
 
     @classmethod

@@ -19,15 +19,27 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Body(Top):
-    """A top with an IMU on it.  The pivot is the origin of the body frame, e3 the axis."""
+    """
+    A top with an IMU on it.  The pivot is the origin of the body frame, e3 the axis.
 
-    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)     # position in the body frame [m]
-    mounting: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # q(body <- IMU), w first
-    field: tuple[float, float, float] = (0.0, 20e-6, -43e-6)    # in the world [T]
-    # Of white noise: a sample has the density over sqrt(interval between the samples) as its
-    # standard deviation.  0: no noise; None: unknown.
-    gyroscope_noise_density: float | None = None                # [rad/s/sqrt(Hz)]
-    accelerometer_noise_density: float | None = None            # [m/s^2/sqrt(Hz)]
+    Parameters
+    ----------
+    lever_arm : (3,) float
+        Position of the IMU in the body frame [m].
+    mounting : (4,) float
+        q(body <- IMU) as w, x, y, z.
+    field : (3,) float
+        Magnetic field in the world [T].
+    gyroscope_noise_density, accelerometer_noise_density : float
+        Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
+        sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
+    """
+
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mounting: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    field: tuple[float, float, float] = (0.0, 20e-6, -43e-6)
+    gyroscope_noise_density: float | None = None
+    accelerometer_noise_density: float | None = None
 
     def __post_init__(self) -> None:
         Top(**{one.name: getattr(self, one.name) for one in fields(Top)})
@@ -66,11 +78,21 @@ class Body(Top):
 
 @dataclass(frozen=True)
 class Start:
-    """How the top starts."""
+    """
+    How the top starts.
 
-    attitude: tuple[float, float, float, float]     # q(world <- body), w first; z points up
-    rates: tuple[float, float, float]               # in the body frame [rad/s]
-    # The same in Euler angles and momenta; `of` and `state_of` convert.
+    Parameters
+    ----------
+    attitude : (4,) float
+        q(world <- body) as w, x, y, z; z of the world points up.
+    rates : (3,) float
+        Angular velocity in the body frame [rad/s].
+    state : State, optional
+        The same in Euler angles and momenta; `of` and `state_of` convert.
+    """
+
+    attitude: tuple[float, float, float, float]
+    rates: tuple[float, float, float]
     state: State | None = field(default=None, repr=False)
 
     @classmethod

@@ -74,7 +74,11 @@ class Messages:
 
     def in_order(self, topics: Mapping[int, str], *, by_time: bool = False,
                  ) -> Iterator[LogMessage]:
-        """Yield the messages of `topics` (names by channel id) in file order, or by log time."""
+        """
+        Yield the messages in file order, or by log time and equal ones in file order.
+
+        topics : names by channel id; messages of other channels are left out
+        """
         entries = [np.frombuffer(numbers, np.uint64).reshape(-1, 2)
                    for channel_id, numbers in self.entries.items() if channel_id in topics]
         if not entries:

@@ -64,7 +64,11 @@ class McapRecorder:
     def __init__(self, path: str | os.PathLike[str], topics: Sequence[RecordedTopic],
                  metadata: Mapping[str, str], *, max_loss: float = 0.5,
                  compression: str = 'zstd', min_free_bytes: int = 100_000_000) -> None:
-        """Start recording; a SIGKILL or a power loss takes the last `max_loss` [s] at most."""
+        """
+        Create the file and start recording; raises as `create_file`.
+
+        max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
+        """
         self.path = Path(path)
         self._file = create_file(self.path, topics, metadata, compression=compression,
                                  min_free_bytes=min_free_bytes)

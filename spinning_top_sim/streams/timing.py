@@ -18,7 +18,12 @@ FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_r
 
 
 class Timing:
-    """Offset, drift and jitter depend on the seed, the number of the sample and its time alone."""
+    """
+    The stamps of an IMU, and the number of messages that are sent for each of its samples.
+
+    Offset, drift and jitter of its clock depend on the seed, the number of the sample and its
+    time alone.
+    """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._seed = values['seed']

@@ -143,7 +143,12 @@ def arrow_table(specification: Specification, found: Mapping[int, Samples]) -> '
 
 
 def write_row(specification: Specification, run: int, path: Path) -> None:
-    """Compute one run into a new file, .mcap or .parquet; an existing file raises an error."""
+    """
+    Compute one run into a new file, .mcap or .parquet.
+
+    Raises RecordingError or OSError if it exists, ValueError if no motion begins, IntegrationError
+    if it ends early.
+    """
     from pyarrow import parquet  # noqa: PLC0415
 
     values = specification.values(run)

@@ -28,7 +28,15 @@ MOST_PIECES = 20
 
 
 def model(values: Mapping[str, Any], file_format: str, name: str) -> str:
-    """Return the model of a top in one of FORMATS.  Raises ValueError for one that has none."""
+    """
+    Return the model of a top.
+
+    values : checked parameters
+    file_format : one of FORMATS
+    name : of the model
+
+    Raises ValueError if no rigid body has the inertia, or, of URDF, if the frames form no tree.
+    """
     if fault := robot.inertia_fault(values):
         raise ValueError(fault)
     return FORMATS[file_format](values, re.sub(r'[^\w.]+', '_', name))

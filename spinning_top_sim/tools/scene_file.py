@@ -85,7 +85,11 @@ def given(arguments: argparse.Namespace) -> dict[str, object]:
 
 
 def chosen_files(arguments: argparse.Namespace) -> dict[Path, dict[str, object]]:
-    """Return the parameter files of --scene and --imu with their content, as `read_scene`."""
+    """
+    Return the parameter files of --scene and --imu, and what is in them.
+
+    Raises ValueError for a name that is not there, or as `read_scene`.
+    """
     found = {}
     for kind in ('scene', 'imu'):
         name = getattr(arguments, kind, None)
@@ -101,7 +105,11 @@ def chosen_files(arguments: argparse.Namespace) -> dict[Path, dict[str, object]]
 
 
 def read_scene(path: str | Path) -> dict[str, object]:
-    """Return the parameters in a ROS 2 file, not checked.  Raises OSError or ValueError."""
+    """
+    Return the parameters of the node spinning_top in a ROS 2 parameter file, not checked.
+
+    Raises OSError, or ValueError, which names the file.
+    """
     source = str(path)
     content = parse_yaml(Path(path).read_bytes(), source)
     sections = [node['ros__parameters'] for name, node in content.items()

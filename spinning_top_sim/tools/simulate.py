@@ -141,7 +141,11 @@ def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
 
 def _play(simulation: Simulation, streams: Sequence[Stream], stops: Sequence[Stop],
           show: Callable[[float], object]) -> Iterator[Block | tuple[float, float]]:
-    """Yield the blocks up to each stop, then its command, applied.  Raises IntegrationError."""
+    """
+    Yield the blocks up to each stop, then L3 and Lz of its command, which has been applied.
+
+    Raises IntegrationError where the state cannot take a command.
+    """
     for stop_ns, momenta in stops:
         for block in simulation.play(streams, stop_ns):
             yield block
@@ -158,7 +162,11 @@ def _play(simulation: Simulation, streams: Sequence[Stream], stops: Sequence[Sto
 
 def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
               show: Callable[[float], object], namespace: str) -> str:
-    """Simulate a run into a new log, whole also after an error; return a text on its size."""
+    """
+    Simulate a run into a new log; return the number of messages and the size of the file.
+
+    After an error the log is closed and readable, and holds what was computed before.
+    """
     values, epoch_ns = simulation.values, simulation.epoch_ns
     streams = journal.recorded_streams(simulation.streams, values)
     types = {stream.topic: stream.type_name for stream in streams} | journal.TOPICS

@@ -104,7 +104,11 @@ def _show_logs(arguments: argparse.Namespace) -> int:
 
 
 def _open_page(arguments: argparse.Namespace, title: str) -> Page:
-    """Return the page, in the browser if there is a desktop.  Raises ValueError or OSError."""
+    """
+    Return the page; print its address, and open it in the browser if there is a desktop.
+
+    Raises ValueError for a wrong port, and OSError if the server cannot start.
+    """
     if arguments.port is not None and not 0 <= arguments.port <= LAST_PORT:
         raise ValueError(f'--port {arguments.port}: must be from 0 to {LAST_PORT}')
     with needed('the page', 'view'):

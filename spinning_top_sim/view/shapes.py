@@ -133,7 +133,12 @@ ARROWS = {
 
 
 def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
-    """Return one of ARROWS (3,) in the scene; None if no sample has it."""
+    """
+    Return a vector of ARROWS (3,) in the world, scaled for drawing; None if no sample has it.
+
+    The length of the axis stands for the usual angular momentum or velocity, for 1 g, and for the
+    torque of gravity when the axis is horizontal.
+    """
     _, topics, vector = ARROWS[name]
     sample = track.best(topics).at(stamp_ns)
     if sample is None or not track.has_body:

@@ -230,7 +230,11 @@ class Track:
 
 
 def constants_and_state(top: Top, row: Rows) -> tuple[tuple[float, float, float], State]:
-    """Return energy, L3 and Lz of a row of `Track.rates`, and the state without its rounding."""
+    """
+    Return energy, L3 and Lz of a row of `Track.rates`, and its state.
+
+    A state within rounding errors of a special motion becomes that motion.
+    """
     quaternion, omega = row[QUATERNION], row[RATES]
     state = placement.state_of(top, quaternion, np.array(
         attitude.rotated(tuple(quaternion), tuple(omega))))
