@@ -20,14 +20,14 @@ from spinning_top_sim.exam.scenarios import Reals, Run
 TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0),
          (1, 110.0), (2, -120.0))
 # Rates of these turns, and of the last one, so slow that a threshold would drop it or take it for
-# a bias [rad/s].
-TURN_RATE, SLOW_RATE = 2.6, 0.15
+# a bias [rad/s].  It has a ripple, relative, because steady rates count as rest in some filters.
+TURN_RATE, SLOW_RATE, RIPPLE = 2.6, 0.15, 0.3
 FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
 # Yaw, pitch and roll of the last rest [deg], and a turn of the heading there.  The yaw passes 180
 # degrees in this turn, whether it counts from the east or from the north.
-DOWN, ASTRAY, ASTRAY_S = (160.0, 20.0, 140.0), np.radians(120.0), 0.5
+DOWN, ASTRAY, ASTRAY_S = (160.0, -40.0, 140.0), np.radians(120.0), 0.5
 
 
 class Kick(NamedTuple):
@@ -80,7 +80,9 @@ def excite(imu: Mapping[str, Any], goes_astray: bool) -> Excitation:
     ends = np.cumsum([FIRST_S * rate, *(lengths + 1 + rest)]).astype(int)
     begins = np.append(0, ends[1:] - rest)
     path = Slerp(np.ravel((begins, ends), 'F'), stops[np.repeat(np.arange(len(stops)), 2)])
-    lead = scenarios.along(path(np.arange(ends[-1] + 1)), imu)
+    samples = np.arange(ends[-1] + 1.0)
+    samples[ends[-2] + 1:begins[-1]:2] += RIPPLE
+    lead = scenarios.along(path(samples), imu)
     end = len(lead.t) + len(motion.t)
     last = Rotation.concatenate((Rotation.from_quat(motion.truth[-1]), Rotation.from_euler(
         'ZYX', DOWN, degrees=True)))

@@ -19,7 +19,7 @@ from spinning_top_sim.tools.verdict import Fault
 WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
 DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
 # A kick is not corrected if more than STAYS is left, and grows if GROWN times its least is left.
-STAYS, GROWN = 0.995, 1.1
+STAYS, GROWN = 0.995, 1.15
 FARTHER = 1.03                  # of the error after the heading is turned: no right filter's
 
 

@@ -76,10 +76,10 @@ class Mahony(Part):
     """A filter of Mahony (2008) with exact steps."""
 
     def start(self, up=0.3, north=0.3, learns=0.15, most=np.inf, advance=body, triad=True,
-              level=True, declination=0.0, about=None, angle=math.atan2):
+              level=True, declination=0.0, about=None, angle=math.atan2, felt=(0, 1, 2)):
         self._gains, self._most, self._advance = (up, north, learns), most, advance
         self._triad, self._level, self._declination, self._about = triad, level, declination, about
-        self._angle = angle
+        self._angle, self._felt = angle, list(felt)
         self._q, self._bias = None, np.zeros(3)
 
     def turn(self, w, a, m, dt):
@@ -88,7 +88,7 @@ class Mahony(Part):
         up, north, learns = self._gains
         self._q = self._advance(self._q, (w - self._bias) * dt)
         r = matrix_of(self._q)
-        e = up * cross(a, r[2]) / math.sqrt(a @ a)
+        e = up * cross(a, r[2])[self._felt] / math.sqrt(a @ a)
         if m is not None:
             h = r @ m
             if not self._level:
@@ -197,6 +197,8 @@ OWN = {     # and these
         'field of a level sensor': ({'level': False}, FIELD),
         'heading by atan': ({'angle': lambda x, y: math.atan(x / y)}, OFF),
         'heading about z': ({'about': np.array((0.0, 0.0, 1.0))}, f'{FIELD} {OFF}'),
+        'tilt about x as y': ({'felt': (0, 0, 2)}, f'{OFF} {GRAVITY}'),
+        'tilt about y as x': ({'felt': (1, 1, 2)}, f'{OFF} {GRAVITY}'),
         'slow turns dropped': ({'gyroscope': lambda v: v * (v @ v > 0.04)}, OFF),
         'dt at most 10 ms': ({'step': lambda dt: min(dt, 0.01)}, STEP),
         'dt cut': ({'step': lambda dt: int(100.0 * dt) / 100.0}, STEP),
