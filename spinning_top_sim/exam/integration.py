@@ -42,8 +42,7 @@ def judge_integration(response: Response) -> None:
     findings, restarts = response.findings, response.subject.restarts
     # A filter that goes on has the one rate of its IMU.
     factors = FACTORS if restarts else FACTORS[:1]
-    *runs, finest = (response.subject.record(replace(
-        scenarios.FAST, rate=factor * scenarios.FAST.rate)) for factor in (*factors, FINEST))
+    runs = [_fast(response, factor) for factor in factors]
     unaided: tuple[Hypothesis, ...] = (WITHOUT_FIELD,)
     try:
         response.respond(runs[0].part(slice(10)), *unaided, shifted=False)
@@ -55,12 +54,17 @@ def judge_integration(response: Response) -> None:
     findings.measures['integration_error_deg'] = math.degrees(moved[0])
     if restarts:
         # With a delay, the turns of a filter would not be those of the same uneven steps.
-        uneven = response.respond(finest.merged(UNEVEN), *unaided).last()
+        uneven = response.respond(_fast(response, FINEST).merged(UNEVEN), *unaided).last()
         _judge_steps(response, [*outcomes, uneven])
     absolute = response.absolute and not unaided
     fault = (_first_order(response, runs[0], diagnosis.error_of(outcomes[0], absolute), unaided)
              or _left_over(response, runs, outcomes, absolute))
     findings.faults += filter(None, [fault])
+
+
+def _fast(response: Response, factor: float) -> Run:
+    return response.subject.record(replace(
+        scenarios.FAST, rate=factor * scenarios.FAST.rate))
 
 
 def _error_of_turn(outcome: Outcome) -> float:

@@ -38,7 +38,11 @@ class Errors(NamedTuple):
 
 
 def errors_of(estimates: Reals, truth: Reals) -> Errors:
-    """Split q_est q_true^-1 of attitudes (n, 4) by heading and tilt (Laidig et al., eq. 2-4)."""
+    """
+    Split q_est q_true^-1 into heading and tilt (Laidig et al. 2021, eq. 2-4).
+
+    estimates, truth : q(world <- sensor) as x, y, z, w (n, 4)
+    """
     x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat(
         canonical=True).T
     return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), 2.0 * np.arctan2(z, w))

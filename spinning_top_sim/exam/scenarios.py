@@ -140,7 +140,11 @@ def magnetic(field: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
-    """Simulate a scenario with this IMU and magnetometer.  Raises ValueError if not allowed."""
+    """
+    Simulate a scenario with these parameters of an IMU and its magnetometer.
+
+    Raises ValueError for parameters that are not allowed.
+    """
     random = np.random.default_rng(seed)
     phi, psi = random.uniform(-np.pi, np.pi, 2).tolist()
     given = imu if scenario.noisy else {name: imu[name] for name in OF_PLACE if name in imu}

@@ -28,7 +28,7 @@ from spinning_top_sim.tools.verdict import number
 FEWEST = 32                 # attitudes that can be fitted
 GROWTH, LEAST_GROWTH = 3.0, 1.1     # of the parts
 LOST = 0.05                 # residual of a part that is too long to begin with [rad]
-FIXED = MOTION[:6]          # L3 and P stay as they are
+TURN_AND_RATES = MOTION[:6]     # of the unknowns: without L3 and P
 FIRST, ENOUGH = 16, 1500    # attitudes of the first part; in a longer one, every k-th is taken
 # Unit of each value; the value has the natural size of a rate to this power.
 NAMES = {'theta': ('rad', 0.0), 'theta_dot': ('rad/s', 1.0), 'phi': ('rad', 0.0),
@@ -144,7 +144,8 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     across = np.cross(*turns[:2].apply((0.0, 0.0, 1.0))) / one.times[1]
     first = np.zeros(unknowns.UNKNOWNS)
     first[unknowns.RATES] = (*turns[0].inv().apply(across)[:2], spin)
-    small = [(*pair, FIRST, FIXED) for pair in unknowns.small_nutation(one.times, one.values)]
+    small = [(*pair, FIRST, TURN_AND_RATES)
+             for pair in unknowns.small_nutation(one.times, one.values)]
     trials: list[_Trial] = []
     for l3, p, size, fitted in ((spin, 0.0, FIRST, MOTION), *small[:4],
                                 (spin, 0.0, 4 * FIRST, MOTION)):

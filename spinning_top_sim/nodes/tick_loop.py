@@ -237,7 +237,11 @@ class TickLoop:
         self.commands += 1
 
     def set_state(self, change: Callable[[States], State]) -> None:
-        """Send what is due, then let `change` turn the present state, n = 1, into a new one."""
+        """
+        Send what is due, then let the top be in another state, or raise ValueError.
+
+        change : takes the present state (n = 1), and returns the new one
+        """
         self._send_before_change()
         state = change(self._simulation.state())
         self._simulation.set_state(state)

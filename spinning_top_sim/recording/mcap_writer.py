@@ -92,7 +92,11 @@ class McapWriter:
             raise
 
     def write(self, record: records.McapRecord, raw: bytes = b'') -> None:
-        """Write any record but a chunk, a channel after its schema; `raw` are its known bytes."""
+        """
+        Write a schema, a channel (after its schema), metadata or an attachment.
+
+        raw : the bytes of the record in another file
+        """
         offset = self.size
         raw = raw or record_bytes(record)
         self._write([raw])

@@ -56,9 +56,8 @@ class McapRecorder:
     """
     A running recording into a new file, until `close`.
 
-    It begins as `create_file`.  Later trouble with the disk never reaches the caller: the
-    recording stops, `state` becomes 'failed' and `error` says why, naming the path.  What was
-    written up to then stays readable.
+    Trouble with the disk never reaches the caller: the recording stops, `state` becomes 'failed'
+    and `error` says why, naming the path.  What was written up to then stays readable.
     """
 
     def __init__(self, path: str | os.PathLike[str], topics: Sequence[RecordedTopic],

@@ -47,15 +47,13 @@ class Controls:
             pad = gui.add_button_group('pivot', tuple(PAD), hint=(
                 'push the pivot: 0.5 m/s along an axis of the world; it brakes soon'))
         for slider in self._sliders:
-            slider.on_update(self._by_user(self._send))
+            slider.on_update(self._on_slider)
         self._pause.on_click(lambda _: self._act(self._switch_pause))
         step.on_click(lambda _: self._act(lambda: sim_node.call('step')))
         reset.on_click(lambda _: self._act(lambda: sim_node.call('reset')))
         pad.on_click(lambda _: self._act(lambda: sim_node.drive(*PAD[pad.value])))
-        self._record.on_update(self._by_user(
-            lambda: sim_node.call('record', self._record.value)))
-        self._scene.on_update(self._by_user(
-            lambda: sim_node.choose(self._scene.value) if self._scene.value else ''))
+        self._record.on_update(self._on_record)
+        self._scene.on_update(self._on_scene)
 
     def _act(self, action: Callable[[], str]) -> None:
         with self._lock:
@@ -64,12 +62,20 @@ class Controls:
             except Exception as error:
                 self._page.message.content = f'**refused:** {error}'
 
-    def _by_user(self, action: Callable[[], str]) -> Callable[[viser.GuiEvent[Any]], None]:
-        """Return a callback that acts if somebody in a browser has changed an input."""
-        return lambda event: None if event.client is None else self._act(action)
+    def _on_record(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:        # somebody in a browser
+            self._act(lambda: self._sim_node.call('record', self._record.value))
+
+    def _on_scene(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None and self._scene.value:
+            self._act(lambda: self._sim_node.choose(self._scene.value))
+
+    def _on_slider(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:
+            self._moved_at = time.monotonic()       # at once: a request before may wait
+            self._act(self._send)
 
     def _send(self) -> str:
-        self._moved_at = time.monotonic()
         values = [slider.value for slider in self._sliders]
         l3, lz = (value if abs(value - shown) > 0.5 * self._sliders[0].step else present
                   for value, shown, present in zip(values, self._shown, self._spin, strict=True))

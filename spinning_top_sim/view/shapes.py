@@ -133,12 +133,7 @@ ARROWS = {
 
 
 def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
-    """
-    Return a vector of ARROWS (3,) in the world, scaled for drawing; None if no sample has it.
-
-    The length of the axis stands for the usual angular momentum or velocity, for 1 g, and for the
-    torque of gravity when the axis is horizontal.
-    """
+    """Return one of ARROWS as a vector (3,) in the world for drawing; None without a sample."""
     _, topics, vector = ARROWS[name]
     sample = track.best(topics).at(stamp_ns)
     if sample is None or not track.has_body:
