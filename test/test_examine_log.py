@@ -16,8 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.log import examine_log
+from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.streams import journal
 from spinning_top_sim.tools.simulate import main as simulate
 
 IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (
@@ -124,6 +127,29 @@ def test_a_message_that_is_cut_is_refused_in_a_line(log, tmp_path, topic):
 def test_the_truth_may_be_of_the_body(log):
     """The IMU is turned on the body."""
     report = examine_log(log, '/ground_truth/imu', 'ground_truth/odom', north='true')
+    assert report.passed and report.measures['tilt_rms_deg'] < 1e-6
+
+
+def test_a_reset_may_turn_the_sensor_on_the_body(log, tmp_path):
+    names, reset_ns = ['/ground_truth/imu', '/pose'], 20 * 10 ** 9
+    with LogReader(log) as first, LogReader(simulated(
+            tmp_path / 'again.mcap', '-p', 'imu.rpy:=[-1.0, 0.5, 2.0]')) as again:
+        metadata, other = (reader.metadata[METADATA_NAME] for reader in (first, again))
+        path = tmp_path / 'both.mcap'
+        file = create_file(path, [*map(RecordedTopic, names, (IMU, POSE)), RecordedTopic(
+            '/events', 'std_msgs/msg/String')], metadata, compression='none')
+        epoch_ns = int(metadata['epoch_ns']) + reset_ns
+        for message in first.messages(names):
+            file.append(names.index(message.topic), message.log_time, message.data)
+        file.append(2, epoch_ns, journal.event('reset', 0, reset_ns - 1, epoch_ns=epoch_ns,
+                                               parameters=json.loads(other['parameters'])))
+        for message in again.messages(names):
+            stamp_ns = message.log_time + reset_ns
+            file.append(names.index(message.topic), stamp_ns, message.data[:4] + struct.pack(
+                '<iI', *divmod(stamp_ns, 10 ** 9)) + message.data[12:])
+        file.flush()
+        file.finish()
+    report = examine_log(str(path), names[0], names[1], north='true')
     assert report.passed and report.measures['tilt_rms_deg'] < 1e-6
 
 

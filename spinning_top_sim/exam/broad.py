@@ -15,8 +15,9 @@ import numpy as np
 from spinning_top_sim.exam.report import Report
 from spinning_top_sim.exam.scenarios import Run
 from spinning_top_sim.exam.scored import ScoredRun, report_of
-from spinning_top_sim.exam.trial import NORM_TOLERANCE, MakeFilter, one_line
+from spinning_top_sim.exam.trial import NORM_TOLERANCE, MakeFilter
 from spinning_top_sim.installation import needed
+from spinning_top_sim.tools.cli import one_line
 
 SUFFIXES = '.mat', '.hdf5', '.h5'
 # Arrays of a trial with their columns; the field is in microtesla, quaternions are w, x, y, z.
@@ -81,9 +82,9 @@ def read_trial(path: Path) -> ScoredRun:
         raise ValueError(f'{path}: must have a sampling_rate > 0, finite readings, and movement '
                          'with opt_quat')
     step = np.full(len(truth), 1.0 / rate)
-    # Nothing asks for the true rates here.
+    no_rates = np.full((len(truth), 3), np.nan)
     return ScoredRun(Run(one_line(path.stem), np.cumsum(step), step, truth[:, [1, 2, 3, 0]],
-                         gyroscope, gyroscope, accelerometer, 1e-6 * magnetometer), counts)
+                         no_rates, gyroscope, accelerometer, 1e-6 * magnetometer), counts)
 
 
 def _hdf5(path: Path) -> Mapping[str, Any]:

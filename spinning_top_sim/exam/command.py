@@ -107,7 +107,9 @@ def _report(arguments: argparse.Namespace) -> Report:
     options = {name: value for names in OPTIONS.values() for name in names
                if (value := getattr(arguments, name)) is not None}
     for name in options.keys() - OPTIONS[kind]:
-        raise ValueError(f'--{name}: {kind} takes --{", --".join(OPTIONS[kind])} only')
+        others = ', '.join(f'--{one}' for one in OPTIONS[kind] if f'--{one}' != kind)
+        raise ValueError(f'--{name} cannot be given with {kind}' + f': must be {others}' * bool(
+            others))
     if arguments.imu is not None:
         (options['imu'],) = scene_file.chosen_files(argparse.Namespace(imu=arguments.imu))
     if kind == 'a log':
@@ -156,8 +158,8 @@ def _own_filter(given: str) -> Callable[[], Filter]:
         raise ValueError(f'--filter {given}: must be FILE.py:CLASS, or one of '
                          f'{", ".join(FILTERS)}')
     sys.path.insert(0, str(Path(path).resolve().parent))    # for what the file imports
-    try:
-        made: Callable[[], Filter] = runpy.run_path(path)[name]
-    except KeyError:
-        raise ValueError(f'--filter {given}: there is no {name} in {path}') from None
+    names = runpy.run_path(path)
+    if name not in names:
+        raise ValueError(f'--filter {given}: there is no {name} in {path}')
+    made: Callable[[], Filter] = names[name]
     return made

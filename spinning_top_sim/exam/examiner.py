@@ -21,8 +21,9 @@ from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.report import Findings, Report
 from spinning_top_sim.exam.response import Response
 from spinning_top_sim.exam.subject import LastingSubject, Subject
-from spinning_top_sim.exam.trial import InvalidOutputError, MakeFilter, Outcome, feed, one_line
+from spinning_top_sim.exam.trial import InvalidOutputError, MakeFilter, Outcome, feed
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.tools.verdict import Fault
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from spinning_top_sim.exam import scenarios
-from spinning_top_sim.exam.scenarios import Reals, Run
+from spinning_top_sim.exam.scenarios import Run
 
 # Turns about an axis of the sensor [deg], each followed by a rest; then one leads back, and a slow
 # one to the motion.
@@ -25,24 +25,15 @@ TURN_RATE, SLOW_RATE, RIPPLE = 2.6, 0.15, 0.3
 FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
-# Yaw, pitch and roll of the last rest [deg], and a turn of the heading there.  The yaw passes 180
-# degrees in this turn, whether it counts from the east or from the north.
-DOWN, ASTRAY, ASTRAY_S = (160.0, -40.0, 140.0), np.radians(120.0), 0.5
+# Yaw, pitch and roll of the last rests [deg], the first of which is level, and a turn of the
+# heading in the end.  The yaw passes 180 degrees in it, counted from the east or from the north.
+LEVEL, DOWN = (30.0, 0.0, 0.0), (160.0, -40.0, 140.0)
+ASTRAY, ASTRAY_S = np.radians(120.0), 0.5
 
 
-class Kick(NamedTuple):
-    """A turn of the gyroscope only, about an axis of the world, and what must correct it."""
-
-    sensor: str
-    what: str
-    turn: Reals         # (3,) [rad]
-    part: slice         # of an error (3,) that is judged
-
-
-# The tilt comes last: its correction may change the heading for a while.
-KICK_S, KICKS = 0.1, (
-    Kick('magnetometer', 'heading', np.radians((0.0, 0.0, 0.7)), slice(2, 3)),
-    Kick('accelerometer', 'tilt', np.radians((0.7, 0.0, 0.0)), slice(2)))
+# Turns of the gyroscope alone, about axes of the world [rad].  The heading comes first: the bias
+# that a filter learns from a tilt may turn the heading for a while.
+KICK_S, KICKS = 0.1, np.radians(0.7) * np.eye(3)[[2, 0, 1]]
 
 
 class Excitation(NamedTuple):
@@ -54,7 +45,7 @@ class Excitation(NamedTuple):
     rests: NDArray[np.intp]
     turns: NDArray[np.intp]         # first sample of each turn
     motion: slice                   # where the slow motion is judged
-    kicks: list[tuple[int, int]]    # first sample of each kick, two at each rest
+    kicks: list[list[int]]          # first sample of each of KICKS at each of the last rests
     astray: slice                   # where the heading has been turned far off, up to the end
 
 
@@ -85,20 +76,21 @@ def excite(imu: Mapping[str, Any], goes_astray: bool) -> Excitation:
     lead = scenarios.along(path(samples), imu)
     end = len(lead.t) + len(motion.t)
     last = Rotation.concatenate((Rotation.from_quat(motion.truth[-1]), Rotation.from_euler(
-        'ZYX', DOWN, degrees=True)))
-    way = round((last[0].inv() * last[1]).magnitude() / TURN_RATE * rate)
-    knots = np.array((0, 3 * answer, 3 * answer + way, 7 * answer + way))
-    still = replace(scenarios.along(Slerp(knots, last[[0, 0, 1, 1]])(np.arange(knots[-1] + 1)), imu
-                                    ).preceded_by(motion.preceded_by(lead)), name='excitation')
+        'ZYX', (LEVEL, DOWN), degrees=True)))
+    ways = np.rint((last[:-1].inv() * last[1:]).magnitude() / TURN_RATE * rate)
+    kicked = (1 + len(KICKS)) * answer
+    knots = np.cumsum((0, ways[0], kicked, ways[1], kicked + answer)).astype(int)
+    still = replace(scenarios.along(Slerp(knots, last[[0, 1, 1, 2, 2]])(
+        np.arange(knots[-1] + 1)), imu).preceded_by(motion.preceded_by(lead)), name='excitation')
     still.gyroscope[:] += NEVER_ZERO
     run = replace(still, gyroscope=still.gyroscope.copy())
-    kicks = [(end + begin + answer, end + begin + 2 * answer) for begin in knots[::2].tolist()]
-    for attitude, pair in zip(last, kicks, strict=True):
-        for first, kick in zip(pair, KICKS, strict=True):
-            run.gyroscope[first:first + round(KICK_S * rate)] += (
-                attitude.inv().apply(kick.turn) / KICK_S)
+    kicks = [(end + begin + answer * np.arange(1, 1 + len(KICKS))).tolist()
+             for begin in knots[1::2]]
+    for attitude, firsts in zip(last[1:], kicks, strict=True):
+        for first, turn in zip(firsts, attitude.inv().apply(KICKS), strict=True):
+            run.gyroscope[first:first + round(KICK_S * rate)] += turn / KICK_S
     far = slice(kicks[-1][-1] + answer, kicks[-1][-1] + answer + round(ASTRAY_S * rate))
     if goes_astray:
-        run.gyroscope[far] += last[1].inv().apply((0.0, 0.0, ASTRAY / ASTRAY_S))
+        run.gyroscope[far] += last[-1].inv().apply((0.0, 0.0, ASTRAY / ASTRAY_S))
     return Excitation(run, still, ends - 1, ends[:len(TURNS)],
                       slice(end - len(motion.t) // 2, end), kicks, slice(far.stop, None))

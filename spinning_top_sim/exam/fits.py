@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import scenarios
-from spinning_top_sim.exam.excitation import ANSWER_S, ASTRAY, KICKS, Excitation, Kick
+from spinning_top_sim.exam.excitation import ANSWER_S, ASTRAY, KICKS, Excitation
 from spinning_top_sim.exam.hypotheses import AXES
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.scenarios import Reals
@@ -18,8 +18,9 @@ from spinning_top_sim.tools.verdict import Fault
 
 WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
 DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
-# A kick is not corrected if more than STAYS is left, and grows if GROWN times its least is left.
-STAYS, GROWN = 0.995, 1.15
+# An error is not corrected if more than STAYS of it is left, and grows if more than GROWN; where
+# less than NEARLY is left, nothing is measured again.
+NEARLY, STAYS, GROWN = 0.9, 0.995, 1.1
 FARTHER = 1.03                  # of the error after the heading is turned: no right filter's
 
 
@@ -58,30 +59,46 @@ def from_identity(matrix: Reals) -> float:
     return float(np.max(np.abs(matrix - np.eye(3))))
 
 
-def not_corrected(estimates: Reals, without: Reals, given: Excitation,
-                  absolute: bool) -> list[Fault]:
-    """Name the sensors that do not correct a kick; attitudes with kicks and `without`, (n, 4)."""
+def answer_to_kicks(estimates: Reals, without: Reals, given: Excitation,
+                    absolute: bool) -> Reals:
+    """
+    Return what takes an error at rest to what is left of it after ANSWER_S, (3, 3) or of tilts.
+
+    Attitudes with kicks and `without`, (n, 4).  Of the two rests, the one with more left counts.
+    An eigenvalue of 1 is that of an error that stays: in axes of the sensor that nothing corrects,
+    for example.
+    """
     n = round(ANSWER_S * scenarios.SLOW.rate)
-    error = (Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()).as_rotvec()
+    errors = Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()
+    kicks, axes = (slice(None), slice(None)) if absolute else (slice(1, None), slice(2))
+    answers = []
+    for firsts in given.kicks:
+        left = errors[np.append(firsts, firsts[-1] + n) - 1]
+        left = left * left[0].inv()
+        begin, end = (Rotation.from_rotvec(KICKS) * left[:-1]).as_rotvec(), left[1:].as_rotvec()
+        answers.append(np.linalg.lstsq(begin[kicks, axes], end[kicks, axes], rcond=None)[0].T)
+    # There, what kicks at the first rest have left moves the heading by the tilt, and vice versa.
+    answers[1][:2, 2:] = answers[1][2:, :2] = 0.0
+    return max(answers, key=most_left)
 
-    def shares(first: int, kick: Kick) -> tuple[float, float]:
-        """Return what is left of a kick in the end, and the least of it."""
-        sizes = np.linalg.norm((error[first + LATEST:first + n] - error[first - 1])[:, kick.part],
-                               axis=1)
-        # Some filters correct most of it before the longest delay is over.
-        whole = max(sizes[0], 0.5 * np.linalg.norm(kick.turn))
-        return sizes[-1] / whole, np.min(sizes) / whole
 
-    heading, tilt = ((kick, *max(shares(first, kick) for first in starts))
-                     for kick, starts in zip(KICKS, zip(*given.kicks, strict=True), strict=True))
-    found = [one for one in (tilt, heading)[:1 + absolute] if one[1] > STAYS]
-    grown = [f'of the {kick.what} grows to {left:.0%}' for kick, left, least in found
-             if left > GROWN * least]
-    if grown:       # by which sensor, and whether by the bias, is not known
-        return [Fault('inaccurate', f'an error {" and ".join(grown)} in {ANSWER_S:g} s at rest')]
-    return [Fault(f'{kick.sensor}_wiring', f'{left:.1%} of an error of the {kick.what} are left '
-                  f'after {ANSWER_S:g} s: the {kick.sensor} does not correct it')
-            for kick, left, _ in found]
+def most_left(answer: Reals) -> float:
+    """Return the largest magnitude of the eigenvalues."""
+    return float(np.max(np.abs(np.linalg.eigvals(answer))))
+
+
+def not_corrected(answer: Reals) -> list[Fault]:
+    """Name the sensors that do not correct kicks by the answer to them."""
+    most = most_left(answer)
+    if most > GROWN:        # by which sensor, and whether by the bias, is not known
+        return [Fault('inaccurate', f'an error grows to {most:.0%} in {ANSWER_S:g} s at rest')]
+    heading = float(np.linalg.norm(answer[:, 2])) if len(answer) == 3 else 0.0
+    staying = np.sum(np.abs(np.linalg.eigvals(answer)) > STAYS)
+    return [Fault(f'{sensor}_wiring', f'{left:.1%} of an error of the {what} are left after '
+                  f'{ANSWER_S:g} s: the {sensor} does not correct it')
+            for stays, sensor, what, left in (
+                (staying > (heading > STAYS), 'accelerometer', 'tilt', most),
+                (heading > STAYS, 'magnetometer', 'heading', heading)) if stays]
 
 
 def astray(outcome: Outcome, given: Excitation, absolute: bool) -> list[Fault]:

@@ -7,8 +7,7 @@ wrong stamps, the covariance and divergence.
 """
 
 import itertools
-import json
-import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,12 +19,13 @@ from scipy.spatial.transform import Rotation, Slerp
 from spinning_top_sim.exam import diagnosis, hypotheses
 from spinning_top_sim.exam.diagnosis import degrees
 from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.scenarios import OF_PLACE, Reals, Run
-from spinning_top_sim.exam.trial import Outcome, invalid, one_line
+from spinning_top_sim.exam.scenarios import Reals, Run
+from spinning_top_sim.exam.trial import Outcome, invalid
 from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader, LogTopic
-from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
+from spinning_top_sim.tools.recorded_run import ForeignLogError, read_run_description
 from spinning_top_sim.tools.verdict import Fault
 
 # The first of these topics in the log is the truth.  An Imu is about the sensor, the others are
@@ -45,14 +45,14 @@ class Stamped(NamedTuple):
     covariances: Reals
 
 
-def examine_log(path: Path, topic: str, truth: str | None = None,
+def examine_log(path: str | Path, topic: str, truth: str | None = None,
                 north: str | None = None) -> Report:
     """
     Examine the attitudes of a topic.
 
     Parameters
     ----------
-    path : Path
+    path : path
         An MCAP file.
     topic : str
         Topic of the attitudes q(world <- sensor); its type must be one of LAYOUTS.
@@ -71,8 +71,8 @@ def examine_log(path: Path, topic: str, truth: str | None = None,
         estimates = _read(reader, examined)
         true_topic = _topic(reader, truth) if truth else _first_truth(reader, examined)
         true = _read(reader, true_topic)
-        turns = _of_sensor(true_topic, true, _parameters(reader), north)
-    subject = one_line(f'{topic} of {path.name}')
+        turns = _of_sensor(true_topic, true, _places(reader), north)
+    subject = one_line(f'{topic} of {Path(path).name}')
     for k, why in invalid(estimates.quaternions, estimates.covariances):
         return Report(subject, [Fault('invalid_output', f'the message of '
                                       f'{estimates.stamps_ns[k] * 1e-9:.9f} s: {why}')], {})
@@ -111,33 +111,39 @@ def _read(reader: LogReader, topic: LogTopic) -> Stamped:
         raise ValueError(f'{topic.name} has {len(rows)} messages: must have {FEWEST} at least')
     stamps, first = np.unique([row.stamp_ns for row in rows], return_index=True)
     return Stamped(stamps, np.array([rows[k].quaternion for k in first]),
-                     np.array([rows[k].covariance for k in first]))
+                   np.array([rows[k].covariance for k in first]))
 
 
-def _parameters(reader: LogReader) -> dict[str, Any]:
-    """Return the parameters OF_PLACE in the metadata of the log.  Raises ValueError."""
-    text = reader.metadata.get(METADATA_NAME, {}).get('parameters', '{}')
+def _places(reader: LogReader) -> dict[int, Mapping[str, Any]]:
+    """Return the parameters by the log time from which they hold [ns].  Raises ValueError."""
     try:
-        return {name: parameters.BY_NAME[name].check(value)
-                for name, value in json.loads(text).items() if name in OF_PLACE}
-    except (ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f'the parameters in the metadata of {reader.path} cannot be used: '
-                         f'{type(error).__name__}: {error}') from error
+        run = read_run_description(reader)
+    except ForeignLogError as error:
+        if reader.metadata.get(METADATA_NAME):
+            raise ValueError(f'{reader.path}: {error}') from error
+        return {0: {}}
+    return {0: run.values_at_start, **{
+        event.stamp_ns: event.details['parameters'] for event in run.events
+        if event.name == 'reset'}}
 
 
-def _of_sensor(topic: LogTopic, true: Stamped, values: dict[str, Any],
+def _of_sensor(topic: LogTopic, true: Stamped, places: Mapping[int, Mapping[str, Any]],
                north: str | None) -> Rotation:
     """Return the true attitudes of the sensor, in a world with this north.  Raises ValueError."""
     for k, why in invalid(true.quaternions, np.empty((0, 3, 3))):
         raise ValueError(f'{topic.name} at {true.stamps_ns[k] * 1e-9:.9f} s: {why}')
     turns = Rotation.from_quat(true.quaternions)
+    place = np.searchsorted([*places], true.stamps_ns, 'right') - 1
     if not (topic.type_name == 'sensor_msgs/msg/Imu' or topic.name.endswith(ODOMETRY_OF_SENSOR)):
-        turns = turns * Rotation.from_euler('xyz', values.get('imu.rpy', (0.0, 0.0, 0.0)))
+        turns = turns * Rotation.from_euler('xyz', np.array([
+            values.get('imu.rpy', (0.0, 0.0, 0.0)) for values in places.values()])[place])
     if north == 'magnetic':
-        if 'mag.field' not in values:
+        if not all('mag.field' in values for values in places.values()):
             raise ValueError('the log does not say where magnetic north is')
-        east_part, north_part, _ = values['mag.field']
-        turns = Rotation.from_euler('z', math.atan2(east_part, north_part)) * turns
+        east_part, north_part, _ = np.array([
+            values['mag.field'] for values in places.values()])[place].T
+        turns = Rotation.from_euler(
+            'z', np.arctan2(east_part, north_part)[:, np.newaxis]) * turns
     return turns
 
 

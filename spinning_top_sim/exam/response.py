@@ -342,14 +342,16 @@ class Response:
 
     def _kicks(self) -> list[Fault] | None:
         """Name the sensors that do not correct a kick; None: it is too far off to tell."""
-        not_corrected = partial(fits.not_corrected, self.outcome.estimates,
-                                given=self.excitation, absolute=self.absolute)
-        if not not_corrected(self._run.truth):
+        if fits.most_left(self._answer(self.outcome, self._run.truth)) < fits.NEARLY:
             return []
         without = self.respond(self.excitation.still).estimates     # has the same error
         error = measures.errors_of(without, self._run.truth).judged(absolute=True)
         # Far from the truth no filter is linear.
-        return not_corrected(without) if error[self.excitation.kicks[0][0]] < NEAR else None
+        return fits.not_corrected(self._answer(self.outcome, without)) if error[
+            self.excitation.kicks[0][0]] < NEAR else None
+
+    def _answer(self, outcome: Outcome, without: Reals) -> Reals:
+        return fits.answer_to_kicks(outcome.estimates, without, self.excitation, self.absolute)
 
     def _unexplained(self) -> list[Fault]:
         """Name what no hypothesis explains by where it shows."""
@@ -374,8 +376,7 @@ class Response:
         found = self._kicks() or []
         if 'accelerometer_wiring' in [fault.name for fault in found]:
             for one, outcome in self._try(*hypotheses.UNITS, screened=False):
-                if not fits.not_corrected(outcome.estimates, self._run.truth,
-                                          self.excitation, self.absolute):
+                if fits.most_left(self._answer(outcome, self._run.truth)) < fits.STAYS:
                     return [Fault(one.faults[0], f'{found[0].evidence}, but {one.text} it is')]
         if not found and wrong:
             return [Fault('inaccurate', f'{left}: no cause explains it')]

@@ -192,7 +192,7 @@ OWN = {     # and these
         'wrong side': ({'advance': world}, GYROSCOPE),
         'Euler angles': ({'advance': euler}, GYROSCOPE),
         # It ends upside down, and its error grows until then.
-        'gain < 0': ({'up': -0.3}, f'gravity_sign {GRAVITY} diverges'),
+        'gain < 0': ({'up': -0.3}, f'gravity_sign {GRAVITY} diverges {OFF}'),
         'no gravity': ({'up': 0.0}, GRAVITY), 'no field': ({'north': 0.0}, FIELD),
         'field of a level sensor': ({'level': False}, FIELD),
         'heading by atan': ({'angle': lambda x, y: math.atan(x / y)}, OFF),
