@@ -322,7 +322,8 @@ def test_the_command_examines_a_class_in_a_file(tmp_path, capsys):
     ([], 'give either a'), (['x', '--topic', '/pose', '--filter', 'vqf'], 'give either a'),
     (['--filter', 'vqf', '--seeds', '0'], 'seeds = 0'), (['--data', '.'], 'give either a'),
     (['x', '--data', '.'], 'give either a'),
-    (['--filter', 'vqf', '--data', '.', '--level', 'full'], '--level cannot be given with --data\n'),
+    (['--filter', 'vqf', '--data', '.', '--level', 'full'],
+     '--level cannot be given with --data\n'),
     (['x', '--topic', '/pose', '--level', 'quick'],
      '--level cannot be given with a log: must be --topic, --truth, --heading')])
 def test_wrong_arguments_of_the_command(capsys, arguments, says):

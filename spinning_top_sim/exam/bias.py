@@ -15,10 +15,12 @@ from spinning_top_sim.tools.verdict import Fault
 
 BIAS = np.array((0.01, -0.01, 0.02))    # of the gyroscope [rad/s]
 SIZE = float(np.linalg.norm(BIAS))      # 1.4 deg/s
-# A bias counts as learned if at most LEARNED of its first effect on tilt and heading is left in the
-# same attitude later; LEARNING of the whole suffices if the estimate that the filter reports grows.
+# A bias counts as learned if at most LEARNED of its first effect on tilt and heading is left in
+# the same attitude later; LEARNING of the whole suffices if the filter's estimate grows.
 LEARNED, LEARNING = 0.5, 0.9
 BIAS_FOUND = 0.05               # share of the bias in the estimate that is more than none
+# Of the largest effect less than VANISHED is left only if the estimate has this share, at least.
+VANISHED, SHARE = 0.3, 0.25
 BIAS_OFF = 0.5                  # relative error of an estimate that is wrong
 
 
@@ -29,10 +31,12 @@ def judge_bias(response: Response) -> None:
     unbiased = response.outcome.part(slice(given.motion.stop))
     biased = response.respond(replace(run, gyroscope=run.gyroscope + BIAS))
     errors = measures.errors_of(biased.estimates, unbiased.estimates)
-    left_s = rms(errors.judged(absolute)[given.motion]) / SIZE
+    apart = errors.judged(absolute)
+    left_s = rms(apart[given.motion]) / SIZE
     effects = np.abs(errors)[:1 + absolute, given.rests[[0, -2]]]
     reported = biased.biases - unbiased.biases
     reported = reported[np.isfinite(reported[:, 0])]
+    none = unbiased.biases[np.isfinite(unbiased.biases[:, 0])]
     if not len(reported):
         reported = np.full((1, 3), math.nan)
     found, shares = reported[-1], reported[-1] / BIAS
@@ -40,19 +44,24 @@ def judge_bias(response: Response) -> None:
     findings.measures |= {'bias_error_s': left_s, 'bias_found': share}
     left = left_s > BIAS_LEFT_S
     partly = absolute and min(shares) < BIAS_FOUND and max(shares) > LEARNED
+    least = SHARE if left_s * SIZE < VANISHED * np.max(apart) else -BIAS_FOUND
     # A filter that has gone on for minutes is sure of its bias, and learns another one slowly.
-    right = (-BIAS_FOUND < share < 2.0 if left or not response.subject.restarts
-             else _is_close(reported))
+    right = (least < share < 2.0 if left or not response.subject.restarts
+             else _is_close(reported, BIAS))
     if left and (partly or not _is_learned(effects, reported)):
         findings.faults.append(Fault(
             'no_bias_estimate', 'a gyroscope bias leaves, for each deg/s, '
             f'{left_s:.3g} deg of {"attitude" if absolute else "tilt"} in the end: '
-            f'it is not learned{" about each axis" * partly} in '
+            f'it is not learned{" about each axis" if partly else ""} in '
             f'{given.motion.stop / scenarios.SLOW.rate:.0f} s'))
     elif not right and not math.isnan(share):
         findings.faults.append(Fault(
             'bias_report', f'a gyroscope bias of {np.degrees(BIAS).round(2).tolist()} deg/s '
             f'is learned, but the estimate is {np.degrees(found).round(2).tolist()} deg/s'))
+    elif response.subject.restarts and len(none) and not _is_close(none, 0.0):
+        findings.faults.append(Fault(
+            'bias_report', 'the gyroscope has no bias, but the estimate is '
+            f'{np.degrees(none[-1]).round(2).tolist()} deg/s'))
 
 
 def _is_learned(effects: Reals, reported: Reals) -> bool:
@@ -66,10 +75,10 @@ def _is_learned(effects: Reals, reported: Reals) -> bool:
     share, before = (reported[[-1, len(reported) // 4]] @ BIAS / SIZE ** 2).tolist()
     return bool(np.all(late < np.maximum(LEARNED * early, BIAS_LEFT_S * SIZE)) or (
         np.linalg.norm(late) < LEARNING * np.linalg.norm(early)
-        and (_is_close(reported) or share > max(BIAS_FOUND, 1.2 * before))))
+        and (_is_close(reported, BIAS) or share > max(BIAS_FOUND, 1.2 * before))))
 
 
-def _is_close(reported: Reals) -> bool:
-    """Return whether the last eighth of the estimates is near BIAS."""
+def _is_close(reported: Reals, bias: Reals | float) -> bool:
+    """Return whether the last eighth of the estimates is near a bias."""
     last = reported[-len(reported) // 8:]
-    return bool(np.median(np.linalg.norm(last - BIAS, axis=1)) < BIAS_OFF * SIZE)
+    return bool(np.median(np.linalg.norm(last - bias, axis=1)) < BIAS_OFF * SIZE)

@@ -64,9 +64,9 @@ def answer_to_kicks(estimates: Reals, without: Reals, given: Excitation,
     """
     Return what takes an error at rest to what is left of it after ANSWER_S, (3, 3) or of tilts.
 
-    Attitudes with kicks and `without`, (n, 4).  Of the two rests, the one with more left counts.
-    An eigenvalue of 1 is that of an error that stays: in axes of the sensor that nothing corrects,
-    for example.
+    Attitudes with kicks and `without`, (n, 4).  Of the two rests, the level one counts if an error
+    stays there, else the one with more left.  An eigenvalue of 1 is that of an error that stays,
+    such as one about an axis of the sensor that nothing corrects.
     """
     n = round(ANSWER_S * scenarios.SLOW.rate)
     errors = Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()
@@ -75,11 +75,11 @@ def answer_to_kicks(estimates: Reals, without: Reals, given: Excitation,
     for firsts in given.kicks:
         left = errors[np.append(firsts, firsts[-1] + n) - 1]
         left = left * left[0].inv()
-        begin, end = (Rotation.from_rotvec(KICKS) * left[:-1]).as_rotvec(), left[1:].as_rotvec()
+        begin, end = (left[:-1] * Rotation.from_rotvec(KICKS)).as_rotvec(), left[1:].as_rotvec()
         answers.append(np.linalg.lstsq(begin[kicks, axes], end[kicks, axes], rcond=None)[0].T)
     # There, what kicks at the first rest have left moves the heading by the tilt, and vice versa.
     answers[1][:2, 2:] = answers[1][2:, :2] = 0.0
-    return max(answers, key=most_left)
+    return max(answers[:1] if most_left(answers[0]) > STAYS else answers, key=most_left)
 
 
 def most_left(answer: Reals) -> float:
@@ -93,12 +93,14 @@ def not_corrected(answer: Reals) -> list[Fault]:
     if most > GROWN:        # by which sensor, and whether by the bias, is not known
         return [Fault('inaccurate', f'an error grows to {most:.0%} in {ANSWER_S:g} s at rest')]
     heading = float(np.linalg.norm(answer[:, 2])) if len(answer) == 3 else 0.0
-    staying = np.sum(np.abs(np.linalg.eigvals(answer)) > STAYS)
+    tilt = np.sum(np.abs(np.linalg.eigvals(answer)) > STAYS) > (heading > STAYS)
     return [Fault(f'{sensor}_wiring', f'{left:.1%} of an error of the {what} are left after '
                   f'{ANSWER_S:g} s: the {sensor} does not correct it')
             for stays, sensor, what, left in (
-                (staying > (heading > STAYS), 'accelerometer', 'tilt', most),
-                (heading > STAYS, 'magnetometer', 'heading', heading)) if stays]
+                (tilt, 'accelerometer', 'tilt', most),
+                # A tilt that stays may turn the heading.
+                (STAYS < heading < (2.0 - STAYS if tilt else GROWN), 'magnetometer', 'heading',
+                 heading)) if stays]
 
 
 def astray(outcome: Outcome, given: Excitation, absolute: bool) -> list[Fault]:

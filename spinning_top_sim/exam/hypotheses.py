@@ -22,7 +22,7 @@ ChangeRows = Callable[[Reals], Reals]
 AXES = 'xyz'
 LIKELY = 4                      # signed permutations of a sensor that are tried
 SIGNED = [sign * one for one in Rotation.create_group('O').as_matrix().round()
-          for sign in (1.0, -1.0)][1:]
+          for sign in (1.0, -1.0) if np.trace(sign * one) < 3.0]
 
 
 class Hypothesis(NamedTuple):
@@ -86,6 +86,16 @@ def permuted(name: str, fit: Callable[[Reals], Any]) -> list[Hypothesis]:
             for one in sorted(SIGNED, key=fit, reverse=True)[:LIKELY]]
 
 
+def relabelled(matrix: Reals) -> Hypothesis:
+    """Return the hypothesis that the vector part of the attitude has other axes or signs."""
+    if np.linalg.det(matrix) > 0.0:
+        name = 'frame_ned'
+    else:
+        name = 'conjugated' if np.all(np.diag(matrix)) else 'component_order'
+    return Hypothesis((name,), f'read with {axes(matrix)} of its vector part for x, y, z',
+                      read=lambda q: np.hstack((q[:, :3] @ matrix.T, q[:, 3:])))
+
+
 def delayed(names: Sequence[str], samples: float) -> Hypothesis:
     """Return the hypothesis that sensors are so many samples late, rounded."""
     return Hypothesis(('lag',), f'with the {" and ".join(names)} {round(samples)} samples earlier',
@@ -117,7 +127,8 @@ MISREADINGS = (
     Hypothesis(('frame_ned',), 'read as attitude in a world north-west-up',
                read=_turned((0.0, 0.0, _HALF, _HALF))),
     Hypothesis(('conjugated', 'component_order'), 'read as w, x, y, z and conjugated',
-               read=lambda q: q[:, _W_LAST] * _CONJUGATE))
+               read=lambda q: q[:, _W_LAST] * _CONJUGATE),
+    *map(relabelled, SIGNED))
 UNITS = [wired('accelerometer', f'with the accelerometer multiplied by {by:.4g}', by * np.eye(3))
          for by in (GRAVITY, 1.0 / GRAVITY)]
 LEVEL = Hypothesis(('magnetometer_wiring',), 'with the field of a level sensor',

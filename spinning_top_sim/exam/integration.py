@@ -14,14 +14,16 @@ from spinning_top_sim.exam.diagnosis import degrees
 from spinning_top_sim.exam.hypotheses import CORRECTS_FIRST, Hypothesis, changed
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.response import Response
-from spinning_top_sim.exam.scenarios import Run
+from spinning_top_sim.exam.scenarios import Reals, Run
 from spinning_top_sim.exam.trial import InvalidOutputError, Outcome
 from spinning_top_sim.tools.verdict import Fault
 
 # Sampling rates for the order of convergence, as multiples of the rate of the fast motion; and the
 # rate at which samples are merged into steps of UNEVEN samples in turn, of 2.5 to 15 ms.
 FACTORS, FINEST, UNEVEN = (1.0, 2.0), 4.0, (1, 2, 6, 1, 5, 2, 1, 3)
-STEP = 0.05                     # by which the response to a rate depends on the step, relative
+# By which the response to a rate depends on the step, relative, and what is left of that where the
+# lengths of steps are undone.
+STEP, SMALL = 0.05, 0.02
 
 
 def for_first_order(run: Run) -> Run:
@@ -53,9 +55,7 @@ def judge_integration(response: Response) -> None:
     findings.measures['order'] = measures.convergence_order(factors, moved)
     findings.measures['integration_error_deg'] = math.degrees(moved[0])
     if restarts:
-        # With a delay, the turns of a filter would not be those of the same uneven steps.
-        uneven = response.respond(_fast(response, FINEST).merged(UNEVEN), *unaided).last()
-        _judge_steps(response, [*outcomes, uneven])
+        _judge_steps(response, outcomes, unaided)
     absolute = response.absolute and not unaided
     fault = (_first_order(response, runs[0], diagnosis.error_of(outcomes[0], absolute), unaided)
              or _left_over(response, runs, outcomes, absolute))
@@ -73,14 +73,23 @@ def _error_of_turn(outcome: Outcome) -> float:
     return rms(((true[0] * one[0].inv()) * one * true.inv()).magnitude())
 
 
-def _judge_steps(response: Response, outcomes: Sequence[Outcome]) -> None:
+def _judge_steps(response: Response, outcomes: Sequence[Outcome],
+                 unaided: Sequence[Hypothesis]) -> None:
     """Judge whether the filter uses the step, or turns by the number of samples."""
-    findings = response.findings
-    lengths, gains = zip(*itertools.chain(*map(gains_of, outcomes)), strict=True)
+    findings, moved = response.findings, [one for one in response.shifts if one.given is None]
+    ahead = bool(moved)         # where the attitude is a step ahead, so are the turns
+    # With a delay, they would not be those of the same uneven steps.
+    uneven = None if any(one.faults for one in moved) else response.respond(
+        _fast(response, FINEST).merged(UNEVEN), *unaided)
+    judged = [*outcomes, uneven.last()] if uneven else outcomes
+    lengths, gains = zip(*itertools.chain(*(gains_of(one, ahead) for one in judged)), strict=True)
     slow, fast = gains[:2]          # at 100 Hz and 200 Hz
-    apart = np.max(np.abs(np.subtract(gains, slow))) / max(abs(slow), STEP)
+    apart = np.max(np.abs(np.subtract(gains, slow)))
     by_samples = abs(fast / FACTORS[1] - slow) < 0.25 * abs(slow)
-    if apart > STEP and (by_samples or abs(slow - 1.0) < STEP):
+    if apart > STEP * max(abs(slow), STEP) and (by_samples or (
+            abs(slow - 1.0) < STEP and uneven is not None
+            and _left_without(response, uneven, unaided, slow, ahead) < max(
+                diagnosis.EXPLAINED * apart, SMALL))):
         # A wrong step turns up as a wrong scale at one rate.
         if 'time_step' in findings.names:
             findings.drop('gyroscope_wiring')
@@ -90,15 +99,30 @@ def _judge_steps(response: Response, outcomes: Sequence[Outcome]) -> None:
             'sensor: the length of a step is misused'))
 
 
-def gains_of(outcome: Outcome) -> list[tuple[float, float]]:
-    """Return each length of a step [s], and the share by which turns move a filter in those."""
+def _left_without(response: Response, outcome: Outcome, unaided: Sequence[Hypothesis],
+                  slow: float, ahead: bool) -> float:
+    """Return how far gains are apart with rates for which wrong lengths of steps are right."""
+    shares = np.clip(_shares(outcome), 0.05, 20.0)[:, np.newaxis]
+    again = response.respond(replace(outcome.run, gyroscope=outcome.run.gyroscope / np.vstack(
+        (shares[:1], shares))), *unaided).last()
+    return max(abs(gain - slow) for _, gain in gains_of(again, ahead))
+
+
+def _shares(outcome: Outcome, shift: int = 0) -> Reals:
+    """Return by which share the steps of the sensor, shifted, turn the filter (n - 1,)."""
     steps, right = (increments(one)[1:] for one in (outcome.estimates, outcome.run.truth))
-    lengths, inner = outcome.run.dt[2:-1].round(6), slice(1, -1)
-    found = []
-    for shift in (0, -1, 1):        # a filter may be a step behind or ahead
-        share = np.sum(np.roll(steps, shift, axis=0) * right, 1) / np.sum(right * right, 1)
-        found.append([(float(one), float(np.median(share[inner][lengths == one])))
-                      for one in np.unique(lengths)])
+    return np.asarray(np.sum(np.roll(steps, shift, axis=0) * right, 1) / np.sum(right * right, 1))
+
+
+def gains_of(outcome: Outcome, ahead: bool = False) -> list[tuple[float, float]]:
+    """
+    Return each length of a step [s], and the share by which turns move a filter in those.
+
+    ahead : the filter may be a step behind or ahead
+    """
+    lengths = outcome.run.dt[2:-1].round(6)
+    found = [[(float(one), float(np.median(_shares(outcome, shift)[1:-1][lengths == one])))
+              for one in np.unique(lengths)] for shift in (0, -1, 1)[:1 + 2 * ahead]]
     return min(found, key=lambda pairs: np.ptp([gain for _, gain in pairs]))
 
 

@@ -185,6 +185,7 @@ def _normalised_squares(estimates: Reals, truth: Reals, covariances: Reals, dime
     x, y, _ = (est * Rotation.from_quat(truth).inv()).apply((0.0, 0.0, 1.0)).T
     vector = np.stack((-y, x, -errors_of(estimates, truth).heading), axis=1)[:, :dimensions]
     covariances = covariances[:, :dimensions, :dimensions]
+    covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
     eigenvalues = np.linalg.eigvalsh(covariances)
     if np.any(eigenvalues[:, 0] <= 1e-12 * eigenvalues[:, -1]):
         raise np.linalg.LinAlgError('no inverse')

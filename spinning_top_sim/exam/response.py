@@ -41,7 +41,8 @@ REVERSED = 3.0                  # heading of a filter whose field has the opposi
 MOST_CAUSES = 4
 START = 50                      # samples after which a filter that starts has an attitude
 SURE = 0.2                      # share of the limit of an explanation: nothing else is tried
-LAG_LEAVES = 0.1                # most of the error, after a delay or a low pass is undone
+# Most of the error, after a low pass, a delay or a small error of the gyroscope is undone.
+LITTLE_LEFT = 0.1
 WORST = 30.0                    # condition of a matrix that can be inverted
 EARLY_RESTS = slice(2, 5)       # rests of a short run, when the error of the start is over
 NEAR = 0.5                      # largest error without a kick with which a kick is judged [rad]
@@ -86,8 +87,9 @@ class Response:
                       f'{degrees(self._error(self.outcome))}{"" if one.shift else UNDONE}')
                 for name in one.faults]
             (self.shifts if one.shift else self._undone).insert(0, one)
-            # A constant bias of the sensor is none about axes of the world.
-            self.unclear |= one.given is hypotheses.of_world
+            # A constant bias of the sensor is none about axes of the world, and longer steps raise
+            # the gains of a filter.
+            self.unclear |= one.given is hypotheses.of_world or 'time_step' in one.faults
         clean = np.degrees(self._errors(self.outcome))
         self.findings.measures |= {'tilt_clean_deg': float(max(clean[::2])),
                                    'heading_clean_deg': float(max(clean[1::2]))}
@@ -152,10 +154,25 @@ class Response:
         gross = turns.off > GROSS_GAIN
         if not (gross or np.any(self._errors(self.outcome) > CLEAN)):
             return None
+        found = self._explanation(turns, gross)
+        if found or not self.subject.restarts or hypotheses.CORRECTS_FIRST in self.shifts:
+            return found
+        # A filter that corrects before the step may have a fault besides.
+        before = self.outcome
+        self.shifts.insert(0, hypotheses.CORRECTS_FIRST)
+        self.outcome = self.respond(self._run)
+        found = self._explanation(self._turns(self.outcome), gross)
+        if found is None or self._error(found[1]) > diagnosis.EXPLAINED * self._error(before):
+            self.shifts.pop(0)
+            self.outcome, found = before, None
+        return found
+
+    def _explanation(self, turns: Turns, gross: bool) -> Tried | None:
         return (self._best(self._of_attitudes()) or self._best(self._of_delays(turns.late))
-                or self._best(self._of_gyroscope(turns), mends_turns=gross)
+                or self._best(self._of_gyroscope(turns), diagnosis.EXPLAINED if gross
+                              else LITTLE_LEFT, mends_turns=gross)
                 or self._best(self._of_accelerometer()) or self._best(self._of_magnetometer())
-                or self._best(self._of_smoothing(), LAG_LEAVES))
+                or self._best(self._of_smoothing(), LITTLE_LEFT))
 
     def _best(self, tried: Iterator[Tried], share: float = diagnosis.EXPLAINED,
               mends_turns: bool = False) -> Tried | None:
@@ -177,6 +194,11 @@ class Response:
         in_sensor, in_world = (true.inv() * estimated).mean(), (estimated * true.inv()).mean()
         heading = 2.0 * math.atan2(*in_world.as_quat(canonical=True)[2:])
         back = Rotation.from_rotvec((0.0, 0.0, -heading))
+        steady = rms((back * estimated * true.inv()).magnitude()) < diagnosis.DIVERGED
+        turned = Hypothesis(
+            ('magnetometer_wiring' if abs(heading) > REVERSED else 'heading_offset',),
+            f'turned by {-math.degrees(heading):.3g} deg about the vertical',
+            read=lambda q: (back * Rotation.from_quat(q)).as_quat())
         group = Rotation.create_group('O')
         square = group[int(np.argmin((group.inv() * in_sensor).magnitude()))]
         tangents = [np.tan(0.5 * turns.magnitude()) for turns in (estimated, true)]
@@ -186,9 +208,7 @@ class Response:
             Hypothesis(('frame_ned',), 'read as attitude of axes '
                        f'{hypotheses.axes(square.as_matrix())} of the sensor',
                        read=lambda q: (Rotation.from_quat(q) * square.inv()).as_quat()),
-            Hypothesis(('magnetometer_wiring' if abs(heading) > REVERSED else 'heading_offset',),
-                       f'turned by {-math.degrees(heading):.3g} deg about the vertical',
-                       read=lambda q: (back * Rotation.from_quat(q)).as_quat()),
+            *([turned] if steady else []),
             Hypothesis(('inaccurate',), f'with the vector part of the attitude divided by '
                        f'{scale:.4g}', read=lambda q: Rotation.from_quat(
                            q / (scale, scale, scale, 1.0)).as_quat()))
@@ -249,7 +269,8 @@ class Response:
         up, horizontal = 2, (0, 1)      # axes of the world
         # Another unit corrects nothing.
         units = hypotheses.UNITS if self._kicks() != [] else ()
-        yield from self._try(hypotheses.GRAVITY_SIGN, *units)
+        yield from self._try(hypotheses.GRAVITY_SIGN)
+        yield from (tried for tried in self._try(*units) if self._corrects(tried[1]))
         yield from self._permutations('accelerometer', up, horizontal)
         yield from self._affine('accelerometer', 'accelerometer_wiring', horizontal)
 
@@ -350,6 +371,9 @@ class Response:
         return fits.not_corrected(self._answer(self.outcome, without)) if error[
             self.excitation.kicks[0][0]] < NEAR else None
 
+    def _corrects(self, outcome: Outcome) -> bool:
+        return fits.most_left(self._answer(outcome, self._run.truth)) < fits.STAYS
+
     def _answer(self, outcome: Outcome, without: Reals) -> Reals:
         return fits.answer_to_kicks(outcome.estimates, without, self.excitation, self.absolute)
 
@@ -376,7 +400,7 @@ class Response:
         found = self._kicks() or []
         if 'accelerometer_wiring' in [fault.name for fault in found]:
             for one, outcome in self._try(*hypotheses.UNITS, screened=False):
-                if fits.most_left(self._answer(outcome, self._run.truth)) < fits.STAYS:
+                if self._corrects(outcome):
                     return [Fault(one.faults[0], f'{found[0].evidence}, but {one.text} it is')]
         if not found and wrong:
             return [Fault('inaccurate', f'{left}: no cause explains it')]

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.exam import measures, scenarios
 from spinning_top_sim.exam.hypotheses import Hypothesis
 from spinning_top_sim.exam.scenarios import Run, Scenario
-from spinning_top_sim.exam.trial import Feed, MakeFilter, Outcome, feed, follow
+from spinning_top_sim.exam.trial import Feed, Filter, MakeFilter, Outcome, feed, follow
 
 FIELD_ASKED = 200, 3000     # updates after which a filter has shown whether it uses the field
+SAME = np.radians(1.0)          # a filter may draw random numbers
 # A filter that goes on is first turned to the attitude at which a run begins [s].
 TURN_S = 30.0
 # A filter uses the field if its heading follows at least a tenth of this alternating turn of the
@@ -55,6 +56,18 @@ class Subject:
             if np.max(np.abs(one - two)) > 1e-9:
                 return True
         return False
+
+    def shares_state(self) -> bool:
+        """Return whether a filter is another one where one was made, and fed, before it."""
+        run = self.record(scenarios.SLOW).part(slice(FIELD_ASKED[0]))
+
+        def make_second() -> Filter:
+            feed(self._make_filter, run)
+            return self._make_filter()
+
+        one, two = (Rotation.from_quat(follow(make, run, (), self._feed).estimates)
+                    for make in (self._make_filter, make_second))
+        return bool(np.max((one * two.inv()).magnitude()) > SAME)
 
     def convergence(self) -> Mapping[str, float]:
         """Return the convergence time; {} where the noisy runs show it."""

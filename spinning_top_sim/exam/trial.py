@@ -18,6 +18,7 @@ from spinning_top_sim.tools.cli import one_line
 # Covariance and bias are read after every tenth update.
 READ_EVERY = 10
 NORM_TOLERANCE = 1e-3
+ASYMMETRIC = 0.01               # difference of a covariance from its transpose, relative
 INTERRUPTED = threading.Event()     # ends the exam of a node; rclpy loses KeyboardInterrupts
 
 
@@ -152,11 +153,14 @@ def invalid(quaternions: Reals, covariances: Reals) -> Iterator[tuple[int, str]]
         yield k, f'the quaternion is {quaternions[k].tolist()}: its norm must be 1'
     finite = np.all(np.isfinite(covariances), axis=(1, 2))
     wrong = ~finite & ~np.any(np.isnan(covariances), axis=(1, 2))
-    eigenvalues = np.linalg.eigvalsh(
-        0.5 * covariances[finite] + 0.5 * np.swapaxes(covariances[finite], 1, 2))
-    wrong[finite] = eigenvalues[:, 0] < -1e-5 * np.abs(eigenvalues).max(axis=1)
+    known, other = covariances[finite], np.swapaxes(covariances[finite], 1, 2)
+    eigenvalues = np.linalg.eigvalsh(0.5 * known + 0.5 * other)
+    largest = np.abs(eigenvalues).max(axis=1)
+    wrong[finite] = (eigenvalues[:, 0] < -1e-5 * largest) | (
+        np.max(np.abs(known - other), axis=(1, 2)) > ASYMMETRIC * largest)
     for k in np.flatnonzero(wrong)[:1].tolist():
-        yield k, f'the covariance is {covariances[k].tolist()}: must have no negative eigenvalue'
+        yield k, (f'the covariance is {covariances[k].tolist()}: must be symmetric and have no '
+                  'negative eigenvalue')
 
 
 def _numbers(what: str, value: object, shape: tuple[int, ...]) -> Reals:
