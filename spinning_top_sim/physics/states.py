@@ -138,8 +138,10 @@ class States:
 
     @cached_property
     def phi_dot(self) -> Column:
-        """Eq. (31) of "Analysis of Symmetric Spinning Top"; for one Lz, where the pivot rests."""
-        lz = self.start.lz
+        """Eq. (31) of "Analysis of Symmetric Spinning Top"; NotImplementedError for several Lz."""
+        lz = self._lz
+        if isinstance(lz, np.ndarray):
+            raise NotImplementedError('phi_dot about several verticals: WorldStates has it')
         return attitude.precession_rate(self.top, self._l3, lz, *self.half_angle_squares)
 
     @cached_property
