@@ -191,10 +191,13 @@ def test_stamps_end_before_their_seconds_do_and_a_reset_says_why_not():
 def test_the_duration_ends_with_its_last_sample_and_nothing_leads_on():
     run = started(duration=0.0723).ticks(100)
     assert run.loop.now_ns == 72_300_000
-    for act in (run.loop.start, run.loop.pause, run.loop.resume,
-                lambda: run.loop.fail('for a test'), lambda: run.loop.reset(run.values, 0)):
+    for act in (run.loop.start, run.loop.pause, run.loop.resume, lambda: run.loop.fail('a test')):
         act()
         assert run.loop.state is tick_loop.LoopState.ENDED
+    said = list(run.told)
+    with pytest.raises(RuntimeError, match='`duration` are sent: nothing follows'):
+        run.loop.reset(run.values, 0)
+    assert run.told == said and run.loop.now_ns == 72_300_000
     assert run.ticks(5).stamps == grid(72_300_000)
 
 
@@ -287,6 +290,8 @@ def test_equations_that_cannot_go_on_stop_the_motion_until_a_reset():
         run.loop.command(1.0, 1.0)
     with pytest.raises(RuntimeError, match='stands still'):
         run.loop.step(POSE_NS)
+    with pytest.raises(RuntimeError, match=r'stands still: .*pole'):
+        run.loop.resume()
     run.ticks(5)
     assert run.loop.now_ns == stands_at
     run.loop.reset(parameters.checked({}), 0)

@@ -145,9 +145,6 @@ class SimulationHandlers:
     def _play(self) -> None:
         self._node.check_started()
         with self._lock:
-            if self._loop.failure:
-                raise RuntimeError(f'the motion stands still: {self._loop.failure}; '
-                                   'STATE_STOPPED resets it')
             self._loop.resume()
 
     def _pause(self) -> None:

@@ -269,7 +269,7 @@ class Simulator(Node):
                 self.loop.pause()
             else:
                 self.loop.resume()
-            return f'{"paused" if self.loop.paused else "running"} {self.loop.time_text}'
+            return f'{self.loop.state.value} {self.loop.time_text}'
 
     def _step(self, _: Trigger.Request) -> str:
         with self.lock:
@@ -286,8 +286,8 @@ class Simulator(Node):
         """
         Reset the motion, and pause it or not; None keeps the present state.
 
-        Raises RuntimeError before the motion begins, and ValueError if no motion begins with the
-        present parameters; nothing changes then.
+        Raises RuntimeError before the motion begins and after `duration`, and ValueError if no
+        motion begins with the present parameters; nothing changes then.
         """
         with self.lock:
             self.check_started()

@@ -50,8 +50,8 @@ class LoopState(Enum):
 
         WAITING --start--> RUNNING --pause--> PAUSED --resume--> RUNNING
         RUNNING, or PAUSED by a step --duration--> ENDED, which is final
-        any other --fail--> FAILED
-        any other --reset--> RUNNING
+        any but ENDED --fail--> FAILED
+        any but ENDED --reset--> RUNNING
 
     `start` and `reset` lead to PAUSED if a pause is asked for.
     """
@@ -197,7 +197,13 @@ class TickLoop:
             self._enter(LoopState.PAUSED)
 
     def resume(self) -> None:
-        """Let simulated time run on from where it was held, without catching up."""
+        """
+        Let simulated time run on from where it was held, without catching up.
+
+        Raises RuntimeError if the motion has failed; a pause remains then.
+        """
+        if self.failure:
+            raise RuntimeError(f'the motion stands still: {self.failure}')
         self.paused = False
         if self.state is LoopState.PAUSED:
             self._enter(LoopState.RUNNING)
@@ -280,8 +286,11 @@ class TickLoop:
         Go back to the start state of these parameters, and out of a failure.
 
         A pause remains, or is as `paused` says.  t = 0 has this date or, as stamps never go back,
-        a later one.  Raises ValueError if no motion begins there; the present one goes on then.
+        a later one.  Raises RuntimeError in ENDED, and ValueError if no motion begins there; the
+        present one goes on then.
         """
+        if self.state is LoopState.ENDED:
+            raise RuntimeError(f'{self.state.value}: nothing follows')
         simulation, sent_ns = self._simulation, self._simulation.now_ns
         epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
         simulation.restart(values)
