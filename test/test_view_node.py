@@ -49,7 +49,7 @@ def live():
     rclpy.init()
     view = LiveView(Page('one', '127.0.0.1', None))
     yield view
-    view._page.close()
+    view.stop()             # as where the start has failed
     view.destroy_node()
     rclpy.try_shutdown()
 

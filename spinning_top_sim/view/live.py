@@ -68,7 +68,8 @@ class LiveView(Node):
 
     def stop(self) -> None:
         self._stopped = True
-        self._thread.join(2.0 * ANSWER_S)
+        if self._thread.is_alive():
+            self._thread.join(2.0 * ANSWER_S)
         if not self._gone:
             self._controls.tell_end('`view` has ended: no more samples come')
         self._page.close()
