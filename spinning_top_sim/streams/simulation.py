@@ -54,7 +54,8 @@ class Simulation:
     path : the motion
     now_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
     history : what was applied since the start: time [ns], then L3 and Lz of a command, the fields
-        of a `State`, the rate of the IMU [Hz], or those of a `Drive`
+        of a `State`, the rate of the IMU [Hz], or those of a `Drive`.  Logs have it as lists of
+        numbers, told apart by their lengths alone
     pivot_path : of the pivot; None while it rests at the origin
     lz : as last commanded, about the vertical of the world [kg m^2/s]
     epoch_ns : stamp of t = 0 [ns]
@@ -282,7 +283,7 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
     try:
         with np.errstate(over='ignore', invalid='ignore'):
             segment = _new_segment(top, start, start_ns, values, pivot)
-            # This also keeps `energy`: that of the first step, which is forgotten later.
+            # Caches `energy` now: the first step, from which it is read, is forgotten later.
             if ((isinstance(start, State) or values['solver.method'] != 'exact')
                     and not math.isfinite(segment.energy)):
                 raise ValueError(f'the energy would be {segment.energy!r} J')
