@@ -50,8 +50,9 @@ def test_the_version_and_the_help_are_printed_and_nothing_runs(main, capfd):
         assert run.code == 0
         assert [line for line in run.out.splitlines() if len(line) > 80] == []
     said = main('--help').out
-    for name in ('~/commands', '~/set_pause', '~/record', '~/step', '~/reset', '/diagnostics',
-                 'imu/data_raw', '~/invariants', '/clock', *parameters.BY_NAME):
+    for name in ('~/commands', '~/cmd_vel', '~/set_pause', '~/record', '~/step', '~/reset',
+                 '/diagnostics', 'imu/data_raw', 'ground_truth/odom_throttle', '~/invariants',
+                 '/clock', *parameters.BY_NAME):
         assert name in said
 
 

@@ -45,7 +45,7 @@ class Run:
                 has_room=room, write_command=lambda *_: self.told.append('command'),
                 write_event=lambda event, sent_ns=None, **_: self.told.append((event, sent_ns))),
             update_subscribers=lambda: self.told.append('subscribers'),
-            tell=lambda text, _: self.told.append(text), source=self.clock, steady=self.clock)
+            warn=self.told.append, error=self.told.append, source=self.clock, steady=self.clock)
 
     @property
     def pose(self):

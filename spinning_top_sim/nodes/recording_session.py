@@ -127,11 +127,13 @@ class RecordingSession:
             self._write([(index, stamp_ns, data)])
 
     def has_room(self) -> bool:
+        """Return whether the recorder, or the queue before it opens, takes more messages."""
         if self._recorder is not None:
             return self._recorder.room
         return len(self._pending) < MOST_PENDING
 
     def wait_for_room(self) -> None:
+        """Wait until the recorder takes more messages, a tenth of a second at most."""
         if self._recorder is not None:
             self._recorder.wait_for_room(0.1)
 
@@ -147,6 +149,7 @@ class RecordingSession:
         return self._recorder.path if self._recorder else None
 
     def numbers(self) -> dict[str, object]:
+        """Return what /diagnostics say of the recorder, by their keys."""
         recorder = self._recorder
         if recorder is None:
             return {'recorder': 'failed' if self.error else 'off'}
