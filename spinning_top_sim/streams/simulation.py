@@ -14,7 +14,7 @@ from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
-from spinning_top_sim.solvers.propagator import accelerated, propagate
+from spinning_top_sim.solvers.propagator import propagate, propagate_accelerated
 from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
@@ -313,5 +313,5 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
         assert isinstance(start, State)
         return Segment(propagate(top, start, **settings), start_ns, jumps=True)
     piece = pivot.lasting(start_ns)
-    motion, vertical = accelerated(top, start, piece.acceleration, **settings)
+    motion, vertical = propagate_accelerated(top, start, piece.acceleration, **settings)
     return Segment(motion, start_ns, Ride(top, vertical, piece), jumps=isinstance(start, State))
