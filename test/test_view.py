@@ -106,19 +106,21 @@ def test_arrows_are_the_vectors_in_the_world(shown, name):
     assert drawn / np.linalg.norm(drawn) == pytest.approx(expected / np.linalg.norm(expected),
                                                           abs=1e-8)
     if name == 'torque':                # P sin(theta), about the line of nodes
-        assert np.linalg.norm(drawn) / shapes.reach(shown) == pytest.approx(
+        assert np.linalg.norm(drawn) / shapes.axis_length(shown) == pytest.approx(
             math.sin(exact.theta[0]), abs=1e-8)
         assert drawn @ [math.sin(exact.phi[0]), -math.cos(exact.phi[0]), 0.0] == pytest.approx(
             -np.linalg.norm(drawn))
     if name == 'angular momentum':      # Lz is conserved, and L3 the usual length
-        assert drawn[2] / shapes.reach(shown) == pytest.approx(exact.lz[0] / exact.l3[0], abs=1e-8)
+        assert drawn[2] / shapes.axis_length(shown) == pytest.approx(
+            exact.lz[0] / exact.l3[0], abs=1e-8)
 
 
 def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     stamp_ns = shown.epoch_ns + 2_000_000_000
     lines = shapes.trace(shown, stamp_ns)
     exact = truth(shown, stamp_ns)
-    assert lines[-1, 1] == pytest.approx(shapes.reach(shown) * np.ravel(exact.rows_axis), abs=1e-6)
+    assert lines[-1, 1] == pytest.approx(
+        shapes.axis_length(shown) * np.ravel(exact.rows_axis), abs=1e-6)
     assert len(lines) == 200            # 2 s at 100 Hz
     track = Track('', parameters.checked({}))
     half = math.sqrt(0.5)
@@ -132,7 +134,7 @@ def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
     track = Track('', shown.values)
     track.add('joint_states', Series(np.arange(20) * 40_000_000, attitude_rows(
         moved.quaternion, moved.angular_velocity, moved.phi_dot)))
-    stamps_ns, axis, joined = shapes.path(track, 0, NANOSECONDS)
+    stamps_ns, axis, joined = shapes.trace_points(track, 0, NANOSECONDS)
     assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
     exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
     assert axis == pytest.approx(np.column_stack(exact.rows_axis), abs=1e-4)
@@ -229,13 +231,13 @@ def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
     player = logs.Player(page, [[track]])
     for t, x in ((1.0, 1.0), (2.2, 4.0 + 0.2 * 4.0)):       # 2 m/s^2, then 4 m/s
         player.draw(t)
-        reach = abs(shapes.reach(track))
+        reach = abs(shapes.axis_length(track))
         assert page._ground.position == pytest.approx((-(x % reach), 0.0, -0.8 * reach), abs=1e-9)
         assert 'The pivot moves' in page._words.content
         stamp_ns = track.epoch_ns + round(t * NANOSECONDS)
         assert track.places(np.array([stamp_ns])) == pytest.approx(np.array([[x, 0.0, 0.0]]))
         # The trace has stayed where the tip was: at the start at x = 0.
-        begin, end = (shapes.reach(track) * shapes.axis_of(track.attitudes.at(at_ns)[1])[0]
+        begin, end = (shapes.axis_length(track) * shapes.axis_of(track.attitudes.at(at_ns)[1])[0]
                       for at_ns in (track.epoch_ns, stamp_ns))
         lines = shapes.trace(track, stamp_ns)
         assert lines[0, 0] == pytest.approx(begin - (x, 0.0, 0.0), abs=1e-6)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from spinning_top_sim.recording.recorder import McapRecorder
 
 MOST_PENDING = 20_000       # stamps whose messages wait while a file is being opened
+RECORDER, RECORDED_FILE = 'recorder', 'recorded file'        # keys in /diagnostics
 
 Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
 
@@ -152,9 +153,9 @@ class RecordingSession:
         """Return what /diagnostics say of the recorder, by their keys."""
         recorder = self._recorder
         if recorder is None:
-            return {'recorder': 'failed' if self.error else 'off'}
+            return {RECORDER: 'failed' if self.error else 'off'}
         counters = recorder.counters
-        return {'recorder': recorder.state, 'recorded file': recorder.path,
+        return {RECORDER: recorder.state, RECORDED_FILE: recorder.path,
                 'recorded messages': counters.messages, 'recorded bytes': counters.bytes,
                 'queued messages': counters.queued,
                 'possible loss [s]': f'{recorder.possible_loss:.3f}'}

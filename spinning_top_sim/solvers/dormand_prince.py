@@ -23,10 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.physics.pivot import NANOSECONDS
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.times import NANOSECONDS, Times
+from spinning_top_sim.solvers.times import Times
 
 # The unknowns of one state: complex numbers, of which floats are some.
 Unknowns = tuple[complex, ...]

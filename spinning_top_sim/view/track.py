@@ -184,16 +184,16 @@ class Track:
     @property
     def attitudes(self) -> Series:
         """The samples that show the attitude."""
-        return self.best(ATTITUDE_TOPICS)
+        return self.first_of(ATTITUDE_TOPICS)
 
     @property
     def rates(self) -> Series:
         """The samples that show attitude, angular velocity and phi'."""
-        return self.best(RATE_TOPICS)
+        return self.first_of(RATE_TOPICS)
 
     def places(self, stamps_ns: NDArray[np.int64]) -> Rows:
         """Return where the pivot is at stamps (n,), (n, 3) [m]; the origin where not known."""
-        known_ns, rows = self.best(PLACE_TOPICS)
+        known_ns, rows = self.first_of(PLACE_TOPICS)
         if not len(rows):
             return np.zeros((len(stamps_ns), 3))
         return np.stack([np.interp(stamps_ns - known_ns[0], known_ns - known_ns[0], column)
@@ -202,9 +202,9 @@ class Track:
     @property
     def pivot_moves(self) -> bool:
         """Whether the pivot has moved between the last two samples."""
-        return bool(np.diff(self.best(PLACE_TOPICS).rows[-2:, PLACE], axis=0).any())
+        return bool(np.diff(self.first_of(PLACE_TOPICS).rows[-2:, PLACE], axis=0).any())
 
-    def best(self, topics: Sequence[str]) -> Series:
+    def first_of(self, topics: Sequence[str]) -> Series:
         """Return the samples of the first of these topics that has some."""
         return next((self.samples[topic] for topic in topics
                      if len(self.samples[topic].stamps_ns)), self.samples[topics[0]])
