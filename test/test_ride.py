@@ -32,7 +32,7 @@ CASES = {case['name']: case for case in json.loads(
     (Path(__file__).parent / 'data' / 'ride.json').read_text())['cases']}
 GENERAL = State(theta=0.5, theta_dot=0.3, phi=0.1, psi=0.2, l3=1.6, lz=1.3)
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
-REST, NOWHERE = (Fraction(0),) * 3, (0.0, 0.0, 0.0)
+NOWHERE = (0.0, 0.0, 0.0)
 
 
 def kinematics(path, times_ns):

@@ -23,7 +23,6 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import command, plots, shapes, svg, text
@@ -71,8 +70,7 @@ def truth(shown, stamp_ns):
 
 
 def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
-    template = next(stream.template for stream in all_streams(shown.values)
-                    if stream.topic == 'pose')
+    template = shown.templates['pose']
     with LogReader(log) as reader:
         for message in reader.messages(topics=['/pose']):
             stamp_ns, row = shown.attitudes.at(message.log_time)
@@ -247,9 +245,8 @@ def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
 def test_a_reset_to_another_top_shows_that_one_from_its_begin_on(page, tmp_path):
     """And attitudes by the mounting of the IMU that is in effect."""
     own_node = pytest.importorskip('helpers.own_node')
-    path = tmp_path / 'run.mcap'
     with own_node.OwnNode(tmp_path, start_paused=True, record__enabled=True,
-                          record__uri=str(path), record__streams=['ground_truth_imu']) as node:
+                          record__streams=['ground_truth_imu']) as node:
         node.step(30)
         assert node.trigger('reset').success        # to the same top
         node.step(20)
@@ -257,7 +254,7 @@ def test_a_reset_to_another_top_shows_that_one_from_its_begin_on(page, tmp_path)
         assert node.trigger('reset').success
         epoch_ns = node.simulation.epoch_ns
         node.step(50)
-    (first, second), = logs.read_logs([path])
+    (first, second), = logs.read_logs([tmp_path / 'run.mcap'])
     assert first.span[1] < epoch_ns == second.span[0] == second.begin_ns
     player = logs.Player(page, [[first, second]])
     for track, mass, begin_ns, t_ns in ((first, 2.0, first.epoch_ns, 300_000_000),
@@ -269,8 +266,7 @@ def test_a_reset_to_another_top_shows_that_one_from_its_begin_on(page, tmp_path)
         assert top.mass == mass and track.motion_at(stamp_ns).energy == pytest.approx(
             exact.energy[0] - exact.l3[0] ** 2 / (2.0 * top.lambda3))
         assert track.attitudes.at(stamp_ns)[1][:4] == pytest.approx(exact.quaternion[0], abs=1e-9)
-    page_file = tmp_path / 'page.html'
-    assert player.write_html(page_file).startswith(
+    assert player.write_html(tmp_path / 'page.html').startswith(
         f'{(first.span[1] - first.epoch_ns) * 1e-9:g} of {player.length:g} s, ')
 
 
