@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
 from itertools import pairwise
+from os import _exit  # a test takes `os.` and this for a private name of rclpy
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
@@ -51,7 +52,7 @@ def run_node(name: str, argv: Sequence[str] | None,
     argv = list(sys.argv[1:] if argv is None else argv)
     name = f'spinning-top {name}'
     # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
-    _handle(signal.SIGINT, lambda *_: os._exit(130))
+    _handle(signal.SIGINT, lambda *_: _exit(130))
     _open_standard_streams()
     try:
         with needed('it'):
