@@ -159,6 +159,15 @@ def test_rows_may_be_uneven_out_of_order_or_without_some_sensors(tmp_path):
     assert (right.inv() * even.rotation).magnitude().max() < 1e-4
 
 
+def test_sensors_that_never_read_together_are_not_all_compared(tmp_path):
+    mag = dict(zip(('mx', 'my', 'mz'), np.where(T > 1.5, FORCE.T, np.nan), strict=True))
+    early = {name: np.where(T < 1.5, values, np.nan) for name, values in imu().items()}
+    recorded = motion_files.read(table(tmp_path / 'a.csv', {
+        **mag, 't': T, **early, **wxyz('qw', 'qx', 'qy', 'qz')}))
+    assert trajectory_of(recorded, EXACT).magnetometer is None
+    assert 'magnetometer: not at the times of the others, left out' in recorded.notes
+
+
 def foreign_log(path, late):
     """Write a log of another program: poses, and readings that come some steps late."""
     pose, reading, rows = 'geometry_msgs/msg/PoseStamped', 'sensor_msgs/msg/Imu', []
@@ -283,6 +292,7 @@ def test_a_log_of_this_package_brings_its_top(tmp_path, capsys):
                      '-p', 'imu.lever_arm:=[0.1, 0.0, 0.2]', '-p', 'imu.rpy:=[0.3, 0.1, -1.0]',
                      ]) == 0
     assert main([str(path)]) == 0
+    assert main([str(path), '-p', 'mag.field:=[0.0, 3e-5, 0.0]']) == 0      # beside the log's
     assert main([str(path), '--scene', 'cusp']) == 2
     out, err = capsys.readouterr()
     assert 'run.mcap: passed' in out

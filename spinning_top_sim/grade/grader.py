@@ -58,6 +58,8 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
         raise TypeError(f'run = {run!r}: must be run(top, start, times, dt)')
     if not 0.0 < dt <= 1.0:
         raise ValueError(f'dt = {dt!r} s: must be in (0, 1]')
+    if not scenes:
+        raise ValueError(f'scenes = {scenes!r}: must have one at least')
     name = one_line(subject or getattr(run, '__name__', type(run).__name__))
     faults: list[Fault] = []
     motions: list[Motion] = []
@@ -112,6 +114,8 @@ def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
     ValueError
         Naming what is no motion, and why.
     """
+    if dt is not None and not 0.0 < dt < math.inf:
+        raise ValueError(f'dt = {dt!r} s: must be > 0, or None')
     body = Body.of(top, **imu)
     start = Start.of(body, start) if isinstance(start, State) else start
     motion = Motion(subject, body, start, Trajectory.of(trajectory, times))
@@ -122,7 +126,7 @@ def _run(run: Run, body: Body, start: Start, times: Reals, dt: float) -> Traject
     """Return the motion.  Raises InvalidTrajectoryError."""
     try:
         said = run(body, start, times.copy(), dt)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
                                      f'{one_line(error)}') from error
     return Trajectory.of(said, times)
