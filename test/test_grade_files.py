@@ -76,6 +76,10 @@ TABLES = {
     'camel case': ({**wxyz('quatW', 'quatX', 'quatY', 'quatZ'), 'Time_ms': 1e3 * T}, '\t', ''),
     'dates and numbers': ({'time': [f'{np.datetime64(ns, "ns")}' for ns in NS.tolist()],
                            **wxyz('q0', 'q1', 'q2', 'q3')}, ',', ''),
+    'nanoseconds before seconds': ({'nanosec': NS % 10 ** 9, **wxyz('qw', 'qx', 'qy', 'qz'),
+                                    'sec': NS // 10 ** 9}, ',', ''),
+    'stamps of ROS 1': ({'header.stamp.nsecs': NS % 10 ** 9, **wxyz('qw', 'qx', 'qy', 'qz'),
+                         'header.stamp.secs': NS // 10 ** 9}, ',', ''),
     'angles': ({'time': T, **euler('')}, ',', ''),
     'degrees': ({**euler('_deg'), 'stamp_ns': NS}, ',', '')}
 
@@ -98,21 +102,27 @@ def test_a_trajectory_of_tum_needs_no_names(tmp_path):
     assert motion_files.read(path).parts['attitudes'][1] == pytest.approx(np.roll(Q, 1, axis=1))
 
 
-@pytest.mark.parametrize(('names', 'unit'), [
-    (('wx', 'wy', 'wz', 'ax', 'ay', 'az'), 1.0),
+@pytest.mark.parametrize(('names', 'unit', 'force_unit'), [
+    (('wx', 'wy', 'wz', 'ax', 'ay', 'az'), 1.0, 1.0),
     (('angular_velocity.x', 'angular_velocity.y', 'angular_velocity.z', 'linear_acceleration.x',
-      'linear_acceleration.y', 'linear_acceleration.z'), 1.0),
-    (('gyr_x_dps', 'gyr_y_dps', 'gyr_z_dps', 'imu_ax', 'imu_ay', 'imu_az'), np.pi / 180.0)])
-def test_readings_are_known_by_their_names(tmp_path, names, unit):
+      'linear_acceleration.y', 'linear_acceleration.z'), 1.0, 1.0),
+    (('gyr_x_dps', 'gyr_y_dps', 'gyr_z_dps', 'ax [m s^-2]', 'ay [m/s²]', 'az [m/s/s]'),
+     np.pi / 180.0, 1.0),
+    (('gx [mrad/s]', 'gy [mrad s-1]', 'gz [mrad]', 'ax [g]', 'ay [g]', 'az [g]'), 1e-3, 9.80665),
+    (('gx [°/s]', 'gy [deg s^-1]', 'gz_deg', 'ax [mg]', 'ay [mg]', 'az [mg]'), np.pi / 180.0,
+     9.80665e-3)])
+def test_readings_are_known_by_their_names(tmp_path, names, unit, force_unit):
     path = table(tmp_path / 'a.csv', {
-        'time': T, **imu(RATES / unit, names=names), **wxyz('qw', 'qx', 'qy', 'qz')})
+        'time': T, **imu(RATES / unit, FORCE / force_unit, names), 'mx [T]': T, 'my [µT]': 1e6 * T,
+        'mz [gauss]': 1e4 * T, **wxyz('qw', 'qx', 'qy', 'qz')})
     recorded = motion_files.read(path)
     parts = recorded.parts
     assert {f'gyroscope of {", ".join(names[:3])}', f'accelerations of {", ".join(names[3:])}',
-            'attitudes of qw, qx, qy, qz'} == {
+            'attitudes of qw, qx, qy, qz', 'magnetometer of mx [T], my [µT], mz [gauss]'} == {
                 note.removesuffix(': 600 from 0 to 2.995 s') for note in recorded.notes}
     assert parts['gyroscope'][1] == pytest.approx(RATES)
     assert parts['accelerations'][1] == pytest.approx(FORCE)
+    assert parts['magnetometer'][1] == pytest.approx(np.stack((T, T, T), axis=1))
 
 
 def test_readings_of_a_fast_spin_are_compared(tmp_path, capsys):
@@ -134,7 +144,7 @@ def test_arrays_and_parquet_are_read(tmp_path):
     from pyarrow import parquet
 
     parquet.write_table(pa.table({'t': T, **wxyz('qw', 'qx', 'qy', 'qz')}), tmp_path / 'a.parquet')
-    np.savez(tmp_path / 'b.npz', t=T, quaternion=Q, rates=RATES)
+    np.savez(tmp_path / 'b.npz', t=T, quaternion=Q, rates=RATES, dt=0.005)
     np.savez(tmp_path / 'c.npz', t=T, attitudes=np.roll(Q, 1, axis=1), gyroscope=RATES)
     for name in ('a.parquet', 'b.npz', 'c.npz'):
         assert motion_files.read(tmp_path / name).parts['attitudes'][1] == pytest.approx(
@@ -186,7 +196,7 @@ def foreign_log(path, late):
         rows += [(number, received, bytes(JAZZY.serialize_cdr(message, kind)))
                  for number, (message, kind) in enumerate((
                      (MAKE['PoseStamped'](header, place), pose), (imu_message, reading)))]
-    return write_rows(path, [RecordedTopic('/body/pose', pose), RecordedTopic('/imu', reading)],
+    return write_rows(path, [RecordedTopic('/a/imu_odom', pose), RecordedTopic('/imu', reading)],
                       rows)
 
 
@@ -232,7 +242,7 @@ def test_a_top_at_rest_cannot_be_fitted(tmp_path, capsys):
 
 def test_a_log_of_another_program_is_graded(tmp_path, capsys):
     right, wrong = (foreign_log(tmp_path / f'{late}.mcap', late) for late in (0, 1))
-    assert main([str(right), *LOOPING]) == 0
+    assert main([str(right), *LOOPING, '--topic', '/a/imu_odom']) == 0
     assert main([str(wrong), *LOOPING, '--json']) == 1
     _, _, text = capsys.readouterr().out.partition('{')
     faults = {fault['name'] for fault in json.loads('{' + text)['faults']}
@@ -285,12 +295,13 @@ def test_a_simulator_whose_steps_show_passes_within_the_tolerance(tmp_path, caps
     assert 'a.csv: passed' in out
 
 
-def test_a_log_of_this_package_brings_its_top(tmp_path, capsys):
+@pytest.mark.parametrize('streams', ['all', 'joint_states, increments, imu'])
+def test_a_log_of_this_package_brings_its_top(tmp_path, capsys, streams):
     path = tmp_path / 'run.mcap'
     assert simulate(['--quiet', '-o', str(path), '--duration', '3', '--command', '2:1.5:1.4',
                      '--params', str(ROOT / 'config/looping.yaml'),
                      '-p', 'imu.lever_arm:=[0.1, 0.0, 0.2]', '-p', 'imu.rpy:=[0.3, 0.1, -1.0]',
-                     ]) == 0
+                     '-p', f'record.streams:=[{streams}]', '-p', 'increments.enabled:=true']) == 0
     assert main([str(path)]) == 0
     assert main([str(path), '-p', 'mag.field:=[0.0, 3e-5, 0.0]']) == 0      # beside the log's
     assert main([str(path), '--scene', 'cusp']) == 2
@@ -320,6 +331,9 @@ def test_noise_of_the_attitudes_is_no_fault(tmp_path, capsys):
     ('text.npz', 'Dear all', 'is no file of numpy.savez', 2),
     ('no.csv', 't,x\n1,2\n', 'has no attitudes', 2),
     ('no_time.csv', 'qw,qx,qy,qz\n1,0,0,0\n', 'no column of times', 2),
+    ('unit.csv', 't,gx [rpm]\n1,2\n', 'gx [rpm]: the unit must be rad, mrad, deg, rad/s, ', 2),
+    ('zero.csv', 't,qw,qx,qy,qz\n' + ''.join(f'{k},0,0,0,0\n' for k in range(50)),
+     'the attitude at 0 s is 0, 0, 0, 0: must be', 2),
     ('short.csv', 't,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n', 'has 2 attitudes: must have', 2),
     ('log.doc', 'x', 'the name must end in', 2)])
 def test_errors_are_one_line(tmp_path, capsys, name, content, words, code):
