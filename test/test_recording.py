@@ -254,6 +254,7 @@ def test_rows_are_written_in_order_and_the_bytes_are_always_the_same(tmp_path, c
             index, times, rows = rows_of(number, number + 400 - number % 3)
             block = rows.copy()
             file.append_rows([(index, times, block)])
+            file.append_rows([])        # makes no chunk
             block[:] = 0                # the rows were copied
         file.append(1, 8000, array_cdr(8000))
         file.flush()

@@ -167,7 +167,10 @@ class McapWriter:
         chunk = self._spare_chunks.get()
         for topic_index, times_ns, rows in blocks:
             chunk.add_rows(*self._numbered(topic_index, len(rows)), times_ns, rows)
-        self._queue(chunk)
+        if chunk.size:
+            self._queue(chunk)
+        else:                   # nothing was due
+            self._spare_chunks.put(chunk)
 
     def flush(self) -> None:
         """Write the chunk in memory, if it holds anything, after those of `append_rows`."""
