@@ -17,8 +17,9 @@ What a file may contain is in docs/grade_files.md.
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +42,6 @@ EVEN = 1e-4                 # share of the interval by which evenly spaced sampl
 GAP = 2.5                   # intervals that are a gap
 DEGREE = 5                  # of the splines between samples
 COARSE = 0.5                # turned from one sample to the next [rad]: splines fail
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('grade', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -180,3 +176,6 @@ def _longest(name: str, at: Reals, values: Reals, notes: list[str]) -> tuple[Rea
         notes.append(f'{name}: the longest part without a gap is used')
     chosen = max(np.split(np.arange(len(at)), gaps), key=len)
     return at[chosen], values[chosen]
+
+
+main = partial(cli.run, 'grade', __doc__, add_arguments, _run)

@@ -11,7 +11,7 @@ exit codes:
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -73,11 +73,6 @@ MEANINGS = {
         'acceleration minus gravity at the IMU, in its frame: +g upwards at rest',
     'pivot_acceleration_x pivot_acceleration_y pivot_acceleration_z':
         'acceleration of the pivot in the world, of the piece that ends where two meet'}
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('export', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -155,3 +150,6 @@ def _imu_and_pivot(imu: Imu, samples: Samples) -> tuple[Column, ...]:
     """Return the readings of a perfect IMU, and the acceleration of the pivot."""
     rates, force = imu.true(samples.states)
     return (*rates, *force, *samples.pivot.acceleration)
+
+
+main = partial(cli.run, 'export', __doc__, add_arguments, _run)
