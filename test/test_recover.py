@@ -171,7 +171,7 @@ DAMAGE = {
         (0, 1, 2), SOME_LOST, 'lost: header at byte 8'),
     'a schema that is lost': (
         lambda log: flipped(torn(log), start_of(log, Opcode.SCHEMA) + 9 + 3, 6),
-        '/top/number', SOME_LOST, 'lost: 24 messages at byte 0'),
+        '/top/number', SOME_LOST, 'lost: 24 messages: no whole record'),
     'a channel that became a message of a channel that exists': (
         lambda log: flipped(log.content, start_of(log, Opcode.CHANNEL, 1), 0),
         (0, 1, 2), SOME_LOST, 'lost: message at byte'),
