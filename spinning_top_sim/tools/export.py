@@ -121,7 +121,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _write_reference(folder: Path, scenes: Mapping[str, Mapping[str, Any]], duration: float,
                      rate: float) -> None:
     """Write trajectories, models, scenes.json and README.md into a new folder."""
-    folder.mkdir(parents=True)
+    folder.mkdir()
     facts = {}
     for name, values in scenes.items():
         table = TrueStates(period_ns(rate), COLUMNS, partial(_imu_and_pivot, Imu(values)))

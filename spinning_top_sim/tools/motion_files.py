@@ -28,7 +28,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 from spinning_top_sim.tools import recorded_run
-from spinning_top_sim.tools.foreign_messages import deserialized
+from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION, deserialized
 
 ATTITUDES, GYROSCOPE, RATES = 'attitudes', 'gyroscope', 'rates'
 ACCELERATIONS, MAGNETOMETER, ANGLES = 'accelerations', 'magnetometer', 'angles'
@@ -381,5 +381,5 @@ def _fields(message: Any, prefix: str = '') -> Iterator[tuple[str, float]]:
         if isinstance(value, float):
             yield prefix + name, value
         elif hasattr(value, '__dataclass_fields__') and not (
-                name == 'orientation' and covariance is not None and covariance[0] == -1.0):
+                name == 'orientation' and covariance is not None and covariance[0] == NO_ORIENTATION):
             yield from _fields(value, f'{prefix}{name}.')
