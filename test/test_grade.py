@@ -239,19 +239,23 @@ def test_another_motion_in_the_same_run_is_told():
     assert short(Random(parts=())).names == ['not_deterministic']
 
 
+def at_rest(t):
+    return np.tile(np.eye(4)[0], (len(t), 1))
+
+
 @pytest.mark.parametrize(('said', 'says'), [
     (lambda t: 1 / 0, 'cusps: run raises ZeroDivisionError'),
     (lambda t: sys.exit(3), 'cusps: run raises SystemExit'),
     (lambda t: None, 'what is returned has nothing: must have attitudes'),
-    (lambda t: {'attitudes': np.tile(np.eye(4)[0], (len(t), 1)), 'covariance': {
-        'gyro': np.eye(3)}}, 'covariance of gyro: must be of gyroscope or accelerations'),
+    (lambda t: {'attitudes': at_rest(t), 'covariance': {'gyro': np.eye(3)}},
+     'covariance of gyro: must be of gyroscope or accelerations'),
     (lambda t: np.ones((len(t), 4)), 'the norm must be 1'),
     (lambda t: np.eye(4)[:1], 'attitudes has shape (1, 4): must be (1001, 4)'),
     (lambda t: {'poses': 1}, "has ['poses']: must have attitudes"),
     (lambda t: np.zeros((len(t), 3)), 'shape (1001, 3): must be (1001, 4)'),
-    (lambda t: {'attitudes': np.tile(np.eye(4)[0], (len(t), 1)), 'rates': np.full(
-        (len(t), 3), np.nan)}, 'rates[0, 0] = nan: must be finite'),
-    (lambda t: {'attitudes': np.tile(np.eye(4)[0], (len(t), 1)), 'energy': 'no'}, 'energy: ')])
+    (lambda t: {'attitudes': at_rest(t), 'rates': 0.0 * at_rest(t)[:, :3] + np.nan},
+     'rates[0, 0] = nan: must be finite'),
+    (lambda t: {'attitudes': at_rest(t), 'energy': 'no'}, 'energy: ')])
 def test_what_is_no_motion_is_told(said, says):
     report = grade(lambda top, start, times, dt: said(times), scenes=SHORT[:1])
     assert report.names == ['invalid_output'] and not report.marks

@@ -102,8 +102,11 @@ def _motion(arguments: argparse.Namespace,
 def _motion_by_fit(arguments: argparse.Namespace, recorded: Recorded, given: Mapping[str, Any],
                    body: Body) -> tuple[Body, State, fitting.Fit]:
     """Return the same as fitted, but for the parts of `body` that are given."""
-    found = fitting.fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
-                        imu=arguments.fit_imu)
+    try:
+        found = fitting.fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
+                            imu=arguments.fit_imu)
+    except ValueError as error:
+        raise ValueError(f'{arguments.file}: {error}') from error
     if arguments.fit_imu:
         body = replace(body, mounting=found.mounting, lever_arm=body.lever_arm if (
             arguments.lever_arm or 'imu.lever_arm' in given) else found.lever_arm)

@@ -375,11 +375,11 @@ def _fields(message: Any, prefix: str = '') -> Iterator[tuple[str, float]]:
     if hasattr(message, 'position') and hasattr(message, 'effort'):
         yield from zip(message.name, message.position.tolist(), strict=False)
         return
-    covariance = getattr(message, 'orientation_covariance', None)
+    first_variance = getattr(message, 'orientation_covariance', (0.0,))[0]
     for name in message.__dataclass_fields__:
         value = getattr(message, name)
         if isinstance(value, float):
             yield prefix + name, value
         elif hasattr(value, '__dataclass_fields__') and not (
-                name == 'orientation' and covariance is not None and covariance[0] == NO_ORIENTATION):
+                name == 'orientation' and first_variance == NO_ORIENTATION):
             yield from _fields(value, f'{prefix}{name}.')
