@@ -45,8 +45,8 @@ ANGLE_WORDS = {'phi': 'a', 'precession': 'a', 'theta': 'b', 'nutation': 'b', 'ps
 COMPONENTS = {'w': 'w', 'x': 'x', 'y': 'y', 'z': 'z', '0': 'w', '1': 'x', '2': 'y', '3': 'z'}
 OTHERS = {'dot', 'bias', 'b', 'covariance', 'cov', 'std', 'error'}
 TIMES = {'t', 'time', 'times', 'timestamp', 'stamp'}
-WHOLE = {'sec', 'secs'}             # of a stamp in two columns, and what is beside it
-REST = {'nanosec', 'nanosecs', 'nsec', 'nsecs'}
+WHOLE = 'sec', 'secs'               # of a stamp in two columns, and what is beside it
+REST = 'nanosec', 'nanosecs', 'nsec', 'nsecs'
 SECONDS = {'': '1', 's': '1', 'ms': '1e-3', 'us': '1e-6', 'ns': '1e-9',
            **dict.fromkeys(WHOLE, '1'), **dict.fromkeys(REST, '1e-9')}
 _DEG, _G = math.pi / 180.0, 9.80665
@@ -59,7 +59,7 @@ UNITS = {
     MAGNETOMETER: {'': 1.0, 'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7,
                    'gauss': 1e-4}}
 SIGNS = str.maketrans({'µ': 'u', 'μ': 'u', '°': 'deg'})
-SUFFIXES = {'rad', 'deg', 'dps', *SECONDS} - {''}     # units without brackets
+SUFFIXES = {'rad', 'deg', 'dps', *SECONDS} - {''}       # units without brackets
 # In the order of preference.
 MESSAGES = [f'{package}/msg/{name}' for package, name in (
     ('geometry_msgs', 'PoseStamped'), ('geometry_msgs', 'PoseWithCovarianceStamped'),
@@ -206,7 +206,7 @@ def _words(name: str) -> tuple[list[str], str]:
     """Return the words of the name of a column, the last being its component, and its unit."""
     bare, _, unit = name.partition('[')
     words = re.findall('[a-z]+|[0-9]+', re.sub('([a-z])([A-Z])', r'\1_\2', bare).lower())
-    if words and words[-1] in (SUFFIXES if words[1:] else WHOLE | REST):
+    if words and words[-1] in (SUFFIXES if words[1:] else WHOLE + REST):
         unit = words.pop()
     if words and words[-1][-1] in 'wxyz' and words[-1][:-1] in set().union(*WORDS.values()):
         words[-1:] = words[-1][:-1], words[-1][-1]      # qw, accx
@@ -233,7 +233,7 @@ def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Part]]:
     for name, cells in columns.items():
         words, unit = _words(name)
         kind, component = _kind(words)
-        if TIMES & {*words} or unit in WHOLE | REST:
+        if TIMES & {*words} or unit in WHOLE + REST:
             stamps[' '.join(words)].setdefault(_unit(name, unit, SECONDS), cells)
         elif kind:
             factor = UNITS[kind][_unit(name, unit, UNITS[kind])]
@@ -287,9 +287,9 @@ def _decimal(cell: Any) -> Decimal:
 
 def _seconds(stamps: Mapping[str, Sequence[Any]]) -> NDArray[np.object_]:
     """Return stamps (n,), decimals [s], of the columns of a clock by their unit."""
-    unit = next(iter(WHOLE & stamps.keys() or stamps))
+    unit = min(stamps, key=lambda unit: unit not in WHOLE)      # else the first
     times = np.array([_decimal(cell) for cell in stamps[unit]], object)
-    for rest in REST & stamps.keys() if unit in WHOLE else ():
+    for rest in stamps.keys() & REST if unit in WHOLE else ():
         times += [_decimal(part) * Decimal('1e-9') for part in stamps[rest]]
     scale = Decimal(SECONDS[unit])
     first = min((one for one in times if one.is_finite()), default=Decimal(0))
