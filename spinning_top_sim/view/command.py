@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     arguments = parser.parse_args(words)
     if arguments.log:
-        return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs)
+        return cli.run('view', DESCRIPTION, add_arguments, _show_logs, words)
     with contextlib.ExitStack() as stack:
         return run_node('view', argv, partial(_prepare, stack, arguments, for_ros))
 
