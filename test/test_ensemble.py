@@ -5,6 +5,7 @@ import json
 import os
 import signal
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from helpers.reference import ROOT
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools import ensemble_spec
+from spinning_top_sim.tools import ensemble_part, ensemble_spec
 from spinning_top_sim.tools.ensemble import main
 from spinning_top_sim.tools.ensemble_part import EPOCH_NS, arrow_table, compute_part, samples
 
@@ -101,6 +102,10 @@ def test_every_stream_has_columns_or_is_left_out():
         'imu/dq.quaternion.w', 'imu/dv.vector.z', 'ground_truth/imu_odom.pose.pose.position.x',
         'ground_truth/imu_timing.data.copies', 'joint_states.velocity.spin_joint',
         'imu/mag.magnetic_field_covariance.8'}
+    toy = SimpleNamespace(type_name='std_msgs/msg/Float64MultiArray', topic='toy',
+                          template=SimpleNamespace(counts=[3]))
+    with pytest.raises(ValueError, match='toy: its numbers have no names'):
+        ensemble_part._column_names(toy)
 
 
 def fields_in(log, values):

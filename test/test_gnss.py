@@ -90,8 +90,7 @@ def test_delay_and_outages_are_exact(noisy):
 
 def test_a_late_fix_is_where_the_pivot_was_before_it_was_driven():
     _, found = run({'gnss.enabled': True, 'gnss.latency': 0.5, 'gnss.rate': 50.0}, 3 * SECOND,
-                   *TOPICS, events=[(SECOND, lambda simulation: simulation.drive((1.0, 0.0, 0.0))
-                                     )])
+                   *TOPICS, events=[(SECOND, lambda simulation: simulation.drive((1.0, 0, 0)))])
     for topic, exact in ((FIX, TRUE_FIX), (VELOCITY, TRUE_VELOCITY)):
         count = len(found[topic][1])
         assert np.array_equal(found[topic][1], found[exact][1][:count])

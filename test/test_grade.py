@@ -4,6 +4,7 @@
 import json
 import math
 import re
+import sys
 from dataclasses import replace
 from functools import cache
 
@@ -238,15 +239,23 @@ def test_another_motion_in_the_same_run_is_told():
     assert short(Random(parts=())).names == ['not_deterministic']
 
 
+def at_rest(t):
+    return np.tile(np.eye(4)[0], (len(t), 1))
+
+
 @pytest.mark.parametrize(('said', 'says'), [
     (lambda t: 1 / 0, 'cusps: run raises ZeroDivisionError'),
+    (lambda t: sys.exit(3), 'cusps: run raises SystemExit'),
+    (lambda t: None, 'what is returned has nothing: must have attitudes'),
+    (lambda t: {'attitudes': at_rest(t), 'covariance': {'gyro': np.eye(3)}},
+     'covariance of gyro: must be of gyroscope or accelerations'),
     (lambda t: np.ones((len(t), 4)), 'the norm must be 1'),
     (lambda t: np.eye(4)[:1], 'attitudes has shape (1, 4): must be (1001, 4)'),
     (lambda t: {'poses': 1}, "has ['poses']: must have attitudes"),
     (lambda t: np.zeros((len(t), 3)), 'shape (1001, 3): must be (1001, 4)'),
-    (lambda t: {'attitudes': np.tile(np.eye(4)[0], (len(t), 1)), 'rates': np.full(
-        (len(t), 3), np.nan)}, 'rates[0, 0] = nan: must be finite'),
-    (lambda t: {'attitudes': np.tile(np.eye(4)[0], (len(t), 1)), 'energy': 'no'}, 'energy: ')])
+    (lambda t: {'attitudes': at_rest(t), 'rates': 0.0 * at_rest(t)[:, :3] + np.nan},
+     'rates[0, 0] = nan: must be finite'),
+    (lambda t: {'attitudes': at_rest(t), 'energy': 'no'}, 'energy: ')])
 def test_what_is_no_motion_is_told(said, says):
     report = grade(lambda top, start, times, dt: said(times), scenes=SHORT[:1])
     assert report.names == ['invalid_output'] and not report.marks
@@ -254,7 +263,8 @@ def test_what_is_no_motion_is_told(said, says):
 
 
 @pytest.mark.parametrize(('options', 'says'), [
-    ({'dt': 0.0}, 'dt = 0.0 s: must be in (0, 1]'), ({'dt': 1.0}, 'turns by more than 0.7 rad')])
+    ({'dt': 0.0}, 'dt = 0.0 s: must be in (0, 1]'), ({'dt': 1.0}, 'turns by more than 0.7 rad'),
+    ({'scenes': []}, 'scenes = []: must have one at least')])
 def test_wrong_arguments_are_refused(options, says):
     with pytest.raises(ValueError, match=re.escape(says)):
         grade(Imu(), **options)
@@ -271,12 +281,17 @@ def test_wrong_parameters_and_trajectories_are_refused():
             grade_trajectory(right, WHEEL, start, **imu)
     with pytest.raises(ValueError, match='times = None'):
         grade_trajectory(right['attitudes'], WHEEL, start)
-    times = right['t'].copy()
-    times[7] += 1e-3
-    with pytest.raises(InvalidTrajectoryError, match='must be equally spaced'):
-        grade_trajectory(right, WHEEL, start, times=times)
+    with pytest.raises(ValueError, match=r'dt = -1.0 s: must be > 0'):
+        grade_trajectory(right, WHEEL, start, dt=-1.0)
+    t = right['t']
+    for times, says in ((np.where(t == t[7], t + 1e-3, t), 'must be equally spaced'),
+                        (-t, r'times\[1\] - times\[0\] = -0.002 s .* must be equally spaced, > 0'),
+                        (0.0 * t, '= 0 s .* > 0'), (t[:5], '5 times: must be 20 at least')):
+        with pytest.raises(InvalidTrajectoryError, match=says):
+            grade_trajectory(right, WHEEL, start, times=times)
 
 
 def test_a_body_is_a_top():
     assert Body.of(WHEEL) is WHEEL and WHEEL.com == (0.0, 0.0, 0.15)
+    assert replace(WHEEL, lambda1='0.123') == WHEEL
     assert WHEEL.inertia_at_com == pytest.approx((0.078, 0.078, 0.15))

@@ -53,7 +53,8 @@ def test_errors_are_those_of_the_cramer_rao_bound():
                   'phi and psi, but for their sum')),
     ('planar_pendulum', ('lambda3, because the top does not spin',)),
     ('free_top', ('mass and com_distance, because no torque acts',)),
-    ('looping', ('mass and com_distance, but for P = mass gravity com_distance',))])
+    *((scene, ('mass and com_distance, but for P = mass gravity com_distance',))
+      for scene in ('looping', 'near_separatrix'))])
 def test_what_the_data_cannot_tell_is_named(name, hidden):
     found = fit(parts_of(name, 5.0, 50.0))
     assert found.reached
@@ -100,11 +101,6 @@ def test_the_place_of_an_imu_is_fitted_to_its_readings():
     assert np.allclose(found.lever_arm, LEVER_ARM, atol=1e-2)
     with pytest.raises(ValueError, match='no gyroscope'):
         fit(parts_of('looping', 1.0, 100.0), imu=True)
-
-
-def test_a_motion_near_the_separatrix_is_found():
-    found = fit(parts_of('near_separatrix', 8.0, 60.0))
-    assert found.reached
 
 
 def test_attitudes_without_noise_give_the_top_to_nine_digits():

@@ -18,6 +18,7 @@ from helpers.formats import (
     closed,
     message,
     recover,
+    written,
     zstd_chunk,
 )
 from helpers.logs import seen_by_us
@@ -39,8 +40,7 @@ def test_a_chunk_that_holds_more_than_it_says_is_not_believed(tmp_path):
     chunk = Chunk(compression='zstd', data=zstandard.compress(plain), uncompressed_crc=0,
                   uncompressed_size=len(message(5, b'first')), message_start_time=5,
                   message_end_time=6)
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(closed(HEADER, RAW_CHANNEL, record_bytes(chunk)))
+    path = written(tmp_path, closed(HEADER, RAW_CHANNEL, record_bytes(chunk)))
     with LogReader(path) as reader:
         assert not list(reader.messages()) and reader.damage.lost_chunks == 1
 
@@ -52,8 +52,7 @@ def test_a_chunk_that_holds_more_than_it_says_is_not_believed(tmp_path):
     Schema(id=1, name='other', encoding='jsonschema', data=b'')])
 def test_a_chunk_with_wrong_declarations_is_not_copied(tmp_path, wrong):
     """A reader that goes from the beginning to the end would believe the last one."""
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(closed(HEADER, SCHEMA, CHANNEL, chunk_of(
+    path = written(tmp_path, closed(HEADER, SCHEMA, CHANNEL, chunk_of(
         message(4, b'1'), 4, 4), chunk_of(record_bytes(wrong) + message(5, b'2'))))
     output = recover(path)
     with open(output, 'rb') as file:
@@ -66,11 +65,10 @@ def test_a_chunk_with_wrong_declarations_is_not_copied(tmp_path, wrong):
 
 @pytest.mark.parametrize('kind', ['chunk', 'metadata'])
 def test_a_record_above_the_ceiling_is_refused_alone(tmp_path, kind):
-    path = tmp_path / 'a.mcap'
     big = (chunk_of(message(5, bytes(5000))) if kind == 'chunk'
            else record_bytes(Metadata('big', {'k': 'v' * 5000})))
-    path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk_of(message(4, b'a'), 4, 4), big,
-                            chunk_of(message(6, b'c'), 6, 6)))
+    path = written(tmp_path, closed(HEADER, RAW_CHANNEL, chunk_of(message(4, b'a'), 4, 4), big,
+                                    chunk_of(message(6, b'c'), 6, 6)))
     with LogReader(path, max_bytes=4000) as reader:
         assert [message.data for message in reader.messages()] == [b'a', b'c']
         (loss,) = reader.damage.losses
@@ -177,8 +175,7 @@ def test_a_search_unpacks_a_limited_amount(tmp_path, monkeypatch):
         unpacked.append(chunk.uncompressed_size), ordinary(chunk, max_bytes))[1])
     plain = bytearray(zstd_chunk(message(5, bytes(1_000_000))))
     plain[9 + 24] ^= 1
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(MCAP0_MAGIC + HEADER + b'\x00' + bytes(plain) * 300)
+    path = written(tmp_path, MCAP0_MAGIC + HEADER + b'\x00' + bytes(plain) * 300)
     max_bytes = 2_000_000
     with LogReader(path, max_bytes) as reader:
         assert reader.damage.lost_bytes == path.stat().st_size - len(MCAP0_MAGIC + HEADER)

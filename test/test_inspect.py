@@ -263,10 +263,6 @@ def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path
 
 def test_a_folder_with_one_log_is_that_log(short, tmp_path, capsys):
     (tmp_path / 'bag').mkdir()
-    assert inspect.main([str(tmp_path / 'bag')]) == 1
-    assert capsys.readouterr().err == (
-        f'spinning-top inspect: cannot read {tmp_path}/bag: a folder must hold one .mcap file; '
-        'in it: none\n')
     (tmp_path / 'bag/bag_0.mcap').symlink_to(short)
     assert inspect.main([str(tmp_path / 'bag')]) == 0
     assert capsys.readouterr().out.startswith(f'{tmp_path}/bag/bag_0.mcap: whole')

@@ -21,6 +21,7 @@ from helpers.formats import (
     padded,
     recover,
     unknown_kind,
+    written,
     zstd_chunk,
 )
 from helpers.logs import (
@@ -50,9 +51,8 @@ from spinning_top_sim.recording.reader import LogReader
 
 def test_extra_fields_and_unknown_kinds_are_no_damage(tmp_path):
     """The specification lets records grow, and gives 0x80 and above to applications."""
-    path = tmp_path / 'a.mcap'
     attachment = padded(record_bytes(Attachment(1, 2, 'name', 'x/y', b'data')), b'behind')
-    path.write_bytes(closed(
+    path = written(tmp_path, closed(
         padded(HEADER, b'new'), padded(SCHEMA, b'\x01\x02\x03'), padded(CHANNEL, b'more'),
         unknown_kind(0x80, b'of an application'), unknown_kind(0x10, b'of the future'),
         padded(chunk_of(message(5, b'1') + message(7, b'2'), 5, 7), b'\x00' * 20),
@@ -75,17 +75,15 @@ def test_extra_fields_and_unknown_kinds_are_no_damage(tmp_path):
 
 def test_extra_fields_inside_of_a_chunk_are_ignored_and_not_copied(tmp_path):
     """The reader of mcap itself does not skip them there."""
-    path = tmp_path / 'a.mcap'
     plain = padded(SCHEMA, b'more') + padded(CHANNEL, b'more') + message(5, b'1')
-    path.write_bytes(closed(HEADER, chunk_of(plain)))
+    path = written(tmp_path, closed(HEADER, chunk_of(plain)))
     output = recover(path)
     assert seen_by_us(path) == seen_by_us(output) == seen_by_mcap(output) == [('/a', 5, b'1')]
 
 
 @pytest.mark.parametrize('records', [[HEADER], [HEADER, SCHEMA, CHANNEL]])
 def test_a_closed_file_without_summary_and_messages_is_whole(tmp_path, records):
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(closed(*records))
+    path = written(tmp_path, closed(*records))
     with LogReader(path) as reader:
         assert reader.whole
         assert reader.damage.lines() == []
@@ -96,8 +94,7 @@ def test_a_closed_file_without_summary_and_messages_is_whole(tmp_path, records):
 def test_a_chunk_of_several_frames_is_read_to_its_end(tmp_path, compression):
     compress = {'zstd': zstandard.compress, 'lz4': lz4.frame.compress}[compression]
     first, second = message(5, b'first'), message(6, b'second' * 50)
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(closed(HEADER, RAW_CHANNEL, chunk_of(
+    path = written(tmp_path, closed(HEADER, RAW_CHANNEL, chunk_of(
         first + second, 5, 6, compression, compress(first) + compress(second))))
     assert [data for _, _, data in seen_by_us(path)] == [b'first', b'second' * 50]
     with LogReader(path) as reader:
@@ -178,13 +175,13 @@ def test_a_summary_behind_a_damaged_end_of_the_data_is_no_data(tmp_path, truncat
 @pytest.mark.parametrize('zeros', [9, (1 << 16) - 5])
 def test_the_search_finds_every_kind_of_record(tmp_path, zeros):
     """Also across two blocks, and behind a chunk of a wild size; truncated metadata are lost."""
-    path = tmp_path / 'a.mcap'
     note = record_bytes(Metadata('note', {'a': 'b'}))
     wild = bytearray(zstd_chunk(message(5, b'x')))
     struct.pack_into('<Q', wild, 9 + 16, 1 << 62)
     parts = (bytes(wild), SCHEMA, CHANNEL, note, chunk_of(message(5, b'1')),
              zstd_chunk(message(6, b'2')) + note[:-1])
-    path.write_bytes(MCAP0_MAGIC + HEADER + b''.join(bytes(zeros) + part for part in parts))
+    path = written(tmp_path, MCAP0_MAGIC + HEADER + b''.join(
+        bytes(zeros) + part for part in parts))
     with LogReader(path) as reader:
         assert [message.data for message in reader.messages()] == [b'1', b'2']
         assert (reader.metadata, reader.topics[0].type_name) == ({'note': {'a': 'b'}}, 'thing')
@@ -193,8 +190,7 @@ def test_the_search_finds_every_kind_of_record(tmp_path, zeros):
 
 def test_a_channel_that_stands_behind_its_messages_is_enough(tmp_path):
     """As when the first one is damaged, and so is the summary that repeats it."""
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(MCAP0_MAGIC + HEADER + chunk_of(message(5, b'x')) + RAW_CHANNEL)
+    path = written(tmp_path, MCAP0_MAGIC + HEADER + chunk_of(message(5, b'x')) + RAW_CHANNEL)
     output = recover(path)
     assert seen_by_us(path) == seen_by_us(output) == seen_by_mcap(output) == [('/a', 5, b'x')]
     with LogReader(path) as reader:
@@ -248,8 +244,7 @@ def test_a_torn_file_of_a_stranger_keeps_what_stands_before_the_tear(tmp_path, n
 
 def test_messages_in_and_out_of_chunks_keep_their_order(tmp_path):
     """All have one stamp, so that only their places in the file order them."""
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(closed(HEADER, RAW_CHANNEL, message(5, b'a'), chunk_of(
+    path = written(tmp_path, closed(HEADER, RAW_CHANNEL, message(5, b'a'), chunk_of(
         message(5, b'b') + message(5, b'c')), message(5, b'd')))
     output = recover(path)
     for file in (path, output):

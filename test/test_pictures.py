@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 
+pytest.importorskip('matplotlib')
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
 CUSP = State(theta=0.5, l3=1.6, lz=float(1.6 * np.cos(0.5)))
 
 
 def test_plot_draws_the_columns():
-    pytest.importorskip('matplotlib')
     motion = solve(TOP, CUSP, np.linspace(0.0, 4.0, 401))
     figure = motion.plot()
     panels = {axes.get_ylabel() or axes.get_title(): axes for axes in figure.axes}
@@ -36,7 +36,6 @@ def test_plot_draws_the_columns():
 
 
 def test_animate_shows_samples_in_time():
-    pytest.importorskip('matplotlib')
     motion = solve(TOP, CUSP, np.linspace(0.0, 1.0, 101))
     animation = motion.animate(fps=5.0, speed=0.5)
     html = animation.to_jshtml()
@@ -56,7 +55,6 @@ def test_animate_shows_samples_in_time():
     ([1.0, 0.5], {}, 't[1] = 0.5 s: must be later than t[0] = 1.0 s'),
     ([0.0, 1.0], {'fps': 0.0}, 'fps = 0.0'), ([0.0, 1.0], {'speed': -1.0}, 'speed = -1.0')])
 def test_what_makes_no_picture_is_refused(times, argument, says):
-    pytest.importorskip('matplotlib')
     motion = solve(TOP, CUSP, np.array(times))
     with pytest.raises(ValueError, match=re.escape(says)):
         motion.animate(**argument) if argument else motion.plot()

@@ -49,21 +49,18 @@ def eventually(condition):
         time.sleep(0.005)
 
 
-def test_too_little_space_at_the_start_leaves_no_file(tmp_path):
-    with pytest.raises(RecordingError, match=r'run\.mcap: \d+ bytes are free .* 10{30}'):
-        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=10 ** 30)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_head_that_cannot_be_written_leaves_no_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, 'fsync', refuse_to_sync)
-    with pytest.raises(RecordingError, match=r'run\.mcap: Input/output error'):
-        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
-    assert not list(tmp_path.iterdir())
-
-
 def refuse_to_sync(descriptor):
     raise OSError(5, os.strerror(5))
+
+
+@pytest.mark.parametrize(('least', 'reason'), [
+    (10 ** 30, r'\d+ bytes are free .* 10{30}'), (0, 'Input/output error')])
+def test_too_little_space_or_a_head_that_cannot_be_written_leaves_no_file(
+        tmp_path, monkeypatch, least, reason):
+    monkeypatch.setattr(os, 'fsync', refuse_to_sync)
+    with pytest.raises(RecordingError, match=rf'run\.mcap: {reason}'):
+        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=least)
+    assert not list(tmp_path.iterdir())
 
 
 def test_topics_twice_are_refused(tmp_path):

@@ -216,17 +216,12 @@ def test_messages_of_any_length_are_all_kept(tmp_path):
     were handed over.
     """
     rng = random.Random(5)
-    wanted = [[], [], []]
-    with closing(McapRecorder(
-            tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=100.0,
-            min_free_bytes=0)) as recorder:
-        for time_ns in range(5000):
-            topic = rng.randrange(3)
-            size = (1000, rng.choice([12, 12, 12, 700]), time_ns % 7)[topic]
-            data = rng.randbytes(size)
-            wanted[topic].append((time_ns, data))
-            write(recorder, topic, time_ns, data)
-    found = [[], [], []]
+    messages, found = [], [[], [], []]
+    for time_ns in range(5000):
+        topic = rng.randrange(3)
+        size = (1000, rng.choice([12, 12, 12, 700]), time_ns % 7)[topic]
+        messages.append((topic, time_ns, rng.randbytes(size)))
+    record(tmp_path / 'run.mcap', messages, max_loss=100.0)
     names = [topic.name for topic in TOPICS]
     with (tmp_path / 'run.mcap').open('rb') as file:
         reader = make_reader(file)
@@ -235,7 +230,8 @@ def test_messages_of_any_length_are_all_kept(tmp_path):
             assert message.sequence == len(of_topic)
             of_topic.append((message.log_time, message.data))
         chunks = reader.get_summary().chunk_indexes
-    assert found == wanted
+    assert found == [[message[1:] for message in messages if message[0] == topic]
+                     for topic in range(3)]
     assert 2 <= len(chunks) <= 4
     assert max(chunk.uncompressed_size for chunk in chunks) < 1.5 * CHUNK_BYTES
 
@@ -254,6 +250,7 @@ def test_rows_are_written_in_order_and_the_bytes_are_always_the_same(tmp_path, c
             index, times, rows = rows_of(number, number + 400 - number % 3)
             block = rows.copy()
             file.append_rows([(index, times, block)])
+            file.append_rows([])        # makes no chunk
             block[:] = 0                # the rows were copied
         file.append(1, 8000, array_cdr(8000))
         file.flush()

@@ -27,8 +27,9 @@ from rosbags.typesys import Stores, get_typestore
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import replay_node
+from spinning_top_sim.nodes.executable import message_class
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS
-from spinning_top_sim.nodes.replayer import Replayer, message_class, open_log
+from spinning_top_sim.nodes.replayer import Replayer, open_log
 from spinning_top_sim.recording.recorder import McapRecorder
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 

@@ -35,7 +35,7 @@ def reported():
     session = SimpleNamespace(error=None, warning=None,
                               numbers=lambda: {'recorder': 'off'}, has_room=lambda: True,
                               write_command=print, write_event=lambda *_, **__: None)
-    loop = TickLoop(simulation, values, session, update_subscribers=lambda: None, tell=print)
+    loop = TickLoop(simulation, values, session, update_subscribers=print, warn=print, error=print)
     loop.start()
     loop.step(1_250_000_000)
     return SimpleNamespace(report=NodeStatus(simulation, loop, session), loop=loop,

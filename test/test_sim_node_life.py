@@ -160,5 +160,7 @@ def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
         logged = [data for _, data in log_of(tmp_path / 'run.mcap')[0]['/pose']]
         assert_received_from([data for data in node.heard['pose']
                               if stamp_of(data) >= stamp_of(logged[0])], logged)
+        answer = node.switch('set_pause', False)
+        assert not answer.success and f'stands still: {reason}' in answer.message
         assert node.trigger('reset').success
         node.wait_until(100_000_000)

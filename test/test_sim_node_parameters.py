@@ -39,16 +39,12 @@ def recorded(node):
     return log_of(path)[0]
 
 
-def as_message(node, l3, lz):
-    node.command(l3, lz)
-
-
 def as_parameters(node, l3, lz):
     assert node.set(spin__l3=l3, spin__lz=lz).successful
 
 
 @pytest.mark.parametrize(('command', 'l3', 'lz'), [
-    (as_message, 1.25, 0.75), (as_parameters, 2, 0)])
+    (OwnNode.command, 1.25, 0.75), (as_parameters, 2, 0)])
 def test_a_command_sets_the_momenta(node, command, l3, lz):
     assert node.switch('record', True).success
     node.step(50)

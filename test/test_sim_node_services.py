@@ -74,6 +74,7 @@ def test_a_node_follows_the_clock_of_another_and_waits_for_it_aloud(peer, diagno
         assert 'follows another /clock' in peer.set_together(node, clock__enabled=True).reason
         answer = peer.trigger(node, 'reset')
         assert not answer.success and 'clock' in answer.message
+        assert 'waiting for the start at t = 0' in peer.switch(node, 'set_pause', False).message
         pose = peer.listen(node.topic('pose'), PoseStamped)
         assert peer.set_together(node, time_scale=1.0).successful
         clock.now_ns += 3_000_000           # not on the grid of the stamps

@@ -50,8 +50,9 @@ def test_the_version_and_the_help_are_printed_and_nothing_runs(main, capfd):
         assert run.code == 0
         assert [line for line in run.out.splitlines() if len(line) > 80] == []
     said = main('--help').out
-    for name in ('~/commands', '~/set_pause', '~/record', '~/step', '~/reset', '/diagnostics',
-                 'imu/data_raw', '~/invariants', '/clock', *parameters.BY_NAME):
+    for name in ('~/commands', '~/cmd_vel', '~/set_pause', '~/record', '~/step', '~/reset',
+                 '/diagnostics', 'imu/data_raw', 'ground_truth/odom_throttle', '~/invariants',
+                 '/clock', *parameters.BY_NAME):
         assert name in said
 
 
@@ -62,6 +63,9 @@ STARTS_REFUSED = {
     'missing file': (['--params-file', 'nowhere.yaml'], ('nowhere.yaml', 'there is no such file')),
     'no YAML': (['--params-file', 'bad.yaml'], ('bad.yaml', 'Error at line 1')),
     'use_sim_time': (['-p', 'use_sim_time:=perhaps'], ('use_sim_time', 'perhaps')),
+    'no scene': (['--', '--scene', 'nowhere.yaml'], ('nowhere.yaml', 'No such file')),
+    'another scene': (['--', '--scene', 'other.yaml'],
+                      ('other.yaml', 'has no parameters for the node spinning_top')),
     'bad qos': (['-p', 'qos_overrides./pose.publisher.reliability:=often'], ('often',)),
 }
 
@@ -72,6 +76,7 @@ def test_what_cannot_be_started_is_said_in_one_line_with_exit_code_2(
     arguments, named = STARTS_REFUSED[case]
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'bad.yaml').write_text('a: [1, 2\n  : {{{\n')
+    (tmp_path / 'other.yaml').write_text('other:\n  ros__parameters:\n    a: 1\n')
     run = main('--ros-args', *arguments)
     assert (run.code, run.out) == (2, '')
     # rcl and rclpy have lines of their own for arguments that they do not understand.
@@ -80,16 +85,6 @@ def test_what_cannot_be_started_is_said_in_one_line_with_exit_code_2(
     assert len(lines) == 1 and lines[0].startswith('spinning-top node: cannot start:'), run.err
     for text in named:
         assert text in lines[0], (text, lines[0])
-
-
-def test_a_scene_without_parameters_of_the_node_is_refused(main, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'other.yaml').write_text('other:\n  ros__parameters:\n    a: 1\n')
-    for path, reason in (('other.yaml', 'has no parameters for the node spinning_top'),
-                         ('nowhere.yaml', 'No such file')):
-        run = main('--scene', path)
-        assert (run.code, run.out, run.err.count('\n')) == (2, '', 1)
-        assert path in run.err and reason in run.err
 
 
 def test_a_short_run_warns_of_what_is_odd_and_ends_with_code_0(main):

@@ -31,21 +31,21 @@ class Run:
     """
     A loop, the steady clock it is on, and what came of it.
 
-    stamps: of the poses recorded;  published: of those published
+    stamps: of the poses recorded
     told: what the loop has said to its environment
     """
 
     def __init__(self, room=lambda: True, **values):
         given = {name.replace('__', '.'): value for name, value in values.items()}
         self.values = parameters.checked(given)
-        self.clock, self.stamps, self.published, self.told = Clock(), [], [], []
+        self.clock, self.stamps, self.told = Clock(), [], []
         self.simulation = LiveSimulation(self.values)
         self.loop = TickLoop(
             self.simulation, self.values, SimpleNamespace(
                 has_room=room, write_command=lambda *_: self.told.append('command'),
                 write_event=lambda event, sent_ns=None, **_: self.told.append((event, sent_ns))),
             update_subscribers=lambda: self.told.append('subscribers'),
-            tell=lambda text, _: self.told.append(text), source=self.clock, steady=self.clock)
+            warn=self.told.append, error=self.told.append, source=self.clock, steady=self.clock)
 
     @property
     def pose(self):
@@ -57,10 +57,6 @@ class Run:
     def record(self):
         self.simulation.log_to(lambda entries: self.stamps.extend(
             stamp_ns for _, stamp_ns, _ in entries), [self.pose.stream])
-        return self
-
-    def publish(self):
-        self.pose.publish = self.published.append
         return self
 
     def tick(self, after_ns=TICK_NS, idle=True):
@@ -111,30 +107,23 @@ def test_late_and_skipped_ticks_are_counted():
 
 
 @pytest.mark.parametrize('ticks_meanwhile', [0, 3])
-def test_a_pause_makes_no_tick_late(ticks_meanwhile):
-    run = started().ticks(10)
-    run.loop.pause()
-    run.ticks(ticks_meanwhile, after_ns=SECOND)
-    run.clock.now_ns += 10 * SECOND
-    run.loop.resume()
-    run.ticks(5)
-    assert run.loop.late_ticks == run.loop.skipped_ticks == 0
-
-
-def test_a_pause_sends_what_is_due_holds_and_catches_nothing_up():
+def test_a_pause_sends_what_is_due_holds_catches_nothing_up_and_makes_no_tick_late(
+        ticks_meanwhile):
     run = started().ticks(4)
     run.clock.now_ns += 3_000_001
     run.loop.pause()
     at_ns = 4 * TICK_NS + 3_000_001
     assert run.loop.paused and run.loop.now_ns == at_ns
-    run.ticks(10)
+    run.ticks(ticks_meanwhile, after_ns=SECOND)
+    run.clock.now_ns += 10 * SECOND
     run.loop.pause()
     assert run.loop.now_ns == at_ns
     run.loop.resume()
     run.loop.resume()
-    run.tick()
-    assert run.loop.now_ns == at_ns + TICK_NS
-    assert run.stamps == grid(at_ns + TICK_NS)
+    run.ticks(5)
+    assert run.loop.now_ns == at_ns + 5 * TICK_NS
+    assert run.stamps == grid(at_ns + 5 * TICK_NS)
+    assert run.loop.late_ticks == run.loop.skipped_ticks == 0
 
 
 @pytest.mark.parametrize('time_scale', [1.0, 50.0])
@@ -191,10 +180,12 @@ def test_stamps_end_before_their_seconds_do_and_a_reset_says_why_not():
 def test_the_duration_ends_with_its_last_sample_and_nothing_leads_on():
     run = started(duration=0.0723).ticks(100)
     assert run.loop.now_ns == 72_300_000
-    for act in (run.loop.start, run.loop.pause, run.loop.resume,
-                lambda: run.loop.fail('for a test'), lambda: run.loop.reset(run.values, 0)):
+    for act in (run.loop.start, run.loop.pause, run.loop.resume, lambda: run.loop.fail('a test')):
         act()
         assert run.loop.state is tick_loop.LoopState.ENDED
+    with pytest.raises(RuntimeError, match='`duration` are sent: nothing follows'):
+        run.loop.reset(run.values, 0)
+    assert run.loop.now_ns == 72_300_000 and not any(told[0] == 'reset' for told in run.told)
     assert run.ticks(5).stamps == grid(72_300_000)
 
 
@@ -287,6 +278,8 @@ def test_equations_that_cannot_go_on_stop_the_motion_until_a_reset():
         run.loop.command(1.0, 1.0)
     with pytest.raises(RuntimeError, match='stands still'):
         run.loop.step(POSE_NS)
+    with pytest.raises(RuntimeError, match=r'stands still: .*pole'):
+        run.loop.resume()
     run.ticks(5)
     assert run.loop.now_ns == stands_at
     run.loop.reset(parameters.checked({}), 0)

@@ -6,7 +6,7 @@ import runpy
 import numpy as np
 import pytest
 from helpers.reference import ROOT, scene_parameters
-from helpers.simulations import record
+from helpers.simulations import record, stream
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.streams import parameters
@@ -42,13 +42,11 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
     values = {**scene_parameters(scene), **MOUNTED}
     model = robot(tmp_path, values)
     simulation = LiveSimulation(parameters.checked(values))
-    pose = next(s for s in simulation.streams if s.topic == 'pose')
-    joints = next(s for s in simulation.streams if s.topic == 'joint_states')
+    pose, joints = (stream(simulation, topic) for topic in ('pose', 'joint_states'))
     taken = record(simulation, pose.topic, joints.topic)
     simulation.advance(SECOND)
-    poses, positions = ([stream.template.decode(data)[place][0] for topic, _, data in taken
-                         if topic == stream.topic]
-                        for stream, place in ((pose, 1), (joints, 0)))
+    poses, positions = ([one.template.decode(data)[place][0] for topic, _, data in taken
+                         if topic == one.topic] for one, place in ((pose, 1), (joints, 0)))
     assert len(poses) == len(positions) == 101
     assert model.actuated_joint_names == list(JOINTS)
     arm = np.array(MOUNTED['imu.lever_arm'])

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from helpers.inspected import rewritten
 from helpers.recordings import write_rows
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,6 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import command, plots, shapes, svg, text
@@ -59,7 +59,7 @@ def log(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def shown(log):
-    return logs.read_logs([log])[0]
+    return logs.read_logs([log])[0][0]
 
 
 def truth(shown, stamp_ns):
@@ -70,8 +70,7 @@ def truth(shown, stamp_ns):
 
 
 def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
-    template = next(stream.template for stream in all_streams(shown.values)
-                    if stream.topic == 'pose')
+    template = shown.templates['pose']
     with LogReader(log) as reader:
         for message in reader.messages(topics=['/pose']):
             stamp_ns, row = shown.attitudes.at(message.log_time)
@@ -105,19 +104,21 @@ def test_arrows_are_the_vectors_in_the_world(shown, name):
     assert drawn / np.linalg.norm(drawn) == pytest.approx(expected / np.linalg.norm(expected),
                                                           abs=1e-8)
     if name == 'torque':                # P sin(theta), about the line of nodes
-        assert np.linalg.norm(drawn) / shapes.reach(shown) == pytest.approx(
+        assert np.linalg.norm(drawn) / shapes.axis_length(shown) == pytest.approx(
             math.sin(exact.theta[0]), abs=1e-8)
         assert drawn @ [math.sin(exact.phi[0]), -math.cos(exact.phi[0]), 0.0] == pytest.approx(
             -np.linalg.norm(drawn))
     if name == 'angular momentum':      # Lz is conserved, and L3 the usual length
-        assert drawn[2] / shapes.reach(shown) == pytest.approx(exact.lz[0] / exact.l3[0], abs=1e-8)
+        assert drawn[2] / shapes.axis_length(shown) == pytest.approx(
+            exact.lz[0] / exact.l3[0], abs=1e-8)
 
 
 def test_the_trace_ends_at_the_tip_and_breaks_where_it_jumps(shown):
     stamp_ns = shown.epoch_ns + 2_000_000_000
     lines = shapes.trace(shown, stamp_ns)
     exact = truth(shown, stamp_ns)
-    assert lines[-1, 1] == pytest.approx(shapes.reach(shown) * np.ravel(exact.rows_axis), abs=1e-6)
+    assert lines[-1, 1] == pytest.approx(
+        shapes.axis_length(shown) * np.ravel(exact.rows_axis), abs=1e-6)
     assert len(lines) == 200            # 2 s at 100 Hz
     track = Track('', parameters.checked({}))
     half = math.sqrt(0.5)
@@ -131,7 +132,7 @@ def test_the_trace_between_distant_samples_is_that_of_their_velocities(shown):
     track = Track('', shown.values)
     track.add('joint_states', Series(np.arange(20) * 40_000_000, attitude_rows(
         moved.quaternion, moved.angular_velocity, moved.phi_dot)))
-    stamps_ns, axis, joined = shapes.path(track, 0, NANOSECONDS)
+    stamps_ns, axis, joined = shapes.trace_points(track, 0, NANOSECONDS)
     assert len(stamps_ns) == 4 * 19 + 1 and joined.all()
     exact = solve(shown.top, parameters.start_state(shown.values), stamps_ns * 1e-9)
     assert axis == pytest.approx(np.column_stack(exact.rows_axis), abs=1e-4)
@@ -224,27 +225,68 @@ def test_every_scene_has_words_and_plots(scene):
 def test_the_ground_moves_under_a_pivot_that_moves(page, tmp_path):
     path = tmp_path / 'shuttle.mcap'
     assert simulate.main(['--scene', 'shuttle', '--duration', '3', '-o', str(path)]) == 0
-    track, = logs.read_logs([path])
-    player = logs.Player(page, [track])
+    (track,), = logs.read_logs([path])
+    player = logs.Player(page, [[track]])
     for t, x in ((1.0, 1.0), (2.2, 4.0 + 0.2 * 4.0)):       # 2 m/s^2, then 4 m/s
         player.draw(t)
-        reach = abs(shapes.reach(track))
+        reach = abs(shapes.axis_length(track))
         assert page._ground.position == pytest.approx((-(x % reach), 0.0, -0.8 * reach), abs=1e-9)
         assert 'The pivot moves' in page._words.content
         stamp_ns = track.epoch_ns + round(t * NANOSECONDS)
         assert track.places(np.array([stamp_ns])) == pytest.approx(np.array([[x, 0.0, 0.0]]))
         # The trace has stayed where the tip was: at the start at x = 0.
-        begin, end = (shapes.reach(track) * shapes.axis_of(track.attitudes.at(at_ns)[1])[0]
+        begin, end = (shapes.axis_length(track) * shapes.axis_of(track.attitudes.at(at_ns)[1])[0]
                       for at_ns in (track.epoch_ns, stamp_ns))
         lines = shapes.trace(track, stamp_ns)
         assert lines[0, 0] == pytest.approx(begin - (x, 0.0, 0.0), abs=1e-6)
         assert lines[-1, 1] == pytest.approx(end, abs=1e-6)
 
 
+def test_a_reset_to_another_top_shows_that_one_from_its_begin_on(page, tmp_path):
+    """And attitudes by the mounting of the IMU that is in effect."""
+    own_node = pytest.importorskip('helpers.own_node')
+    with own_node.OwnNode(tmp_path, start_paused=True, record__enabled=True,
+                          record__streams=['ground_truth_imu']) as node:
+        node.step(30)
+        assert node.trigger('reset').success        # to the same top
+        node.step(20)
+        assert node.set(top__mass=0.3, imu__rpy=[0.0, 1.0, 0.0]).successful
+        assert node.trigger('reset').success
+        epoch_ns = node.simulation.epoch_ns
+        node.step(50)
+    (first, second), = logs.read_logs([tmp_path / 'run.mcap'])
+    assert first.span[1] < epoch_ns == second.span[0] == second.begin_ns
+    player = logs.Player(page, [[first, second]])
+    for track, mass, begin_ns, t_ns in ((first, 2.0, first.epoch_ns, 300_000_000),
+                                        (second, 0.3, epoch_ns, 500_000_000)):
+        stamp_ns = begin_ns + t_ns
+        player.draw((stamp_ns - first.epoch_ns) * 1e-9)
+        top = page._tops[0].track.top
+        exact = solve(top, parameters.start_state(track.values), [t_ns * 1e-9])
+        assert top.mass == mass and track.motion_at(stamp_ns).energy == pytest.approx(
+            exact.energy[0] - exact.l3[0] ** 2 / (2.0 * top.lambda3))
+        assert track.attitudes.at(stamp_ns)[1][:4] == pytest.approx(exact.quaternion[0], abs=1e-9)
+    assert player.write_html(tmp_path / 'page.html').startswith(
+        f'{(first.span[1] - first.epoch_ns) * 1e-9:g} of {player.length:g} s, ')
+
+
+def test_messages_that_show_no_attitude_are_left_out(log, shown, tmp_path):
+    """Of another size, or with a quaternion of zeros."""
+    at, _ = shown.templates['ground_truth/imu']._fields[0]
+    changed = {('/pose', 5): lambda data: data[:-1],
+               ('/ground_truth/imu', 7): lambda data: data[:at] + bytes(32) + data[at + 32:]}
+    (track,), = logs.read_logs([rewritten(
+        log, tmp_path / 'odd.mcap', lambda topic, number, data: changed.get(
+            (topic, number), lambda data: data)(data))])
+    for topic, number in (('pose', 5), ('ground_truth/imu', 7)):
+        assert np.array_equal(track.samples[topic].stamps_ns,
+                              np.delete(shown.samples[topic].stamps_ns, number))
+
+
 def test_a_truncated_log_is_shown_as_far_as_it_goes(log, shown, tmp_path):
     path = tmp_path / 'torn.mcap'
     path.write_bytes(log.read_bytes()[:-60_000])
-    part, = logs.read_logs([path])
+    (part,), = logs.read_logs([path])
     assert part.note.startswith('torn.mcap: it is truncated') and not shown.note
     assert shown.span[0] == part.span[0] < part.span[1] <= shown.span[1]
 
@@ -263,12 +305,12 @@ def foreign(log, path, topics):
 def test_the_log_of_another_program_shows_its_attitudes(log, shown, page, tmp_path, topic):
     # The first topic has no orientation.
     path = foreign(log, tmp_path / 'run.mcap', {'/imu/data_raw': '/raw', topic: '/robot/state'})
-    track, = logs.read_logs([path])
+    (track,), = logs.read_logs([path])
     assert not track.has_body and track.epoch_ns == track.span[0]
     if topic == '/pose':
         assert track.attitudes.rows == pytest.approx(
             shown.samples['pose'].rows, abs=1e-15, nan_ok=True)
-    player = logs.Player(page, [track])
+    player = logs.Player(page, [[track]])
     player.draw_next(0.5)
     assert 'The body is not in this log' in page._words.content
     assert page._plots.content.count('<svg') == 1       # the tilt
@@ -283,7 +325,7 @@ def test_a_log_without_attitudes_is_refused(log, tmp_path):
 
 
 def test_a_player_follows_its_buttons_and_the_slider(shown, page):
-    player = logs.Player(page, [shown])
+    player = logs.Player(page, [[shown]])
     assert player.length == pytest.approx(6.0)
     player.draw_next(1.0)
     assert player._slider.value == pytest.approx(1.0)
@@ -316,6 +358,8 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port(page):
 
 @pytest.mark.parametrize(('arguments', 'told'), [
     (['LOG', 'LOG', 'LOG'], '3 logs: must be one or two'),
+    (['LOG', '--scene', 'wavy'], '--scene wavy: must be without a log, which has its own'),
+    (['LOG', '--imu', 'bmi088'], '--imu bmi088: must be without a log, which has its own'),
     (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535')])
 def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
     assert command.main([*(str(log) if word == 'LOG' else word

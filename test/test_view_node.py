@@ -49,7 +49,7 @@ def live():
     rclpy.init()
     view = LiveView(Page('one', '127.0.0.1', None))
     yield view
-    view._page.close()
+    view.stop()             # as where the start has failed
     view.destroy_node()
     rclpy.try_shutdown()
 
@@ -57,7 +57,7 @@ def live():
 def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypatch):
     """Without ground_truth/odom, and where a new run has an earlier clock."""
     values = parameters.checked({'spin.lz': 1.4})
-    live._sim_node.is_stale, live._track = False, Track('', values)
+    live._client.is_stale, live._track = False, Track('', values)
     live._page.set_tracks([live._track])
     for seconds, count in ((100, 1), (200, 0), (300, 1), (5, 1)):
         epoch_ns = seconds * NANOSECONDS

@@ -23,7 +23,8 @@ import argparse
 import runpy
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +40,6 @@ NORTHS = 'true', 'magnetic'
 # Options for each kind of subject.
 OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 'imu', 'seeds'),
            '--filter': ('level', 'imu', 'seeds'), '--data': ('data',)}
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('examine', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -163,3 +159,6 @@ def _own_filter(given: str) -> Callable[[], Filter]:
         raise ValueError(f'--filter {given}: there is no {name} in {path}')
     made: Callable[[], Filter] = names[name]
     return made
+
+
+main = partial(cli.run, 'examine', __doc__, add_arguments, _run)

@@ -17,8 +17,9 @@ What a file may contain is in docs/grade_files.md.
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from spinning_top_sim.grade import fit as fitting
 from spinning_top_sim.grade.grader import grade_trajectory
-from spinning_top_sim.grade.motion import Trajectory
+from spinning_top_sim.grade.motion import LEAST_SAMPLES, Trajectory
 from spinning_top_sim.grade.scenes import Body, Reals
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -41,11 +42,6 @@ EVEN = 1e-4                 # share of the interval by which evenly spaced sampl
 GAP = 2.5                   # intervals that are a gap
 DEGREE = 5                  # of the splines between samples
 COARSE = 0.5                # turned from one sample to the next [rad]: splines fail
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('grade', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,8 +81,9 @@ def _motion(arguments: argparse.Namespace,
     given, fits = scene_file.given(arguments), arguments.fit or arguments.fit_imu
     if fits and (starts := [name for name in given if name.startswith(('initial.', 'spin.'))]):
         raise ValueError(f'--fit finds the start: {", ".join(starts)} must not be given')
-    known = None if given else recorded.parameters
-    values = known or parameters.checked(given)
+    # A scene is another top and start; anything else changes what the file tells.
+    known = None if arguments.scene or arguments.params else recorded.parameters
+    values = parameters.checked({**(known or {}), **given})
     x, y, z, w = Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()
     top, start = parameters.top_of(values), parameters.start_state(values)
     body = Body.of(
@@ -105,8 +102,11 @@ def _motion(arguments: argparse.Namespace,
 def _motion_by_fit(arguments: argparse.Namespace, recorded: Recorded, given: Mapping[str, Any],
                    body: Body) -> tuple[Body, State, fitting.Fit]:
     """Return the same as fitted, but for the parts of `body` that are given."""
-    found = fitting.fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
-                        imu=arguments.fit_imu)
+    try:
+        found = fitting.fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
+                            imu=arguments.fit_imu)
+    except ValueError as error:
+        raise ValueError(f'{arguments.file}: {error}') from error
     if arguments.fit_imu:
         body = replace(body, mounting=found.mounting, lever_arm=body.lever_arm if (
             arguments.lever_arm or 'imu.lever_arm' in given) else found.lever_arm)
@@ -129,12 +129,18 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
     parts = {name: _longest(name, at - begin, values, notes)
              for name, (at, values) in recorded.parts.items()}
     times, attitudes = parts.pop('attitudes')
-    for name, (at, _) in [*parts.items()]:
-        if min(at[-1], times[-1]) - max(at[0], times[0]) < 0.5 * np.ptp(times):
-            notes.append(f'{name}: not at the times of the attitudes, left out')
+    sensors = [name for name in ('gyroscope', 'accelerations') if name in parts]
+    begin, end = times[0] - SAME_S, times[-1] + SAME_S
+    for name in dict.fromkeys([*sensors, *parts]):
+        at = parts[name][0]
+        both = max(at[0] - SAME_S, begin), min(at[-1] + SAME_S, end)
+        if both[1] - both[0] < 0.5 * np.ptp(times):
+            notes.append(f'{name}: not at the times of the others, left out')
             del parts[name]
-    even = _evenly([*(parts[name][0] for name in ('gyroscope', 'accelerations') if name in parts),
-                    times, *(at for at, _ in parts.values())], notes)
+        else:
+            begin, end = both
+    every = next((parts[name][0] for name in sensors if name in parts), times)
+    even = _evenly(every[(every >= begin) & (every <= end)], notes)
     error = turns(times).inv() * Rotation.from_quat(np.roll(attitudes, -1, axis=1))
     level, white = fitting.whiteness(error.as_rotvec().T)
     found = turns(even)
@@ -154,10 +160,11 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
     return Trajectory.of({**readings, 'covariance': recorded.covariance}, even)
 
 
-def _evenly(every: Sequence[Reals], notes: list[str]) -> Reals:
-    """Return the first of these times, made evenly spaced, as far as all of them go."""
-    begin, end = max(at[0] for at in every) - SAME_S, min(at[-1] for at in every) + SAME_S
-    grid = every[0][(every[0] >= begin) & (every[0] <= end)]
+def _evenly(grid: Reals, notes: list[str]) -> Reals:
+    """Return times, made evenly spaced.  Raises ValueError if they are too few."""
+    if len(grid) < LEAST_SAMPLES:
+        raise ValueError(f'{len(grid)} times at which there are attitudes and readings: must be '
+                         f'{LEAST_SAMPLES} at least')
     even: Reals = np.linspace(grid[0], grid[-1], len(grid))
     if np.max(np.abs(even - grid)) < EVEN * (even[1] - even[0]):
         return grid
@@ -172,3 +179,6 @@ def _longest(name: str, at: Reals, values: Reals, notes: list[str]) -> tuple[Rea
         notes.append(f'{name}: the longest part without a gap is used')
     chosen = max(np.split(np.arange(len(at)), gaps), key=len)
     return at[chosen], values[chosen]
+
+
+main = partial(cli.run, 'grade', __doc__, add_arguments, _run)

@@ -36,7 +36,8 @@ NAMES = {'theta': ('rad', 0.0), 'theta_dot': ('rad/s', 1.0), 'phi': ('rad', 0.0)
          'lambda3/lambda1': ('1', 0.0), 'P/lambda1': ('1/s^2', 2.0),
          **{f'mounting_{axis}': ('rad', 0.0) for axis in 'xyz'},
          **{f'lever_arm_{axis}': ('m', 0.0) for axis in 'xyz'}, 'stamp_offset': ('s', -1.0)}
-ANGLES, RATIO = (2, 3), 6   # of NAMES: those that may change by a turn, lambda3/lambda1
+# Of NAMES: the angles that may change by a turn, lambda3/lambda1, P/lambda1.
+ANGLES, RATIO, TORQUE = (2, 3), 6, 7
 EXACT = 1e-7                # residual that needs no noise: quaternions in single precision [rad]
 NEGLIGIBLE = 1e-5           # of readings: errors of a simulator's steps
 LARGEST = 0.3               # noise [rad]
@@ -85,7 +86,7 @@ class Fit:
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; null: not told by the readings."""
         return {'values': dict(self.values), 'undetermined': list(self.undetermined),
-                'deviations': {name: number(one) for name, one in self.deviations.items()},
+                'deviations': {name: number(value) for name, value in self.deviations.items()},
                 'residual': self.residual, 'noise': self.noise, 'reached': self.reached}
 
     def lines(self) -> Iterator[str]:
@@ -97,7 +98,7 @@ class Fit:
             spread = INTERVAL * self.deviations[name]
             yield f'  {name:<16}{value:>16.9g} ' + (
                 f'+- {spread:.2g} {NAMES[name][0]}' if math.isfinite(spread) else '(not told)')
-        yield from (f'  the file does not tell {one}' for one in self.undetermined)
+        yield from (f'  the file does not tell {what}' for what in self.undetermined)
 
 
 class _Trial(NamedTuple):
@@ -137,26 +138,25 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
     if not np.any(np.ptp(attitudes, axis=0)):
         raise ValueError('the attitude never changes: there is no motion to fit')
     turns = Rotation.from_quat(np.roll(attitudes, -1, axis=1))
-    one = Samples('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
+    samples = Samples('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
     told = parts.get('rates', parts.get('gyroscope'))
-    spin, sure = unknowns.spin_rate(one.times, one.values,
+    spin, sure = unknowns.spin_rate(samples.times, samples.values,
                                     told and float(np.median(told[1][:, 2])))
-    across = np.cross(*turns[:2].apply((0.0, 0.0, 1.0))) / one.times[1]
-    first = np.zeros(unknowns.UNKNOWNS)
-    first[unknowns.RATES] = (*turns[0].inv().apply(across)[:2], spin)
+    across = np.cross(*turns[:2].apply((0.0, 0.0, 1.0))) / samples.times[1]
+    rates = (*turns[0].inv().apply(across)[:2], spin)
     small = [(*pair, FIRST, TURN_AND_RATES)
-             for pair in unknowns.small_nutation(one.times, one.values)]
+             for pair in unknowns.small_nutation(samples.times, samples.values)]
     trials: list[_Trial] = []
     for l3, p, size, fitted in ((spin, 0.0, FIRST, MOTION), *small[:4],
                                 (spin, 0.0, 4 * FIRST, MOTION)):
-        first[[L3, P]] = l3, p
-        trials.append(_fit_from(one, first, size, fitted, gravity))
+        guess = np.array((0.0, 0.0, 0.0, *rates, l3, p, *np.zeros(len(SENSOR))))
+        trials.append(_fit_from(samples, guess, size, fitted, gravity))
         if trials[-1].explained:
             break                               # another guess finds the same
     best = min(trials, key=lambda trial: trial.residual)
     if not sure:
-        best.x[SPIN] += unknowns.turns_added(best.x, one.times)
-    best.problem.readings = [replace(one, sigma=max(best.residual, 1e-15))]
+        best.x[SPIN] += unknowns.turns_added(best.x, samples.times)
+    best.problem.readings = [replace(samples, sigma=max(best.residual, 1e-15))]
     if best.reached:
         at, frozen = _without_unseen_nutation(best.problem, best.x, best.residual)
         free = [k for k in MOTION if k not in frozen]
@@ -186,15 +186,17 @@ def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) 
         f'at its begin the attitude is up to {math.degrees(np.max(apart)):.3g} deg off')
 
 
-def _fit_from(one: Samples, x: Reals, size: int, free: Sequence[int], gravity: float) -> _Trial:
+def _fit_from(samples: Samples, x: Reals, size: int, free: Sequence[int],
+              gravity: float) -> _Trial:
     """Fit longer parts, from `size` attitudes on; before the last only the unknowns `free`."""
-    problem = Problem([one], one.values[:, 0], gravity)
-    done, growth, level, last = size / GROWTH, GROWTH, math.inf, len(one.times)
+    problem = Problem([samples], samples.values[:, 0], gravity)
+    done, growth, level, last = size / GROWTH, GROWTH, math.inf, len(samples.times)
     converged = False
     while done < last:
         count = min(math.ceil(done * growth), last)
         chosen = slice(0, count, math.ceil(count / ENOUGH) if count < last else 1)
-        problem.readings = [replace(one, times=one.times[chosen], values=one.values[:, chosen])]
+        problem.readings = [replace(samples, times=samples.times[chosen],
+                                    values=samples.values[:, chosen])]
         found, converged = (_descend(problem, x, MOTION) if count == last else
                             _descend(problem, x, free, 8, 1e-3))
         left = float(np.std(problem.residuals(found)))
@@ -209,10 +211,11 @@ def _fit_from(one: Samples, x: Reals, size: int, free: Sequence[int], gravity: f
 
 def _judged(problem: Problem, x: Reals, converged: bool, frozen: Sequence[int] = ()) -> _Trial:
     """Return unknowns with what the residuals show."""
-    rests = [problem.residual(x, one) for one in problem.readings]
+    rests = [problem.residual(x, samples) for samples in problem.readings]
     levels, white = zip(*map(whiteness, rests), strict=True)
-    small = [np.std(rest) < EXACT + NEGLIGIBLE * (one.kind != 'attitude') * np.std(one.values)
-             for rest, one in zip(rests, problem.readings, strict=True)]
+    small = [np.std(rest) < EXACT + NEGLIGIBLE * (samples.kind != 'attitude')
+             * np.std(samples.values)
+             for rest, samples in zip(rests, problem.readings, strict=True)]
     residual = math.sqrt(float(np.sum(rests[0] ** 2)) / (rests[0].size - len(MOTION)))
     explained = residual < LARGEST and all(np.logical_or(white, small))
     return _Trial(problem, x, residual, levels[0], explained,
@@ -255,11 +258,11 @@ def _with_imu(trial: _Trial, parts: Mapping[str, tuple[Reals, Reals]]) -> _Trial
         streams.append(Samples(kind, parts[name][0] - parts['attitudes'][0][0],
                                np.ascontiguousarray(parts[name][1].T)))
         streams[-1].sigma = float(np.std(streams[-1].values)) or 1.0
-    (one,), problem.readings = problem.readings, streams
+    (attitudes,), problem.readings = problem.readings, streams
     _, model = problem.motion(x, streams[0])
     problem.mounting = Rotation.align_vectors(model.T, streams[0].values.T)[0].as_quat()
     x, _ = _descend(problem, x, SENSOR)
-    problem.readings = [one, *streams]
+    problem.readings = [attitudes, *streams]
     free = [k for k in (*MOTION, *SENSOR) if k not in trial.frozen]
     for _ in range(2):          # noise of each, then all with it
         for stream in problem.readings:
@@ -329,7 +332,7 @@ def _not_told(names: Sequence[str], values: Reals, deviations: Reals,
         yield f'phi and psi, but for their {"sum" if values[0] < 1.0 else "difference"}'
     if math.isinf(deviations[RATIO]) and not np.any(hidden[RATIO]):
         yield 'lambda3, because the top does not spin'
-    no_torque = abs(values[P]) < 3.0 * deviations[P] < math.inf
+    no_torque = abs(values[TORQUE]) < 3.0 * deviations[TORQUE] < math.inf
     yield 'mass and com_distance, ' + ('because no torque acts' if no_torque else
                                        'but for P = mass gravity com_distance')
     yield 'the scale of lambda1, lambda3, mass, L3 and Lz'

@@ -15,14 +15,15 @@ from spinning_top_sim.grade.report import Fault, Report
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Reals, Scene, Start
 from spinning_top_sim.physics.top import State, Top
 
-Run = Callable[[Body, Start, Reals, float], Any]
+Simulate = Callable[[Body, Start, Reals, float], Any]
 # The largest error of an attitude that is no fault [rad].
 TOLERANCE = math.radians(0.1)
 MOST = 0.7              # that the top turns in a step [rad]: in longer ones rates are not known
 
 
-def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[Scene] = SCENES,
-          seed: int = 0, tolerance: float = TOLERANCE, subject: str | None = None) -> Report:
+def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
+          scenes: Sequence[Scene] = SCENES, seed: int = 0, tolerance: float = TOLERANCE,
+          subject: str | None = None) -> Report:
     """
     Grade a simulator.
 
@@ -58,6 +59,8 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
         raise TypeError(f'run = {run!r}: must be run(top, start, times, dt)')
     if not 0.0 < dt <= 1.0:
         raise ValueError(f'dt = {dt!r} s: must be in (0, 1]')
+    if not scenes:
+        raise ValueError(f'scenes = {scenes!r}: must have one at least')
     name = one_line(subject or getattr(run, '__name__', type(run).__name__))
     faults: list[Fault] = []
     motions: list[Motion] = []
@@ -71,7 +74,8 @@ def grade(run: Run, *, dt: float = 0.002, body: Body = WHEEL, scenes: Sequence[S
             same = [Motion(scene.name, body, start, _run(run, body, start, times, dt / divided))
                     for divided in scene.divided]
             motions.append(same[0])
-            orders[scene.name] = convergence_order(scene.divided, [one.worst for one in same])
+            orders[scene.name] = convergence_order(
+                scene.divided, [motion.worst for motion in same])
             if scene is scenes[0]:
                 again = _run(run, body, start, times, dt).attitudes
                 if not np.array_equal(again, same[0].trajectory.attitudes):
@@ -112,17 +116,19 @@ def grade_trajectory(trajectory: Any, top: Top, start: Start | State, *,
     ValueError
         Naming what is no motion, and why.
     """
+    if dt is not None and not 0.0 < dt < math.inf:
+        raise ValueError(f'dt = {dt!r} s: must be > 0, or None')
     body = Body.of(top, **imu)
     start = Start.of(body, start) if isinstance(start, State) else start
     motion = Motion(subject, body, start, Trajectory.of(trajectory, times))
     return _judge(subject, [motion], {}, [], dt or motion.trajectory.step, tolerance)
 
 
-def _run(run: Run, body: Body, start: Start, times: Reals, dt: float) -> Trajectory:
+def _run(run: Simulate, body: Body, start: Start, times: Reals, dt: float) -> Trajectory:
     """Return the motion.  Raises InvalidTrajectoryError."""
     try:
         said = run(body, start, times.copy(), dt)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
                                      f'{one_line(error)}') from error
     return Trajectory.of(said, times)
@@ -135,16 +141,16 @@ def _judge(subject: str, motions: Sequence[Motion], orders: Mapping[str, float],
         return Report(subject, faults, {})
     of_rates, _ = sensors.judge('rates', motions)
     faults += of_rates
-    name = of_rates[0].name if of_rates else ''
-    if name in ('', 'rates_scale', 'rates_in_world'):       # they can be used
+    first = of_rates[0].name if of_rates else ''
+    if first in ('', 'rates_scale', 'rates_in_world'):      # they can be used
         for motion in motions:
-            motion.use_told_rates(in_world=name == 'rates_in_world')
-    marks = {f'{name}: {motion.name}': value for motion in motions
-             for name, value in motion.marks.items()}
-    marks.update({f'order: {name}': order for name, order in orders.items()})
+            motion.use_told_rates(in_world=first == 'rates_in_world')
+    marks = {f'{measure}: {motion.name}': value for motion in motions
+             for measure, value in motion.marks.items()}
+    marks.update({f'order: {scene}': order for scene, order in orders.items()})
     known = any(fault.name == 'rates_scale' for fault in faults)
-    faults += [one for one in _motion_faults(motions, orders, dt, tolerance)
-               if not (known and one.name == 'inaccurate')]
+    faults += [fault for fault in _motion_faults(motions, orders, dt, tolerance)
+               if not (known and fault.name == 'inaccurate')]
     faults += dynamics.energy_fault(motions[0])
     for kind in sensors.KINDS:
         if kind != 'rates':
@@ -160,10 +166,10 @@ def _motion_faults(motions: Sequence[Motion], orders: Mapping[str, float], dt: f
     if worst.worst <= tolerance:
         return
     text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
-    first = {name: order for name, order in orders.items() if 0.5 < order < 1.5}
+    first = {scene: order for scene, order in orders.items() if 0.5 < order < 1.5}
     if first:
-        name, order = next(iter(first.items()))
-        yield Fault('first_order', f'{text}; {name}: the error falls as dt^{order:.2f}', order)
+        scene, order = next(iter(first.items()))
+        yield Fault('first_order', f'{text}; {scene}: the error falls as dt^{order:.2f}', order)
     causes = [fault for fault in dynamics.faults_of(motions, dt)
               if not (first and fault.name == 'first_order')]
     yield from (fault._replace(evidence=f'{text}; {fault.evidence}') for fault in causes)

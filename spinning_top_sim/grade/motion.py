@@ -70,19 +70,22 @@ class Trajectory:
             said = {name: getattr(said, name, None) for name in cls.__dataclass_fields__}
         elif not isinstance(said, Mapping):
             said = {'attitudes': said}
+        said = {str(name): part for name, part in said.items() if part is not None}
         if 'attitudes' not in said:
-            raise InvalidTrajectoryError(f'the mapping has {sorted(map(str, said))}: must have '
-                                         'attitudes')
+            raise InvalidTrajectoryError(f'what is returned has {sorted(said) or "nothing"}: must '
+                                         'have attitudes')
         times = said.get('t') if times is None else times
         if times is None:
             raise InvalidTrajectoryError('times = None: must be given, the trajectory has no t')
-        t = _numbers('times', times, (max(np.size(times), LEAST_SAMPLES),))
+        t = _numbers('times', times, (np.size(times),))
+        if len(t) < LEAST_SAMPLES:
+            raise InvalidTrajectoryError(f'{len(t)} times: must be {LEAST_SAMPLES} at least')
         steps, usual = np.diff(t), np.median(np.diff(t))
-        for at in np.flatnonzero(~(np.abs(steps - usual) <= 1e-3 * usual))[:1]:
-            raise InvalidTrajectoryError(f'times[{at + 1}] - times[{at}] = {steps[at]:g} s after '
-                                         f'{usual:g} s: must be equally spaced')
+        for at in np.flatnonzero(~(np.abs(steps - usual) <= 1e-3 * usual) | (steps <= 0.0))[:1]:
+            raise InvalidTrajectoryError(f'times[{at + 1}] - times[{at}] = {steps[at]:g} s where '
+                                         f'{usual:g} s is usual: must be equally spaced, > 0')
         parts = {name: _numbers(name, said[name], (len(t), *columns))
-                 for name, columns in _PARTS.items() if said.get(name) is not None}
+                 for name, columns in _PARTS.items() if name in said}
         attitudes = parts.pop('attitudes')
         norms = np.linalg.norm(attitudes, axis=1, keepdims=True)
         for at in np.flatnonzero(~(np.abs(norms - 1.0) < 1e-2)):
@@ -91,6 +94,9 @@ class Trajectory:
         told = said.get('covariance')
         if not isinstance(told, Mapping):
             told = {} if told is None else {'gyroscope': told, 'accelerations': told}
+        if others := [*map(str, told.keys() - {'gyroscope', 'accelerations'})]:
+            raise InvalidTrajectoryError(f'covariance of {", ".join(others)}: must be of gyroscope'
+                                         ' or accelerations')
         return cls(t, attitudes / norms, **parts, covariance={
             name: _numbers(f'covariance of {name}', matrix, (3, 3))
             for name, matrix in told.items()})

@@ -69,14 +69,14 @@ class Problem:
     def residuals(self, x: Reals) -> Reals:
         """Return (readings - model)/sigma (m,); they are FAR where no motion begins so."""
         try:
-            return np.concatenate([self.residual(x, one).ravel() / one.sigma
-                                   for one in self.readings])
+            return np.concatenate([self.residual(x, samples).ravel() / samples.sigma
+                                   for samples in self.readings])
         except ValueError:
-            return np.full(3 * sum(len(one.times) for one in self.readings), FAR)
+            return np.full(3 * sum(len(samples.times) for samples in self.readings), FAR)
 
     def jacobian(self, x: Reals, free: Sequence[int], central: bool = False) -> Reals:
         """Return the derivatives of the residuals (m, len(free)), by finite differences."""
-        columns, sigma = [], min(one.sigma for one in self.readings)
+        columns, sigma = [], min(samples.sigma for samples in self.readings)
         behind = self.residuals(x)
         for k in free:
             step = np.zeros(UNKNOWNS)
@@ -88,29 +88,29 @@ class Problem:
             self._steps[k] = min(max(CHANGE / max(largest, 1e-300), 1e-12), 1e-4)
         return np.stack(columns, axis=1)
 
-    def residual(self, x: Reals, one: Samples) -> Reals:
+    def residual(self, x: Reals, samples: Samples) -> Reals:
         """Return readings - model (3, n)."""
-        q, w = self.motion(x, one)
-        if one.kind == 'attitude':
+        q, w = self.motion(x, samples)
+        if samples.kind == 'attitude':
             a, b, c, d = q          # SciPy's rotations take ten times as long
-            turn = np.stack(attitude.product((-a, -b, -c, d), tuple(one.values)))
+            turn = np.stack(attitude.product((-a, -b, -c, d), tuple(samples.values)))
             return np.stack(attitude.rotation_vector(tuple(np.where(turn[3] < 0.0, -turn, turn))))
-        model = w if one.kind == 'rates' else self._force(x, q, w)
-        return one.values - turned(self.mounting, x[MOUNTING]).inv().apply(model.T).T
+        model = w if samples.kind == 'rates' else self._force(x, q, w)
+        return samples.values - turned(self.mounting, x[MOUNTING]).inv().apply(model.T).T
 
-    def motion(self, x: Reals, one: Samples) -> tuple[Reals, Reals]:
+    def motion(self, x: Reals, samples: Samples) -> tuple[Reals, Reals]:
         """Return attitudes (4, n), and for an IMU rates in the body (3, n), at its times."""
-        late = 0.0 if one.kind == 'attitude' else float(x[LATE])
-        return self._motion(one, *x[:8].tolist(), late=late)
+        late = 0.0 if samples.kind == 'attitude' else float(x[LATE])
+        return self._motion(samples, *x[:8].tolist(), late=late)
 
-    def _motion_of(self, one: Samples, *unknowns: float, late: float) -> tuple[Reals, Reals]:
-        x, t = np.array(unknowns), one.times - late
+    def _motion_of(self, samples: Samples, *unknowns: float, late: float) -> tuple[Reals, Reals]:
+        x, t = np.array(unknowns), samples.times - late
         states = ExactSolution(*self.start(x)).states_at_seconds(t)
         angle, zero = (x[SPIN] - x[L3]) * t, np.zeros(1)
         q = np.stack(attitude.product(states.rows_quaternion, (
             zero, zero, np.sin(0.5 * angle), np.cos(0.5 * angle))))
         w = np.full((3, len(t)), x[SPIN])
-        if one.kind != 'attitude':
+        if samples.kind != 'attitude':
             (w1, w2), sine, cosine = states.transverse_velocity, np.sin(angle), np.cos(angle)
             w[:2] = cosine * w1 + sine * w2, cosine * w2 - sine * w1
         return q, w

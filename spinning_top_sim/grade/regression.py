@@ -18,8 +18,7 @@ WORTHWHILE = 0.8        # share of what remains that another cause leaves at mos
 TINY = 1e-6             # rms of an effect that cannot be seen
 NEAR = 0.25             # distance of a coefficient from the value that it has for a fault
 # Causes count as equally good if they leave at most AS_GOOD times what the best one leaves, or at
-# most AS_GOOD_SHARE of what there was, but no more than the noise.  Of these the one with the
-# fewest columns wins.
+# most AS_GOOD_SHARE of what there was, but no more than the noise.
 AS_GOOD, AS_GOOD_SHARE = 2.0, 0.02
 
 Judge = Callable[[Reals], Fault | None]     # of the coefficients of a cause; None: no fault
@@ -42,7 +41,7 @@ def instead(name: str, evidence: str) -> Judge:
 def pooled(parts: Iterable[tuple[Reals, Mapping[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
     """Return the discrepancy and the effects of all parts."""
     targets, effects = zip(*parts, strict=True)
-    return np.concatenate(targets), {name: np.concatenate([one[name] for one in effects])
+    return np.concatenate(targets), {name: np.concatenate([part[name] for part in effects])
                                      for name in effects[0]}
 
 
@@ -58,13 +57,15 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
     residual, found, others = target, np.empty(0), [*causes]
     enough = max(ENOUGH * beyond(target, floor), ENOUGH_OF_NOISE * floor)
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
-        tried = [fitted(target, [effects[name] for cause in (*chosen, one)
-                                 for name in cause.effects]) for one in others]
+        tried = [fitted(target, [effects[name] for known in (*chosen, cause)
+                                 for name in known.effects]) for cause in others]
         # A cause with a judge that names no fault explains nothing.
-        after = [np.inf if one.judge and one.judge(part[-len(one.effects):]) is None else
-                 beyond(left, floor) for one, (part, left) in zip(others, tried, strict=True)]
+        after = [np.inf if cause.judge and cause.judge(part[-len(cause.effects):]) is None else
+                 beyond(left, floor) for cause, (part, left) in zip(others, tried, strict=True)]
         good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * before, floor or np.inf))
-        _, left, best = min((len(one.effects), left, k) for k, (one, left) in enumerate(
+        # Of equally good causes the one with the fewest columns wins: more columns always fit
+        # better.
+        _, left, best = min((len(cause.effects), left, k) for k, (cause, left) in enumerate(
             zip(others, after, strict=True)) if left <= good)
         if left > WORTHWHILE * before:
             break
@@ -76,9 +77,9 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
 def _named(causes: Sequence[Cause], found: Reals) -> list[Fault]:
     """Return the faults that causes with these coefficients are."""
     # Without causes `split` gives one part.
-    ends = np.cumsum([len(one.effects) for one in causes], dtype=int)[:-1]
-    return [fault for one, part in zip(causes, np.split(found, ends), strict=False)
-            if one.judge and (fault := one.judge(part))]
+    ends = np.cumsum([len(cause.effects) for cause in causes], dtype=int)[:-1]
+    return [fault for cause, part in zip(causes, np.split(found, ends), strict=False)
+            if cause.judge and (fault := cause.judge(part))]
 
 
 def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:

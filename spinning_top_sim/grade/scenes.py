@@ -42,7 +42,8 @@ class Body(Top):
     accelerometer_noise_density: float | None = None
 
     def __post_init__(self) -> None:
-        Top(**{one.name: getattr(self, one.name) for one in fields(Top)})
+        top = Top(**{one.name: getattr(self, one.name) for one in fields(Top)})
+        vars(self).update(vars(top))        # numbers that were given as text
         for name, length in (('lever_arm', 3), ('mounting', 4), ('field', 3)):
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (length,) or not np.all(np.isfinite(value)):

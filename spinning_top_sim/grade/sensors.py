@@ -3,7 +3,9 @@
 Compares readings of an IMU with the motion that the same simulator tells.
 
 A reading is fitted with its physical terms: for the accelerometer gravity, a x r and w x (w x r).
-The error of the motion does not matter.
+The error of the motion does not matter.  What remains is the discrepancy.  Its white noise is
+measured by sixth differences, in which motions vanish: `floor` is its rms in all motions together,
+and `most` what it may be at most.
 """
 
 import math
@@ -47,10 +49,16 @@ KINDS = {
     'rotations': Kind(_DEGREES),
     'velocities': Kind(_G, 5e-2)}
 # Discrepancies and noise are relative to the rms of the reading.
+_SIXTH = math.comb(12, 6)   # sum of the squares of the coefficients of a sixth difference
+# The rms of white noise by n of them has this over sqrt(n) as its relative standard deviation:
+# neighbours are correlated by math.comb(12, 6 + k) / _SIXTH.
+_SPREAD = math.sqrt(0.5 * math.comb(24, 12)) / _SIXTH
+SAME_POWER = 1.05           # of the noise, by which it may be larger besides
 LAGS = range(-3, 31)        # lags that are tried [samples]
 LATE = 0.75                 # lag from which on it is a fault [steps]
 CONSISTENT = 1e-3           # discrepancy below which no lag is looked for
-TURNED = 0.02               # share of the discrepancy that a turn of the axes leaves at most
+# A turn of the axes leaves at most these shares of the discrepancy, and of what causes leave.
+TURNED, TURNED_RATHER = 0.02, 0.1
 UNEXPLAINED = 0.5           # share that causes leave where they explain nothing
 NOISY = 1e-4                # smaller noise is rounding
 NOISE_BAND = 0.05           # share by which noise may differ from what is declared
@@ -58,14 +66,8 @@ FOUR_SIGMA = 4.0            # standard deviations by which its measurement may d
 LEAST_KURTOSIS = 2.4        # of normal noise; it is 3, and 1.8 of uniform noise
 
 def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, float]]:
-    """
-    Return faults and measures of the readings of one of KINDS.
-
-    Throughout, `noise` of each motion and `floor` of all are the rms of white noise in
-    the discrepancy, by differences; `doubt` is the relative error of that, and `most` what the
-    noise may be at most.
-    """
-    runs = [one for motion in motions if (one := readings_of(kind, motion))]
+    """Return faults and measures of the readings of one of KINDS."""
+    runs = [run for motion in motions if (run := readings_of(kind, motion))]
     if not runs:
         return [], {}
     # Velocities are means over a step.
@@ -73,8 +75,8 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     wrong, effects = zip(*(run.at_lag(lag) for run in runs), strict=True)
     target, sizes = np.concatenate(wrong), np.array([run.size for run in runs])
     noise, floor = np.array([*map(_white, wrong)]), _white(*wrong)
-    doubt = FOUR_SIGMA * math.sqrt(1.6 / target.size)       # of the noise, by sixth differences
-    most = floor * math.sqrt(1.05 + 2.0 * doubt)
+    doubt = FOUR_SIGMA * _SPREAD / math.sqrt(target.size)       # the relative error of the noise
+    most = floor * math.sqrt(SAME_POWER + 2.0 * doubt)
     marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(sizes * noise)),
              f'{kind}_discrepancy': beyond(target, most)}
     faults = []
@@ -86,7 +88,7 @@ def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, 
     faults += found
     if explained and KINDS[kind].density and not any(
             fault.name in ('units', 'reading_scale') for fault in faults):
-        noises = [size * one for size, one in zip(
+        noises = [size * rest for size, rest in zip(
             sizes, np.split(residual, np.cumsum([*map(len, wrong)])[:-1]), strict=True)]
         # A cause that is found has taken fast motion away, or has left some.
         level = float(np.mean(np.minimum(sizes * noise, [*map(_white, noises)])))
@@ -101,14 +103,14 @@ def _find_causes(kind: str, motions: Sequence[Motion], target: Reals, effects: M
     before, strange = beyond(target, most), KINDS[kind].strange
     if motions[0].derived and kind != 'rates':
         # Rates of the attitudes may be half a step apart from those of the simulator.
-        turns = (one.trajectory.rotation[:2] for one in motions)
-        strange += 0.25 * max(float((a.inv() * b).magnitude()) ** 2 for a, b in turns)
+        firsts = (motion.trajectory.rotation[:2] for motion in motions)
+        strange += max(float(0.5 * (a.inv() * b).magnitude()) ** 2 for a, b in firsts)
     if before <= strange:
         return [], target, True
     faults, residual = regression.explain(target, effects, _causes(kind, motions[0].body),
                                           math.hypot(floor, 0.5 * strange))
     mounted, left = _mounted(target, effects['total'])
-    if beyond(left, most) < min(TURNED * before, 0.1 * beyond(residual, most)):
+    if beyond(left, most) < min(TURNED * before, TURNED_RATHER * beyond(residual, most)):
         faults, residual = mounted, left
     rest = beyond(residual, most)
     if explained := rest <= max(UNEXPLAINED * before, strange):
@@ -176,7 +178,7 @@ def _lag(runs: Sequence[Readings]) -> tuple[int, float]:
 
 def _white(*runs: Reals) -> float:
     """Return the standard deviation of white noise, by differences in which motions vanish."""
-    return rms(np.concatenate([np.diff(rows, 6, axis=0) for rows in runs])) / math.sqrt(924.0)
+    return rms(np.concatenate([np.diff(rows, 6, axis=0) for rows in runs])) / math.sqrt(_SIXTH)
 
 
 def _causes(kind: str, body: Body) -> list[Cause]:

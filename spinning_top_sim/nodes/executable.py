@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import importlib
 import os
 import re
 import signal
@@ -12,7 +14,8 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
 from itertools import pairwise
-from os import _exit
+from os import _exit  # a test takes `os.` and this for a private name of rclpy
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
 from spinning_top_sim.installation import needed, remedy
@@ -141,12 +144,12 @@ def _cannot_start(name: str, error: Exception) -> int:
                              f'{remedy("ros")}{without}')
     expected = (isinstance(error, ValueError | RuntimeError | OSError | ImportError)
                 or kind.startswith('Invalid'))
-    print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{one_line(text_of(error))}',
+    print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{short_reason(text_of(error))}',
           file=sys.stderr)
     return 2
 
 
-def one_line(text: object) -> str:
+def short_reason(text: object) -> str:
     """Return a text as one line, without positions in the code of rcl, and not too long."""
     line = cli.one_line(re.sub(r',\s*at \S+:\d+', '', str(text)))
     return line if len(line) <= 600 else f'{line[:300]} ... {line[-300:]}'
@@ -166,6 +169,21 @@ def _executor(node: RunnableNode) -> Executor:
     gc.freeze()             # a full collection then skips all objects of the start
     gc.collect()            # finds nothing, so that the next full collection comes soon
     return executor
+
+
+def message_class(type_name: str) -> type:
+    """Return a message class of an installed ROS package.  Raises LookupError for any other."""
+    # REP-144 and the ROS 2 interface names.
+    match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
+    if match:
+        package, name = match.groups()
+        prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+        # Other Python packages must not be imported because a log names them.
+        if any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
+               for prefix in prefixes):
+            with contextlib.suppress(ImportError, AttributeError):
+                return getattr(importlib.import_module(f'{package}.msg'), name)
+    raise LookupError(f'{type_name} is not installed')
 
 
 def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,

@@ -14,6 +14,10 @@ from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 
+# Keys in /diagnostics that the page of `view` reads, with those of `recording_session`.
+STATE, TIME, EPOCH = 'state', 'simulated time [s]', 'stamp of t = 0 [ns]'
+SPEED, DRIFT, ERROR = 'real-time factor', 'energy drift', 'orientation error [rad]'
+
 
 class NodeStatus:
     """Describes a running simulation; the caller holds the simulation's lock."""
@@ -43,17 +47,17 @@ class NodeStatus:
         _, level, message = max(filter(itemgetter(0), states), key=itemgetter(1))
         now_ns = loop.now_ns
         numbers = {
-            'state': loop.state.name.lower(),
-            'simulated time [s]': f'{now_ns / NANOSECONDS:.6f}',
-            'stamp of t = 0 [ns]': simulation.epoch_ns,
-            'real-time factor': f'{self._measure_speed(now_ns):.3f}',
+            STATE: loop.state.name.lower(),
+            TIME: f'{now_ns / NANOSECONDS:.6f}',
+            EPOCH: simulation.epoch_ns,
+            SPEED: f'{self._measure_speed(now_ns):.3f}',
             'late ticks': loop.late_ticks,
             'skipped ticks': loop.skipped_ticks,
             'published messages': self._total('sent'),
             'skipped samples': self._total('skipped'),
             'clock slip [s]': f'{loop.slipped_ns / NANOSECONDS:.3f}',
-            'energy drift': f'{simulation.energy_drift:.3g}',
-            'orientation error [rad]': f'{error:.3g}',
+            DRIFT: f'{simulation.energy_drift:.3g}',
+            ERROR: f'{error:.3g}',
             'commands': loop.commands,
             'rejected commands': loop.rejected_commands,
             'integration steps': simulation.steps,

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The publishers of the streams of a simulation, and those with a limited rate, for displays."""
 
-import importlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
@@ -12,6 +11,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from spinning_top_sim.nodes.executable import message_class
 from spinning_top_sim.nodes.recording_session import Topic
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.live import Output
@@ -63,10 +63,10 @@ class StreamPublishers:
         self.by_topic: dict[str, Publisher] = {}
         self._throttles: dict[str, Throttle] = {}       # by the topic of the stream
 
-    def create(self, message_class: type, topic: str) -> Publisher:
+    def create(self, kind: type, topic: str) -> Publisher:
         """Return a new publisher, whose QoS parameters can override."""
         return self._node.create_publisher(
-            message_class, topic, QoSProfile(depth=10),
+            kind, topic, QoSProfile(depth=10),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     @staticmethod
@@ -84,11 +84,10 @@ class StreamPublishers:
             stream = output.stream
             topic, enabled = stream.topic, parameters.is_enabled(stream.parameter, values)
             if enabled and topic not in self.by_topic:
-                package, _, name = stream.type_name.split('/')
-                message_class = getattr(importlib.import_module(f'{package}.msg'), name)
-                self.by_topic[topic] = self.create(message_class, topic)
+                kind = message_class(stream.type_name)
+                self.by_topic[topic] = self.create(kind, topic)
                 if topic in THROTTLED:
-                    self._throttles[topic] = Throttle(self.create(message_class, THROTTLED[topic]))
+                    self._throttles[topic] = Throttle(self.create(kind, THROTTLED[topic]))
             elif topic in self.by_topic and not enabled:
                 output.publish = None
                 self._node.destroy_publisher(self.by_topic.pop(topic))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from spinning_top_sim.recording.recorder import McapRecorder
 
 MOST_PENDING = 20_000       # stamps whose messages wait while a file is being opened
+RECORDER, RECORDED_FILE = 'recorder', 'recorded file'        # keys in /diagnostics
 
 Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
 
@@ -127,11 +128,13 @@ class RecordingSession:
             self._write([(index, stamp_ns, data)])
 
     def has_room(self) -> bool:
+        """Return whether the recorder, or the queue before it opens, takes more messages."""
         if self._recorder is not None:
             return self._recorder.room
         return len(self._pending) < MOST_PENDING
 
     def wait_for_room(self) -> None:
+        """Wait until the recorder takes more messages, a tenth of a second at most."""
         if self._recorder is not None:
             self._recorder.wait_for_room(0.1)
 
@@ -147,11 +150,12 @@ class RecordingSession:
         return self._recorder.path if self._recorder else None
 
     def numbers(self) -> dict[str, object]:
+        """Return what /diagnostics say of the recorder, by their keys."""
         recorder = self._recorder
         if recorder is None:
-            return {'recorder': 'failed' if self.error else 'off'}
+            return {RECORDER: 'failed' if self.error else 'off'}
         counters = recorder.counters
-        return {'recorder': recorder.state, 'recorded file': recorder.path,
+        return {RECORDER: recorder.state, RECORDED_FILE: recorder.path,
                 'recorded messages': counters.messages, 'recorded bytes': counters.bytes,
                 'queued messages': counters.queued,
                 'possible loss [s]': f'{recorder.possible_loss:.3f}'}

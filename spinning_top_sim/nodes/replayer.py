@@ -3,10 +3,7 @@
 
 import argparse
 import contextlib
-import importlib
 import itertools
-import os
-import re
 import sys
 import threading
 import time
@@ -28,7 +25,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import playback
-from spinning_top_sim.nodes.executable import one_line, wait_for_all_acked
+from spinning_top_sim.nodes.executable import message_class, short_reason, wait_for_all_acked
 from spinning_top_sim.nodes.terminal import Terminal
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
@@ -84,7 +81,7 @@ class Replayer(Node):
                     made[key] = made.get(key) or self._publisher(channel)
                     outputs[channel.channel_id] = made[key]
             except Exception as error:      # a log may ask for anything; the others are played
-                self.get_logger().warning(one_line(f'{channel.name} is not played: {error}'))
+                self.get_logger().warning(short_reason(f'{channel.name} is not played: {error}'))
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
@@ -203,21 +200,6 @@ def open_log(path: Path, partial: bool) -> LogReader:
     if damaged:
         print(f'spinning-top replay: {path} is damaged, playing what is whole', file=sys.stderr)
     return log
-
-
-def message_class(type_name: str) -> type:
-    """Return a message class of an installed ROS package.  Raises LookupError for any other."""
-    # REP-144 and the ROS 2 interface names.
-    match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
-    if match:
-        package, name = match.groups()
-        prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
-        # Other Python packages must not be imported because a log names them.
-        if any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
-               for prefix in prefixes):
-            with contextlib.suppress(ImportError, AttributeError):
-                return getattr(importlib.import_module(f'{package}.msg'), name)
-    raise LookupError(f'{type_name} is not installed')
 
 
 def qos_profile(recorded: Mapping[str, Any]) -> QoSProfile:

@@ -22,11 +22,14 @@ exit code: 0 ended, also by a signal; 2 cannot start; 130 interrupted before
 INTERFACE = """\
 ~ is /spinning_top.  Subscribes to:
   ~/commands (std_msgs/Float64MultiArray: [L3, Lz] in kg m^2/s)
+  ~/cmd_vel (geometry_msgs/Twist: velocity of the pivot in the world, m/s)
 Services:
   ~/set_pause, ~/record (std_srvs/SetBool); ~/step, ~/reset (std_srvs/Trigger)
   those of simulation_interfaces, where that package is installed
 Publishes, where enabled:
-  /diagnostics (diagnostic_msgs/DiagnosticArray), always"""
+  /diagnostics (diagnostic_msgs/DiagnosticArray), always
+  ground_truth/odom_throttle (nav_msgs/Odometry), with ground_truth/odom: at
+      most 30 messages a second of it"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

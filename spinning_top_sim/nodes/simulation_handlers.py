@@ -57,7 +57,7 @@ def offer(node: Simulator) -> None:
         if hasattr(services, name):
             node.create_service(getattr(services, name), service_name(name),
                                 partial(handlers.serve, name))
-    node.has_goals = True
+    node.offers_actions = True
     # The node keeps the action server.
     ActionServer(node, actions.SimulateSteps, 'simulate_steps', handlers.simulate_steps,
                  cancel_callback=lambda _: CancelResponse.ACCEPT)
@@ -145,9 +145,6 @@ class SimulationHandlers:
     def _play(self) -> None:
         self._node.check_started()
         with self._lock:
-            if self._loop.failure:
-                raise RuntimeError(f'the motion stands still: {self._loop.failure}; '
-                                   'STATE_STOPPED resets it')
             self._loop.resume()
 
     def _pause(self) -> None:
@@ -315,7 +312,7 @@ class SimulationHandlers:
         response.info.category.category = self._category
         top = self._simulation.top
         response.info.description = (
-            f'heavy symmetric top on a fixed pivot: mass {top.mass:g} kg, centre of mass '
+            f'heavy symmetric top on a pivot: mass {top.mass:g} kg, centre of mass '
             f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
             f'{top.lambda3:g} kg m^2')
         response.info.tags = list(entity.TAGS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `spinning_top`: connects a `Simulation` to topics, services and parameters."""
+"""The node `spinning_top`: connects a `LiveSimulation` to topics, services and parameters."""
 
 import functools
 import sys
@@ -49,7 +49,7 @@ class Simulator(Node):
     def __init__(self, argv: Sequence[str] = ()) -> None:
         super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()        # completes after `duration`
-        self.has_goals = False                  # those of actions end with the motion
+        self.offers_actions = False             # their goals end with the motion
         self._terminal = Terminal()
         values = ros_parameters.declare(self, argv)
         simulation = self.simulation = LiveSimulation(values)
@@ -64,8 +64,7 @@ class Simulator(Node):
         self._outputs = StreamPublishers(self)
         self._session = RecordingSession(simulation, self.lock, self._outputs.topics_to_record)
         self.loop = TickLoop(
-            simulation, values, self._session,
-            tell=lambda text, bad: self._log.error(text) if bad else self._log.warning(text),
+            simulation, values, self._session, warn=self._warn, error=self._tell_error,
             update_subscribers=lambda: self._outputs.update_subscribers(simulation.outputs),
             source=self._date.now_ns if self._date.follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self.loop.grid, self.fail)
@@ -93,21 +92,10 @@ class Simulator(Node):
         self._begin()
 
     def _begin(self) -> None:
-        if self._date.now_ns() == 0:
-            return
-        if self.values['max_error'] > 0.0:
-            _ = self.simulation.segment.closed_form  # its modules take a while to import
-        now_ns = self._date.first_ns()
-        try:
-            self.simulation.epoch_ns = next_epoch(now_ns)
-        except ValueError as error:
-            if not self._date.follows:
-                raise
-            self._log.warning(f'/clock: {error}', once=True)
+        """Let time run if the clock that is followed has begun; a timer calls it until then."""
+        if self._date.now_ns() == 0 or not self._set_epoch():
             return
         self.destroy_timer(self._begin_timer)
-        if not self._date.follows:
-            time.sleep((self.simulation.epoch_ns - now_ns) / NANOSECONDS)
         self.loop.start()
         if self.values['record.enabled']:
             self._session.start(self.start_values)
@@ -118,6 +106,22 @@ class Simulator(Node):
             except RecordingError as error:     # no client waits for an answer
                 self._session.error = str(error)
                 self._log.error(f'not recording: {error}')
+
+    def _set_epoch(self) -> bool:
+        """Set the stamp of t = 0, and wait for its date; return False if no stamp can have it."""
+        if self.values['max_error'] > 0.0:
+            _ = self.simulation.segment.closed_form  # its modules take a while to import
+        now_ns = self._date.first_ns()
+        try:
+            self.simulation.epoch_ns = next_epoch(now_ns)
+        except ValueError as error:
+            if not self._date.follows:
+                raise
+            self._log.warning(f'/clock: {error}', once=True)
+            return False
+        if not self._date.follows:
+            time.sleep((self.simulation.epoch_ns - now_ns) / NANOSECONDS)
+        return True
 
     def stop(self) -> None:
         """End the motion and close the recording, whether the context is valid or not."""
@@ -151,7 +155,7 @@ class Simulator(Node):
                 self._outputs.flush(at_once=self.loop.state is LoopState.ENDED)
         if self.loop.state is LoopState.ENDED and not self.finished.done():
             wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
-            if self.has_goals:
+            if self.offers_actions:
                 time.sleep(LAST_ANSWERS_S)
             self.finished.set_result(None)
         return wants_idle
@@ -250,7 +254,11 @@ class Simulator(Node):
         return response
 
     def outcome(self, act: Callable[[], str | None]) -> tuple[Exception | None, str]:
-        """Return the error of an action, and its text; unexpected errors stop the motion."""
+        """
+        Return the error of an action, and its text.
+
+        An error other than ValueError, RuntimeError and OSError is unexpected: the motion stops.
+        """
         try:
             return None, act() or ''
         except (ValueError, RuntimeError, OSError) as error:
@@ -260,6 +268,7 @@ class Simulator(Node):
             return error, f'{type(error).__name__}: {error}'
 
     def check_started(self) -> None:
+        """Raise RuntimeError if no ticks come: before the first /clock, or behind an error."""
         if not self._pacer.is_alive():
             raise RuntimeError(self.loop.failure or 'waiting for /clock (use_sim_time is set)')
 
@@ -269,7 +278,7 @@ class Simulator(Node):
                 self.loop.pause()
             else:
                 self.loop.resume()
-            return f'{"paused" if self.loop.paused else "running"} {self.loop.time_text}'
+            return f'{self.loop.state.value} {self.loop.time_text}'
 
     def _step(self, _: Trigger.Request) -> str:
         with self.lock:
@@ -286,8 +295,8 @@ class Simulator(Node):
         """
         Reset the motion, and pause it or not; None keeps the present state.
 
-        Raises RuntimeError before the motion begins, and ValueError if no motion begins with the
-        present parameters; nothing changes then.
+        Raises RuntimeError before the motion begins and after `duration`, and ValueError if no
+        motion begins with the present parameters; nothing changes then.
         """
         with self.lock:
             self.check_started()
@@ -319,6 +328,12 @@ class Simulator(Node):
         """The logger, on a line below the status line."""
         self._terminal.end()
         return self.get_logger()
+
+    def _warn(self, text: str) -> None:
+        self._log.warning(text)
+
+    def _tell_error(self, text: str) -> None:
+        self._log.error(text)
 
     def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
         """Create a timer that follows no /clock; unexpected errors stop the motion."""

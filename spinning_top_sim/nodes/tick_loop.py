@@ -50,8 +50,8 @@ class LoopState(Enum):
 
         WAITING --start--> RUNNING --pause--> PAUSED --resume--> RUNNING
         RUNNING, or PAUSED by a step --duration--> ENDED, which is final
-        any other --fail--> FAILED
-        any other --reset--> RUNNING
+        any but ENDED --fail--> FAILED
+        any but ENDED --reset--> RUNNING
 
     `start` and `reset` lead to PAUSED if a pause is asked for.
     """
@@ -70,15 +70,15 @@ class TickLoop:
     What is sent does not depend on when ticks come: each sends all samples that are due.
 
     update_subscribers : sets `publish` of each output that has subscribers
-    tell : takes a text for the log, and whether the motion has failed
+    warn, error : take a text for the log; `error` why the motion has failed
     source : returns the time that simulated time follows [ns]
     steady : returns steady time [ns]; decides which ticks are late and how long one may work
     grid : steady time of a tick, just after samples are due, and the time between ticks [s]
     """
 
     def __init__(self, simulation: LiveSimulation, values: Mapping[str, Any],
-                 recording: RecordingSession, *, tell: Callable[[str, bool], object],
-                 update_subscribers: Callable[[], object],
+                 recording: RecordingSession, *, warn: Callable[[str], object],
+                 error: Callable[[str], object], update_subscribers: Callable[[], object],
                  source: Callable[[], int] = time.monotonic_ns,
                  steady: Callable[[], int] = time.monotonic_ns) -> None:
         self.late_ticks = self.skipped_ticks = self.slipped_ns = 0      # since the start
@@ -88,11 +88,10 @@ class TickLoop:
         self.failure: str | None = None         # why the motion stands still until `reset`
         self.interruptions = 0                  # changes of the state, and resets
         self._simulation, self._recording = simulation, recording
-        self._update_subscribers, self._tell = update_subscribers, tell
+        self._update_subscribers, self._warn, self._error = update_subscribers, warn, error
         self._steady, self._is_steady = steady, source is steady
         self._clock = SimulatedClock(source, values['time_scale'])
         self._subscribers_due_ns = 0            # on the steady clock
-        self._stop_at_ns = 0                    # on the steady clock: when a tick gives way
         # Asked for the pivot, and not yet applied
         self._velocity: tuple[float, float, float] | None = None
         self._drive_from_ns = 0                 # simulated time of the next velocity
@@ -169,14 +168,15 @@ class TickLoop:
             return target_ns
         if due_ns < simulation.now_ns:          # as where a log is played in a loop
             back_s = (simulation.now_ns - due_ns) / self._time_scale / NANOSECONDS
-            self._tell(f'/clock stepped back by {back_s:g} s: the motion and its stamps go on '
-                       'from where they are', False)
+            self._warn(f'/clock stepped back by {back_s:g} s: the motion and its stamps go on '
+                       'from where they are')
             self._anchor_clock()
             return simulation.now_ns
-        self._stop_at_ns = self._steady() + TICK_BUDGET_NS
+        stop_at_ns, has_room = self._steady() + TICK_BUDGET_NS, self._recording.has_room
         try:
-            arrived = self._recording.has_room() and simulation.advance(
-                target_ns, target_ns - self._latest_ns, self._has_to_give_way)
+            arrived = has_room() and simulation.advance(
+                target_ns, target_ns - self._latest_ns,
+                lambda: self._steady() > stop_at_ns or not has_room())
         except IntegrationError as error:
             self.fail(str(error))
             return target_ns
@@ -186,9 +186,6 @@ class TickLoop:
             self._anchor_clock()
         return target_ns
 
-    def _has_to_give_way(self) -> bool:
-        return self._steady() > self._stop_at_ns or not self._recording.has_room()
-
     def pause(self) -> None:
         """Send what is due, then hold the motion; does nothing when paused already."""
         self._advance()
@@ -197,7 +194,13 @@ class TickLoop:
             self._enter(LoopState.PAUSED)
 
     def resume(self) -> None:
-        """Let simulated time run on from where it was held, without catching up."""
+        """
+        Let simulated time run on from where it was held, without catching up.
+
+        Raises RuntimeError if the motion has failed; a pause remains then.
+        """
+        if self.failure:
+            raise RuntimeError(f'the motion stands still: {self.failure}')
         self.paused = False
         if self.state is LoopState.PAUSED:
             self._enter(LoopState.RUNNING)
@@ -261,7 +264,7 @@ class TickLoop:
             stop_ns = self._simulation.drive(velocity)
         except ValueError as error:
             self.rejected_commands += 1
-            self._tell(f'~/cmd_vel: refused: {error}', False)
+            self._warn(f'~/cmd_vel: refused: {error}')
             return
         if stop_ns is not None:
             x, y, z = velocity
@@ -280,8 +283,11 @@ class TickLoop:
         Go back to the start state of these parameters, and out of a failure.
 
         A pause remains, or is as `paused` says.  t = 0 has this date or, as stamps never go back,
-        a later one.  Raises ValueError if no motion begins there; the present one goes on then.
+        a later one.  Raises RuntimeError in ENDED, and ValueError if no motion begins there; the
+        present one goes on then.
         """
+        if self.state is LoopState.ENDED:
+            raise RuntimeError(f'{self.state.value}: nothing follows')
         simulation, sent_ns = self._simulation, self._simulation.now_ns
         epoch_ns = next_epoch(max(simulation.epoch_ns + sent_ns + 1, date_ns))
         simulation.restart(values)
@@ -299,7 +305,7 @@ class TickLoop:
         """Hold the motion until `reset`."""
         self.failure = reason
         self._enter(LoopState.FAILED)
-        self._tell(f'{reason}; the motion stands still until ~/reset', True)
+        self._error(f'{reason}; the motion stands still until ~/reset')
 
     def set_pace(self, values: Mapping[str, Any]) -> None:
         """Take over tick_rate, time_scale and duration."""

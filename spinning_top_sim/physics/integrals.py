@@ -27,7 +27,7 @@ LEAST_ANGLE = 0.05
 # A panel is at most so many times 1/`fastest_rate` long; with n nodes for an angle of a = rate *
 # length, where (a/2)^n is less than this, the error of the rule, some (a/2)^2n, is a rounding.
 LONGEST_PANEL, HALF_THE_DIGITS, MOST_PANELS = 0.5, 1e-8, 100
-Rows = NDArray[np.float64]
+Matrix = NDArray[np.float64]
 
 
 class Increments(NamedTuple):
@@ -36,15 +36,16 @@ class Increments(NamedTuple):
 
     rotation : (4, n) q(body at a <- body at b) as x, y, z, w
     velocity : (3, n) integral of the specific force of a point of the body, in the body frame at a
-        [m/s]: R(a)^T (v(b) - v(a) + g (b - a) z) with the velocity v of the point in the world
+        [m/s]: R(a)^T (v(b) - v(a) + g (b - a) z), in the axes of the world with the velocity v of
+        the point relative to the pivot and the effective gravity g along its vertical z
     angles : (3, n) integral of the angular velocity in the body frame of each moment [rad]
     forces : (3, n) integral of the specific force in the body frame of each moment [m/s]
     """
 
-    rotation: Rows
-    velocity: Rows
-    angles: Rows
-    forces: Rows
+    rotation: Matrix
+    velocity: Matrix
+    angles: Matrix
+    forces: Matrix
 
     def then(self, later: 'Increments') -> 'Increments':
         """Return the increments over this interval and the one that follows it."""
@@ -113,7 +114,7 @@ def _panels(states: Callable[[NDArray[np.int64]], States], times_ns: NDArray[np.
     """
     now = states(times_ns.ravel())
 
-    def rows_of(vector: Sequence[Column | float]) -> Rows:
+    def rows_of(vector: Sequence[Column | float]) -> Matrix:
         """Return components of the states, (components, nodes and ends, n)."""
         rows = np.empty((len(vector), times_ns.size))
         for row, component in zip(rows, vector, strict=True):
@@ -148,7 +149,7 @@ def joined(parts: Sequence[Increments]) -> Increments:
         np.concatenate(rows, axis=1) for rows in zip(*parts, strict=True)))
 
 
-def _differences(quaternions: Rows, velocities: Rows, fall: float) -> Rows:
+def _differences(quaternions: Matrix, velocities: Matrix, fall: float) -> Matrix:
     """
     Return rotation and velocity (7, n) of `Increments` from the states at both ends.
 

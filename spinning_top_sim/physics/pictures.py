@@ -82,7 +82,11 @@ def _outline(motion: Any) -> tuple[Reals, list[float]]:
 
 
 def plot(motion: Any) -> Figure:
-    """Return a figure of `States`; see `States.plot`."""
+    """
+    Return a figure of `States`, or of what has its columns; see `States.plot`.
+
+    motion : has t, top, start, rows_axis, theta_folded, phi_dot and energy
+    """
     (path, bounds), energy = _outline(motion), motion.energy
     with rc_context(STYLE):
         figure = Figure(figsize=(10.0, 7.0), layout='constrained')
@@ -113,7 +117,7 @@ def plot(motion: Any) -> Figure:
 
 
 def animate(motion: Any, fps: float, speed: float) -> FuncAnimation:
-    """Return an animation of `States`; see `States.animate`."""
+    """Return an animation, for which `motion` has t, top, start, rows_axis and quaternion."""
     path, bounds = _outline(motion)
     for name, value in (('fps', fps), ('speed', speed)):
         if not 0.0 < value < np.inf:

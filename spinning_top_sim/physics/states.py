@@ -40,8 +40,8 @@ class States:
     States of a top at n times.
 
     Who asks for the attitude does not pay for Euler angles.  A value depends on its own time only,
-    never on the other times.  A solver has a subclass with the columns that raise
-    NotImplementedError here; all others follow.
+    never on the other times.  A solver has a subclass with its name, `method`, and the columns
+    that raise NotImplementedError here; all others follow.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class States:
         and of the angular velocity, which cost no copy.
     """
 
-    method = 'rk45'             # name of the method that computes them
+    method: str
 
     def __init__(self, top: Top, start: State, n: int, *, lz: Column | None = None,
                  gravity: Column | None = None, torque: Column | None = None) -> None:
@@ -94,7 +94,7 @@ class States:
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
-        """Return phi, theta, psi [rad]."""
+        """Phi, theta and psi [rad]."""
         raise NotImplementedError
 
     @cached_property
@@ -112,7 +112,7 @@ class States:
 
     @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
-        """Return the squares of cosine and sine of theta/2."""
+        """Squares of cosine and sine of theta/2."""
         x, y, z, w = self.rows_quaternion
         return w * w + z * z, x * x + y * y
 
@@ -138,8 +138,10 @@ class States:
 
     @cached_property
     def phi_dot(self) -> Column:
-        """Eq. (31) of "Analysis of Symmetric Spinning Top"; for one Lz, where the pivot rests."""
-        lz = self.start.lz
+        """Eq. (31) of "Analysis of Symmetric Spinning Top"; NotImplementedError for several Lz."""
+        lz = self._lz
+        if isinstance(lz, np.ndarray):
+            raise NotImplementedError('phi_dot about several verticals: WorldStates has it')
         return attitude.precession_rate(self.top, self._l3, lz, *self.half_angle_squares)
 
     @cached_property
@@ -227,7 +229,7 @@ class States:
             Components in the body frame [m/s^2].
         """
         gravity, (z1, z2, z3) = self._gravity, self.rows_vertical
-        if not any(point):          # the pivot is at rest: no rate is needed
+        if not any(point):          # the point is the pivot: no rate is needed
             return gravity * z1, gravity * z2, gravity * z3
         r1, r2, r3 = point
         w1, w2, w3 = self.rows_angular_velocity
@@ -249,13 +251,20 @@ class States:
         """
         Draw the motion: the path of its axis, tilt, precession rate and energy drift.
 
-        The path is drawn on the sphere and from above, with the bounds of theta, which are dotted
-        lines beside the tilt.  The drift is relative to the first sample.
+        The path is drawn on the sphere and from above.  The bounds of theta are circles there, and
+        dotted lines in the plot of the tilt.  The drift is relative to the first sample.
 
         Returns
         -------
         matplotlib.figure.Figure
             A notebook with `%matplotlib inline` shows it; `savefig` writes it to a file.
+
+        Raises
+        ------
+        ValueError
+            For fewer than two times, or times that do not ascend.
+        ImportError
+            Without matplotlib.
         """
         with needed('a picture', 'plot'):
             from spinning_top_sim.physics import pictures  # noqa: PLC0415 - matplotlib is slow
@@ -276,6 +285,13 @@ class States:
         -------
         matplotlib.animation.FuncAnimation
             `to_jshtml` makes it a part of a notebook, `save` a file.
+
+        Raises
+        ------
+        ValueError
+            For fewer than two times, times that do not ascend, or numbers that are not > 0.
+        ImportError
+            Without matplotlib.
         """
         with needed('a picture', 'plot'):
             from spinning_top_sim.physics import pictures  # noqa: PLC0415 - matplotlib is slow

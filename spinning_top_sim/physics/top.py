@@ -5,8 +5,6 @@ The heavy symmetric (Lagrange) top: its constants, its states, and what it looks
 A rigid symmetric body turns about a fixed point on its axis, without friction.  Euler angles are
 ZYZ (Taylor, *Classical Mechanics*, sect. 10.9): body to space is Rz(phi) Ry(theta) Rz(psi), phi is
 the precession, theta the tilt from the upward vertical, psi the spin about the symmetry axis.
-
-Constants and states raise ValueError naming the field, its value and what is allowed.
 """
 
 import math
@@ -35,6 +33,11 @@ class Top:
         Signed distance from pivot to centre of mass along +e3 [m].
     gravity : float
         Acceleration of gravity [m/s^2], downwards positive.
+
+    Raises
+    ------
+    ValueError
+        Naming the field, its value and what is allowed; also if the gravity torque overflows.
     """
 
     lambda1: float
@@ -67,7 +70,7 @@ class Top:
 
     @property
     def objection(self) -> str:
-        """Why no rigid body has this inertia, '' if one has."""
+        """Why no rigid body has this inertia, in names of parameters; '' if one has."""
         return '' if self.is_realizable else (
             f'top.lambda3 = {self.lambda3!r} kg m^2: no rigid body has more than '
             f'2 (lambda1 - M R^2) = {2.0 * self.lambda1_at_com:g}; simulated all the same')
@@ -96,6 +99,11 @@ class State:
     l3, lz : float
         Angular momentum along the body axis and along the vertical [kg m^2/s].  Where the axis
         is vertical, lz must be l3 at the top and -l3 at the bottom.
+
+    Raises
+    ------
+    ValueError
+        Naming the field, its value and what is allowed.
     """
 
     theta: float

@@ -18,9 +18,9 @@ class WorldStates(States):
     """
     States about another vertical, seen from the world.
 
-    Attitude and Euler angles are those in the world: theta in [0, pi], phi and psi within two
-    turns.  Energy and Lz are those in the frame of the pivot about the vertical there, constants
-    of the motion.
+    Attitude and Euler angles are those in the world: theta in [0, pi], phi and psi in
+    [-2 pi, 2 pi].  Energy, Lz and `start` are those in the frame of the pivot about the vertical
+    there; energy and Lz are constants of the motion.
 
     Parameters
     ----------

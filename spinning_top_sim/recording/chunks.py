@@ -25,7 +25,7 @@ RowBlock = tuple[int, NDArray[np.integer], NDArray[np.uint8]]
 
 # Message index entries of a chunk by channel id: log time, offset in the uncompressed chunk, log
 # time, offset, .. (uint64), as in the file: no platform of ROS 2 Jazzy is big-endian.
-Entries = Mapping[int, 'array[int]']
+IndexEntries = Mapping[int, 'array[int]']
 
 # Only what grows with every message is packed here (MCAP specification, "Message" and "Message
 # Index"); mcap's record classes do the rest.
@@ -63,6 +63,7 @@ class ChunkBuilder:
         return self._memory[:self.size]
 
     def record(self) -> Chunk:
+        """Return the chunk record of all messages, compressed."""
         start_ns, end_ns = time_span(self.entries)
         return Chunk(
             compression='' if self._compression == 'none' else self._compression,
@@ -72,6 +73,7 @@ class ChunkBuilder:
 
     def add(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
             data: bytes | bytearray | memoryview) -> None:
+        """Add a message; its sequence number is taken modulo 2^32, its times are in [0, 2^64)."""
         offset = self.size
         start = offset + MESSAGE.size
         end = start + len(data)
@@ -131,7 +133,7 @@ def record_bytes(record: McapRecord) -> bytes:
     return builder.end()
 
 
-def message_indexes(entries: Entries) -> dict[int, bytes]:
+def message_indexes(entries: IndexEntries) -> dict[int, bytes]:
     """Return the message index records behind a chunk by channel id, in ascending order."""
     return {
         channel_id: INDEX_HEAD.pack(
@@ -140,7 +142,7 @@ def message_indexes(entries: Entries) -> dict[int, bytes]:
         for channel_id, numbers in sorted(entries.items())}
 
 
-def time_span(entries: Entries) -> tuple[int, int]:
+def time_span(entries: IndexEntries) -> tuple[int, int]:
     """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
     times = [np.frombuffer(numbers, np.uint64)[::2] for numbers in entries.values()]
     return (min((int(column.min()) for column in times), default=0),

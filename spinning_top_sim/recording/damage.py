@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Loss:
-    """A range of a file that cannot be decoded, or messages in it that cannot be understood."""
+    """A range of a file that cannot be decoded, or, of 0 bytes, what cannot be understood."""
 
     offset: int
     bytes: int
@@ -15,15 +15,16 @@ class Loss:
     is_chunk: bool = False
 
     def __str__(self) -> str:
-        return (f'lost: {self.what} at byte {self.offset} ({count(self.bytes, "byte")}): '
-                f'{self.reason}')
+        place = f' at byte {self.offset} ({count(self.bytes, "byte")})' if self.bytes else ''
+        return f'lost: {self.what}{place}: {self.reason}'
 
 
 @dataclass(frozen=True)
 class Damage:
     """What a scan of a whole file found."""
 
-    truncated: bool                 # the file does not end as an MCAP file ends
+    # The file does not end as an MCAP file ends; `torn` in the JSON of `inspect`.
+    truncated: bool
     losses: tuple[Loss, ...]        # in the order of the file
     defects: tuple[str, ...]        # what is wrong but costs nothing
     # Exact if `missing_exactly`, by the statistics of the file; else a lower bound, by the message

@@ -41,6 +41,7 @@ class LogFile:
             self.size = os.fstat(self._file.fileno()).st_size
 
     def close(self) -> None:
+        """Close it."""
         self._file.close()
 
     def read(self, offset: int, length: int) -> bytes:
@@ -53,6 +54,7 @@ class LogFile:
             return self._file.read(length)
 
     def crc(self, end: int) -> int:
+        """Return the CRC-32 of the bytes before `end`."""
         crc = 0
         for offset in range(0, end, _BLOCK):
             crc = zlib.crc32(self.read(offset, min(_BLOCK, end - offset)), crc)
@@ -68,10 +70,12 @@ class LogFile:
         raise DamagedError('no record ends in the file that begins there')
 
     def raw(self, offset: int, end: int) -> bytes:
+        """Return the bytes of a record; DamagedError if it is larger than `max_bytes`."""
         check_size(end - offset - HEAD.size, self.max_bytes)
         return self.read(offset, end - offset)
 
     def record(self, offset: int, limit: int) -> records.McapRecord:
+        """Return the record there; DamagedError if it is none, or as of `head` and `raw`."""
         _, end = self.head(offset, limit)
         return parse(self.raw(offset, end))
 

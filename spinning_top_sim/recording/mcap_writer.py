@@ -36,9 +36,10 @@ class McapWriter:
     """
     A new MCAP file, which must not exist (FileExistsError), used by one thread at a time.
 
-    Messages come one by one into a chunk in memory (`append`, `append_all`, and `add_message` with
-    its numbers), or as arrays that make a chunk (`append_rows`).  `flush` writes the chunk in
-    memory, `write_chunk` another one, `write` any other record.
+    Messages come one by one into a chunk in memory (`append`, `append_all`), or as arrays that
+    make a chunk (`append_rows`).  A topic is an index here, its channel has the id index + 1, and
+    its messages are numbered; `copy_message` takes one with channel and number of another file.
+    `flush` writes the chunk in memory, `write_chunk` another one, `write` any other record.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
@@ -117,8 +118,8 @@ class McapWriter:
             self.message_counts[record.id] = self._next_sequence[record.id] = 0
 
     def append(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
-        """Add the next message of channel `topic_index + 1`, as `add_message` does."""
-        self.add_message(*self._numbered(topic_index, 1), log_time_ns, log_time_ns, data)
+        """Add the next message of a topic to the chunk in memory; write it when it is full."""
+        self.copy_message(*self._numbered(topic_index, 1), log_time_ns, log_time_ns, data)
 
     def _numbered(self, topic_index: int, count: int) -> tuple[int, int]:
         """Return a topic's channel, and the sequence number of the first of `count` messages."""
@@ -144,9 +145,9 @@ class McapWriter:
                 *self._numbered(topic_index, len(data)), np.array(times_ns, np.uint64),
                 np.frombuffer(b''.join(data), np.uint8).reshape(len(data), len(data[0])))
 
-    def add_message(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
-                    data: bytes | bytearray | memoryview) -> None:
-        """Add a message to the chunk in memory; write the chunk when it is full."""
+    def copy_message(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
+                     data: bytes | bytearray | memoryview) -> None:
+        """Add a message to the chunk in memory, with these numbers; write it when it is full."""
         self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
         if self._chunk.size >= chunks.CHUNK_BYTES:
             self.flush()
@@ -167,7 +168,10 @@ class McapWriter:
         chunk = self._spare_chunks.get()
         for topic_index, times_ns, rows in blocks:
             chunk.add_rows(*self._numbered(topic_index, len(rows)), times_ns, rows)
-        self._queue(chunk)
+        if chunk.size:
+            self._queue(chunk)
+        else:                   # nothing was due
+            self._spare_chunks.put(chunk)
 
     def flush(self) -> None:
         """Write the chunk in memory, if it holds anything, after those of `append_rows`."""
@@ -176,7 +180,8 @@ class McapWriter:
             self.write_chunk(self._chunk.record(), self._chunk.entries)
             self._chunk.clear()
 
-    def write_chunk(self, chunk: records.Chunk, entries: chunks.Entries) -> None:
+    def write_chunk(self, chunk: records.Chunk, entries: chunks.IndexEntries) -> None:
+        """Write a chunk with the indexes of its messages.  Raises OSError."""
         raw = record_bytes(chunk)
         indexes = chunks.message_indexes(entries)
         offsets = list(itertools.accumulate(

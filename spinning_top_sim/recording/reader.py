@@ -93,6 +93,19 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     max_bytes : int
         Largest record, and largest uncompressed chunk, that is read into memory.
 
+    Attributes
+    ----------
+    path : Path
+        The file; of a folder, the one in it.
+    size : int
+        Its size when it was opened [bytes]: what is written later is not read.
+    profile, library : str
+        What its header says: such as 'ros2', and the program that wrote it.
+    left_out : int
+        Damaged chunks that `messages` has skipped so far.
+    file : LogFile
+        Its bytes and records, for recovery.
+
     Raises
     ------
     LogError
@@ -101,7 +114,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = parsing.MAX_BYTES) -> None:
         self.path = _file_of(Path(path))
-        self.left_out = 0       # damaged chunks that `messages` has skipped
+        self.left_out = 0
         self.file = LogFile(self.path, max_bytes)
         self.size = self.file.size
         self._scanned: Scan | None = None
@@ -114,6 +127,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.profile, self.library = header.profile, header.library
 
     def close(self) -> None:
+        """Close the file; nothing can be read any more."""
         self.file.close()
 
     def __exit__(self, *exception: object) -> None:
@@ -154,8 +168,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
         Beside dates, a time of 0 does not count: it says that there was no clock yet.
         """
-        begin_ns = min((part.start_ns for part in self._messages), default=0)
-        end_ns = max((part.end_ns for part in self._messages), default=0)
+        begin_ns = min((part.start_ns for part in self._message_parts), default=0)
+        end_ns = max((part.end_ns for part in self._message_parts), default=0)
         if begin_ns == 0 and end_ns > _FIRST_DATE:
             first = next(self.messages(start=1), None)
             begin_ns = first.log_time if first and first.log_time > _FIRST_DATE else 0
@@ -184,7 +198,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         times = range(start or 0, 1 << 64 if end is None else end)
         held: list[int] = []        # bytes of each part that is read and not yet passed
         # A part is read when its time comes.
-        streams = [self._stream(part, wanted, held) for part in self._messages
+        streams = [self._stream(part, wanted, held) for part in self._message_parts
                    if part.end_ns >= times.start and part.start_ns < times.stop
                    and not part.channel_ids.isdisjoint(wanted)]
         for message in heapq.merge(*streams, key=attrgetter('log_time')):
@@ -251,7 +265,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         return Index(parts, metadata, summary.schemas, summary.channels)
 
     @property
-    def _messages(self) -> list[Part]:
+    def _message_parts(self) -> list[Part]:
         return [part for part in self._index.parts if part.channel_ids]
 
     def _leads_to_chunk(self, index: ChunkIndex) -> bool:

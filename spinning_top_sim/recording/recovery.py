@@ -21,7 +21,7 @@ def recover(reader: LogReader, output: str | os.PathLike[str],
     Write everything that can be decoded of a log into a new file; return what has written it.
 
     output : must not exist; is removed again where the recovery fails
-    progress : is called with the number of bytes that are done
+    progress : is called with what is done, of `reader.size`; the scan is the first half
 
     Chunks of messages are copied as they are, other messages are put into new chunks; message
     indexes, statistics, summary and the `rosbag2` record are made anew.
@@ -76,8 +76,8 @@ def _copy_messages(reader: LogReader, part: Part, writer: McapWriter) -> None:
         writer.write_chunk(chunk, messages.entries)
         return
     for message in messages.in_order(topics):
-        writer.add_message(message.channel_id, message.sequence, message.log_time,
-                           message.publish_time, message.data)
+        writer.copy_message(message.channel_id, message.sequence, message.log_time,
+                            message.publish_time, message.data)
 
 
 def _copy_record(reader: LogReader, part: Part, writer: McapWriter) -> None:

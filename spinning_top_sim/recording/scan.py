@@ -27,7 +27,10 @@ _DATA_END_SIZE = HEAD.size + 4
 _RUN_BYTES = 1 << 20    # of messages outside of chunks that are read at a time
 _BLOCK = 1 << 16        # bytes searched at a time
 # What may begin a record that is searched: opcode, a length below 2^40, and behind the fields of
-# fixed size a name of less than 2^16 bytes; of a chunk, a compression, or one size twice.
+# fixed size a name of less than 2^16 bytes; of a chunk, a compression, or one size twice.  Offsets
+# in the record, of which the expression, that stands behind the opcode, has one less:
+#   03 schema: name 11; 04 channel: topic 13; 0c metadata: name 9
+#   06 chunk: uncompressed size 25, checksum 33, compression 37, size of the records 41 without one
 # Single messages are not looked for: nothing in them tells them from chance.
 _CANDIDATE = re.compile(
     rb'[\x03\x04\x06\x0c](?=.{5}\0{3})(?:'

@@ -23,15 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.physics.pivot import NANOSECONDS
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.times import NANOSECONDS, Times
+from spinning_top_sim.solvers.times import Times
 
 # The unknowns of one state: complex numbers, of which floats are some.
-Vector = tuple[complex, ...]
-# A row of each component (k, n), a complex one as two rows; a column of each state.
-Rows = NDArray[np.float64]
+Unknowns = tuple[complex, ...]
+# Their components (k, n), a complex one as two rows; a column of each state.
+UnknownRows = NDArray[np.float64]
 
 
 def _fractions(text: str) -> tuple[Fraction, ...]:
@@ -67,7 +68,7 @@ class IntegrationError(RuntimeError):
     """The integration cannot go on; the message says where, why and what to do instead."""
 
 
-StepFunction = Callable[..., tuple[Vector, Vector, Vector]]
+StepFunction = Callable[..., tuple[Unknowns, Unknowns, Unknowns]]
 
 
 @functools.cache
@@ -105,14 +106,14 @@ class Step(NamedTuple):
     """One accepted step: times [s], unknowns and their derivatives at both ends."""
 
     t0: float
-    y0: Vector
-    derivative0: Vector
+    y0: Unknowns
+    derivative0: Unknowns
     t1: float
-    y1: Vector
-    derivative1: Vector
+    y1: Unknowns
+    derivative1: Unknowns
 
 
-def components(vectors: Sequence[float] | Sequence[Vector]) -> Rows:
+def components(vectors: Sequence[float] | Sequence[Unknowns]) -> UnknownRows:
     """Return rows (k, n) of n vectors, or (n,) of floats; a complex component makes two rows."""
     columns: NDArray[np.generic] = np.array(vectors)
     return np.ascontiguousarray(columns.view(np.float64).T)
@@ -129,15 +130,16 @@ class SteppedMotion(ABC):
     closed_form : the same motion; None where doubles cannot hold it
 
     A subclass has the equations: f, its derivative, the error that is tolerated, and the states.
+    It sets what `derivative` needs before it calls `__init__`, which calls `derivative`.
 
     The unknowns `y` at t = 0 are all complex or all real.  The first step's length comes from the
     relative error of a step, `tolerance`, and a bound on |y'|/|y|, `fastest_rate` [1/s].
     """
 
-    derivative: Callable[..., Vector]   # f of the unknowns, which it takes one by one
+    derivative: Callable[..., Unknowns]   # f of the unknowns, which it takes one by one
     ns_limit = 2 ** 63 - 1              # steps go on for ever
 
-    def __init__(self, top: Top, start: State, y: Vector, tolerance: float,
+    def __init__(self, top: Top, start: State, y: Unknowns, tolerance: float,
                  fastest_rate: float) -> None:
         self.top, self.start = top, start
         derivative = self.derivative(*y)
@@ -150,19 +152,19 @@ class SteppedMotion(ABC):
         self.steps, self.evaluations = 0, 1
 
     @abstractmethod
-    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+    def second_derivative(self, y: UnknownRows, derivative: UnknownRows) -> UnknownRows:
         """Return y'' from y and y': rows of components (k, n), real and imaginary parts apart."""
 
     @abstractmethod
-    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
+    def errors(self, y: Unknowns, y_new: Unknowns, difference: Unknowns) -> tuple[float, ...]:
         """Return each error estimate over what is tolerated: a step passes if all are <= 1."""
 
     @abstractmethod
-    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+    def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
         """Return the end of a step, perhaps moved; IntegrationError if it cannot be trusted."""
 
     @abstractmethod
-    def _states_of(self, t: Column, unknowns: Rows) -> States:
+    def _states_of(self, t: Column, unknowns: UnknownRows) -> States:
         """Return the states at times [s] from what `_unknowns` returns."""
 
     def _take_step(self) -> None:
@@ -262,11 +264,11 @@ class SteppedMotion(ABC):
         unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
         return self._states_of(t.copy(), unknowns)
 
-    def _unknowns(self, t: Column) -> Rows:
+    def _unknowns(self, t: Column) -> UnknownRows:
         """Return the unknowns (k, n) at times [s] within the steps that are kept."""
         return self._interpolated(t)[1]
 
-    def _interpolated(self, t: Column) -> tuple[NDArray[np.int64], Rows]:
+    def _interpolated(self, t: Column) -> tuple[NDArray[np.int64], UnknownRows]:
         """Return in which of the steps that are kept times [s] lie, and the unknowns there."""
         steps = np.array([step.t1 for step in self._kept]).searchsorted(t)
         first, last = (int(steps[0]), int(steps[-1])) if len(t) else (0, 0)

@@ -10,7 +10,12 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import IntegrationError, Rows, SteppedMotion, Vector
+from spinning_top_sim.solvers.dormand_prince import (
+    IntegrationError,
+    SteppedMotion,
+    UnknownRows,
+    Unknowns,
+)
 
 # |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
 SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
@@ -35,7 +40,7 @@ class EulerMotion(SteppedMotion):
             abs(start.theta_dot) + (abs(start.l3) + abs(start.lz)) / top.lambda1
             + abs(start.l3) / top.lambda3 + math.sqrt(abs(top.gravity_torque) / top.lambda1))
 
-    def derivative(self, theta: float, theta_dot: float, phi: float, psi: float) -> Vector:
+    def derivative(self, theta: float, theta_dot: float, phi: float, psi: float) -> Unknowns:
         """Return (theta', theta'', phi', psi'), eqs. (29)-(32); IntegrationError near a pole."""
         sine, cosine = math.sin(theta), math.cos(theta)
         if not abs(sine) > SMALLEST_SINE:
@@ -51,7 +56,7 @@ class EulerMotion(SteppedMotion):
                 + top.gravity_torque / top.lambda1 * sine,
                 phi_dot, psi_dot)
 
-    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+    def second_derivative(self, y: UnknownRows, derivative: UnknownRows) -> UnknownRows:
         theta = y[0]
         theta_dot, theta_ddot, phi_dot, _ = derivative
         sine, cosine = np.sin(theta), np.cos(theta)
@@ -65,12 +70,12 @@ class EulerMotion(SteppedMotion):
         return np.array((theta_ddot, theta_dddot, phi_ddot,
                          phi_dot * sine * theta_dot - phi_ddot * cosine))
 
-    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
+    def errors(self, y: Unknowns, y_new: Unknowns, difference: Unknowns) -> tuple[float, ...]:
         return tuple(
             abs(e) / (self._atol + self._rtol * max(abs(a), abs(b)) or math.ulp(0.0))
             for e, a, b in zip(difference, y, y_new, strict=True))
 
-    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+    def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
         """Raise IntegrationError if the step leapt over a pole: phi and psi would be lost."""
         before, after = y[0].real, y_new[0].real
         if math.floor(before / math.pi) != math.floor(after / math.pi):
@@ -79,12 +84,14 @@ class EulerMotion(SteppedMotion):
                 f'{after!r} rad, and lost phi and psi; {ADVICE}')
         return y_new
 
-    def _states_of(self, t: Column, unknowns: Rows) -> States:
+    def _states_of(self, t: Column, unknowns: UnknownRows) -> States:
         return _EulerStates(self.top, self.start, t, unknowns)
 
 
 class _EulerStates(States):
-    def __init__(self, top: Top, start: State, t: Column, unknowns: Rows) -> None:
+    method = 'rk45'
+
+    def __init__(self, top: Top, start: State, t: Column, unknowns: UnknownRows) -> None:
         super().__init__(top, start, len(t))
         theta, theta_dot, phi, psi = unknowns
         self.t, self.theta_dot, self.angles = t, theta_dot, (phi, theta, psi)

@@ -188,6 +188,7 @@ class ExactSolution(ClosedForm):
         return self.arrays.bounds[1]
 
     def describe(self) -> Description:
+        """Return the motion in numbers."""
         top, start = self.top, self.start
         rests = axis_rests(top, start)
         low, high = 2 * (start.theta,) if rests else (self.theta_min, self.theta_max)
@@ -307,7 +308,7 @@ class _ExactStates(ThetaStates):
         return theta_dot
 
     def _across(self) -> Column:
-        # `AcceleratedStates` chooses between two formulas.  Here there is only the first, because
-        # a choice would change the last bits of earlier logs.
+        # `AcceleratedStates` chooses between two formulas.  Here there is only the first, until a
+        # MINOR version: a choice would change the last bits of earlier logs.
         cosine, sine = self._rows('half_theta')
         return axis_rate(self._solution.bottom_rate, self._solution.top_rate, cosine, sine)

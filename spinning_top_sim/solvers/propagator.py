@@ -69,8 +69,8 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
     return motion
 
 
-def accelerated(top: Top, start: State | Posture, acceleration: Fractions, *, method: str,
-                **settings: Any) -> tuple[Motion, Vertical]:
+def propagate_accelerated(top: Top, start: State | Posture, acceleration: Fractions, *,
+                          method: str, **settings: Any) -> tuple[Motion, Vertical]:
     """
     Return the motion while the pivot accelerates uniformly, and the vertical that it is about.
 
@@ -81,8 +81,8 @@ def accelerated(top: Top, start: State | Posture, acceleration: Fractions, *, me
     if method == 'exact':
         motion = AcceleratedMotion(top, posture, acceleration)
         return motion, motion.vertical
-    vertical, halves = about_vertical(top, posture, acceleration)
-    return propagate(vertical.top, rounded(halves), method=method, **settings), vertical
+    vertical, precise_start = about_vertical(top, posture, acceleration)
+    return propagate(vertical.top, rounded(precise_start), method=method, **settings), vertical
 
 
 def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -> Motion:

@@ -11,9 +11,9 @@ from spinning_top_sim.solvers.theta_setup import Factor, PreciseState, ThetaMoti
 
 def cayley_klein(motion: ThetaMotion, t: mpfr) -> tuple[mpc, mpc, mpfr]:
     """Return alpha, beta and cos(theta)' at t [s] in the frame of a motion."""
-    quarters = motion.quarter0 + motion.offset0 + motion.quarter_rate * t
+    quarters = motion.start_whole + motion.start_offset + motion.quarter_rate * t
     whole = int(rint(quarters))
-    rest = (motion.quarter0 - whole) + motion.quarter_rate * t + motion.offset0
+    rest = (motion.start_whole - whole) + motion.quarter_rate * t + motion.start_offset
     y = const_pi() / 2 * rest
     if motion.stretch:
         sine = sinh(motion.stretch * y)

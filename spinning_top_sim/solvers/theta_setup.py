@@ -7,19 +7,29 @@ E. T. Whittaker, *Analytical Dynamics*, 4th ed., sect. 71 and 72; theta function
 Watson, *Modern Analysis*, ch. XXI; D. F. Lawden, *Elliptic Functions and Applications*; DLMF,
 https://dlmf.nist.gov, ch. 19, 20 and 22.
 
-docs/theta_functions.md derives steps 1, 2 and 4.  r is the mean rate, r+- + s+- pi w/(2K) there.
+The last four lines of the symbols are of alpha; beta has its own.
 
-1. *Nutation.*  u = cos(theta) = u1 + (u2 - u1) sn^2(chi) [DLMF 22.13(i)], where chi grows at the
-   constant rate w, w^2 = P (u3 - u1)/(2 lambda1), P = M g R, with the parameter
-   m = (u2 - u1)/(u3 - u1); m1 = 1 - m.  K = K(m) and K' = K(m1) are the quarter periods.
+    P, Omega        M g R, L3/lambda3 - L3/lambda1
+    u, u1, u2, u3   cos(theta), and the zeros of its cubic: u1 <= u <= u2 <= 1 <= u3
+    chi, w          argument of the elliptic functions, and its constant rate
+    m, m1           their parameter (u2 - u1)/(u3 - u1), and 1 - m
+    K, K'           the quarter periods K(m) and K(m1)
+    Z, N, y         chi/K, the nearest integer, and (pi/2) (Z - N)
+    s               the sign of Lz + L3; beta: of Lz - L3
+    a               the place of its zero; beta: b
+    X, R, J, D      numerator R + i s J and denominator of its quotient of theta functions
+    r, c, kappa     its phase is r t + c + kappa y besides that of X; r is a mean rate
+
+docs/theta_functions.md derives steps 1, 2 and 4; r is r+- + s+- pi w/(2K) there.
+
+1. *Nutation.*  u = u1 + (u2 - u1) sn^2(chi) [DLMF 22.13(i)], w^2 = P (u3 - u1)/(2 lambda1).
 
 2. *Attitude.*  alpha vanishes where u = -1, at chi = i (2K/pi) a; beta where u = 1, at
    chi = K + i (2K/pi) b, with real a and b [DLMF 22.6(iv)].  A quotient of theta functions with
    these zeros and the poles of u differs from alpha or beta by a factor
    exp(constant + constant * t).
 
-3. *Phase.*  Z = chi/K counts quarter periods.  N is the nearest integer and y = (pi/2) (Z - N), so
-   |y| <= pi/4.  By step 2, with the signs s of Lz + L3 for alpha and of Lz - L3 for beta,
+3. *Phase.*  Z counts quarter periods, and |y| <= pi/4.  By step 2
 
        alpha = X(y)/D(y) exp i(r t + c + kappa y),   X = R + i s J,   beta likewise.
 
@@ -28,10 +38,10 @@ docs/theta_functions.md derives steps 1, 2 and 4.  r is the mean rate, r+- + s+-
    it is the other way round [DLMF 20.2(i), 20.2(iii)].
 
 4. *Rates.*  The argument of alpha has the rate Omega/2 + (Lz + L3)/(2 lambda1 (1 + u)), that of
-   beta -Omega/2 + (Lz - L3)/(2 lambda1 (1 - u)), Omega = L3/lambda3 - L3/lambda1.  r follows where
-   X is theta2 and y = 0, at u2 for alpha and at u1 for beta.  X(y) turns by a quarter turn from
-   one N to the next, which r t contains already: kappa = -s takes it out again.  The imaginary
-   form has kappa = s (2 K a/(pi K') - 1) [DLMF 20.7(viii)].
+   beta -Omega/2 + (Lz - L3)/(2 lambda1 (1 - u)).  r follows where X is theta2 and y = 0, at u2 for
+   alpha and at u1 for beta.  X(y) turns by a quarter turn from one N to the next, which r t
+   contains already: kappa = -s takes it out again.  The imaginary form has
+   kappa = s (2 K a/(pi K') - 1) [DLMF 20.7(viii)].
 
 5. *Poles.*  s = 0 means that the axis passes a pole exactly.  Then X is real and changes its sign
    there.  If Lz = L3 and u3 = 1, beta has no zero: it is proportional to dn(chi), with theta4 and
@@ -97,7 +107,7 @@ class ThetaMotion(NamedTuple):
 
     stretch : K/K', if the series are in the imaginary form, of x = stretch y
     quarter_rate : quarter periods per second, w/K
-    quarter0, offset0 : N and 2y/pi at t = 0, offset0 accurate relative to itself
+    start_whole, start_offset : N and 2y/pi at t = 0, start_offset accurate relative to itself
     size : coefficients of each polynomial that doubles need
     u_dot, u_dot_series : c at even and at odd N, and theta1, of u' = c theta1(2y)/D^4
     precession0, precession_swing : p and q at even and at odd N, of
@@ -108,8 +118,8 @@ class ThetaMotion(NamedTuple):
     beta: Factor
     stretch: mpfr | None = None
     quarter_rate: mpfr = ZERO
-    quarter0: int = 0
-    offset0: mpfr = ZERO
+    start_whole: int = 0
+    start_offset: mpfr = ZERO
     u_dot: tuple[mpfr, mpfr] = (ZERO, ZERO)
     u_dot_series: Series = NOTHING
     precession0: tuple[mpfr, mpfr] = (ZERO, ZERO)
@@ -234,27 +244,27 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
     a, g, c = sqrt(roots.gap31), sqrt(roots.gap32), sqrt(roots.gap21)
     mean = GaussMean(a, g, c)
     form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary)
-    quarter0, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
+    start_whole, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
     stretch = form.mean.mean / mean.mean if imaginary else None
     sin = form.mean.amplitude(square, 1 if imaginary else -1)
     xi = -sin * sin if imaginary else sin * sin
     cos = sqrt(1 - xi)
     y0 = direction * (asinh(sin) / stretch if stretch else atan2(sin, cos))
-    scale = sqrt(f3)
+    root_f3 = sqrt(f3)
     # w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
-    y_rate = scale * mean.mean / 2
-    factors = [_quotient(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, quarter0,
+    y_rate = root_f3 * mean.mean / 2
+    factors = [_quotient(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, start_whole,
                          y0, (direction * sin, cos, xi))
                for side, pole in zip(sides, poles, strict=True)]
-    scale *= mirror * a / 2 * roots.gap21        # w (u2 - u1)
+    swing_rate = root_f3 * (mirror * a / 2 * roots.gap21)       # w (u2 - u1)
     even, odd = form.slopes_of_sn2()
     turn = mirror * l3 / lambda1
     swing = turn * roots.gap21 * (form.mean.quarter_period / form.slope1) ** 2
     alpha, beta = factors[::mirror]
     return ThetaMotion(
-        alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / const_pi(), quarter0=quarter0,
-        offset0=y0 * 2 / const_pi(),
-        u_dot=(scale * even, scale * odd), u_dot_series=form.theta1,
+        alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / const_pi(),
+        start_whole=start_whole, start_offset=y0 * 2 / const_pi(),
+        u_dot=(swing_rate * even, swing_rate * odd), u_dot_series=form.theta1,
         precession0=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
         precession_swing=(-swing * form.middle4 ** 2,
                           swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
@@ -277,19 +287,19 @@ class _Pole(NamedTuple):
     zero: mpfr | None
 
 
-def _poles(sides: tuple[_Side, ...], roots: Roots, scale: mpfr,
+def _poles(sides: tuple[_Side, ...], roots: Roots, two_p_lambda1: mpfr,
            imaginary: bool) -> tuple[_Pole, _Pole]:
     """
-    Return the poles of alpha and beta; scale: 2 P lambda1.
+    Return the poles of alpha and beta.
 
     No subtraction cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2.  So the product of
     three distances is known, and the smallest of them needs no difference.
     """
     c0, s0 = (2 * side.modulus ** 2 for side in sides)              # 1 + u0 and 1 - u0
     below1, above2 = s0 - roots.y1, c0 + roots.y2
-    above1 = sides[0].momentum ** 2 / (scale * above2 * (roots.y3 + c0))
+    above1 = sides[0].momentum ** 2 / (two_p_lambda1 * above2 * (roots.y3 + c0))
     below2, u3_minus_one = s0 - roots.y2, roots.y3 - s0
-    product = sides[1].momentum ** 2 / (scale * below1)
+    product = sides[1].momentum ** 2 / (two_p_lambda1 * below1)
     if below2 <= u3_minus_one:
         below2 = product / u3_minus_one
     else:

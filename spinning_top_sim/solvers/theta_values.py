@@ -28,16 +28,25 @@ from spinning_top_sim.solvers.theta_series import SIN_ODD
 from spinning_top_sim.solvers.theta_setup import Factor, ThetaMotion
 from spinning_top_sim.solvers.times import UNITS, Times, halves, products
 
-# glibc gives freed memory back at once, and clears the pages again at the next use, until it has
-# freed a block of this size [mallopt(3): M_MMAP_THRESHOLD].  It doubles the speed of large blocks.
-np.empty(2 ** 22, np.uint8)
-
 Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
 SIGNS = np.array((1.0, -1.0))   # of an even and of an odd number of half turns
 HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the three phases' units
 # Smaller amplitudes leave no room for their squares in doubles, larger numbers none for halves.
 LEAST_AMPLITUDE, LARGEST_NUMBER = 1e-145, 1e290
+
+
+def _keep_freed_memory() -> None:
+    """
+    Let glibc keep freed memory for large arrays, which doubles the speed of large blocks.
+
+    It gives memory back at once, and clears the pages again at the next use, until it has freed a
+    block of this size [mallopt(3): M_MMAP_THRESHOLD].
+    """
+    np.empty(2 ** 22, np.uint8)
+
+
+_keep_freed_memory()
 
 
 class MotionConstants:
@@ -47,7 +56,7 @@ class MotionConstants:
     Raises ValueError if doubles cannot hold an amplitude or a rate.
 
     rates : of the three phases [1/s], in multiprecision
-    start_whole, offsets : at t = 0 a phase is their sum; the latter are two doubles each
+    start_wholes, start_offsets : at t = 0 a phase is their sum; the latter are two doubles each
     drifts : kappa/2 of alpha and beta
     stretch : K/K' times a quarter turn, 0 in the real form
     prefactors, polynomials : at even and at odd N, of the rows R of alpha and beta, s J of alpha
@@ -61,9 +70,9 @@ class MotionConstants:
         factors = motion.alpha, motion.beta
         self.rates = [motion.quarter_rate, *(x.rate / const_pi() for x in factors)]
         turns = [2 * x.phase_turns for x in factors]
-        self.start_whole = [motion.quarter0, *map(int, map(rint, turns))]
-        self.offsets = [*map(double_double, (
-            motion.offset0, *map(sub, turns, self.start_whole[1:])))]
+        self.start_wholes = [motion.start_whole, *map(int, map(rint, turns))]
+        self.start_offsets = [*map(double_double, (
+            motion.start_offset, *map(sub, turns, self.start_wholes[1:])))]
         self.drifts = [0.5 * float(factor.drift) for factor in factors]
         self.stretch = QUARTER * float(motion.stretch) if motion.stretch else 0.0
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
@@ -116,9 +125,9 @@ class ConstantArrays:
                  counts: Sequence[int] | None = None) -> None:
         self._motions, self._counts, present = motions, counts, motions[0]
         self._rates: dict[str, tuple[Matrix, Matrix, Matrix, Matrix]] = {}
-        self.start_whole = self.columns([one.start_whole for one in motions])
-        self.offset, self.offset_rest = map(self.columns, np.array(
-            [one.offsets for one in motions]).transpose(2, 0, 1))
+        self.start_wholes = self.columns([one.start_wholes for one in motions])
+        self.start_offsets, self.start_offset_rests = map(self.columns, np.array(
+            [one.start_offsets for one in motions]).transpose(2, 0, 1))
         self.drifts = self.columns([one.drifts for one in motions])
         (stretch,) = self.columns([(one.stretch,) for one in motions])
         self.stretch = stretch if np.any(stretch) else None
@@ -179,9 +188,9 @@ class ConstantArrays:
         alpha, beta, *_ = self._middles
         first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
         slope = (second - first + 2.0) % 4.0 - 2.0
-        quarter0 = int(self.start_whole[0, 0])
-        start = (first + slope * quarter0 + 1.0) % 4.0 - 1.0
-        return start - slope * quarter0, slope
+        start_whole = int(self.start_wholes[0, 0])
+        start = (first + slope * start_whole + 1.0) % 4.0 - 1.0
+        return start - slope * start_whole, slope
 
 
 class ThetaValues:
@@ -189,22 +198,8 @@ class ThetaValues:
 
     def __init__(self, arrays: ConstantArrays, times: Times) -> None:
         self._arrays = arrays
-        self._turned, self._turned_rest = high, rest = arrays.turned(times)
-        whole = np.rint(high)
-        part = high - whole
-        shift = part + arrays.offset
-        shift += rest
-        np.rint(shift, out=shift)
-        # No difference rounds where the result is small: its terms are within a factor of two of
-        # each other then (Sterbenz).
-        half = 0.5 * shift
-        part -= half
-        half -= arrays.offset
-        part -= half
-        part += rest + arrays.offset_rest
-        self._whole = whole.astype(np.int64)
-        shift += arrays.start_whole
-        self._whole += shift.astype(np.int64)
+        self._turned, self._turned_rest = arrays.turned(times)
+        self._whole, part = _reduced(self._turned, self._turned_rest, arrays)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
@@ -355,6 +350,33 @@ def in_range(name: str, value: mpfr) -> float:
         raise ValueError(f'{name} is {value:.3e}: must be at most {LARGEST_NUMBER} for doubles to '
                          'hold the motion; the constants of the top are too far apart in size')
     return float(value)
+
+
+def _reduced(turned: Matrix, turned_rest: Matrix,
+             arrays: ConstantArrays) -> tuple[NDArray[np.int64], Matrix]:
+    """
+    Return the nearest integers of three phases, and what is left of them, (3, n) each.
+
+    turned, turned_rest : what they have grown by, as two doubles each
+
+    whole + part = turned + turned_rest + the phases at t = 0
+    """
+    whole = np.rint(turned)
+    part = turned - whole
+    shift = part + arrays.start_offsets
+    shift += turned_rest
+    np.rint(shift, out=shift)
+    # No difference rounds where the result is small: its terms are within a factor of two of each
+    # other then (Sterbenz).
+    half = 0.5 * shift
+    part -= half
+    half -= arrays.start_offsets
+    part -= half
+    part += turned_rest + arrays.start_offset_rests
+    wholes = whole.astype(np.int64)
+    shift += arrays.start_wholes
+    wholes += shift.astype(np.int64)
+    return wholes, part
 
 
 def _side_by_side(polynomials: Sequence[list[float]]) -> Matrix:

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number
+from spinning_top_sim.physics.pivot import NANOSECONDS
 
 Matrix = NDArray[np.float64]
-NANOSECONDS = 1_000_000_000
-UNITS = {'s': 1, 'ns': 10 ** 9}
+UNITS = {'s': 1, 'ns': NANOSECONDS}
 # The largest time [ns] that is taken as an integer: the end of int64 lies a second behind it.
 LARGEST_NS = 2 ** 63 - NANOSECONDS
 # 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).

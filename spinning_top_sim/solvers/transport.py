@@ -13,7 +13,12 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.dormand_prince import Rows, SteppedMotion, Vector, components
+from spinning_top_sim.solvers.dormand_prince import (
+    SteppedMotion,
+    UnknownRows,
+    Unknowns,
+    components,
+)
 
 # The energy corrects the nutation rate only where its square is at least this share of the
 # largest |m|^2: at a turning point the energy does not tell the rate.
@@ -21,7 +26,7 @@ NUTATION_SHARE = 1e-6
 # (sin(theta)/2)^2 below which rounding in L.e3 would spoil the momentum more than it mends it.
 POLE_SHARE = 1e-4
 # Real and imaginary parts of alpha, beta and m.
-Parts = Sequence[Column]
+Components = Sequence[Column]
 # What a projection computes with: sqrt, copysign and where.
 Functions = tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]
 COLUMNS: Functions = np.sqrt, np.copysign, np.where
@@ -97,7 +102,7 @@ class TransportMotion(SteppedMotion):
             top, start, self.accepted((), (alpha, beta, m)), self._tolerance,
             self._scale + (abs(l3) + abs(lz)) / lambda1 + math.sqrt(abs(torque) / lambda1))
 
-    def _vector(self, start: State) -> Vector:
+    def _vector(self, start: State) -> Unknowns:
         """Return alpha, beta and m of a state; L_x + i L_y by eq. (6), turned by exp(i phi)."""
         lambda1 = self.top.lambda1
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
@@ -111,12 +116,12 @@ class TransportMotion(SteppedMotion):
                 sine * cmath.rect(1.0, 0.5 * start.phi - 0.5 * start.psi),
                 0.5j * momentum / lambda1)
 
-    def derivative(self, alpha: complex, beta: complex, m: complex) -> Vector:
+    def derivative(self, alpha: complex, beta: complex, m: complex) -> Unknowns:
         return (self._turn_alpha * alpha + m * beta.conjugate(),
                 self._turn_beta * beta - m * alpha.conjugate(),
                 self._fall * (alpha * beta))
 
-    def second_derivative(self, y: Rows, derivative: Rows) -> Rows:
+    def second_derivative(self, y: UnknownRows, derivative: UnknownRows) -> UnknownRows:
         # The product rule in real parts: of complex columns the last bits depend on the block.
         a, a_imag, b, b_imag, m, m_imag = y
         da, da_imag, db, db_imag, dm, dm_imag = derivative
@@ -129,12 +134,12 @@ class TransportMotion(SteppedMotion):
             fall * (da * b - da_imag * b_imag + a * db - a_imag * db_imag),
             fall * (da * b_imag + da_imag * b + a * db_imag + a_imag * db)))
 
-    def errors(self, y: Vector, y_new: Vector, difference: Vector) -> tuple[float, ...]:
+    def errors(self, y: Unknowns, y_new: Unknowns, difference: Unknowns) -> tuple[float, ...]:
         da, db, dm = difference
         tolerance = self._tolerance
         return abs(da) / tolerance, abs(db) / tolerance, abs(dm) / self._scale / tolerance
 
-    def accepted(self, y: Vector, y_new: Vector) -> Vector:
+    def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
         """Return y_new moved back onto the invariants; see `project`."""
         alpha, beta, m = y_new
         projected = self.project((alpha.real, alpha.imag, beta.real, beta.imag, m.real, m.imag),
@@ -212,13 +217,13 @@ class TransportMotion(SteppedMotion):
         super()._forget(count)
         self._begins = self._begins[:, count:].copy()
 
-    def _unknowns(self, t: Column) -> Rows:
+    def _unknowns(self, t: Column) -> UnknownRows:
         """Return the unknowns, and `_begins` of the step that each time [s] lies in."""
         self._unwrap()
         steps, unknowns = self._interpolated(t)
         return np.concatenate((unknowns, self._begins.take(steps, axis=1)))
 
-    def _states_of(self, t: Column, unknowns: Rows) -> States:
+    def _states_of(self, t: Column, unknowns: UnknownRows) -> States:
         return _TransportStates(self, t, unknowns)
 
 
@@ -245,14 +250,16 @@ class _TransportStates(States):
     rows : what `TransportMotion._unknowns` returns
     """
 
-    def __init__(self, motion: TransportMotion, t: Column, rows: Rows) -> None:
+    method = 'rk45'
+
+    def __init__(self, motion: TransportMotion, t: Column, rows: UnknownRows) -> None:
         super().__init__(motion.top, motion.start, len(t))
         self.t, self._motion = t, motion
-        self._stepped: Parts = tuple(rows[:6])
+        self._stepped: Components = tuple(rows[:6])
         self._begins = rows[6:]
 
     @cached_property
-    def _projected(self) -> Parts:
+    def _projected(self) -> Components:
         """The unknowns on the invariants, in the body's own frame."""
         motion, y, pole_share = self._motion, self._stepped, POLE_SHARE
         if not all(motion.momenta[:2]):     # the meridian of the axis is known
@@ -263,7 +270,7 @@ class _TransportStates(States):
         return (a * cosine - b * sine, b * cosine + a * sine,
                 c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
 
-    def _on_lines(self, y: Parts, uniform: Column) -> Parts:
+    def _on_lines(self, y: Components, uniform: Column) -> Components:
         """Return y with alpha or beta moved onto the line through zero, and m turned with them."""
         moved = list(y[:4])
         moduli, phases = self._motion.polar(y, uniform)

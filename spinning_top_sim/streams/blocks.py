@@ -96,14 +96,14 @@ def _reach(path: Path, after_ns: int, until_ns: int, most_steps: int,
     Returns the first time, where segments meet, and the time that is reached [ns]; and why the
     motion does not go on from there, if it does not.
     """
-    edges, pieces = [after_ns], -(-most_steps // STEPS_IN_A_PIECE)
+    edges, budget = [after_ns], -(-most_steps // STEPS_IN_A_PIECE)
     try:
-        while edges[-1] < until_ns and pieces and len(edges) <= MOST_SEGMENTS:
+        while edges[-1] < until_ns and budget and len(edges) <= MOST_SEGMENTS:
             segment = path.after(edges[-1])
             goal_ns = min(until_ns, segment.end_ns)
             try:
-                while pieces and not segment.reach(goal_ns, STEPS_IN_A_PIECE):
-                    pieces -= 1
+                while budget and not segment.reach(goal_ns, STEPS_IN_A_PIECE):
+                    budget -= 1
                     yield None
             finally:
                 edges.append(max(edges[-1], min(goal_ns, segment.reached_ns)))

@@ -44,6 +44,7 @@ class CdrWriter:
         self.fields: list[tuple[int, int]] = []
 
     def append(self, code: str, *values: float) -> Self:
+        """Append numbers of one type, a format character of `struct`, aligned to its size."""
         if values:
             size = struct.calcsize('<' + code)
             self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
@@ -71,6 +72,7 @@ class CdrWriter:
         return self
 
     def header(self, frame_id: str) -> Self:
+        """Append a std_msgs/Header: its stamp, which differs, and a frame."""
         return self.stamp().string(frame_id)
 
 
@@ -108,7 +110,11 @@ class Template:
 
     def encode_runs(self, stamps_ns: NDArray[np.int64],
                     runs: Iterable[tuple[int, Sequence[Field]]]) -> NDArray[Any]:
-        """Return the same; `runs` has the fields of so many messages after the other."""
+        """
+        Return messages as `encode` does, from consecutive runs of them.
+
+        runs : of each the number of its messages, and their fields
+        """
         count = len(stamps_ns)
         if len(self._rows) < count:
             self._rows = np.frombuffer(count * self._buffer, self._row_type)
@@ -150,7 +156,7 @@ class Template:
 
 def fill(fields: Sequence[NDArray[np.float64]],
          runs: Iterable[tuple[int, Sequence[Field]]]) -> None:
-    """Fill fields (n, count); `runs` has the values of so many messages after the other."""
+    """Fill fields (n, count) from runs, as those of `Template.encode_runs`."""
     begin = 0
     for size, values in runs:
         for field, value in zip(fields, values, strict=True):

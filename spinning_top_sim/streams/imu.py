@@ -31,9 +31,12 @@ LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
 
 class Imu:
     """
-    An ideal IMU at `imu.lever_arm` [m] with orientation `imu.rpy` [rad] on the body.
+    The IMU at `imu.lever_arm` [m] with orientation `imu.rpy` [rad] on the body.
 
-    sensor : adds the errors
+    `true`, `means` and `increments` are exact, `felt` adds bandwidth and vibration, `sensor` the
+    errors.
+
+    sensor : the errors of its readings
     takes_means : whether a sample is the mean over the interval before it (`imu.sampling`)
     length_ns : period of its samples [ns]
 
@@ -189,6 +192,7 @@ class Imu:
         return (x, y, z), self.orientation(states), self.from_body((v1, v2, v3))
 
     def from_body(self, vector: Vector) -> Vector:
+        """Return a vector given in the body frame in the frame of the IMU."""
         return attitude.rotated_back(self._mounting, vector) if self._is_rotated else vector
 
 

@@ -109,6 +109,7 @@ class Sensor:
                 (v1 + f1, v2 + f2, v3 + f3))
 
     def bias(self, times: range) -> tuple[Vector, Vector]:
+        """Return the biases [rad/s], [m/s^2] of the readings at these times [ns]."""
         _, (w1, w2, w3, f1, f2, f3) = self._noise.at(times)
         return (w1, w2, w3), (f1, f2, f3)
 

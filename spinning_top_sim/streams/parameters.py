@@ -39,7 +39,7 @@ STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
     ('markers', 20.0, False, 'markers (visualization_msgs/MarkerArray)'),
     ('clock', 100.0, False, '/clock (rosgraph_msgs/Clock)'),
 )
-# Of streams that have two switches.
+# Second parameter that switches a stream on.
 OTHER_SWITCH = {'clock': 'publish_clock', 'ground_truth_imu_odom': 'increments.enabled'}
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HIGHEST_RATE = 10_000.0
@@ -240,9 +240,8 @@ def checked(values: Mapping[str, Any]) -> dict[str, Any]:
     if result['gnss.enabled'] and find_spec('pymap3d') is None:
         raise ValueError('gnss.enabled = True: needs pymap3d, which is not installed: '
                          f'{remedy("gnss")}')
-    top_of(result)
-    start_state(result)
-    pivot_path(result)
+    for describe in (top_of, start_state, pivot_path):      # they refuse what cannot be
+        describe(result)
     return result
 
 

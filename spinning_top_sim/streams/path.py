@@ -249,9 +249,10 @@ class Path:
     def exact_points(self, times_ns: NDArray[np.int64], along: float) -> NDArray[np.float64]:
         """Return where a point of the axis is at ascending times (n,) [ns], (n, 3)."""
         return np.concatenate([np.stack(segment.exact_point(times, along), axis=-1)
-                               for segment, times in self._shares(times_ns)])
+                               for segment, times in self._times_of_segments(times_ns)])
 
-    def _shares(self, times_ns: NDArray[np.int64]) -> list[tuple[Segment, NDArray[np.int64]]]:
+    def _times_of_segments(self, times_ns: NDArray[np.int64],
+                           ) -> list[tuple[Segment, NDArray[np.int64]]]:
         """Return the segments at ascending times (n,) [ns], with those of each."""
         # A segment ends with the command that begins the next one, that instant included.
         ends = np.searchsorted(times_ns, [one.start_ns for one in self._segments[1:]], 'right')
@@ -260,9 +261,9 @@ class Path:
 
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at ascending times (n,) [ns], those before now too."""
-        shares = self._shares(times_ns) or [(self._segments[-1], times_ns)]
-        return kinematics([segment.piece for segment, _ in shares],
-                          [len(times) for _, times in shares], times_ns)
+        found = self._times_of_segments(times_ns) or [(self._segments[-1], times_ns)]
+        return kinematics([segment.piece for segment, _ in found],
+                          [len(times) for _, times in found], times_ns)
 
     def increments(self, begin_ns: int, end_ns: int, point: Point, count: int = 1,
                    step_ns: int = 1) -> Increments:

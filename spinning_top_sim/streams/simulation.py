@@ -14,7 +14,7 @@ from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
-from spinning_top_sim.solvers.propagator import accelerated, propagate
+from spinning_top_sim.solvers.propagator import propagate, propagate_accelerated
 from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
@@ -54,7 +54,8 @@ class Simulation:
     path : the motion
     now_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
     history : what was applied since the start: time [ns], then L3 and Lz of a command, the fields
-        of a `State`, the rate of the IMU [Hz], or those of a `Drive`
+        of a `State`, the rate of the IMU [Hz], or those of a `Drive`.  Logs have it as lists of
+        numbers, told apart by their lengths alone
     pivot_path : of the pivot; None while it rests at the origin
     lz : as last commanded, about the vertical of the world [kg m^2/s]
     epoch_ns : stamp of t = 0 [ns]
@@ -282,7 +283,7 @@ def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[st
     try:
         with np.errstate(over='ignore', invalid='ignore'):
             segment = _new_segment(top, start, start_ns, values, pivot)
-            # This also keeps `energy`: that of the first step, which is forgotten later.
+            # Caches `energy` now: the first step, from which it is read, is forgotten later.
             if ((isinstance(start, State) or values['solver.method'] != 'exact')
                     and not math.isfinite(segment.energy)):
                 raise ValueError(f'the energy would be {segment.energy!r} J')
@@ -312,5 +313,5 @@ def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mappin
         assert isinstance(start, State)
         return Segment(propagate(top, start, **settings), start_ns, jumps=True)
     piece = pivot.lasting(start_ns)
-    motion, vertical = accelerated(top, start, piece.acceleration, **settings)
+    motion, vertical = propagate_accelerated(top, start, piece.acceleration, **settings)
     return Segment(motion, start_ns, Ride(top, vertical, piece), jumps=isinstance(start, State))

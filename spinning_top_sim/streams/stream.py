@@ -88,18 +88,25 @@ class Stream:
     One topic, with samples at t = k * period_ns for k = 0, 1, 2, ...
 
     parameter : prefix of its parameters
+    topic, type_name : such as 'imu/data_raw' and 'sensor_msgs/msg/Imu'
+    template : of its messages; the stream keeps a copy
     fields : returns the numbers that go into the fields of `template`
     timing : the timing faults of its messages
     rate_parameter : name of the parameter that is its rate
+    period_ns : time between two samples [ns]
+    size : of a message [bytes]
     late_ns : time from a sample to its message [ns]
     silences_ns : begin and end of the times without messages [ns]
+
+    Raises LookupError if there is no parameter of its rate.
     """
 
     late_ns = 0
     silences_ns: Sequence[tuple[int, int]] = ()
 
     def __init__(self, values: Mapping[str, Any], parameter: str, topic: str, type_name: str,
-                 template: Template, fields: Callable[[Samples], Sequence[Field]] = lambda _: (),
+                 template: Template, *,
+                 fields: Callable[[Samples], Sequence[Field]] = lambda _: (),
                  timing: Timing | None = None, rate_parameter: str = '') -> None:
         self.parameter, self.topic, self.type_name = parameter, topic, type_name
         # A copy, with rows of its own: equal streams share the template.
@@ -114,6 +121,11 @@ class Stream:
         return len(self.template)
 
     def apply(self, changes: Mapping[str, Any]) -> None:
+        """
+        Take over checked parameters that act at once on the samples that follow.
+
+        A stream extends it for parameters of its own; `Simulation.apply` calls it.
+        """
         if self.rate_parameter in changes:
             self.period_ns = period_ns(changes[self.rate_parameter])
 

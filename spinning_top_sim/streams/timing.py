@@ -55,6 +55,6 @@ class Timing:
         return noise.white(self._seed, noise.Purpose.TIMING, t_ns // period_ns, 3)
 
 
-def faults_of(values: Mapping[str, Any]) -> Timing | None:
+def timing_of(values: Mapping[str, Any]) -> Timing | None:
     """Return the timing of an IMU with faults, None if it has none."""
     return Timing(values) if any(map(values.get, FAULTS)) else None

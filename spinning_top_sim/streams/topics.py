@@ -20,7 +20,7 @@ from spinning_top_sim.streams.gnss import Fix, Velocity
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.stream import Samples, Stream
-from spinning_top_sim.streams.timing import Timing, faults_of
+from spinning_top_sim.streams.timing import Timing, timing_of
 
 NODE_NAME = 'spinning_top'
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
@@ -94,7 +94,7 @@ class ImuStream(Stream):
         self.imu, self._frame_id = imu, values['imu.frame_id']
         self.has_orientation, self._is_noisy = has_orientation, is_noisy
         super().__init__(values, parameter, topic, 'sensor_msgs/msg/Imu', self._template(),
-                         fields, faults_of(values) if is_noisy else None)
+                         fields=fields, timing=timing_of(values) if is_noisy else None)
 
     def apply(self, changes: Mapping[str, Any]) -> None:
         super().apply(changes)
@@ -117,7 +117,7 @@ class MagneticField(Stream):
 
     def __init__(self, values: Mapping[str, Any], imu: Imu) -> None:
         super().__init__(values, 'mag', 'imu/mag', MAGNETIC_FIELD,
-                         messages.stamped(values['imu.frame_id'], 3, 9), self._field)
+                         messages.stamped(values['imu.frame_id'], 3, 9), fields=self._field)
         self._imu, self._sensor_of = imu, lru_cache(4)(partial(Magnetometer, values))
 
     def _field(self, samples: Samples) -> Sequence[Field]:
@@ -153,7 +153,7 @@ class Markers(Stream):
             values['world_frame'], (2.0 * shape.radius, 2.0 * shape.radius, shape.height), lines,
             0.02 * abs(shape.tip), self._count + 1 if self._count else 0)
         super().__init__(values, 'markers', 'markers', 'visualization_msgs/msg/MarkerArray',
-                         template, self._markers)
+                         template, fields=self._markers)
 
     def _markers(self, samples: Samples) -> Sequence[Field]:
         states = samples.states
@@ -188,16 +188,17 @@ def all_streams(values: Mapping[str, Any], imu: Imu | None = None) -> list[Strea
     imu : of which they are; None: one of these parameters
     """
     imu, world, body = imu or Imu(values), values['world_frame'], values['body_frame']
-    frame, faults = values['imu.frame_id'], faults_of(values)
+    frame, timing = values['imu.frame_id'], timing_of(values)
     stream, of_imu = partial(Stream, values), partial(ImuStream, values, imu)
-    increment = partial(stream, 'increments', timing=faults, rate_parameter='imu.rate')
+    increment = partial(stream, 'increments', timing=timing, rate_parameter='imu.rate')
     return [
         stream('clock', '/clock', 'rosgraph_msgs/msg/Clock', messages.clock()),
         stream('pose', 'pose', 'geometry_msgs/msg/PoseStamped', messages.stamped(world, 3, 4),
-               _pose),
-        stream('tf', '/tf', 'tf2_msgs/msg/TFMessage', messages.transform(world, body), _pose),
+               fields=_pose),
+        stream('tf', '/tf', 'tf2_msgs/msg/TFMessage', messages.transform(world, body),
+               fields=_pose),
         stream('joint_states', 'joint_states', 'sensor_msgs/msg/JointState',
-               messages.joint_state(JOINTS), _joints),
+               messages.joint_state(JOINTS), fields=_joints),
         of_imu('imu', 'imu/data_raw', partial(_readings, imu), has_orientation=False,
                is_noisy=True),
         of_imu('imu_data', 'imu/data', partial(_estimates, imu), is_noisy=True),
@@ -206,11 +207,11 @@ def all_streams(values: Mapping[str, Any], imu: Imu | None = None) -> list[Strea
         of_imu('ground_truth_imu', 'ground_truth/imu',
                lambda samples: (imu.orientation(samples.states), *imu.sampled(samples))),
         stream('imu_timing', 'ground_truth/imu_timing', ARRAY,
-               messages.float64_multi_array(TIMING), partial(_timing, Timing(values), imu),
-               rate_parameter='imu.rate'),
+               messages.float64_multi_array(TIMING), rate_parameter='imu.rate',
+               fields=partial(_timing, Timing(values), imu)),
         MagneticField(values, imu),
         stream('mag', 'ground_truth/mag', MAGNETIC_FIELD, messages.stamped(frame, 3, 9),
-               lambda samples: (
+               fields=lambda samples: (
                    attitude.rotated_back(imu.orientation(samples.states), values['mag.field']),
                    messages.EXACT)),
         Fix(values, 'gnss/fix'),
@@ -218,16 +219,16 @@ def all_streams(values: Mapping[str, Any], imu: Imu | None = None) -> list[Strea
         Velocity(values, 'gnss/velocity'),
         Velocity(values, 'ground_truth/gnss/velocity', is_exact=True),
         increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped', messages.stamped(frame, 4),
-                  lambda samples: samples.once(imu.measured_increments)[:1]),
+                  fields=lambda samples: samples.once(imu.measured_increments)[:1]),
         increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', messages.stamped(frame, 3),
-                  lambda samples: samples.once(imu.measured_increments)[1:]),
+                  fields=lambda samples: samples.once(imu.measured_increments)[1:]),
         stream('ground_truth_odom', 'ground_truth/odom', ODOMETRY, messages.odometry(world, body),
-               _odometry),
+               fields=_odometry),
         stream('ground_truth_imu_odom', 'ground_truth/imu_odom', ODOMETRY,
                messages.odometry(world, frame),
-               lambda samples: (*imu.motion(samples), imu.true(samples.states)[0])),
+               fields=lambda samples: (*imu.motion(samples), imu.true(samples.states)[0])),
         stream('invariants', '~/invariants', ARRAY, messages.float64_multi_array(INVARIANTS),
-               _invariants),
+               fields=_invariants),
         Markers(values)]
 
 

@@ -14,8 +14,8 @@ from spinning_top_sim.streams import noise
 
 # Sines that a spectral density becomes, for each axis.
 LINES = 512
-Rows = NDArray[np.float64]
-Response = Callable[[Rows], NDArray[np.complex128]]
+Matrix = NDArray[np.float64]
+Response = Callable[[Matrix], NDArray[np.complex128]]
 
 
 class Vibration:
@@ -53,7 +53,7 @@ class Vibration:
         return rates, force
 
 
-def _sum(lines: Rows, middle: Column, seconds: Column | float, vector: Vector) -> Vector:
+def _sum(lines: Matrix, middle: Column, seconds: Column | float, vector: Vector) -> Vector:
     if not len(lines):
         return vector
     total = np.zeros((3, len(middle)))
@@ -67,7 +67,7 @@ def _sum(lines: Rows, middle: Column, seconds: Column | float, vector: Vector) -
 
 
 def _lines(values: Mapping[str, Any], kind: str, purpose: noise.Purpose,
-           response: Response) -> Rows:
+           response: Response) -> Matrix:
     """Return frequencies [Hz], amplitudes and phases [turns] of the sines, (lines, 3, 3 axes)."""
     lines = np.empty((0, 3, 3))
     amplitude = values[f'imu.vibration.{kind}']

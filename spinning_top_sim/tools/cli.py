@@ -27,11 +27,13 @@ class Parser(argparse.ArgumentParser):
         self.exit(WRONG_USAGE, printable(f'{self.prog}: {message}; see --help') + '\n')
 
 
-def run(name: str, help_text: str | None, argv: Sequence[str] | None,
+def run(name: str, help_text: str | None,
         add_arguments: Callable[[argparse.ArgumentParser], object],
-        command: Callable[[argparse.Namespace], int]) -> int:
+        command: Callable[[argparse.Namespace], int], argv: Sequence[str] | None = None) -> int:
     """
-    Run the command `spinning-top NAME`; return its exit code.
+    Run the command `spinning-top NAME`; return its exit code: the `main` of its module.
+
+    argv : arguments, by default those of the program
 
     A ValueError is printed as one line, and the code is WRONG_USAGE; a RuntimeError,
     ArithmeticError, OSError or ImportError likewise, with FAILED.

@@ -22,7 +22,7 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -34,11 +34,6 @@ from spinning_top_sim.tools import cli, ensemble_spec
 from spinning_top_sim.tools.ensemble_part import DATA, compute_part, versions, write_row
 
 MANIFEST = 'manifest.json'
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('ensemble', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -143,3 +138,6 @@ def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     written = folder / f'{MANIFEST}.new'
     written.write_text(json.dumps(manifest, indent=1), encoding='utf-8')
     written.replace(folder / MANIFEST)
+
+
+main = partial(cli.run, 'ensemble', __doc__, add_arguments, _run)

@@ -25,7 +25,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS, CdrWriter, Field, Template
 from spinning_top_sim.streams.messages import FIELDS
 from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
+from spinning_top_sim.streams.topics import ARRAY, INVARIANTS, JOINTS, TIMING
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
 from spinning_top_sim.tools.simulate import write_log
 
@@ -54,6 +54,8 @@ def versions() -> dict[str, str]:
 
 def _column_names(stream: Stream) -> Sequence[str]:
     """Return the names of the numbers in a message, '' for those that are not kept."""
+    if stream.type_name == ARRAY and stream.topic not in LABELS:
+        raise ValueError(f'{stream.topic}: its numbers have no names, which must be in LABELS')
     names = []
     for field, count in zip(FIELDS[stream.type_name], stream.template.counts, strict=True):
         labels = LABELS.get(stream.topic) or ('xyzw'[:count] if count <= 4 else range(count))

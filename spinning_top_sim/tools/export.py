@@ -11,7 +11,7 @@ exit codes:
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -75,11 +75,6 @@ MEANINGS = {
         'acceleration of the pivot in the world, of the piece that ends where two meet'}
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('export', __doc__, argv, add_arguments, _run)
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     kind = parser.add_mutually_exclusive_group(required=True)
@@ -126,7 +121,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _write_reference(folder: Path, scenes: Mapping[str, Mapping[str, Any]], duration: float,
                      rate: float) -> None:
     """Write trajectories, models, scenes.json and README.md into a new folder."""
-    folder.mkdir(parents=True)
+    folder.mkdir()
     facts = {}
     for name, values in scenes.items():
         table = TrueStates(period_ns(rate), COLUMNS, partial(_imu_and_pivot, Imu(values)))
@@ -155,3 +150,6 @@ def _imu_and_pivot(imu: Imu, samples: Samples) -> tuple[Column, ...]:
     """Return the readings of a perfect IMU, and the acceleration of the pivot."""
     rates, force = imu.true(samples.states)
     return (*rates, *force, *samples.pivot.acceleration)
+
+
+main = partial(cli.run, 'export', __doc__, add_arguments, _run)

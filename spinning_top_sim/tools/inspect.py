@@ -17,8 +17,9 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from spinning_top_sim.installation import needed
@@ -42,11 +43,6 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
         ('greatest precession [rad/s]', 'precession_max', 1.0),
         ('1 - m (separatrix: 0)', 'separatrix_distance', 1.0),
         ('L3^2/(4 lambda1 |P|) (sleeps: > 1)', 'gyroscopic_ratio', 1.0))
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('inspect', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -253,3 +249,6 @@ def _difference(expected: float | None, seen: float | None) -> str:
     if abs(difference) > abs(expected):         # also where that is 0
         return f'{difference:.1e} absolute'
     return f'{difference / abs(expected):.1e}' if difference else '0'
+
+
+main = partial(cli.run, 'inspect', __doc__, add_arguments, _run)

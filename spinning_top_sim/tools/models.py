@@ -44,6 +44,7 @@ def model(values: Mapping[str, Any], file_format: str, name: str) -> str:
 
 def start_of(values: Mapping[str, Any]) -> States:
     """Return the state at the start, as columns of one."""
+    # 'rk45' returns the start as it is, the exact motion rounds it.
     return solve(parameters.top_of(values), parameters.start_state(values), [0.0], method='rk45')
 
 

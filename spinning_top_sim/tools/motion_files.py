@@ -11,7 +11,7 @@ import csv
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from functools import partial
@@ -28,7 +28,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 from spinning_top_sim.tools import recorded_run
-from spinning_top_sim.tools.foreign_messages import deserialized
+from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION, deserialized
 
 ATTITUDES, GYROSCOPE, RATES = 'attitudes', 'gyroscope', 'rates'
 ACCELERATIONS, MAGNETOMETER, ANGLES = 'accelerations', 'magnetometer', 'angles'
@@ -44,9 +44,22 @@ ANGLE_WORDS = {'phi': 'a', 'precession': 'a', 'theta': 'b', 'nutation': 'b', 'ps
                'spin': 'c'}
 COMPONENTS = {'w': 'w', 'x': 'x', 'y': 'y', 'z': 'z', '0': 'w', '1': 'x', '2': 'y', '3': 'z'}
 OTHERS = {'dot', 'bias', 'b', 'covariance', 'cov', 'std', 'error'}
-TIMES = {'t', 'time', 'times', 'timestamp', 'stamp', 'sec', 'secs'}
-SECONDS = {'nanosec': '1e-9', 'nsec': '1e-9', 'ns': '1e-9', 'us': '1e-6', 'ms': '1e-3'}
-UNITS = {'deg': math.pi / 180.0, 'dps': math.pi / 180.0}
+TIMES = {'t', 'time', 'times', 'timestamp', 'stamp'}
+WHOLE = 'sec', 'secs'               # of a stamp in two columns, and what is beside it
+REST = 'nanosec', 'nanosecs', 'nsec', 'nsecs'
+SECONDS = {'': '1', 's': '1', 'ms': '1e-3', 'us': '1e-6', 'ns': '1e-9',
+           **dict.fromkeys(WHOLE, '1'), **dict.fromkeys(REST, '1e-9')}
+_DEG, _G = math.pi / 180.0, 9.80665
+_ANGLE = {'': 1.0, 'rad': 1.0, 'mrad': 1e-3, 'deg': _DEG}
+_RATE = {**_ANGLE, 'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': _DEG, 'dps': _DEG}
+# By part, units that the name of a column may tell; their letters count.
+UNITS = {
+    ATTITUDES: {'': 1.0}, ANGLES: _ANGLE, GYROSCOPE: _RATE, RATES: _RATE,
+    ACCELERATIONS: {'': 1.0, 'm/s^2': 1.0, 'm/s/s': 1.0, 'g': _G, 'mg': 1e-3 * _G},
+    MAGNETOMETER: {'': 1.0, 'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7,
+                   'gauss': 1e-4}}
+SIGNS = str.maketrans({'µ': 'u', 'μ': 'u', '°': 'deg'})
+SUFFIXES = {'rad', 'deg', 'dps', *SECONDS} - {''}       # units without brackets
 # In the order of preference.
 MESSAGES = [f'{package}/msg/{name}' for package, name in (
     ('geometry_msgs', 'PoseStamped'), ('geometry_msgs', 'PoseWithCovarianceStamped'),
@@ -55,7 +68,7 @@ MESSAGES = [f'{package}/msg/{name}' for package, name in (
     ('tf2_msgs', 'TFMessage'), ('sensor_msgs', 'Imu'), ('sensor_msgs', 'MagneticField'))]
 COVARIANCES = {GYROSCOPE: 'angular_velocity_covariance',
                ACCELERATIONS: 'linear_acceleration_covariance'}
-NOT_OF_BODY = ('imu_odom', 'imu_bias')      # topics of this package
+NOT_OF_BODY = ('imu_odom', 'imu_bias', 'imu/dq')    # topics of this package
 TUM = 'timestamp tx ty tz qx qy qz qw'      # of a file that does not name its columns
 NEEDED = ('columns such as t, qw, qx, qy, qz or phi, theta, psi, or messages of a type that '
           'docs/grade_files.md lists')
@@ -126,10 +139,13 @@ def read(path: Path, topic: str | None = None) -> Recorded:
             recorded.add({'': READERS[path.suffix](path)})
         except (ValueError, EOFError) as error:
             raise ValueError(f'{path}: {" ".join(str(error).split())}') from error
-    found = len(recorded.parts.get(ATTITUDES, ((), ()))[0])
-    if found < LEAST_SAMPLES:
-        raise ValueError(f'{path} has {found or "no"} attitudes: must have {LEAST_SAMPLES} at '
-                         f'least; from {NEEDED}')
+    times, attitudes = recorded.parts.get(ATTITUDES, (np.empty(0), np.empty((0, 4))))
+    if len(times) < LEAST_SAMPLES:
+        raise ValueError(f'{path} has {len(times) or "no"} attitudes: must have {LEAST_SAMPLES} '
+                         f'at least; from {NEEDED}')
+    for at in times[~np.any(attitudes, axis=1)][:1]:
+        raise ValueError(f'{path}: the attitude at {at:.9g} s is 0, 0, 0, 0: must be a quaternion '
+                         'of norm 1, or not be there')
     return recorded
 
 
@@ -175,8 +191,11 @@ def _npz(path: Path) -> Table:
         for name, values in arrays.items():
             # `Trajectory.attitudes` are w, x, y, z, `States.quaternion` x, y, z, w.
             order = 'wxyz' if name == ATTITUDES else 'xyzw'
-            columns.update({name: values} if values.ndim == 1 else {
-                f'{name}_{part}': one for part, one in zip(order, values.T, strict=False)})
+            if values.ndim == 2:
+                columns.update((f'{name}_{part}', column) for part, column in zip(
+                    order, values.T, strict=False))
+            elif values.ndim == 1:
+                columns[name] = values
     return columns
 
 
@@ -187,11 +206,11 @@ def _words(name: str) -> tuple[list[str], str]:
     """Return the words of the name of a column, the last being its component, and its unit."""
     bare, _, unit = name.partition('[')
     words = re.findall('[a-z]+|[0-9]+', re.sub('([a-z])([A-Z])', r'\1_\2', bare).lower())
-    if len(words) > 1 and words[-1] in {*UNITS, *SECONDS, 's', 'rad'}:
-        unit = unit or words.pop()
+    if words and words[-1] in (SUFFIXES if words[1:] else WHOLE + REST):
+        unit = words.pop()
     if words and words[-1][-1] in 'wxyz' and words[-1][:-1] in set().union(*WORDS.values()):
         words[-1:] = words[-1][:-1], words[-1][-1]      # qw, accx
-    return words, re.split('[^a-z]', unit.lower())[0]
+    return words, unit.partition(']')[0]
 
 
 def _kind(words: Sequence[str]) -> tuple[str, str]:
@@ -209,17 +228,17 @@ def _kind(words: Sequence[str]) -> tuple[str, str]:
 
 def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Part]]:
     """Return stamps (n,), decimals [s], and the parts that these columns make."""
-    stamps: dict[str, Sequence[Any]] = {}
+    stamps: dict[str, dict[str, Sequence[Any]]] = defaultdict(dict)     # by clock and unit
     groups: dict[tuple[str, str], dict[str, tuple[Reals, str]]] = defaultdict(dict)
     for name, cells in columns.items():
         words, unit = _words(name)
-        if TIMES & {*words}:
-            stamps.setdefault(unit if unit in SECONDS else words[-1], cells)
-        elif (named := _kind(words))[0]:
-            kind, component = named
+        kind, component = _kind(words)
+        if TIMES & {*words} or unit in WHOLE + REST:
+            stamps[' '.join(words)].setdefault(_unit(name, unit, SECONDS), cells)
+        elif kind:
+            factor = UNITS[kind][_unit(name, unit, UNITS[kind])]
             groups[kind, '' if kind == ANGLES else ' '.join(words[:-1])].setdefault(
-                component, (UNITS.get(unit, 1.0) * np.array([_number(cell) for cell in cells]),
-                            name))
+                component, (factor * np.array([_number(cell) for cell in cells]), name))
     if not stamps:
         raise ValueError(f'no column of times among {", ".join(columns)}: must be t, time, '
                          'timestamp or stamp')
@@ -237,7 +256,18 @@ def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Part]]:
             np.where(known, np.roll(turns.as_quat(), 1, axis=1), np.nan), names))
     if {RATES, ACCELERATIONS} <= parts.keys() and GYROSCOPE not in parts:
         parts[GYROSCOPE] = parts.pop(RATES)     # wx .. az are those of an IMU
-    return _seconds(stamps), parts
+    return _seconds(next(iter(stamps.values()))), parts
+
+
+def _unit(name: str, unit: str, known: Collection[str]) -> str:
+    """Return the one of the known units that the name of a column tells, by its letters."""
+    def letters(text: str) -> str:
+        return re.sub('[^a-z\ufffd]', '', text.translate(SIGNS).lower())
+
+    for one in known:
+        if letters(one) == letters(unit):
+            return one
+    raise ValueError(f'{name}: the unit must be {", ".join(filter(None, known))}, or not be told')
 
 
 def _number(cell: Any) -> float:
@@ -256,13 +286,12 @@ def _decimal(cell: Any) -> Decimal:
 
 
 def _seconds(stamps: Mapping[str, Sequence[Any]]) -> NDArray[np.object_]:
-    """Return stamps (n,), decimals [s], of columns by their unit."""
-    unit = next(iter(stamps))
+    """Return stamps (n,), decimals [s], of the columns of a clock by their unit."""
+    unit = min(stamps, key=lambda unit: unit not in WHOLE)      # else the first
     times = np.array([_decimal(cell) for cell in stamps[unit]], object)
-    if unit in ('sec', 'secs'):
-        for fine in stamps.keys() & {'nanosec', 'nsec'}:
-            times += [_decimal(part) * Decimal('1e-9') for part in stamps[fine]]
-    scale = Decimal(SECONDS.get(unit, '1'))
+    for rest in stamps.keys() & REST if unit in WHOLE else ():
+        times += [_decimal(part) * Decimal('1e-9') for part in stamps[rest]]
+    scale = Decimal(SECONDS[unit])
     first = min((one for one in times if one.is_finite()), default=Decimal(0))
     if scale == 1 and first > 10 ** 11:         # a date in ms, us or ns: in s it has ten digits
         scale = Decimal(10) ** (-3 * round((first.adjusted() - 9) / 3))
@@ -275,7 +304,7 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
     recorded, origin, end_ns = Recorded(), None, 1 << 63
     with LogReader(path) as reader:
         types = {topic.name: topic.type_name for topic in reader.topics
-                 if topic.type_name in MESSAGES and not topic.name.endswith(NOT_OF_BODY)}
+                 if topic.type_name in MESSAGES}
         if wanted is not None and wanted not in types:
             raise ValueError(f'{path} has no topic {wanted} with attitudes; it has '
                              f'{", ".join(types) or "none"}')
@@ -283,11 +312,14 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
             run = recorded_run.read_run_description(reader)
             recorded.parameters, origin = run.values_in_effect, Decimal(run.epoch_ns) / 10 ** 9
             end_ns = next((one.stamp_ns for one in run.events if one.name != 'start'), end_ns)
+            types = {name: kind for name, kind in types.items()
+                     if name == wanted or not name.endswith(NOT_OF_BODY)}
         if not reader.whole:
             recorded.notes.append('the log is truncated: read as far as it goes')
         tables, first = _log_tables(reader, types, end_ns)
     chosen = sorted(tables, key=lambda one: (
-        one[0] != wanted, _rests(tables[one]), MESSAGES.index(types[one[0]]), one))
+        one[0] != wanted, _rests(tables[one]), one[0].endswith(NOT_OF_BODY),
+        MESSAGES.index(types[one[0]]), one))
     recorded.add({' '.join(filter(None, one)): tables[one] for one in chosen}, origin)
     for topic, message in first.items():
         recorded.covariance.update((kind, matrix) for kind, matrix in _covariances(message)
@@ -343,11 +375,11 @@ def _fields(message: Any, prefix: str = '') -> Iterator[tuple[str, float]]:
     if hasattr(message, 'position') and hasattr(message, 'effort'):
         yield from zip(message.name, message.position.tolist(), strict=False)
         return
-    covariance = getattr(message, 'orientation_covariance', None)
+    first_variance = getattr(message, 'orientation_covariance', (0.0,))[0]
     for name in message.__dataclass_fields__:
         value = getattr(message, name)
         if isinstance(value, float):
             yield prefix + name, value
         elif hasattr(value, '__dataclass_fields__') and not (
-                name == 'orientation' and covariance is not None and covariance[0] == -1.0):
+                name == 'orientation' and first_variance == NO_ORIENTATION):
             yield from _fields(value, f'{prefix}{name}.')

@@ -14,7 +14,7 @@ exit codes:
 """
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from spinning_top_sim.recording.damage import count
@@ -23,11 +23,6 @@ from spinning_top_sim.recording.recovery import recover
 from spinning_top_sim.tools import cli
 
 SOME_LOST = 3
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('recover', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,3 +48,6 @@ def _run(arguments: argparse.Namespace) -> int:
                    f'{count(recovered.chunk_count, "chunk")}, {count(recovered.size, "byte")} in '
                    f'{output}')
     return cli.OK if damage.lossless else SOME_LOST
+
+
+main = partial(cli.run, 'recover', __doc__, add_arguments, _run)

@@ -13,6 +13,7 @@ exit codes:
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,6 @@ FORMATS = ('mcap', 'csv', 'parquet')
 
 # Time [ns], and L3 and Lz commanded there [kg m^2/s], None at the end of the run.
 Stop = tuple[int, tuple[float, float] | None]
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with these arguments, by default the program's; return its exit code."""
-    return cli.run('simulate', __doc__, argv, add_arguments, _run)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -193,3 +189,6 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
         finally:
             file.finish()
     return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
+
+
+main = partial(cli.run, 'simulate', __doc__, add_arguments, _run)

@@ -40,9 +40,9 @@ def wheel(shape: Shape, length: float) -> list[BodyPart]:
     axle = creation.revolve(np.column_stack((thick[:, 0], thick[:, 1] * np.sign(length))))
     parts = [
         BodyPart('rim', creation.annulus(0.82 * radius, radius, height, sections=SMOOTH), BLUE),
-        BodyPart('marks', _joined(marks[1:]), WHITE),
-        BodyPart('mark', _joined([marks[0], marked_spoke]), GOLD),
-        BodyPart('spokes', _joined([hub, *(spoke.copy().apply_transform(turn)
+        BodyPart('marks', _merged(marks[1:]), WHITE),
+        BodyPart('mark', _merged([marks[0], marked_spoke]), GOLD),
+        BodyPart('spokes', _merged([hub, *(spoke.copy().apply_transform(turn)
                                        for turn in turns[1:])]), STEEL)]
     for part in parts:
         part.mesh.apply_translation(centre)
@@ -63,7 +63,7 @@ def stand(radius: float) -> trimesh.Trimesh:
         sections=SMOOTH)
 
 
-def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    joined = trimesh.util.concatenate(meshes)
-    assert isinstance(joined, trimesh.Trimesh)
-    return joined
+def _merged(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    merged = trimesh.util.concatenate(meshes)
+    assert isinstance(merged, trimesh.Trimesh)
+    return merged

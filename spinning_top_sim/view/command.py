@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     arguments = parser.parse_args(words)
     if arguments.log:
-        return cli.run('view', DESCRIPTION, words, add_arguments, _show_logs)
+        return cli.run('view', DESCRIPTION, add_arguments, _show_logs, words)
     with contextlib.ExitStack() as stack:
         return run_node('view', argv, partial(_prepare, stack, arguments, for_ros))
 
@@ -77,13 +77,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--host', default=LOOPBACK,
         help=f'address to serve at (default: {LOOPBACK}, which only this machine reaches)')
     add('--html', type=Path, metavar='FILE',
-        help='write the first minute of the logs as a page that needs no server, and end')
+        help='write the first minute of the logs, up to a reset to another top, as a page that '
+             'needs no server, and end')
     add('--no-browser', action='store_true', help='only print the address')
 
 
 def _show_logs(arguments: argparse.Namespace) -> int:
     if len(arguments.log) > 2:
         raise ValueError(f'{len(arguments.log)} logs: must be one or two')
+    for option in ('scene', 'imu'):
+        if (name := getattr(arguments, option)) is not None:
+            raise ValueError(f'--{option} {name}: must be without a log, which has its own')
     if arguments.html is not None:
         cli.check_output(arguments.html)
     with needed('the page', 'view'):

@@ -10,10 +10,12 @@ from typing import Any
 import viser
 
 from spinning_top_sim.installation import parameter_files
+from spinning_top_sim.nodes.node_status import SPEED, STATE, TIME
+from spinning_top_sim.nodes.recording_session import RECORDED_FILE, RECORDER
 from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
+from spinning_top_sim.view.node_client import NodeClient
 from spinning_top_sim.view.page import Page, set_content, set_value
-from spinning_top_sim.view.sim_node import SimNode
 
 STEPS = 1000                    # of a slider
 # Velocity x, y of the pivot [m/s] that a button asks for, until `pivot.cmd_timeout` ends it.
@@ -25,8 +27,8 @@ LEFT_ALONE_S = 1.0              # after that a slider follows the node again
 class Controls:
     """The controls.  Their callbacks run in threads of viser; only one at a time acts."""
 
-    def __init__(self, page: Page, sim_node: SimNode) -> None:
-        self._page, self._sim_node = page, sim_node
+    def __init__(self, page: Page, client: NodeClient) -> None:
+        self._page, self._client = page, client
         self._lock = threading.Lock()
         self._paused = False
         self._spin = [0.0, 0.0]                     # L3 and Lz of the node
@@ -49,9 +51,9 @@ class Controls:
         for slider in self._sliders:
             slider.on_update(self._on_slider)
         self._pause.on_click(lambda _: self._act(self._switch_pause))
-        step.on_click(lambda _: self._act(lambda: sim_node.call('step')))
-        reset.on_click(lambda _: self._act(lambda: sim_node.call('reset')))
-        pad.on_click(lambda _: self._act(lambda: sim_node.drive(*PAD[pad.value])))
+        step.on_click(lambda _: self._act(lambda: client.call('step')))
+        reset.on_click(lambda _: self._act(lambda: client.call('reset')))
+        pad.on_click(lambda _: self._act(lambda: client.drive(*PAD[pad.value])))
         self._record.on_update(self._on_record)
         self._scene.on_update(self._on_scene)
 
@@ -64,11 +66,11 @@ class Controls:
 
     def _on_record(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:        # somebody in a browser
-            self._act(lambda: self._sim_node.call('record', self._record.value))
+            self._act(lambda: self._client.call('record', self._record.value))
 
     def _on_scene(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None and self._scene.value:
-            self._act(lambda: self._sim_node.choose(self._scene.value))
+            self._act(lambda: self._client.choose(self._scene.value))
 
     def _on_slider(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:
@@ -82,7 +84,7 @@ class Controls:
         if [l3, lz] == self._spin:      # they are sent: a slider may move while a request waits
             return self._page.message.content
         try:
-            said = self._sim_node.command(l3, lz)
+            said = self._client.command(l3, lz)
         except Exception:
             self._leave_sliders()           # show the spin of the node again
             self.show_spin(*self._spin)
@@ -91,7 +93,7 @@ class Controls:
         return said
 
     def _switch_pause(self) -> str:
-        said = self._sim_node.call('set_pause', not self._paused)
+        said = self._client.call('set_pause', not self._paused)
         self._show_paused(not self._paused)
         return said
 
@@ -125,14 +127,14 @@ class Controls:
                     self._shown[k] = slider.value
 
     def tell_status(self, message: str, numbers: Mapping[str, str]) -> None:
-        recorder, path = numbers['recorder'], numbers.get('recorded file', '')
+        """Show what the node says in /diagnostics: its message, and its numbers by their keys."""
+        recorder, path = numbers[RECORDER], numbers.get(RECORDED_FILE, '')
         self._status.content = ' · '.join(filter(None, (
-            message, f't = {float(numbers["simulated time [s]"]):.1f} s',
-            f'real-time factor {numbers["real-time factor"]}',
+            message, f't = {float(numbers[TIME]):.1f} s', f'{SPEED} {numbers[SPEED]}',
             f'recorder {recorder} {path}'.rstrip())))
         if not self._lock.locked():
-            if numbers['state'] in ('paused', 'running'):
-                self._show_paused(numbers['state'] == 'paused')
+            if numbers[STATE] in ('paused', 'running'):
+                self._show_paused(numbers[STATE] == 'paused')
             # A click whose callback has not come yet would be undone.
             is_on, clicked_at = recorder == 'recording', self._record.update_timestamp
             if self._record.value != is_on and time.time() - clicked_at > LEFT_ALONE_S:

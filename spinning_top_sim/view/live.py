@@ -17,13 +17,14 @@ from rclpy.subscription import Subscription
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
 
+from spinning_top_sim.nodes.node_status import DRIFT, EPOCH, ERROR
 from spinning_top_sim.nodes.publishers import THROTTLED
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.view import shapes
 from spinning_top_sim.view.controls import Controls
+from spinning_top_sim.view.node_client import ANSWER_S, NodeClient, RequestError
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, WINDOW_NS, Page
-from spinning_top_sim.view.sim_node import ANSWER_S, RequestError, SimNode
 from spinning_top_sim.view.track import Track, empty
 
 # Best effort and a short queue, so that a slow page never makes the node wait.
@@ -51,7 +52,7 @@ class LiveView(Node):
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
         self._arrived = threading.Event()       # something is in the inbox
         self._listeners: dict[str, Subscription] = {}
-        self._sim_node = SimNode(self)
+        self._client = NodeClient(self)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, QOS)
         self.create_timer(0.2, self._listen_as_needed)
         self._track: Track | None = None
@@ -60,7 +61,7 @@ class LiveView(Node):
         self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
         self._gone = False              # whether the page says that the node has ended
         self._stopped = False
-        self._controls = Controls(page, self._sim_node)
+        self._controls = Controls(page, self._client)
         self._thread = threading.Thread(target=self._draw, name='page', daemon=True)
 
     def start(self) -> None:
@@ -68,7 +69,8 @@ class LiveView(Node):
 
     def stop(self) -> None:
         self._stopped = True
-        self._thread.join(2.0 * ANSWER_S)
+        if self._thread.is_alive():
+            self._thread.join(2.0 * ANSWER_S)
         if not self._gone:
             self._controls.tell_end('`view` has ended: no more samples come')
         self._page.close()
@@ -94,17 +96,16 @@ class LiveView(Node):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name == self._sim_node.name.lstrip('/'):
+            if status.name == self._client.name.lstrip('/'):
                 self._heard_at = time.monotonic()
                 numbers = {pair.key: pair.value for pair in status.values}
                 self._controls.tell_status(status.message, numbers)
-                epoch_ns = int(numbers['stamp of t = 0 [ns]'])
+                epoch_ns = int(numbers[EPOCH])
                 if self._epoch_ns not in (None, epoch_ns):
                     # Not `|=`: that could undo what `choose` writes.
-                    self._sim_node.is_stale = True
+                    self._client.is_stale = True
                 self._epoch_ns = epoch_ns
-                self._errors = float(numbers['energy drift']), float(
-                    numbers['orientation error [rad]'])
+                self._errors = float(numbers[DRIFT]), float(numbers[ERROR])
 
     # The thread of the page.
 
@@ -123,14 +124,14 @@ class LiveView(Node):
             self._arrived.wait(1.0 / RATE)
 
     def _draw_once(self) -> None:
-        ready = self._sim_node.is_there
-        if self._sim_node.is_stale and ready:
+        ready = self._client.is_there
+        if self._client.is_stale and ready:
             self._read_parameters()
         if self._track is None:
             return
         self._gone = not ready or time.monotonic() > self._heard_at + SILENT_S
         if self._gone:
-            self._controls.tell_end(f'{self._sim_node.name} has ended, or does not answer')
+            self._controls.tell_end(f'{self._client.name} has ended, or does not answer')
         self._take_messages()
         track = self._track
         if not len(track.attitudes.rows):
@@ -165,7 +166,7 @@ class LiveView(Node):
     def _read_parameters(self) -> None:
         """Read the parameters of the sim_node, and draw its top."""
         try:
-            values = self._sim_node.values()
+            values = self._client.values()
         except RequestError:
             return
         track = Track('', values)

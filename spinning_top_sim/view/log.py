@@ -2,10 +2,11 @@
 """The page of one log or two: reads their tracks, and plays them."""
 
 import contextlib
+import itertools
 import time
 from bisect import bisect_right
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,48 +21,83 @@ from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
 from spinning_top_sim.view import plots, svg, text
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
-from spinning_top_sim.view.track import DescribedMotion, Series, Track, attitude_rows, joined
+from spinning_top_sim.view.track import (
+    WIDTHS,
+    DescribedMotion,
+    Series,
+    Track,
+    attitude_rows,
+    joined,
+)
 
 SPEEDS = ('0.1', '0.25', '0.5', '1', '2', '4', '8')
 LONGEST_HTML_S = 60.0
 
 
-def read_logs(paths: Sequence[Path]) -> list[Track]:
-    """Return the tracks of one log or two, which may be truncated.  Raises LogError."""
+def read_logs(paths: Sequence[Path]) -> list[list[Track]]:
+    """
+    Return the tracks of each of one log or two, which may be truncated.  Raises LogError.
+
+    A log has one track, and another one from each reset on that makes another top of it.
+    """
     return [_read_log(path, path.stem if len(paths) > 1 else '') for path in paths]
 
 
-def _read_log(path: Path, name: str) -> Track:
+def _read_log(path: Path, name: str) -> list[Track]:
     with LogReader(path) as reader:
         notes = [] if reader.whole else ['it is truncated: shown as far as it goes']
         try:
             run = recorded_run.read_run_description(reader)
         except recorded_run.ForeignLogError as error:
-            track = _read_foreign(reader, name)
+            tracks = [_read_foreign(reader, name)]
             notes.append(str(error))
         else:
-            track = Track(name, run.values_in_effect)
-            track.epoch_ns = run.epoch_ns
-            _read_samples(reader, track, run.topics)
+            tracks = _new_tracks(run, name)
+            _read_samples(reader, tracks, run)
             try:
-                _follow_run(track, run, reader.span[1])
+                _follow_run(tracks, run, reader.span[1])
             except MALFORMED as error:
                 notes.append(f'the run cannot be followed: {reason_of(error)}')
-    if not len(track.attitudes.rows):
+    tracks = [track for track in tracks if len(track.attitudes.rows)]
+    if not tracks:
         raise LogError(f'{path}: no attitude in it ({", ".join(LAYOUTS)})')
     if notes:
-        track.note = f'{path.name}: {"; ".join(notes)}'
-    return track
+        tracks[0].note = f'{path.name}: {"; ".join(notes)}'
+    return tracks
 
 
-def _read_samples(reader: LogReader, track: Track, topics: Mapping[str, str]) -> None:
-    """Read the samples of a log of this package; `topics` as in RunDescription."""
-    names = {topics[name]: name for name in track.samples if name in topics}
+def _new_tracks(run: recorded_run.RunDescription, name: str) -> list[Track]:
+    """Return tracks without samples, one for each top or mounting of the IMU in a run."""
+    tracks = [Track(name, run.values_in_effect)]
+    for event in run.events:
+        if event.name == 'reset':
+            before, values = tracks[-1].values, event.details['parameters']
+            if any(values[key] != before[key] for key in values
+                   if key.startswith('top.') or key == 'imu.rpy'):
+                tracks.append(Track(name, values))
+                tracks[-1].begin_ns = event.details['epoch_ns']
+    for track in tracks:
+        track.epoch_ns = run.epoch_ns
+    return tracks
+
+
+def _track_at(tracks: Sequence[Track], stamp_ns: int) -> Track:
+    """Return the track of a log that a stamp belongs to, the first one before that begins."""
+    return tracks[max(bisect_right(tracks, stamp_ns, key=lambda track: track.begin_ns) - 1, 0)]
+
+
+def _read_samples(reader: LogReader, tracks: Sequence[Track],
+                  run: recorded_run.RunDescription) -> None:
+    """Read the samples of a log of this package; messages of another size are none."""
+    names = {run.topics[name]: name for name in WIDTHS if name in run.topics}
     parts = defaultdict(list)
     for topic, group in reader.groups(names):
-        stamps_ns, data = zip(*((one.log_time, one.data) for one in group), strict=True)
-        parts[names[topic]].append(track.decode(names[topic], data, stamps_ns))
-    for name, samples in parts.items():
+        name = names[topic]
+        for track, part in itertools.groupby(group, lambda one: _track_at(tracks, one.log_time)):
+            fitting = [one for one in part if len(one.data) == len(track.templates[name])]
+            parts[track, name].append(track.decode(
+                name, [one.data for one in fitting], [one.log_time for one in fitting]))
+    for (track, name), samples in parts.items():
         track.samples[name] = joined(samples)
 
 
@@ -73,7 +109,7 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
         if topic.type_name not in LAYOUTS:
             continue
         for message in reader.messages([topic.name]):
-            with contextlib.suppress(ValueError):       # without an orientation
+            with contextlib.suppress(ValueError):       # undecodable, or without
                 stamp_ns, quaternion, _ = decode(message.data, topic.type_name)
                 norm = float(np.linalg.norm(quaternion))
                 if 0.5 < norm < 2.0:
@@ -86,11 +122,12 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
     return track
 
 
-def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> None:
+def _follow_run(tracks: Sequence[Track], run: recorded_run.RunDescription, end_ns: int) -> None:
     for simulation, event in recorded_run.rerun(run, end_ns):
         if isinstance(event, Block) or event.name == 'parameters':
             continue
         begin_ns = simulation.epoch_ns + max(simulation.now_ns, 0)
+        track = _track_at(tracks, begin_ns)
         track.motions.append(DescribedMotion.of(
             begin_ns, track.top, simulation.segment.start, simulation.describe(),
             pivot_moves=simulation.segment.ride is not None))
@@ -99,19 +136,23 @@ def _follow_run(track: Track, run: recorded_run.RunDescription, end_ns: int) -> 
 
 
 class Player:
-    """Plays logs on a page; its time [s] begins with the first sample, and ends at `length`."""
+    """
+    Plays logs on a page; its time [s] begins with the first sample, and ends at `length`.
 
-    def __init__(self, page: Page, tracks: Sequence[Track]) -> None:
+    logs : the tracks of each, as from `read_logs`
+    """
+
+    def __init__(self, page: Page, logs: Sequence[Sequence[Track]]) -> None:
         self._page = page
-        self._epoch_ns = tracks[0].epoch_ns       # t = 0 of all logs coincides
-        shifts_ns = [track.epoch_ns - self._epoch_ns for track in tracks]
-        shifted = list(zip(tracks, shifts_ns, strict=True))
+        self._epoch_ns = logs[0][0].epoch_ns      # t = 0 of all logs coincides
+        self._logs = [(tracks, tracks[0].epoch_ns - self._epoch_ns) for tracks in logs]
+        self._shown: list[Track] = []
+        shifted = [(track, shift_ns) for tracks, shift_ns in self._logs for track in tracks]
         self._begin_ns = min(track.span[0] - shift_ns for track, shift_ns in shifted)
         self.length = self._seconds(max(track.span[1] - shift_ns for track, shift_ns in shifted))
         self._commands = sorted({self._seconds(stamp_ns - shift_ns)
                                  for track, shift_ns in shifted for stamp_ns in track.commands_ns})
-        page.set_tracks(tracks, shifts_ns)
-        page.message.content = '\n'.join(f'*{track.note}*' for track in tracks if track.note)
+        page.message.content = '\n'.join(f'*{track.note}*' for track, _ in shifted if track.note)
         gui = page.gui
         with page.controls:
             self._button = gui.add_button('Pause')
@@ -162,16 +203,28 @@ class Player:
         self.draw(self._now)
 
     def draw(self, now: float) -> None:
-        self._page.draw(self._begin_ns + round(now * NANOSECONDS), self._epoch_ns)
+        """Draw the picture at a time [s], of the tops that are there then."""
+        page_ns = self._begin_ns + round(now * NANOSECONDS)
+        present = [_track_at(tracks, page_ns + shift_ns) for tracks, shift_ns in self._logs]
+        if present != self._shown:
+            self._shown = present
+            self._page.set_tracks(present, [shift_ns for _, shift_ns in self._logs])
+        self._page.draw(page_ns, self._epoch_ns)
 
     def write_html(self, path: Path) -> str:
-        """Write a file that plays the first minute by itself; return its length and size."""
+        """
+        Write a file that plays the first minute by itself; return its length and size.
+
+        It ends before the first reset to another top, as its plots are of one.
+        """
         page, begin_ns = self._page, self._begin_ns
         clock = page.server.scene.add_frame('/clock', show_axes=False)
         start = (begin_ns - self._epoch_ns) / NANOSECONDS
         clock.position = (start, 0.0, 0.0)          # read by the script of the file
         self.draw(0.0)
-        seconds = min(self.length, LONGEST_HTML_S)
+        seconds = min(self.length, LONGEST_HTML_S, *(
+            self._seconds(tracks[0].span[1] - shift_ns)
+            for tracks, shift_ns in self._logs if len(tracks) > 1))
         words = ''.join(page.words(begin_ns + round(second * NANOSECONDS), self._epoch_ns)
                         for second in [0.0, *self._commands] if second <= seconds)
         tops = page.plotted(begin_ns, self._epoch_ns, begin_ns,

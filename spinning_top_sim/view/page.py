@@ -50,7 +50,7 @@ class DrawnTop:
 
     def __init__(self, scene: viser.SceneApi, number: int, track: Track, shift_ns: int) -> None:
         self.track, self.shift_ns = track, shift_ns
-        name, far = f'/top{number}', shapes.reach(track)
+        name, far = f'/top{number}', shapes.axis_length(track)
         radius = abs(far)
         self.root = scene.add_frame(name, show_axes=False)
         self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
@@ -98,7 +98,7 @@ class DrawnTop:
         for name, arrow in self._arrows.items():
             arrow.visible = name in arrows
             vector = shapes.arrow(self.track, name, stamp_ns) if arrow.visible else None
-            arrow.points = NO_LINES if vector is None else shapes.segments(
+            arrow.points = NO_LINES if vector is None else shapes.lines_through(
                 np.vstack((np.zeros(3), vector)))
         self._draw_bounds(self.track.motion_at(stamp_ns), bounds)
 
@@ -122,15 +122,20 @@ class DrawnTop:
             return
         self._limits = limits
         for bound, theta in zip(self._bounds, self._limits, strict=True):
-            bound.points = shapes.circle(shapes.reach(self.track), theta)
+            bound.points = shapes.circle(shapes.axis_length(self.track), theta)
         # A top that comes low hangs from above.
         self._stand.wxyz = (1, 0, 0, 0) if description.theta_max < STANDS_TO else (0, 1, 0, 0)
 
 
 class Page:
     """
-    The page, with its own server.  One thread calls `set_tracks` and `draw`.
+    The page, with its own server.
 
+    One thread calls `set_tracks` and `draw`.  Threads of viser call what inputs call back: it may
+    set `message` and inputs.
+
+    server, gui : of viser
+    address : of the page, http://...
     title : such as the name of the log
     controls : the folder for the controls of the source of the samples
     message : what was done, or the reason why not
@@ -181,7 +186,7 @@ class Page:
         scene = self.server.scene
         self._tops = [DrawnTop(scene, number, track, shift_ns) for number, (track, shift_ns)
                       in enumerate(zip(tracks, shifts_ns, strict=True))]
-        size = self._reach = max(abs(shapes.reach(track)) for track in tracks)
+        size = self._size = max(abs(shapes.axis_length(track)) for track in tracks)
         self._over.visible = len(tracks) > 1
         self._bounds.visible = self._accuracy_folder.visible = any(
             track.has_body for track in tracks)
@@ -201,13 +206,13 @@ class Page:
     def draw(self, page_ns: int, epoch_ns: int) -> None:
         """Draw all tops at a stamp of the page [ns]; `epoch_ns` is that of t = 0."""
         arrows = {name for name, switch in self.arrows.items() if switch.value}
-        side = 0.0 if self._over.value else 1.3 * self._reach
+        side = 0.0 if self._over.value else 1.3 * self._size
         places = [top.track.places(np.array([page_ns + top.shift_ns]))[0] for top in self._tops]
         with self.server.atomic():
             if places:          # the picture follows the first top: the ground moves
                 x, y, z = places[0]
-                self._ground.position = (-(x % self._reach), -(y % self._reach),
-                                         -FOOT * self._reach - z)
+                self._ground.position = (-(x % self._size), -(y % self._size),
+                                         -FOOT * self._size - z)
             for k, (top, place) in enumerate(zip(self._tops, places, strict=True)):
                 top.root.position = place - places[0] + (
                     side * (2 * k - len(self._tops) + 1), 0.0, 0.0)

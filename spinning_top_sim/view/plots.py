@@ -31,9 +31,11 @@ class Plotted(NamedTuple):
     epoch_ns: int
 
     def seconds(self, stamps_ns: NDArray[np.int64]) -> Reals:
+        """Return the times of stamps (n,) [ns] since t = 0 [s]."""
         return (stamps_ns - self.epoch_ns) / NANOSECONDS
 
     def part(self, samples: Series) -> tuple[Reals, Reals]:
+        """Return times (n,) [s] and rows (n, width) of some samples in the span."""
         stamps_ns, rows = samples.part(self.begin_ns, self.end_ns).thinned(POINTS)
         return self.seconds(stamps_ns), rows
 
@@ -43,7 +45,7 @@ def motion_plots(tops: Sequence[Plotted]) -> list[Plot]:
     potential, energy, tilt, rate = (list[Line]() for _ in range(4))
     for top, dash in zip(tops, ('', '5 3'), strict=False):
         potential += _potential(top, dash)
-        stamps_ns, axis, _ = shapes.path(top.track, top.begin_ns, top.end_ns)
+        stamps_ns, axis, _ = shapes.trace_points(top.track, top.begin_ns, top.end_ns)
         stamps_ns, axis = Series(stamps_ns, axis).thinned(POINTS)
         tilt.append(Line('θ', RED, top.seconds(stamps_ns), shapes.tilt(axis), dash))
         times, rows = top.part(top.track.rates)
@@ -82,19 +84,19 @@ def _potential(top: Plotted, dash: str) -> list[Line]:
     motion = top.track.motion_at(top.stamp_ns)
     if motion is None or motion.description is None:
         return []
-    axis, (l3, lz) = top.track.top, (motion.l3, motion.lz)
+    body, (l3, lz) = top.track.top, (motion.l3, motion.lz)
     theta = np.linspace(1e-3, math.pi - 1e-3, 2000)
-    values = effective_potential(axis, l3, lz, theta)
-    depth = max(motion.energy - float(values.min()), 0.05 * abs(axis.gravity_torque),
+    values = effective_potential(body, l3, lz, theta)
+    depth = max(motion.energy - float(values.min()), 0.05 * abs(body.gravity_torque),
                 1e-6 * abs(motion.energy))
     shown = np.flatnonzero(values <= motion.energy + depth)
     theta = np.linspace(theta[shown[0]], theta[shown[-1]], POINTS // 2)
     bounds = np.array([motion.description.theta_min, motion.description.theta_max])
     with np.errstate(all='ignore'):         # at the poles V may be infinite
-        heights = effective_potential(axis, l3, lz, bounds)
+        heights = effective_potential(body, l3, lz, bounds)
     turning = bounds[np.abs(heights - motion.energy) < 1e-3 * depth]
     inside = np.degrees(np.clip(bounds, theta[0], theta[-1]))
-    return [Line('V', BLUE, np.degrees(theta), effective_potential(axis, l3, lz, theta), dash),
+    return [Line('V', BLUE, np.degrees(theta), effective_potential(body, l3, lz, theta), dash),
             Line('E − L₃²/2λ₃', GREEN, inside, np.full(2, motion.energy), dash),
             Line('turning points', VIOLET, np.degrees(turning),
                  np.full(len(turning), motion.energy), dots=True)]

@@ -29,12 +29,12 @@ Vectors = NDArray[np.float64]
 Lines = NDArray[np.float32]     # (n, 2, 3), as viser takes them
 
 
-def reach(track: Track) -> float:
+def axis_length(track: Track) -> float:
     """Return the signed length of the drawn axis along e3 [m]; it ends outside of most bodies."""
     return REACH * track.shape.tip
 
 
-def segments(points: Vectors) -> Lines:
+def lines_through(points: Vectors) -> Lines:
     """Return the lines (n - 1, 2, 3) from each point (n, 3) to the next."""
     return np.stack((points[:-1], points[1:]), axis=1).astype(np.float32)
 
@@ -42,19 +42,20 @@ def segments(points: Vectors) -> Lines:
 def circle(radius: float, theta: float) -> Lines:
     """Return the lines of the circle of all tips with this tilt."""
     phi = np.linspace(0.0, math.tau, 4 * STEPS + 1)
-    return segments(radius * np.column_stack((
+    return lines_through(radius * np.column_stack((
         math.sin(theta) * np.cos(phi), math.sin(theta) * np.sin(phi),
         np.full_like(phi, math.cos(theta)))))
 
 
 def trace(track: Track, stamp_ns: int) -> Lines:
     """Return the lines along which the tip has moved, up to a stamp, from where the pivot is."""
-    stamps_ns, axis, joined = path(track, stamp_ns - TRACE_NS, stamp_ns)
+    stamps_ns, axis, connected = trace_points(track, stamp_ns - TRACE_NS, stamp_ns)
     moved = track.places(stamps_ns) - track.places(np.array([stamp_ns]))
-    return segments(reach(track) * axis + moved)[joined]
+    return lines_through(axis_length(track) * axis + moved)[connected]
 
 
-def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDArray[np.bool_]]:
+def trace_points(track: Track, begin_ns: int, end_ns: int,
+                 ) -> tuple[Stamps, Vectors, NDArray[np.bool_]]:
     """
     Return stamps (n,) [ns] and the axis (n, 3) between two stamps, and which steps are no jumps.
 
@@ -71,14 +72,14 @@ def path(track: Track, begin_ns: int, end_ns: int) -> tuple[Stamps, Vectors, NDA
     velocity = np.cross(in_world(rows[:, QUATERNION].T, rows[:, RATES].T), axis, axisa=0)
     span = 1e-9 * np.diff(stamps_ns)[:, np.newaxis]
     before, after = span * velocity[:-1], span * velocity[1:]
-    joined = np.linalg.norm(steps - 0.5 * (before + after), axis=1) < LONGEST_CHORD
+    connected = np.linalg.norm(steps - 0.5 * (before + after), axis=1) < LONGEST_CHORD
     s = np.arange(count)[:, np.newaxis, np.newaxis] / count
     between = (axis[:-1] + s * s * (3.0 - 2.0 * s) * steps
                + s * (1.0 - s) * ((1.0 - s) * before - s * after))
     fine_ns = stamps_ns[:-1] + (np.arange(count)[:, np.newaxis] * np.diff(stamps_ns)) // count
     return (np.append(fine_ns.T.ravel(), stamps_ns[-1]),
             np.vstack((between.transpose(1, 0, 2).reshape(-1, 3), axis[-1:])),
-            np.repeat(joined, count))
+            np.repeat(connected, count))
 
 
 def axis_of(rows: Vectors) -> Vectors:
@@ -135,7 +136,7 @@ ARROWS = {
 def arrow(track: Track, name: str, stamp_ns: int) -> Vectors | None:
     """Return one of ARROWS as a vector (3,) in the world for drawing; None without a sample."""
     _, topics, vector = ARROWS[name]
-    sample = track.best(topics).at(stamp_ns)
+    sample = track.first_of(topics).at(stamp_ns)
     if sample is None or not track.has_body:
         return None
-    return abs(reach(track)) * vector(track, sample[1], stamp_ns)
+    return abs(axis_length(track)) * vector(track, sample[1], stamp_ns)

@@ -22,6 +22,8 @@ from spinning_top_sim.tools.analysis import attitudes_of
 ATTITUDE_TOPICS = ('pose', 'joint_states', 'ground_truth/odom', 'ground_truth/imu')
 RATE_TOPICS = ('joint_states', 'ground_truth/odom')
 PLACE_TOPICS = ('pose', 'ground_truth/odom')
+# Which field of a message is a quaternion.
+QUATERNION_FIELDS = {'pose': 1, 'ground_truth/odom': 1, 'ground_truth/imu': 0}
 # Their columns, NaN where a topic has none: x, y, z, w; the angular velocity and the specific
 # force in the body; phi'; the place of the pivot.
 QUATERNION, RATES, FORCE, PRECESSION, PLACE = (
@@ -111,10 +113,13 @@ class Track:
     name : shown if there are several tracks
     values : checked parameters of the run
     has_body : whether they are those of the body; in the logs of other programs they are not
-    samples : by topic
+    templates, samples : of the messages, by topic
     motions : in the order of their begin
+    begin_ns : of a log, the stamp from which on this is the top [ns]
     epoch_ns, commands_ns : of a log, stamps of t = 0 and of its commands [ns]
     note : what is missing in a log, '' if nothing is
+
+    One thread changes it and draws it.
     """
 
     def __init__(self, name: str, values: Mapping[str, Any], has_body: bool = True) -> None:
@@ -123,21 +128,29 @@ class Track:
         self.shape = Shape(self.top)
         self.samples = {topic: empty(topic) for topic in WIDTHS}
         self.motions: list[DescribedMotion] = []
-        self.epoch_ns, self.commands_ns = 0, list[int]()
+        self.begin_ns, self.epoch_ns, self.commands_ns = 0, 0, list[int]()
         self.note = ''
         self._constants: tuple[float, float, float] | None = None   # of the newest motion
         self._imu = Imu(values)
-        self._templates = {stream.topic: stream.template for stream in all_streams(values)
-                           if stream.topic in WIDTHS}
+        self.templates = {stream.topic: stream.template for stream in all_streams(values)
+                          if stream.topic in WIDTHS}
 
     def decode(self, topic: str, messages: Sequence[bytes],
                stamps_ns: Sequence[int] | None = None) -> Series:
-        """Return serialized messages of a topic as samples; by default with the stamps in them."""
-        template, data = self._templates[topic], b''.join(messages)
+        """
+        Return serialized messages of a topic as samples; by default with the stamps in them.
+
+        Those whose quaternion is no attitude are left out.
+        """
+        template, data = self.templates[topic], b''.join(messages)
         stamps = template.stamps_ns(data) if stamps_ns is None else np.array(stamps_ns, np.int64)
         fields = template.decode(data)
         if topic == '~/invariants':
             return Series(stamps, fields[0])
+        if topic in QUATERNION_FIELDS:
+            norm = np.linalg.norm(fields[QUATERNION_FIELDS[topic]], axis=1)
+            valid = np.isfinite(norm) & (norm > 0.0)
+            stamps, fields = stamps[valid], tuple(field[valid] for field in fields)
         found = attitudes_of(topic, self._imu, stamps, fields)
         assert found is not None
         rows = attitude_rows(found.rows[:4].T)
@@ -150,8 +163,7 @@ class Track:
                 _, in_body = self._imu.in_body(tuple(fields[0].T), tuple(field.T))
                 rows[:, columns] = np.vstack(in_body).T
         if topic in PLACE_TOPICS:
-            norm = np.linalg.norm(fields[1], axis=1)
-            rows[:, PLACE] = np.nan_to_num(fields[0][np.isfinite(norm) & (norm > 0.0)])
+            rows[:, PLACE] = np.nan_to_num(fields[0])
         return Series(found.stamps_ns, rows)
 
     def add(self, topic: str, samples: Series) -> None:
@@ -172,16 +184,16 @@ class Track:
     @property
     def attitudes(self) -> Series:
         """The samples that show the attitude."""
-        return self.best(ATTITUDE_TOPICS)
+        return self.first_of(ATTITUDE_TOPICS)
 
     @property
     def rates(self) -> Series:
         """The samples that show attitude, angular velocity and phi'."""
-        return self.best(RATE_TOPICS)
+        return self.first_of(RATE_TOPICS)
 
     def places(self, stamps_ns: NDArray[np.int64]) -> Rows:
         """Return where the pivot is at stamps (n,), (n, 3) [m]; the origin where not known."""
-        known_ns, rows = self.best(PLACE_TOPICS)
+        known_ns, rows = self.first_of(PLACE_TOPICS)
         if not len(rows):
             return np.zeros((len(stamps_ns), 3))
         return np.stack([np.interp(stamps_ns - known_ns[0], known_ns - known_ns[0], column)
@@ -190,9 +202,9 @@ class Track:
     @property
     def pivot_moves(self) -> bool:
         """Whether the pivot has moved between the last two samples."""
-        return bool(np.diff(self.best(PLACE_TOPICS).rows[-2:, PLACE], axis=0).any())
+        return bool(np.diff(self.first_of(PLACE_TOPICS).rows[-2:, PLACE], axis=0).any())
 
-    def best(self, topics: Sequence[str]) -> Series:
+    def first_of(self, topics: Sequence[str]) -> Series:
         """Return the samples of the first of these topics that has some."""
         return next((self.samples[topic] for topic in topics
                      if len(self.samples[topic].stamps_ns)), self.samples[topics[0]])

@@ -33,6 +33,12 @@ def chunk_of(plain: bytes, start: int = 5, end: int = 5, compression: str = '',
         message_start_time=start, message_end_time=end))
 
 
+def written(folder: Path, content: bytes) -> Path:
+    path = folder / 'a.mcap'
+    path.write_bytes(content)
+    return path
+
+
 def padded(record: bytes, extra: bytes) -> bytes:
     opcode, length = struct.unpack_from('<BQ', record)
     return struct.pack('<BQ', opcode, length + len(extra)) + record[9:] + extra

@@ -23,9 +23,9 @@ class RequestError(Exception):
     """The sim_node refuses or does not answer; the text is the reason."""
 
 
-class SimNode:
+class NodeClient:
     """
-    The sim_node in the namespace of a node, for threads that may wait for its answers.
+    A client of the sim_node in the namespace of a node, for threads that may wait for answers.
 
     Requests raise RequestError, or return the text to show.
 
@@ -44,6 +44,7 @@ class SimNode:
 
     @property
     def is_there(self) -> bool:
+        """Whether the sim_node can be asked."""
         return self._services['get_parameters'].service_is_ready()
 
     def values(self) -> dict[str, Any]:
