@@ -85,7 +85,7 @@ def _judge_steps(response: Response, outcomes: Sequence[Outcome],
     lengths, gains = zip(*itertools.chain(*(gains_of(one, ahead) for one in judged)), strict=True)
     slow, fast = gains[:2]          # at 100 Hz and 200 Hz
     apart = np.max(np.abs(np.subtract(gains, slow)))
-    by_samples = abs(fast / FACTORS[1] - slow) < 0.25 * abs(slow)
+    by_samples = abs(fast / FACTORS[1] - slow) < 2.0 * STEP * abs(slow)
     if apart > STEP * max(abs(slow), STEP) and (by_samples or (
             abs(slow - 1.0) < STEP and uneven is not None
             and _left_without(response, uneven, unaided, slow, ahead) < max(
