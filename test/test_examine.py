@@ -229,9 +229,15 @@ def test_a_covariance_may_be_unknown_but_not_impossible(slow):
         covariance = np.zeros((3, 3))
 
     assert np.isnan(follow(Known, slow).covariances).all()
-    for Known.covariance in (-np.eye(3), 0.5, np.full((3, 3), math.nan)):
+    asymmetric = np.eye(3) + 0.1 * np.eye(3, k=1)
+    for Known.covariance in (-np.eye(3), 0.5, np.full((3, 3), math.nan), asymmetric):
         with pytest.raises(InvalidOutputError, match=r'covariance is .*: must '):
             follow(Known, slow)
+
+
+def test_filters_must_share_no_state():
+    vqf = Vqf()
+    assert 'share no state' in str(examine(lambda: vqf, seeds=1))
 
 
 def test_whatever_a_filter_says_can_be_written(tmp_path):

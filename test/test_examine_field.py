@@ -2,14 +2,20 @@
 """The scenes of the field: their motion is consistent, their sensor errs as it is told to."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from helpers.faulty_filters import Misreading
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import examine, field
+from spinning_top_sim.exam.adapters import Vqf
+from spinning_top_sim.exam.reference import product
 from spinning_top_sim.exam.scenarios import GRAVITY
 from spinning_top_sim.streams.parameters import IDENTITY
+
+pytest.importorskip('vqf')
 
 SHORT = ((1.0, 9.0),)
 BY_NAME = {scene.name: replace(scene, motions=SHORT) for scene in field.SCENES}
@@ -18,20 +24,6 @@ PERFECT = {name: IDENTITY if name.endswith(('_M', 'soft_iron')) else 3 * (0.0,)
            for name in field.LEFT} | {
     name: 0.0 for name in field.DEVICE if name != 'mag.field'} | {
     'mag.disturbance.world': 5 * (0.0,)}
-
-
-def turned(make_filter):
-    class Turned:
-        """The filter, whose heading is 10 degrees off."""
-
-        def __init__(self):
-            self._filter = make_filter()
-
-        def update(self, *readings):
-            turn = Rotation.from_euler('z', 10.0, degrees=True)
-            return (turn * Rotation.from_quat(self._filter.update(*readings))).as_quat()
-
-    return Turned
 
 
 @pytest.fixture
@@ -96,10 +88,10 @@ def test_the_device_errs_by_its_bias_its_bandwidth_and_the_magnet(perfect, monke
 
 
 def test_the_mark_is_the_mean_over_scenes_and_tells_filters_apart(monkeypatch):
-    vqf = pytest.importorskip('spinning_top_sim.exam.adapters').Vqf
-    pytest.importorskip('vqf')
     monkeypatch.setattr(field, 'SCENES', [BY_NAME['slow_translation'], BY_NAME['vibration']])
-    good, bad = (examine(make, 'field', seeds=1).measures for make in (vqf, turned(vqf)))
+    turned = partial(Misreading, Vqf, said=partial(product, Rotation.from_euler(
+        'z', 10.0, degrees=True).as_quat()))
+    good, bad = (examine(make, 'field', seeds=1).measures for make in (Vqf, turned))
     names = [f'field_rms_{scene.name}_deg' for scene in field.SCENES]
     ratios = [f'field_{scene.name}_to_gyroscope' for scene in field.SCENES]
     assert {*good} == {*names, *ratios, 'field_rms_deg', 'field_heading_rms_deg',
@@ -114,11 +106,9 @@ def test_the_mark_is_the_mean_over_scenes_and_tells_filters_apart(monkeypatch):
 
 
 def test_a_level_is_a_part_of_full_and_needs_new_filters(monkeypatch):
-    vqf = pytest.importorskip('spinning_top_sim.exam.adapters').Vqf
-    pytest.importorskip('vqf')
     with pytest.raises(ValueError, match="level = 'field': the filter must be made anew"):
-        examine(vqf, 'field', restart=False)
+        examine(Vqf, 'field', restart=False)
     monkeypatch.setattr(field, 'SCENES', [BY_NAME['slow_rotation']])
-    asked = examine(vqf, 'field', seeds=[7], imu={'mag.field': (0.0, 2e-5, 0.0)}).measures
+    asked = examine(Vqf, 'field', seeds=[7], imu={'mag.field': (0.0, 2e-5, 0.0)}).measures
     assert 0.0 < asked['field_rms_deg'] < 10.0
-    assert 'field_rms_deg' in examine(vqf, 'full', seeds=1).measures
+    assert 'field_rms_deg' in examine(Vqf, 'full', seeds=1).measures

@@ -18,7 +18,6 @@ from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.log import examine_log
 from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recorder import create_file
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.streams import journal
 from spinning_top_sim.tools.simulate import main as simulate
@@ -26,6 +25,7 @@ from spinning_top_sim.tools.simulate import main as simulate
 IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (
     'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped', 'geometry_msgs/msg/PoseStamped',
     'geometry_msgs/msg/PoseWithCovarianceStamped', 'nav_msgs/msg/Odometry')
+STRING = 'std_msgs/msg/String'
 add_definitions(POSE_COVARIANCE)
 
 
@@ -34,6 +34,10 @@ def simulated(path, *options):
                      'imu_data.enabled:=true', '--params', str(ROOT / 'config/wavy.yaml'),
                      *options]) == 0
     return path
+
+
+def stamped(message, stamp_ns):
+    return message.data[:4] + struct.pack('<iI', *divmod(stamp_ns, 10 ** 9)) + message.data[12:]
 
 
 @pytest.fixture(scope='module')
@@ -131,24 +135,19 @@ def test_the_truth_may_be_of_the_body(log):
 
 
 def test_a_reset_may_turn_the_sensor_on_the_body(log, tmp_path):
-    names, reset_ns = ['/ground_truth/imu', '/pose'], 20 * 10 ** 9
+    names, rows, reset_ns = ['/ground_truth/imu', '/pose'], [], 20 * 10 ** 9
     with LogReader(log) as first, LogReader(simulated(
             tmp_path / 'again.mcap', '-p', 'imu.rpy:=[-1.0, 0.5, 2.0]')) as again:
-        metadata, other = (reader.metadata[METADATA_NAME] for reader in (first, again))
-        path = tmp_path / 'both.mcap'
-        file = create_file(path, [*map(RecordedTopic, names, (IMU, POSE)), RecordedTopic(
-            '/events', 'std_msgs/msg/String')], metadata, compression='none')
-        epoch_ns = int(metadata['epoch_ns']) + reset_ns
-        for message in first.messages(names):
-            file.append(names.index(message.topic), message.log_time, message.data)
-        file.append(2, epoch_ns, journal.event('reset', 0, reset_ns - 1, epoch_ns=epoch_ns,
-                                               parameters=json.loads(other['parameters'])))
-        for message in again.messages(names):
-            stamp_ns = message.log_time + reset_ns
-            file.append(names.index(message.topic), stamp_ns, message.data[:4] + struct.pack(
-                '<iI', *divmod(stamp_ns, 10 ** 9)) + message.data[12:])
-        file.flush()
-        file.finish()
+        metadata, other = (one.metadata[METADATA_NAME] for one in (first, again))
+        for shift_ns, messages in (0, first.messages(names)), (reset_ns, again.messages(names)):
+            for message in messages:
+                stamp_ns = message.log_time + shift_ns
+                rows.append((names.index(message.topic), stamp_ns, stamped(message, stamp_ns)))
+    epoch_ns = int(metadata['epoch_ns']) + reset_ns
+    rows.append((2, epoch_ns, journal.event('reset', 0, reset_ns - 1, epoch_ns=epoch_ns,
+                                            parameters=json.loads(other['parameters']))))
+    path = write_rows(tmp_path / 'both.mcap', [*map(RecordedTopic, names, (IMU, POSE)),
+                                               RecordedTopic('/events', STRING)], rows, metadata)
     report = examine_log(str(path), names[0], names[1], north='true')
     assert report.passed and report.measures['tilt_rms_deg'] < 1e-6
 
@@ -161,9 +160,7 @@ def test_a_delay_in_a_log_is_in_steps_of_the_filter(tmp_path):
             if message.topic == '/ground_truth/imu':
                 rows.append((0, message.log_time, message.data))
                 continue
-            stamp_ns = message.log_time + 3_000_000
-            stamp = struct.pack('<iI', *divmod(stamp_ns, 10 ** 9))
-            rows.append((1, message.log_time, message.data[:4] + stamp + message.data[12:]))
+            rows.append((1, message.log_time, stamped(message, message.log_time + 3_000_000)))
     report = examine_log(write_rows(tmp_path / 'late.mcap', [
         RecordedTopic(name, IMU) for name in ('/ground_truth/imu', '/late')], rows),
         '/late', north='true')

@@ -34,7 +34,6 @@ def read(path):
     return found, metadata['spinning_top_sim']
 
 
-EPOCH_NS = 1_000_000_000        # as `simulate` has it unasked
 SCENE = {'imu_data.enabled': True, 'clock.enabled': True, 'markers.enabled': True,
          'imu.gyroscope_noise_density': 0.001, 'imu.lever_arm': [0.1, 0.0, 0.2],
          'imu.accelerometer_random_walk': 0.01, 'imu.rpy': [0.1, 0.2, 0.3]}

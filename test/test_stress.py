@@ -78,7 +78,8 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
 
 
 @pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0), *(('wrong', [*TABLE]
-    .index(f'mahony, {one}')) for one in ('dt rounded', 'slow heading', 'heading by atan'))])
+    .index(f'mahony, {one}')) for one in (
+        'dt rounded', 'slow heading', 'heading by atan', 'no tilt about y', 'vector y x z'))])
 def test_a_seed_of_a_part_of_make_stress(tmp_path, monkeypatch, request, part, seed):
     pytest.importorskip('rclpy')
     module = importlib.import_module(f'stress.{part}')

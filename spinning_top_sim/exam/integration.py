@@ -101,11 +101,17 @@ def _judge_steps(response: Response, outcomes: Sequence[Outcome],
 
 def _left_without(response: Response, outcome: Outcome, unaided: Sequence[Hypothesis],
                   slow: float, ahead: bool) -> float:
-    """Return how far gains are apart with rates for which wrong lengths of steps are right."""
+    """
+    Return how far gains are apart with rates for which wrong lengths of steps are right.
+
+    What does not turn it at all cannot be undone, and is left out.
+    """
     shares = np.clip(_shares(outcome), 0.05, 20.0)[:, np.newaxis]
     again = response.respond(replace(outcome.run, gyroscope=outcome.run.gyroscope / np.vstack(
         (shares[:1], shares))), *unaided).last()
-    return max(abs(gain - slow) for _, gain in gains_of(again, ahead))
+    before, after = (gains_of(one, ahead) for one in (outcome.last(), again))
+    return max((abs(gain - slow) for (_, first), (_, gain) in zip(before, after, strict=True)
+                if abs(first) > STEP), default=0.0)
 
 
 def _shares(outcome: Outcome, shift: int = 0) -> Reals:

@@ -32,28 +32,20 @@ class Misreading:
 
 
 class Late(Misreading):
-    """Its attitudes are 50 ms old."""
+    """Its attitudes, or the rates that it gets, are 50 ms old."""
 
-    def __init__(self, make_filter):
+    def __init__(self, make_filter, of_rates=False):
         super().__init__(make_filter)
-        self._kept = deque()
+        self._kept, self._of_rates = deque(), of_rates
 
     def update(self, gyroscope, accelerometer, magnetometer, dt):
-        self._kept.append(super().update(gyroscope, accelerometer, magnetometer, dt))
-        return self._kept.popleft() if len(self._kept) > round(0.05 / dt) else self._kept[0]
+        def late(value):
+            self._kept.append(value)
+            return self._kept.popleft() if len(self._kept) > round(0.05 / dt) else self._kept[0]
 
-
-class LateRates(Misreading):
-    """It gets rates that are 50 ms old."""
-
-    def __init__(self, make_filter):
-        super().__init__(make_filter)
-        self._kept = deque()
-
-    def update(self, gyroscope, accelerometer, magnetometer, dt):
-        self._kept.append(gyroscope)
-        old = self._kept.popleft() if len(self._kept) > round(0.05 / dt) else self._kept[0]
-        return super().update(old, accelerometer, magnetometer, dt)
+        q = super().update(late(gyroscope) if self._of_rates else gyroscope, accelerometer,
+                           magnetometer, dt)
+        return q if self._of_rates else late(q)
 
 
 class Drifting(Misreading):
@@ -87,8 +79,8 @@ MISREADINGS = {
     'heading_offset': partial(Misreading, said=partial(product, np.array(
         (0.0, 0.0, np.sin(0.04), np.cos(0.04))))),
     'hard_iron': partial(Misreading, iron=np.array((10e-6, 0.0, 0.0))),
-    'lag': LateRates, 'inaccurate': partial(Misreading, said=longer), 'diverges': Drifting,
-    'invalid_output': partial(Misreading, said=lambda q: q * np.nan)}
+    'lag': partial(Late, of_rates=True), 'inaccurate': partial(Misreading, said=longer),
+    'diverges': Drifting, 'invalid_output': partial(Misreading, said=lambda q: q * np.nan)}
 
 
 class FirstOrder(Vqf):
@@ -112,18 +104,19 @@ class Negated(Vqf):
     bias = property(lambda self: -super().bias)
 
 
-class HalfCovariance(ReferenceFilter):
-    covariance = property(lambda self: 0.5 * ReferenceFilter.covariance.fget(self))
+class OtherCovariance(ReferenceFilter):
+    def __init__(self, factor):
+        super().__init__()
+        self._factor = factor
 
-
-class TwiceCovariance(ReferenceFilter):
-    covariance = property(lambda self: 2.0 * ReferenceFilter.covariance.fget(self))
+    covariance = property(lambda self: self._factor * ReferenceFilter.covariance.fget(self))
 
 
 # A filter with each fault.
 FAULTY = {
     'first_order_integration': FirstOrder,
-    'covariance_small': HalfCovariance, 'covariance_large': TwiceCovariance,
+    'covariance_small': partial(OtherCovariance, 0.5),
+    'covariance_large': partial(OtherCovariance, 2.0),
     'bias_report': Negated, 'lever_arm': partial(Tuned, tauAcc=0.1),
     'no_bias_estimate': partial(Tuned, motionBiasEstEnabled=False, restBiasEstEnabled=False),
     **{name: partial(misread, Vqf) for name, misread in MISREADINGS.items()}}

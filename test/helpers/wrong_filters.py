@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from helpers.faulty_filters import longer
 from spinning_top_sim.exam.reference import (
     ReferenceFilter,
     exponential,
@@ -15,6 +16,8 @@ from spinning_top_sim.exam.reference import (
     matrix_of,
     product,
 )
+
+X, Y, Z = np.eye(3)
 
 
 class Part:
@@ -76,10 +79,10 @@ class Mahony(Part):
     """A filter of Mahony (2008) with exact steps."""
 
     def start(self, up=0.3, north=0.3, learns=0.15, most=np.inf, advance=body, triad=True,
-              level=True, declination=0.0, about=None, angle=math.atan2, felt=(0, 1, 2)):
+              level=True, declination=0.0, about=None, angle=math.atan2, felt=(X, Y, Z)):
         self._gains, self._most, self._advance = (up, north, learns), most, advance
         self._triad, self._level, self._declination, self._about = triad, level, declination, about
-        self._angle, self._felt = angle, list(felt)
+        self._angle, self._felt = angle, np.array(felt)
         self._q, self._bias = None, np.zeros(3)
 
     def turn(self, w, a, m, dt):
@@ -88,7 +91,7 @@ class Mahony(Part):
         up, north, learns = self._gains
         self._q = self._advance(self._q, (w - self._bias) * dt)
         r = matrix_of(self._q)
-        e = up * cross(a, r[2])[self._felt] / math.sqrt(a @ a)
+        e = up * self._felt @ cross(a, r[2]) / math.sqrt(a @ a)
         if m is not None:
             h = r @ m
             if not self._level:
@@ -150,11 +153,6 @@ def added(*offset):
     return lambda v: v + offset
 
 
-def longer(q):
-    scaled = q * (1.05, 1.05, 1.05, 1.0)
-    return scaled / np.linalg.norm(scaled)
-
-
 GYROSCOPE, GRAVITY, FIELD = 'gyroscope_wiring', 'accelerometer_wiring', 'magnetometer_wiring'
 UNITS, STEP, LAG, OFF = 'gyroscope_units', 'time_step', 'lag', 'inaccurate'
 # For each kind of filter: the changes, and the causes that may be named; none is a right filter.
@@ -172,6 +170,7 @@ CHANGES = {
     'rates smoothed': ({'smooth': (0.05, 0.0, 0.0)}, LAG),
     'force y x z': ({'accelerometer': axes(2, 1, 3)}, GRAVITY),
     'force x -y z': ({'accelerometer': axes(1, -2, 3)}, GRAVITY),
+    'force x -y -z': ({'accelerometer': axes(1, -2, -3)}, GRAVITY),
     'force negated': ({'accelerometer': axes(-1, -2, -3)}, 'gravity_sign'),
     'force x 1.2': ({'accelerometer': scaled(1.2, 1.0, 1.0)}, GRAVITY),
     'force late': ({'late': (0, 8, 0, 0)}, LAG),
@@ -184,6 +183,7 @@ CHANGES = {
     'w first': ({'said': lambda q: q[[3, 0, 1, 2]]}, 'component_order'),
     'vector longer': ({'said': longer}, OFF),
     'vector positive': ({'said': np.abs}, OFF),
+    'vector y x z': ({'said': lambda q: q[[1, 0, 2, 3]]}, 'component_order'),
     'attitude late': ({'late': (0, 0, 0, 5)}, 'stamp_offset'),
     'twice dt': ({'step': lambda dt: 2.0 * dt}, f'{GYROSCOPE} {STEP}'),
     'dt of 100 Hz': ({'step': lambda dt: 0.01}, STEP)}
@@ -197,8 +197,9 @@ OWN = {     # and these
         'field of a level sensor': ({'level': False}, FIELD),
         'heading by atan': ({'angle': lambda x, y: math.atan(x / y)}, OFF),
         'heading about z': ({'about': np.array((0.0, 0.0, 1.0))}, f'{FIELD} {OFF}'),
-        'tilt about x as y': ({'felt': (0, 0, 2)}, f'{OFF} {GRAVITY}'),
-        'tilt about y as x': ({'felt': (1, 1, 2)}, f'{OFF} {GRAVITY}'),
+        'tilt about x as y': ({'felt': (X, X, Z)}, f'{OFF} {GRAVITY}'),
+        'tilt about y as x': ({'felt': (Y, Y, Z)}, f'{OFF} {GRAVITY}'),
+        'no tilt about y': ({'felt': (X, 0 * Y, Z)}, GRAVITY),
         'slow turns dropped': ({'gyroscope': lambda v: v * (v @ v > 0.04)}, OFF),
         'dt at most 10 ms': ({'step': lambda dt: min(dt, 0.01)}, STEP),
         'dt cut': ({'step': lambda dt: int(100.0 * dt) / 100.0}, STEP),
@@ -208,6 +209,7 @@ OWN = {     # and these
         'bias gain < 0': ({'learns': -0.15}, f'no_bias_estimate diverges {OFF}'),
         'no bias': ({'learns': 0.0}, 'no_bias_estimate'),
         'bias about z': ({'learns': np.array((0.0, 0.0, 0.15))}, 'no_bias_estimate'),
+        'bias off': ({'report': lambda b: b + 0.02}, 'bias_report'),
         'bias in deg/s': ({'report': np.degrees}, 'bias_report'),
         'bias clamped': ({'most': np.radians(0.1)}, 'no_bias_estimate'),
         'bias negated': ({'report': np.negative}, 'bias_report')},
