@@ -20,7 +20,7 @@ WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; th
 DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
 # An error is not corrected if more than STAYS of it is left, and grows if more than GROWN; where
 # less than NEARLY is left, nothing is measured again.
-NEARLY, STAYS, GROWN = 0.9, 0.995, 1.1
+NEARLY, STAYS, GROWN = 0.9, 0.995, 1.02
 FARTHER = 1.03                  # of the error after the heading is turned: no right filter's
 
 
@@ -99,8 +99,7 @@ def not_corrected(answer: Reals) -> list[Fault]:
             for stays, sensor, what, left in (
                 (tilt, 'accelerometer', 'tilt', most),
                 # A tilt that stays may turn the heading.
-                (STAYS < heading < (2.0 - STAYS if tilt else GROWN), 'magnetometer', 'heading',
-                 heading)) if stays]
+                (STAYS < heading < GROWN, 'magnetometer', 'heading', heading)) if stays]
 
 
 def astray(outcome: Outcome, given: Excitation, absolute: bool) -> list[Fault]:
