@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How a filter responds to its inputs one by one: turns, gravity and field at rest, a kick.
+How a filter responds to its inputs one by one: turns, gravity and field at rest, kicks.
 
 The readings have no noise, so a right filter has no error, and what remains has a cause.  A cause
 is a hypothesis: its inverse is applied to the readings or the attitudes, and the error disappears.
@@ -168,6 +168,7 @@ class Response:
         return found
 
     def _explanation(self, turns: Turns, gross: bool) -> Tried | None:
+        """Try one group after the other; a hypothesis is tried only while none is sure."""
         return (self._best(self._of_attitudes()) or self._best(self._of_delays(turns.late))
                 or self._best(self._of_gyroscope(turns), diagnosis.EXPLAINED if gross
                               else LITTLE_LEFT, mends_turns=gross)
@@ -372,9 +373,11 @@ class Response:
             self.excitation.kicks[0][0]] < NEAR else None
 
     def _corrects(self, outcome: Outcome) -> bool:
+        """Return whether no error stays after kicks."""
         return fits.most_left(self._answer(outcome, self._run.truth)) < fits.STAYS
 
     def _answer(self, outcome: Outcome, without: Reals) -> Reals:
+        """See `fits.answer_to_kicks`."""
         return fits.answer_to_kicks(outcome.estimates, without, self.excitation, self.absolute)
 
     def _unexplained(self) -> list[Fault]:

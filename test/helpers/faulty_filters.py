@@ -92,14 +92,6 @@ class FirstOrder(Vqf):
                               accelerometer, magnetometer, dt)
 
 
-class Tuned(Vqf):
-    """VQF with other settings."""
-
-    def __init__(self, **settings):
-        super().__init__()
-        self._make = partial(self._make, **settings)
-
-
 class Negated(Vqf):
     bias = property(lambda self: -super().bias)
 
@@ -117,6 +109,6 @@ FAULTY = {
     'first_order_integration': FirstOrder,
     'covariance_small': partial(OtherCovariance, 0.5),
     'covariance_large': partial(OtherCovariance, 2.0),
-    'bias_report': Negated, 'lever_arm': partial(Tuned, tauAcc=0.1),
-    'no_bias_estimate': partial(Tuned, motionBiasEstEnabled=False, restBiasEstEnabled=False),
+    'bias_report': Negated, 'lever_arm': partial(Vqf, tauAcc=0.1),
+    'no_bias_estimate': partial(Vqf, motionBiasEstEnabled=False, restBiasEstEnabled=False),
     **{name: partial(misread, Vqf) for name, misread in MISREADINGS.items()}}
