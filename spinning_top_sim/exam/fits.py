@@ -98,7 +98,7 @@ def not_corrected(answer: Reals) -> list[Fault]:
                   f'{ANSWER_S:g} s: the {sensor} does not correct it')
             for stays, sensor, what, left in (
                 (tilt, 'accelerometer', 'tilt', most),
-                # A tilt that stays may turn the heading.
+                # One that grows is turned by a tilt that stays.
                 (STAYS < heading < GROWN, 'magnetometer', 'heading', heading)) if stays]
 
 
