@@ -146,9 +146,9 @@ def test_a_reset_may_turn_the_sensor_on_the_body(log, tmp_path):
     epoch_ns = int(metadata['epoch_ns']) + reset_ns
     rows.append((2, epoch_ns, journal.event('reset', 0, reset_ns - 1, epoch_ns=epoch_ns,
                                             parameters=json.loads(other['parameters']))))
-    path = write_rows(tmp_path / 'both.mcap', [*map(RecordedTopic, names, (IMU, POSE)),
-                                               RecordedTopic('/events', STRING)], rows, metadata)
-    report = examine_log(str(path), names[0], names[1], north='true')
+    topics = [*map(RecordedTopic, names, (IMU, POSE)), RecordedTopic('/events', STRING)]
+    path = write_rows(tmp_path / 'both.mcap', topics, rows, metadata=metadata)
+    report = examine_log(str(path), *names, north='true')
     assert report.passed and report.measures['tilt_rms_deg'] < 1e-6
 
 

@@ -39,7 +39,7 @@ def array_cdr(number: int) -> bytes:
     return struct.pack('<4sIII4xd', b'\x00\x01\x00\x00', 0, 0, 1, float(number))
 
 
-def write_rows(path, topics, rows, metadata=None, per_chunk=None):
+def write_rows(path, topics, rows, per_chunk=None, metadata=None):
     """Write a log of rows (number of a topic, stamp [ns], data), so many in a chunk."""
     file = create_file(path, topics, metadata or {}, compression='none')
     for number, row in enumerate(rows, start=1):
