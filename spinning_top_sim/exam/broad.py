@@ -35,9 +35,12 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
 
     Parameters
     ----------
-    make_filter, subject : as for `examine`
+    make_filter : callable
+        As of `examine`.
     folder : path
         With files of BROAD: .mat, or .hdf5, which need h5py.
+    subject : str, optional
+        Name in the report.  The default is the name of the filter's class.
     show : callable, optional
         Is called with the number of trials that are done.
 

@@ -54,7 +54,7 @@ class Fit:
     """
     A fitted motion; `lines` tells it.
 
-    Attributes
+    Parameters
     ----------
     top, start : Top, State
         At the first attitude.  lambda1 is as given: attitudes tell ratios only.

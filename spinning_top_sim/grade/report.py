@@ -8,7 +8,18 @@ from spinning_top_sim.tools.verdict import Fault, Verdict, number
 
 
 class Report(Verdict):
-    """The result of grading a simulator; `str(report)` is readable."""
+    """
+    The result of grading a simulator; `str(report)` is readable.
+
+    Parameters
+    ----------
+    subject : str
+        Name of the simulator.
+    found : sequence of Fault
+        As `faults`.
+    measures : mapping
+        As `marks`.
+    """
 
     @property
     def faults(self) -> Sequence[Fault]:

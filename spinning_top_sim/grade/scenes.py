@@ -24,6 +24,8 @@ class Body(Top):
 
     Parameters
     ----------
+    lambda1, lambda3, mass, com_distance, gravity : float
+        As of `Top`.
     lever_arm : (3,) float
         Position of the IMU in the body frame [m].
     mounting : (4,) float
@@ -113,12 +115,25 @@ class Start:
 
 @dataclass(frozen=True)
 class Scene:
-    """A motion that is graded."""
+    """
+    A motion that is graded.
+
+    Parameters
+    ----------
+    name : str
+        Of the scene, in reports.
+    start : mapping
+        l3, lz, theta and theta_dot, those that are not 0.
+    duration : float
+        Length [s].
+    divided : tuple of int
+        Divisors of dt, 1 first; several give the order of convergence.
+    """
 
     name: str
-    start: Mapping[str, float]          # l3, lz, theta and theta_dot
-    duration: float                     # [s]
-    divided: tuple[int, ...] = (1,)     # of dt, 1 first; several give the order of convergence
+    start: Mapping[str, float]
+    duration: float
+    divided: tuple[int, ...] = (1,)
 
     def start_of(self, top: Top, seed: int) -> Start:
         """Return the start; the seed determines phi and psi."""
