@@ -136,8 +136,8 @@ def noisy_limit(run: Run, absolute: bool, imu: Mapping[str, Any]) -> float:
     if not imu.keys() <= {*scenarios.CALIBRATED, 'mag.field', 'imu.rpy'}:
         return DIVERGED             # the filter may still be learning biases
     last = run.part(slice(-len(run.t) // 4, None))
-    single = measures.errors_of(np.array([from_two_vectors(*pair) for pair in zip(
-        last.accelerometer, last.magnetometer, strict=True)]), last.truth)
+    single = measures.errors_of(
+        from_two_vectors(last.accelerometer, last.magnetometer), last.truth)
     return min(DIVERGED, max(math.hypot(TILT, absolute * HEADING),
                              3.0 * rms(single.judged(absolute))))
 

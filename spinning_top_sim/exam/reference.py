@@ -224,11 +224,11 @@ def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:
     """
     Return the attitude in which `up` is vertical and the field has no east component (TRIAD).
 
-    Without a field the heading is arbitrary.
+    up, magnetometer : (3,) or (n, 3); without a field (3,), and the heading is arbitrary
     """
-    z = up / np.linalg.norm(up)
+    z = up / np.linalg.norm(up, axis=-1, keepdims=True)
     north = magnetometer if magnetometer is not None else np.eye(3)[np.argmin(np.abs(z))]
     x = np.cross(north, z)
-    x /= np.linalg.norm(x)
-    quaternion: Reals = Rotation.from_matrix(np.stack((x, np.cross(z, x), z))).as_quat()
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    quaternion: Reals = Rotation.from_matrix(np.stack((x, np.cross(z, x), z), axis=-2)).as_quat()
     return quaternion
