@@ -19,7 +19,7 @@ SIZE = float(np.linalg.norm(BIAS))      # 1.4 deg/s
 # the same attitude later; LEARNING of the whole suffices if the filter's estimate grows.
 LEARNED, LEARNING = 0.5, 0.9
 BIAS_FOUND = 0.05               # share of the bias in the estimate that is more than none
-# Of the largest effect less than VANISHED is left only if the estimate has this share, at least.
+# Where less than VANISHED of the largest effect is left, the estimate must have this share.
 VANISHED, SHARE = 0.3, 0.25
 BIAS_OFF = 0.5                  # relative error of an estimate that is wrong
 
@@ -50,9 +50,9 @@ def judge_bias(response: Response) -> None:
              else _is_close(reported, BIAS))
     if left and (partly or not _is_learned(effects, reported)):
         findings.faults.append(Fault(
-            'no_bias_estimate', 'a gyroscope bias leaves, for each deg/s, '
-            f'{left_s:.3g} deg of {"attitude" if absolute else "tilt"} in the end: '
-            f'it is not learned{" about each axis" if partly else ""} in '
+            'no_bias_estimate', 'each deg/s of gyroscope bias leaves '
+            f'{"an attitude" if absolute else "a tilt"} error of {left_s:.3g} deg: '
+            f'the bias is not learned{" about each axis" if partly else ""} in '
             f'{given.motion.stop / scenarios.SLOW.rate:.0f} s'))
     elif not right and not math.isnan(share):
         findings.faults.append(Fault(

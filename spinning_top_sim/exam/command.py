@@ -104,8 +104,8 @@ def _report(arguments: argparse.Namespace) -> Report:
                if (value := getattr(arguments, name)) is not None}
     for name in options.keys() - OPTIONS[kind]:
         others = ', '.join(f'--{one}' for one in OPTIONS[kind] if f'--{one}' != kind)
-        raise ValueError(f'--{name} cannot be given with {kind}' + f': must be {others}' * bool(
-            others))
+        refusal = f'--{name} cannot be given with {kind}'
+        raise ValueError(f'{refusal}: must be {others}' if others else refusal)
     if arguments.imu is not None:
         (options['imu'],) = scene_file.chosen_files(argparse.Namespace(imu=arguments.imu))
     if kind == 'a log':

@@ -167,8 +167,8 @@ class _Exam:
 
     def _begin(self) -> None:
         if self._subject.restarts and self._subject.shares_state():
-            raise InvalidOutputError('a second filter in one process gives other attitudes: '
-                                     'filters must share no state')
+            raise InvalidOutputError('the attitudes depend on a filter that ran before in '
+                                     'the same process: filters must share no state')
         self._absolute = self._subject.uses_field()
         self._response = Response(self._subject, self._absolute, self.findings)
 

@@ -62,11 +62,16 @@ def from_identity(matrix: Reals) -> float:
 def answer_to_kicks(estimates: Reals, without: Reals, given: Excitation,
                     absolute: bool) -> Reals:
     """
-    Return what takes an error at rest to what is left of it after ANSWER_S, (3, 3) or of tilts.
+    Return the matrix from an attitude error at rest to what is left of it after ANSWER_S.
 
-    Attitudes with kicks and `without`, (n, 4).  Of the two rests, the level one counts if an error
-    stays there, else the one with more left.  An eigenvalue of 1 is that of an error that stays,
-    such as one about an axis of the sensor that nothing corrects.
+    An error is a rotation vector about axes of the world.  An eigenvalue of 1 is that of an error
+    that stays, such as one about an axis of the sensor that nothing corrects.
+
+    estimates, without : attitudes (n, 4) with kicks and without them
+    absolute : the matrix is (3, 3); otherwise (2, 2), of tilts
+
+    Of the matrices at two rests, that of the level one counts if an error stays there, else the
+    one with the larger spectral radius.
     """
     n = round(ANSWER_S * scenarios.SLOW.rate)
     errors = Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()
@@ -77,18 +82,18 @@ def answer_to_kicks(estimates: Reals, without: Reals, given: Excitation,
         left = left * left[0].inv()
         begin, end = (left[:-1] * Rotation.from_rotvec(KICKS)).as_rotvec(), left[1:].as_rotvec()
         answers.append(np.linalg.lstsq(begin[kicks, axes], end[kicks, axes], rcond=None)[0].T)
-    # There, what kicks at the first rest have left moves the heading by the tilt, and vice versa.
+    # At the second rest, heading and tilt are still moved by what earlier kicks have left.
     answers[1][:2, 2:] = answers[1][2:, :2] = 0.0
     return max(answers[:1] if most_left(answers[0]) > STAYS else answers, key=most_left)
 
 
 def most_left(answer: Reals) -> float:
-    """Return the largest magnitude of the eigenvalues."""
+    """Return the spectral radius of what `answer_to_kicks` returns."""
     return float(np.max(np.abs(np.linalg.eigvals(answer))))
 
 
 def not_corrected(answer: Reals) -> list[Fault]:
-    """Name the sensors that do not correct kicks by the answer to them."""
+    """Name the sensors that do not correct kicks; `answer` as from `answer_to_kicks`."""
     most = most_left(answer)
     if most > GROWN:        # by which sensor, and whether by the bias, is not known
         return [Fault('inaccurate', f'an error grows to {most:.0%} in {ANSWER_S:g} s at rest')]

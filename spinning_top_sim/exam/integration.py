@@ -102,9 +102,10 @@ def _judge_steps(response: Response, outcomes: Sequence[Outcome],
 def _left_without(response: Response, outcome: Outcome, unaided: Sequence[Hypothesis],
                   slow: float, ahead: bool) -> float:
     """
-    Return how far gains are apart with rates for which wrong lengths of steps are right.
+    Return the largest deviation of gains from `slow` when the lengths of steps are undone.
 
-    What does not turn it at all cannot be undone, and is left out.
+    The rates of a step are divided by its share of the turn.  Steps that do not turn the filter
+    cannot be undone, and are left out.
     """
     shares = np.clip(_shares(outcome), 0.05, 20.0)[:, np.newaxis]
     again = response.respond(replace(outcome.run, gyroscope=outcome.run.gyroscope / np.vstack(
@@ -115,16 +116,16 @@ def _left_without(response: Response, outcome: Outcome, unaided: Sequence[Hypoth
 
 
 def _shares(outcome: Outcome, shift: int = 0) -> Reals:
-    """Return by which share the steps of the sensor, shifted, turn the filter (n - 1,)."""
+    """Return the turns of the filter relative to those of the sensor, of each step (n - 1,)."""
     steps, right = (increments(one)[1:] for one in (outcome.estimates, outcome.run.truth))
     return np.asarray(np.sum(np.roll(steps, shift, axis=0) * right, 1) / np.sum(right * right, 1))
 
 
 def gains_of(outcome: Outcome, ahead: bool = False) -> list[tuple[float, float]]:
     """
-    Return each length of a step [s], and the share by which turns move a filter in those.
+    Return each length of a step [s], and the median of the relative turns in such steps.
 
-    ahead : the filter may be a step behind or ahead
+    ahead : the filter may be a step behind or ahead of the sensor
     """
     lengths = outcome.run.dt[2:-1].round(6)
     found = [[(float(one), float(np.median(_shares(outcome, shift)[1:-1][lengths == one])))

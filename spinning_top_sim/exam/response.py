@@ -168,7 +168,7 @@ class Response:
         return found
 
     def _explanation(self, turns: Turns, gross: bool) -> Tried | None:
-        """Try one group after the other; a hypothesis is tried only while none is sure."""
+        """Return the best hypothesis of the first group that explains the error, or None."""
         return (self._best(self._of_attitudes()) or self._best(self._of_delays(turns.late))
                 or self._best(self._of_gyroscope(turns), diagnosis.EXPLAINED if gross
                               else LITTLE_LEFT, mends_turns=gross)

@@ -15,7 +15,7 @@ from spinning_top_sim.exam.scenarios import Run, Scenario
 from spinning_top_sim.exam.trial import Feed, Filter, MakeFilter, Outcome, feed, follow
 
 FIELD_ASKED = 200, 3000     # updates after which a filter has shown whether it uses the field
-SAME = np.radians(1.0)          # a filter may draw random numbers
+SAME = np.radians(1.0)      # apart at most in two runs of a filter, which may be random
 # A filter that goes on is first turned to the attitude at which a run begins [s].
 TURN_S = 30.0
 # A filter uses the field if its heading follows at least a tenth of this alternating turn of the
@@ -58,7 +58,7 @@ class Subject:
         return False
 
     def shares_state(self) -> bool:
-        """Return whether a filter is another one where one was made, and fed, before it."""
+        """Return whether attitudes depend on a filter that ran before in the same process."""
         run = self.record(scenarios.SLOW).part(slice(FIELD_ASKED[0]))
 
         def make_second() -> Filter:

@@ -65,6 +65,7 @@ NOISE_BAND = 0.05           # share by which noise may differ from what is decla
 FOUR_SIGMA = 4.0            # standard deviations by which its measurement may differ besides
 LEAST_KURTOSIS = 2.4        # of normal noise; it is 3, and 1.8 of uniform noise
 
+
 def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, float]]:
     """Return faults and measures of the readings of one of KINDS."""
     runs = [run for motion in motions if (run := readings_of(kind, motion))]

@@ -144,8 +144,8 @@ def read(path: Path, topic: str | None = None) -> Recorded:
         raise ValueError(f'{path} has {len(times) or "no"} attitudes: must have {LEAST_SAMPLES} '
                          f'at least; from {NEEDED}')
     for at in times[~np.any(attitudes, axis=1)][:1]:
-        raise ValueError(f'{path}: the attitude at {at:.9g} s is 0, 0, 0, 0: must be a quaternion '
-                         'of norm 1, or not be there')
+        raise ValueError(f'{path}: the attitude at {at:.9g} s is 0, 0, 0, 0: must be a unit '
+                         'quaternion')
     return recorded
 
 
@@ -260,14 +260,14 @@ def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Part]]:
 
 
 def _unit(name: str, unit: str, known: Collection[str]) -> str:
-    """Return the one of the known units that the name of a column tells, by its letters."""
+    """Return the known unit with the letters of `unit`; `name` is that of the column."""
     def letters(text: str) -> str:
         return re.sub('[^a-z\ufffd]', '', text.translate(SIGNS).lower())
 
     for one in known:
         if letters(one) == letters(unit):
             return one
-    raise ValueError(f'{name}: the unit must be {", ".join(filter(None, known))}, or not be told')
+    raise ValueError(f'{name}: the unit must be {", ".join(filter(None, known))}, or missing')
 
 
 def _number(cell: Any) -> float:
