@@ -16,14 +16,7 @@ from helpers.faulty_filters import FAULTY, MISREADINGS
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import (
-    diagnosis,
-    examine,
-    isolation,
-    measures,
-    pytest_plugin,
-    scenarios,
-)
+from spinning_top_sim.exam import diagnosis, examine, isolation, measures, pytest_plugin, scenarios
 from spinning_top_sim.exam.adapters import FILTERS, Vqf
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.diagnosis import FAULTS
@@ -69,6 +62,12 @@ def test_the_gyroscope_reads_the_mean_over_its_step_and_a_delay_is_measured():
     offset = measures.time_offset(fine.truth[:-16], fine.truth[16:], fine.rates[16:], True)
     assert offset.seconds == pytest.approx(0.01, rel=0.01)
     assert offset.after < 0.1 * offset.before
+
+
+def test_an_error_that_is_off_changes_no_limit(slow):
+    off = {**scenarios.CALIBRATED, 'imu.gyroscope_turn_on_bias': 0.0}
+    for imu, is_same in ((off, True), ({**off, 'imu.gyroscope_turn_on_bias': 0.1}, False)):
+        assert (diagnosis.noisy_limit(slow, True, imu) < diagnosis.DIVERGED) == is_same
 
 
 def test_the_autocorrelation_time_is_the_direct_sum():
@@ -299,6 +298,8 @@ def test_a_process_of_its_own_changes_nothing(report):
     ({'level': 'slow'}, "level = 'slow': must be one of quick, full"),
     ({'imu': {'imu.colour': 1.0}}, 'imu.colour = 1.0: there is no such parameter'),
     ({'imu': ROOT / 'config/cusp.yaml'}, 'cusp.yaml has top.'),
+    ({'imu': {'imu.bandwidth': 9.0}}, 'imu has imu.bandwidth = 9.0: must have its default'),
+    ({'imu': {'imu.rate': 9.0}, 'level': 'full'}, 'imu.rate = 9.0: must have its default'),
     ({'seeds': 0}, 'seeds = 0: must be'), ({'seeds': [-1]}, 'must be'),
     ({'seeds': 2.5}, 'seeds = 2.5: must be')])
 def test_wrong_arguments_are_refused(options, says):

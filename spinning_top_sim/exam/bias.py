@@ -21,7 +21,7 @@ LEARNED, LEARNING = 0.5, 0.9
 BIAS_FOUND = 0.05               # share of the bias in the estimate that is more than none
 # Where less than VANISHED of the largest effect is left, the estimate must have this share.
 VANISHED, SHARE = 0.3, 0.25
-BIAS_OFF = 0.5                  # relative error of an estimate that is wrong
+BIAS_OFF, PART = 0.5, 0.8       # relative error of an estimate that is wrong; most of a part
 
 
 def judge_bias(response: Response) -> None:
@@ -45,9 +45,9 @@ def judge_bias(response: Response) -> None:
     left = left_s > BIAS_LEFT_S
     partly = absolute and min(shares) < BIAS_FOUND and max(shares) > LEARNED
     least = SHARE if left_s * SIZE < VANISHED * np.max(apart) else -BIAS_FOUND
-    # A filter that has gone on for minutes is sure of its bias, and learns another one slowly.
-    right = (least < share < 2.0 if left or not response.subject.restarts
-             else _is_close(reported, BIAS))
+    # Where an error is left, or minutes without a bias came before, it may be learned in part.
+    right = _is_close(reported, BIAS) or (
+        (left or not response.subject.restarts) and least < share < PART)
     if left and (partly or not _is_learned(effects, reported)):
         findings.faults.append(Fault(
             'no_bias_estimate', 'each deg/s of gyroscope bias leaves '

@@ -13,6 +13,7 @@ from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.exam.reference import from_two_vectors
 from spinning_top_sim.exam.scenarios import Run
 from spinning_top_sim.exam.trial import Outcome
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.verdict import Fault
 
 FAULTS = ('first_order_integration', 'gyroscope_units', 'conjugated', 'component_order',
@@ -133,7 +134,8 @@ def noisy_limit(run: Run, absolute: bool, imu: Mapping[str, Any]) -> float:
     It is the limit without noise, or three standard deviations of attitudes from single samples,
     where a slow filter starts, if that is larger; at most DIVERGED.
     """
-    if not imu.keys() <= {*scenarios.CALIBRATED, 'mag.field', 'imu.rpy'}:
+    white = {*scenarios.CALIBRATED, 'mag.field', 'imu.rpy'}
+    if any(imu[name] != parameters.BY_NAME[name].default for name in imu.keys() - white):
         return DIVERGED             # the filter may still be learning biases
     last = run.part(slice(-len(run.t) // 4, None))
     single = measures.errors_of(

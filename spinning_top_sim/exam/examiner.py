@@ -32,6 +32,9 @@ SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
 # When the lever arm comes, and from when until when its effect is measured [s].  Later the
 # estimate of a bias would have adapted to the force.
 ARM_S = 13.33, 14.33, 19.33
+# What begins the names of the parameters that the exam takes, and that only its scenes take.
+TAKEN = 'imu.gyroscope_', 'imu.accelerometer_', 'imu.bias_', *scenarios.OF_PLACE, 'mag.'
+OF_SCENES = 'imu.bandwidth', 'imu.vibration.', 'mag.disturbance.'
 
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
@@ -58,6 +61,7 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     imu : mapping or path, optional
         Parameters imu.* and mag.* by name, or the path of a parameter file such as those in
         config/imu.  The default, `scenarios.CALIBRATED`, is the noise of a calibrated device.
+        The scenes alone have a bandwidth, vibration and disturbed fields.
     seeds : int or iterable of int, optional
         Seeds of the noisy runs, or their number.  The default, SEEDS, depends on the level.
     subject : str, optional
@@ -86,7 +90,7 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
                         "spinning_top_sim.exam.adapters.FILTERS, such as FILTERS['vqf']")
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
-    values = _imu_parameters(imu)
+    values = _imu_parameters(imu, level)
     numbers = list(SEEDS[level]) if seeds is None else _seed_numbers(seeds)
     if level == 'field' and not restart:
         raise ValueError("level = 'field': the filter must be made anew for each scene")
@@ -107,16 +111,21 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     return exam.findings.report(subject, exam.outcomes)
 
 
-def _imu_parameters(imu: Mapping[str, Any] | str | Path | None) -> Mapping[str, Any]:
+def _imu_parameters(imu: Mapping[str, Any] | str | Path | None,
+                    level: str) -> Mapping[str, Any]:
     if imu is None:
         return scenarios.CALIBRATED
-    values = imu if isinstance(imu, Mapping) else read_scene(imu)
-    parameters.checked(values)
-    others = [name for name in values if not name.startswith(('imu.', 'mag.'))]
-    if others:
-        raise ValueError(f'{"imu" if imu is values else imu} has {", ".join(others)}: must have '
-                         'parameters imu.* and mag.* only')
-    return values
+    given = imu if isinstance(imu, Mapping) else read_scene(imu)
+    checked = parameters.checked(given)
+    source = 'imu' if imu is given else imu
+    for name in given:
+        if not name.startswith(('imu.', 'mag.')):
+            raise ValueError(f'{source} has {name}: must have parameters imu.* and mag.* only')
+        taken = level != 'quick' if name.startswith(OF_SCENES) else name.startswith(TAKEN)
+        if not taken and checked[name] != parameters.BY_NAME[name].default:
+            raise ValueError(f'{source} has {name} = {given[name]!r}: must have its default, as '
+                             f'level {level!r} leaves it out')
+    return {name: checked[name] for name in given}
 
 
 def _seed_numbers(seeds: int | Iterable[int]) -> list[int]:

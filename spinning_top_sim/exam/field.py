@@ -174,7 +174,7 @@ def _readings(values: Mapping[str, Any], turns: Rotation, rates: Reals, force: R
     if 0.0 < values['imu.bandwidth'] < 0.5 / HALF:
         from scipy.signal import butter, lfilter, lfilter_zi  # noqa: PLC0415 - slow
 
-        low_pass = butter(1, 2.0 * HALF * values['imu.bandwidth'])
+        low_pass = butter(values['imu.bandwidth_order'], 2.0 * HALF * values['imu.bandwidth'])
         signals = lfilter(*low_pass, signals, zi=lfilter_zi(*low_pass) * signals[:, :1])[0]
     late = np.maximum(np.arange(1, len(t_ns), 2) - MAG_LATE, 0)
     x, y, z, w = turns[late].as_quat().T

@@ -9,13 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from helpers.faulty_filters import longer
-from spinning_top_sim.exam.reference import (
-    ReferenceFilter,
-    exponential,
-    from_two_vectors,
-    matrix_of,
-    product,
-)
+from spinning_top_sim.exam import reference
 
 X, Y, Z = np.eye(3)
 
@@ -63,11 +57,11 @@ def cross(one, other):
 
 
 def body(q, turn):
-    return product(q, exponential(turn))
+    return reference.product(q, reference.exponential(turn))
 
 
 def world(q, turn):
-    return product(exponential(turn), q)
+    return reference.product(reference.exponential(turn), q)
 
 
 def euler(q, turn):
@@ -87,10 +81,12 @@ class Mahony(Part):
 
     def turn(self, w, a, m, dt):
         if self._q is None:
-            self._q = from_two_vectors(a, m) if self._triad else np.array((0.0, 0.0, 0.0, 1.0))
+            self._q = np.array((0.0, 0.0, 0.0, 1.0))
+            if self._triad:
+                self._q = reference.from_two_vectors(a, m)
         up, north, learns = self._gains
         self._q = self._advance(self._q, (w - self._bias) * dt)
-        r = matrix_of(self._q)
+        r = reference.matrix_of(self._q)
         e = up * self._felt @ cross(a, r[2]) / math.sqrt(a @ a)
         if m is not None:
             h = r @ m
@@ -113,13 +109,14 @@ class Complementary(Part):
 
     def turn(self, w, a, m, dt):
         if self._q is None:
-            self._q = from_two_vectors(a, m)
+            self._q = reference.from_two_vectors(a, m)
         self._q = self._advance(self._q, (w - self._bias) * dt)
         if m is None:
-            r = matrix_of(self._q)
+            r = reference.matrix_of(self._q)
             e = cross(a, r[2]) / math.sqrt(a @ a)
         else:
-            e = product(self._q * (-1.0, -1.0, -1.0, 1.0), from_two_vectors(a, m))
+            e = reference.product(self._q * (-1.0, -1.0, -1.0, 1.0),
+                                  reference.from_two_vectors(a, m))
             e = 2.0 * e[:3] * np.sign(e[3])
         self._bias = np.minimum(np.maximum(self._bias - self._learns * e, -self._most), self._most)
         self._q = body(self._q, self._share * e)
@@ -130,7 +127,7 @@ class Ekf(Part):
     """The reference filter of the exam."""
 
     def start(self, fields=10 ** 9, **settings):
-        self._filter, self._bias = ReferenceFilter(**settings), np.zeros(3)
+        self._filter, self._bias = reference.ReferenceFilter(**settings), np.zeros(3)
         self._fields = iter(range(fields))
 
     def turn(self, w, a, m, dt):
@@ -211,6 +208,8 @@ OWN = {     # and these
         'bias about z': ({'learns': np.array((0.0, 0.0, 0.15))}, 'no_bias_estimate'),
         'bias off': ({'report': lambda b: b + 0.02}, 'bias_report'),
         'bias in deg/s': ({'report': np.degrees}, 'bias_report'),
+        'bias turned': ({'learns': 0.06, 'report': lambda b: b + np.cross(b, (-0.3, -0.3, -0.9))},
+                        'bias_report'),
         'bias clamped': ({'most': np.radians(0.1)}, 'no_bias_estimate'),
         'bias negated': ({'report': np.negative}, 'bias_report')},
     'complementary': {
