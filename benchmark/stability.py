@@ -25,16 +25,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import report
-from cases import (
-    CUSP,
-    HEAVY_TOP,
-    TOY_200,
-    WHEEL,
-    Case,
-    grid_ns,
-    near_pole,
-    scene,
-)
+from cases import CUSP, HEAVY_TOP, TOY_200, WHEEL, Case, grid_ns, near_pole, scene
 from peers import FailedError, peer
 from truth import angles_between, long_attitudes
 

@@ -23,15 +23,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from processes import (
-    Process,
-    children_cpu,
-    load,
-    median,
-    ros_arguments,
-    script,
-    sim_node,
-)
+from processes import Process, children_cpu, load, median, ros_arguments, script, sim_node
 from report import preamble, table, write_section
 
 from spinning_top_sim.streams import parameters

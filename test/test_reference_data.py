@@ -20,7 +20,8 @@ pytest.importorskip('xacro')
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp('reference') / 'new'
-    assert main(['export', '--reference', str(folder), '--duration', '1', '--rate', '50']) == 0
+    assert main(['export', '--reference', str(folder), '--duration', '1', '--rate', '50',
+                 '--imu', 'bmi088']) == 0
     return folder
 
 
@@ -87,3 +88,5 @@ def test_an_existing_folder_is_left_alone(folder, capsys):
     assert main(['export', '--reference', str(folder), '--scene', 'cusp']) == 1
     assert 'exists' in capsys.readouterr().err
     assert sorted(folder.iterdir()) == before
+    assert main(['export', '--reference', str(folder.parent / 'b'), '-p', 'top.mass:=2.5']) == 2
+    assert [*folder.parent.iterdir()] == [folder]

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('file', type=Path, help='.mcap, .csv, .parquet or .npz')
     scene_file.add_parameters(parser)
     add('--fit', action='store_true', help='fit top and start to the attitudes, or only the start '
-        'of a top that is given; the default where nothing is given and the file tells nothing')
+        'of a top that is given; the default where neither arguments nor file tell them')
     add('--fit-imu', action='store_true', help='the same, and mounting, place and stamps of the '
         'IMU to its readings')
     add('--lever-arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
@@ -91,7 +91,8 @@ def _motion(arguments: argparse.Namespace,
         mounting=(w, x, y, z), field=tuple(values['mag.field']),
         **{name: given.get(f'imu.{name}') for name in (
             'gyroscope_noise_density', 'accelerometer_noise_density')})
-    if fits or not (given or known):
+    about_motion = known or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
+    if fits or not about_motion:
         return _motion_by_fit(arguments, recorded, given, body)
     if off := fitting.far_start(recorded.parts, top, start):
         raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '

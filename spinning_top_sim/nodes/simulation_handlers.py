@@ -178,7 +178,6 @@ class SimulationHandlers:
 
     def _step(self, count: int) -> None:
         loop = self._loop
-        # A step is a whole number of nanoseconds, so that n steps are n times one step.
         step_ns = round(self._node.values['step.dt'] * NANOSECONDS)
         with self._lock:
             target_ns = loop.now_ns + count * step_ns

@@ -283,8 +283,8 @@ class Simulator(Node):
     def _step(self, _: Trigger.Request) -> str:
         with self.lock:
             self.check_started()
-            self.loop.step(round(
-                self.values['step.count'] * self.values['step.dt'] * NANOSECONDS))
+            # A step is a whole number of nanoseconds, so that n steps are n times one step.
+            self.loop.step(self.values['step.count'] * round(self.values['step.dt'] * NANOSECONDS))
             return self.loop.time_text
 
     def _reset(self, _: Trigger.Request) -> str:

@@ -31,7 +31,7 @@ def state_of(top: Top, quaternion: Reals, angular_velocity: Reals) -> State:
     Returns
     -------
     State
-        phi and psi are in [-2 pi, 2 pi], and belong to the sign of the quaternion.
+        The sum and the difference of phi and psi belong to the sign of the quaternion.
     """
     x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
     wx, wy, wz = angular_velocity.tolist()

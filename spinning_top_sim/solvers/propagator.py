@@ -109,7 +109,8 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
         Times [s]: in any order and of any sign for 'exact', from 0 on and never decreasing for
         'rk45'.
     method : {'exact', 'rk45'}
-        The closed form, or Dormand-Prince steps.
+        The closed form, or Dormand-Prince steps, which the 'transport' equations take only where
+        the axis moves and has a torque.
     rtol, atol : float
         Tolerated error of a step; atol is rtol/10 by default.
     equations : {'transport', 'euler'}

@@ -124,7 +124,7 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2),
     _at_once('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
              'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
-    _at_once('tick_rate', 200.0, 'How often due samples are sent; 4 Hz at least', 'Hz', 1e-2,
+    _at_once('tick_rate', 200.0, 'How often due samples are sent; below 4, it is 4', 'Hz', 1e-2,
              HIGHEST_RATE),
     _at_once('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
     _at_start('start_paused', False, 'Wait for ~/set_pause or ~/step'),
@@ -167,8 +167,8 @@ TABLE: tuple[Parameter, ...] = (
     _at_reset('imu.orientation_stddev', (0.0, 0.0, 0.0), 'Standard deviation of the noise of the '
               'orientation in imu/data, about the axes of the IMU', 'rad', 0.0, 1.0,
               smallest=1e-12),
-    _at_reset('imu.stamp_offset', 0.0, 'Added to the stamps of imu/data_raw and imu/data', 's',
-              -1.0, 1.0),
+    _at_reset('imu.stamp_offset', 0.0, 'Added to the stamps of imu/data_raw, imu/data, imu/dq '
+              'and imu/dv', 's', -1.0, 1.0),
     _at_reset('imu.stamp_jitter', 0.0, 'Standard deviation of the noise of these stamps, cut at '
               '0.45 periods', 's', 0.0, 1.0),
     _at_reset('imu.clock_drift', 0.0, 'How much faster than simulated time these stamps go',

@@ -11,6 +11,7 @@ exit codes:
 
 import argparse
 import json
+import tempfile
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -93,7 +94,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     given = scene_file.given(arguments)
-    files = [*scene_file.chosen_files(arguments), *map(Path, arguments.params)]
+    # An IMU alone names no scene.
+    files = [*scene_file.chosen_files(arguments)][:arguments.scene is not None]
+    files += map(Path, arguments.params)
     name = files[0].stem if files else 'spinning_top'
     if arguments.model:
         if arguments.output is None:
@@ -112,9 +115,13 @@ def _run(arguments: argparse.Namespace) -> int:
         stem: {**scene_file.read_scene(path), **given}
         for stem, path in parameter_files('scene').items()}
     cli.check_output(arguments.reference)
-    _write_reference(arguments.reference, {
-        name: parameters.checked({**MOUNTING, **values, 'solver.method': 'exact'})
-        for name, values in scenes.items()}, arguments.duration, arguments.rate)
+    # Whole or not at all.
+    with tempfile.TemporaryDirectory(dir=arguments.reference.parent) as temporary:
+        folder = Path(temporary) / arguments.reference.name
+        _write_reference(folder, {
+            name: parameters.checked({**MOUNTING, **values, 'solver.method': 'exact'})
+            for name, values in scenes.items()}, arguments.duration, arguments.rate)
+        folder.rename(arguments.reference)
     return cli.OK
 
 
