@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from spinning_top_sim.grade import fit as fitting
 from spinning_top_sim.grade.grader import grade_trajectory
 from spinning_top_sim.grade.motion import LEAST_SAMPLES, Trajectory
-from spinning_top_sim.grade.scenes import Body, Reals
+from spinning_top_sim.grade.scenes import Body, Reals, rotation_of
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
@@ -142,7 +142,7 @@ def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0)
             begin, end = both
     every = next((parts[name][0] for name in sensors if name in parts), times)
     even = _evenly(every[(every >= begin) & (every <= end)], notes)
-    error = turns(times).inv() * Rotation.from_quat(np.roll(attitudes, -1, axis=1))
+    error = turns(times).inv() * rotation_of(attitudes)
     level, white = fitting.whiteness(error.as_rotvec().T)
     found = turns(even)
     if white and fitting.EXACT < level < fitting.LARGEST:

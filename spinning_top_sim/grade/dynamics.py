@@ -15,8 +15,8 @@ import numpy as np
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade.motion import MARGIN, Motion
 from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, listed, pooled
-from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
+from spinning_top_sim.tools.verdict import Fault
 
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0

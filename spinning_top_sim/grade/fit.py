@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import problem as unknowns
-from spinning_top_sim.grade.problem import L3, MOTION, SENSOR, SPIN, P, Problem, Samples, turned
-from spinning_top_sim.grade.scenes import Reals, Start
+from spinning_top_sim.grade import unknowns
+from spinning_top_sim.grade.scenes import Reals, Start, rotation_of
+from spinning_top_sim.grade.unknowns import L3, MOTION, SENSOR, SPIN, P, Problem, Samples, turned
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools.verdict import number
@@ -101,6 +101,13 @@ class Fit:
         yield from (f'  the file does not tell {what}' for what in self.undetermined)
 
 
+class _Guess(NamedTuple):
+    l3: float
+    p: float
+    size: int = FIRST                   # attitudes of the first part
+    free: Sequence[int] = MOTION        # unknowns that are fitted to all parts but the last
+
+
 class _Trial(NamedTuple):
     problem: Problem
     x: Reals
@@ -137,20 +144,19 @@ def fit(parts: Mapping[str, tuple[Reals, Reals]], *, lambda1: float = 1.0,
         raise ValueError(f'{len(times)} attitudes: must be {FEWEST} at least for a fit')
     if not np.any(np.ptp(attitudes, axis=0)):
         raise ValueError('the attitude never changes: there is no motion to fit')
-    turns = Rotation.from_quat(np.roll(attitudes, -1, axis=1))
+    turns = rotation_of(attitudes)
     samples = Samples('attitude', times - times[0], np.ascontiguousarray(turns.as_quat().T))
     told = parts.get('rates', parts.get('gyroscope'))
     spin, sure = unknowns.spin_rate(samples.times, samples.values,
                                     told and float(np.median(told[1][:, 2])))
     across = np.cross(*turns[:2].apply((0.0, 0.0, 1.0))) / samples.times[1]
     rates = (*turns[0].inv().apply(across)[:2], spin)
-    small = [(*pair, FIRST, TURN_AND_RATES)
-             for pair in unknowns.small_nutation(samples.times, samples.values)]
+    small = [_Guess(l3, p, free=TURN_AND_RATES)
+             for l3, p in unknowns.small_nutation(samples.times, samples.values)]
     trials: list[_Trial] = []
-    for l3, p, size, fitted in ((spin, 0.0, FIRST, MOTION), *small[:4],
-                                (spin, 0.0, 4 * FIRST, MOTION)):
-        guess = np.array((0.0, 0.0, 0.0, *rates, l3, p, *np.zeros(len(SENSOR))))
-        trials.append(_fit_from(samples, guess, size, fitted, gravity))
+    for guess in _Guess(spin, 0.0), *small[:4], _Guess(spin, 0.0, 4 * FIRST):
+        x = np.array((0.0, 0.0, 0.0, *rates, guess.l3, guess.p, *np.zeros(len(SENSOR))))
+        trials.append(_fit_from(samples, x, guess.size, guess.free, gravity))
         if trials[-1].explained:
             break                               # another guess finds the same
     best = min(trials, key=lambda trial: trial.residual)
@@ -180,7 +186,7 @@ def far_start(parts: Mapping[str, tuple[Reals, Reals]], top: Top, start: State) 
     times, attitudes = (part[:FIRST] for part in parts['attitudes'])
     right = ExactSolution(top, start).states_at_seconds(times)
     apart = (Rotation.from_quat(right.quaternion).inv()
-             * Rotation.from_quat(np.roll(attitudes, -1, axis=1))).magnitude()
+             * rotation_of(attitudes)).magnitude()
     angle = np.linalg.norm(right.angular_velocity[0]) * (times - times[0])
     return '' if np.all(apart < OFF * (1.0 + angle)) else (
         f'at its begin the attitude is up to {math.degrees(np.max(apart)):.3g} deg off')

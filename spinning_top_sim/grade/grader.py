@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from spinning_top_sim.exam.measures import convergence_order
-from spinning_top_sim.exam.trial import one_line
 from spinning_top_sim.grade import dynamics, sensors
 from spinning_top_sim.grade.motion import InvalidTrajectoryError, Motion, Trajectory
-from spinning_top_sim.grade.report import Fault, Report
+from spinning_top_sim.grade.report import Report
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Reals, Scene, Start
 from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.tools.cli import one_line
+from spinning_top_sim.tools.verdict import Fault
 
 Simulate = Callable[[Body, Start, Reals, float], Any]
 # The largest error of an attitude that is no fault [rad].

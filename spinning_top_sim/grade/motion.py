@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import correlate1d
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.scenes import Body, Reals, Start
+from spinning_top_sim.grade.scenes import Body, Reals, Start, rotation_of
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools.analysis import Attitudes, measure
@@ -62,6 +62,8 @@ class Trajectory:
     increments: Reals | None = None
     energy: Reals | None = None
     covariance: Mapping[str, Reals] = field(default_factory=dict)
+    step: float = field(init=False)             # [s]
+    rotation: Rotation = field(init=False)      # world <- body
 
     @classmethod
     def of(cls, said: Any, times: Any = None) -> Self:
@@ -102,8 +104,8 @@ class Trajectory:
             for name, matrix in told.items()})
 
     def __post_init__(self) -> None:
-        self.step = float(self.t[-1] - self.t[0]) / (len(self.t) - 1)       # [s]
-        self.rotation = Rotation.from_quat(self.attitudes[:, [1, 2, 3, 0]])
+        self.step = float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
+        self.rotation = rotation_of(self.attitudes)
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
@@ -144,20 +146,25 @@ class Motion:
     start: Start
     trajectory: Trajectory
     derived: bool = True        # the rates are from the attitudes, as before `use_told_rates`
+    solution: ExactSolution = field(init=False)
+    truth: States = field(init=False)               # of it, at the times of the trajectory
+    errors: Mapping[str, Reals] = field(init=False)     # as of `errors_by_angle`
+    worst: float = field(init=False)                # total error [rad]
+    # In the body, at all samples but MARGIN at each end (n - 6, 3) [rad/s].
+    rates: Reals = field(init=False)
 
     def __post_init__(self) -> None:
         self.solution = ExactSolution(self.body, self.start.state_of(self.body))
-        self.truth: States = self.solution.states_at_seconds(self.trajectory.t)
+        self.truth = self.solution.states_at_seconds(self.trajectory.t)
         right = Rotation.from_quat(self.truth.quaternion)
         self.errors = errors_by_angle(self.trajectory.rotation, right)
-        self.worst = float(np.max(self.errors['total']))        # [rad]
+        self.worst = float(np.max(self.errors['total']))
         # The rotation from the exact attitudes turns slowly.
         error, n = right.inv() * self.trajectory.rotation, len(self.trajectory.t) - 2 * MARGIN
         here = error[MARGIN:-MARGIN].inv()
         total = sum(weight * (here * error[at:at + n]).as_rotvec()
                     for at, weight in enumerate(_WEIGHTS) if weight)
-        # At all samples but MARGIN at each end (n - 6, 3).
-        self.rates: Reals = total / self.trajectory.step + here.apply(
+        self.rates = total / self.trajectory.step + here.apply(
             self.truth.angular_velocity[MARGIN:-MARGIN])
 
     def use_told_rates(self, in_world: bool) -> None:
@@ -177,7 +184,7 @@ class Motion:
     @property
     def data(self) -> Attitudes:
         """Attitudes and rates."""
-        part = self.trajectory.attitudes[MARGIN:-MARGIN, [1, 2, 3, 0]]
+        part = self.trajectory.rotation[MARGIN:-MARGIN].as_quat()
         stamps = np.rint(1e9 * self.trajectory.t[MARGIN:-MARGIN]).astype(np.int64)
         return Attitudes(stamps, np.vstack((part.T, self.rates.T)))
 

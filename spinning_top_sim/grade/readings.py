@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.measures import rms
 from spinning_top_sim.grade.motion import MARGIN, Motion
-from spinning_top_sim.grade.scenes import Reals
+from spinning_top_sim.grade.scenes import Reals, rotation_of
 
 FORCES = ('accelerations', 'velocities')
 _per_step = partial(np.gradient, axis=0)        # change per step of values (m, 3)
@@ -43,8 +43,7 @@ def readings_of(kind: str, motion: Motion) -> Readings | None:
     if reading is None:
         return None
     rotation, first, arms = said.rotation[inner], MARGIN, np.empty((0, len(w), 3))
-    mounting = (Rotation.identity() if kind == 'rates' else
-                Rotation.from_quat(np.roll(body.mounting, -1)))
+    mounting = Rotation.identity() if kind == 'rates' else rotation_of(body.mounting)
     if kind in ('rates', 'gyroscope'):
         terms = {'rates': w}
     elif kind == 'magnetometer':

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Reals
+from spinning_top_sim.tools.verdict import Fault
 
 MOST_CAUSES = 3
 # Further causes are looked for while more than these shares of the discrepancy and of the noise

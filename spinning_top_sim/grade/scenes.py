@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.physics.placement import state_of
@@ -15,6 +15,11 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 
 Reals = NDArray[np.float64]
+
+
+def rotation_of(quaternions: ArrayLike) -> Rotation:
+    """Return the rotation of quaternions (4,) or (n, 4) as w, x, y, z, the order of this room."""
+    return Rotation.from_quat(np.roll(quaternions, -1, axis=-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +114,7 @@ class Start:
         """Return `state`, or else the start as a state of `top`."""
         if self.state is not None:
             return self.state
-        turn = Rotation.from_quat(np.roll(self.attitude, -1))
+        turn = rotation_of(self.attitude)
         return state_of(top, turn.as_quat(), turn.apply(self.rates))
 
 

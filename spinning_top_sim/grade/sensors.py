@@ -22,8 +22,8 @@ from spinning_top_sim.grade import regression
 from spinning_top_sim.grade.motion import Motion
 from spinning_top_sim.grade.readings import FORCES, Readings, readings_of
 from spinning_top_sim.grade.regression import NEAR, Cause, beyond, fitted, instead, listed, pooled
-from spinning_top_sim.grade.report import Fault
 from spinning_top_sim.grade.scenes import Body, Reals
+from spinning_top_sim.tools.verdict import Fault
 
 
 class Kind(NamedTuple):
