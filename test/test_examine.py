@@ -300,6 +300,7 @@ def test_a_process_of_its_own_changes_nothing(report):
     ({'imu': ROOT / 'config/cusp.yaml'}, 'cusp.yaml has top.'),
     ({'imu': {'imu.bandwidth': 9.0}}, 'imu has imu.bandwidth = 9.0: must have its default'),
     ({'imu': {'imu.rate': 9.0}, 'level': 'full'}, 'imu.rate = 9.0: must have its default'),
+    ({'imu': {'mag.field': [0.0, 0.0, 1.0]}}, 'mag.field = [0.0, 0.0, 1.0]: must have a horiz'),
     ({'seeds': 0}, 'seeds = 0: must be'), ({'seeds': [-1]}, 'must be'),
     ({'seeds': 2.5}, 'seeds = 2.5: must be')])
 def test_wrong_arguments_are_refused(options, says):
@@ -319,7 +320,10 @@ def test_the_command_examines_a_class_in_a_file(tmp_path, capsys):
                                       '    def update(self, *readings):\n        return UP[:3]\n')
     assert main(['--filter', f'{tmp_path}/mine.py:Still', '--seeds', '1']) == 1
     assert capsys.readouterr().out.startswith('Still: invalid_output')
+    (tmp_path / 'bad.py').write_text('Still = \n')
     for given, code, says in (('mine.py:Other', 2, 'there is no Other in'),
+                              ('mine.py:UP', 2, 'that can be called'),
+                              ('bad.py:Still', 2, 'raises SyntaxError: invalid syntax'),
                               ('mine:Still', 2, 'must be'), ('none.py:Still', 1, 'No such file')):
         assert main(['--filter', f'{tmp_path}/{given}']) == code
         assert says in capsys.readouterr().err

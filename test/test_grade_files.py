@@ -315,6 +315,7 @@ def test_noise_of_the_attitudes_is_no_fault(tmp_path, capsys):
     ('no.csv', 't,x\n1,2\n', 'has no attitudes', 2),
     ('no_time.csv', 'qw,qx,qy,qz\n1,0,0,0\n', 'no column of times', 2),
     ('unit.csv', 't,gx [rpm]\n1,2\n', 'gx [rpm]: the unit must be rad, mrad, deg, rad/s, ', 2),
+    ('units.csv', 't,ax [m/s]\n1,2\n', 'ax [m/s]: the unit must be m/s^2, m/s/s, g, mg, or', 2),
     ('zero.csv', 't,qw,qx,qy,qz\n' + ''.join(f'{k},0,0,0,0\n' for k in range(50)),
      'the attitude at 0 s is 0, 0, 0, 0: must be', 2),
     ('rest.csv', 't,qw,qx,qy,qz\n' + ''.join(f'{k},1,0,0,0\n' for k in range(50)),

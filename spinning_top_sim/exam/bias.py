@@ -53,7 +53,7 @@ def judge_bias(response: Response) -> None:
             'no_bias_estimate', 'each deg/s of gyroscope bias leaves '
             f'{"an attitude" if absolute else "a tilt"} error of {left_s:.3g} deg: '
             f'the bias is not learned{" about each axis" if partly else ""} in '
-            f'{given.motion.stop / scenarios.SLOW.rate:.0f} s'))
+            f'{(given.rests[-2] - given.rests[0]) / scenarios.SLOW.rate:.0f} s'))
     elif not right and not math.isnan(share):
         findings.faults.append(Fault(
             'bias_report', f'a gyroscope bias of {np.degrees(BIAS).round(2).tolist()} deg/s '

@@ -154,10 +154,15 @@ def _own_filter(given: str) -> Callable[[], Filter]:
         raise ValueError(f'--filter {given}: must be FILE.py:CLASS, or one of '
                          f'{", ".join(FILTERS)}')
     sys.path.insert(0, str(Path(path).resolve().parent))    # for what the file imports
-    names = runpy.run_path(path)
-    if name not in names:
-        raise ValueError(f'--filter {given}: there is no {name} in {path}')
-    made: Callable[[], Filter] = names[name]
+    try:
+        made: Callable[[], Filter] | None = runpy.run_path(path).get(name)
+    except (OSError, ImportError):
+        raise
+    except Exception as error:      # whatever the file does
+        raise ValueError(f'--filter {given}: {path} raises {type(error).__name__}: '
+                         f'{cli.one_line(error)}') from error
+    if not callable(made):
+        raise ValueError(f'--filter {given}: there is no {name} in {path} that can be called')
     return made
 
 

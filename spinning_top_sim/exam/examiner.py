@@ -125,6 +125,9 @@ def _imu_parameters(imu: Mapping[str, Any] | str | Path | None,
         if not taken and checked[name] != parameters.BY_NAME[name].default:
             raise ValueError(f'{source} has {name} = {given[name]!r}: must have its default, as '
                              f'level {level!r} leaves it out')
+    if not any(checked['mag.field'][:2]):
+        raise ValueError(f'{source} has mag.field = {given["mag.field"]!r}: must have a '
+                         'horizontal part, which shows north')
     return {name: checked[name] for name in given}
 
 

@@ -21,8 +21,9 @@ MEANINGS = {
     'tilt_to_bound': 'of the least that white noise allows; mean over seeds',
     'tilt_to_bound_spread': 'standard deviation over seeds',
     'tilt_to_gyroscope': 'of the error of the gyroscope alone',
-    'heading_to_bound': 'the same of the heading', 'heading_to_bound_spread': '',
-    'heading_to_gyroscope': '',
+    'heading_to_bound': 'the same of the heading',
+    'heading_to_bound_spread': 'the same of the heading',
+    'heading_to_gyroscope': 'the same of the heading',
     'order': 'p of error ~ rate^-p on the fast motion',
     'integration_error_deg': 'on the fast motion, without noise',
     'lever_arm_deg': f'tilt by motion 10 cm off the axis; fault from '

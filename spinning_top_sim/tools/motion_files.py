@@ -52,13 +52,13 @@ SECONDS = {'': '1', 's': '1', 'ms': '1e-3', 'us': '1e-6', 'ns': '1e-9',
 _DEG, _G = math.pi / 180.0, 9.80665
 _ANGLE = {'': 1.0, 'rad': 1.0, 'mrad': 1e-3, 'deg': _DEG}
 _RATE = {**_ANGLE, 'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': _DEG, 'dps': _DEG}
-# By part, units that the name of a column may tell; their letters count.
+# By part, units that the name of a column may tell; their letters and exponents count.
 UNITS = {
     ATTITUDES: {'': 1.0}, ANGLES: _ANGLE, GYROSCOPE: _RATE, RATES: _RATE,
     ACCELERATIONS: {'': 1.0, 'm/s^2': 1.0, 'm/s/s': 1.0, 'g': _G, 'mg': 1e-3 * _G},
     MAGNETOMETER: {'': 1.0, 'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7,
                    'gauss': 1e-4}}
-SIGNS = str.maketrans({'µ': 'u', 'μ': 'u', '°': 'deg'})
+SIGNS = str.maketrans({'µ': 'u', 'μ': 'u', '°': 'deg', '²': '2'})
 SUFFIXES = {'rad', 'deg', 'dps', *SECONDS} - {''}       # units without brackets
 # In the order of preference.
 MESSAGES = [f'{package}/msg/{name}' for package, name in (
@@ -260,14 +260,15 @@ def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Part]]:
 
 
 def _unit(name: str, unit: str, known: Collection[str]) -> str:
-    """Return the known unit with the letters of `unit`; `name` is that of the column."""
-    def letters(text: str) -> str:
-        return re.sub('[^a-z\ufffd]', '', text.translate(SIGNS).lower())
+    """Return the known unit that is spelled like `unit`; `name` is that of the column."""
+    def spelled(text: str) -> str:      # without signs between, and without exponents of -1
+        return re.sub('[^a-z02-9\ufffd]', '', text.translate(SIGNS).lower())
 
     for one in known:
-        if letters(one) == letters(unit):
+        if spelled(one) == spelled(unit):
             return one
-    raise ValueError(f'{name}: the unit must be {", ".join(filter(None, known))}, or missing')
+    allowed = ', '.join([*filter(None, known), 'or missing']).removeprefix('or ')
+    raise ValueError(f'{name}: the unit must be {allowed}')
 
 
 def _number(cell: Any) -> float:
