@@ -26,42 +26,51 @@ BIAS_OFF, PART = 0.5, 0.8       # relative error of an estimate that is wrong; m
 
 def judge_bias(response: Response) -> None:
     """Compare the excitation with and without BIAS, as docs/exam.md says."""
-    given, findings, absolute = response.excitation, response.findings, response.absolute
-    run = given.run.part(slice(given.motion.stop))
-    unbiased = response.outcome.part(slice(given.motion.stop))
+    excitation, findings, absolute = response.excitation, response.findings, response.absolute
+    run = excitation.run.part(slice(excitation.motion.stop))
+    unbiased = response.outcome.part(slice(excitation.motion.stop))
     biased = response.respond(replace(run, gyroscope=run.gyroscope + BIAS))
     errors = measures.errors_of(biased.estimates, unbiased.estimates)
     apart = errors.judged(absolute)
-    left_s = rms(apart[given.motion]) / SIZE
-    effects = np.abs(errors)[:1 + absolute, given.rests[[0, -2]]]
-    reported = biased.biases - unbiased.biases
-    reported = reported[np.isfinite(reported[:, 0])]
-    none = unbiased.biases[np.isfinite(unbiased.biases[:, 0])]
-    if not len(reported):
-        reported = np.full((1, 3), math.nan)
-    found, shares = reported[-1], reported[-1] / BIAS
-    share = float(found @ BIAS) / SIZE ** 2
-    findings.measures |= {'bias_error_s': left_s, 'bias_found': share}
-    left = left_s > BIAS_LEFT_S
-    partly = absolute and min(shares) < BIAS_FOUND and max(shares) > LEARNED
-    least = SHARE if left_s * SIZE < VANISHED * np.max(apart) else -BIAS_FOUND
-    # Where an error is left, or minutes without a bias came before, it may be learned in part.
-    right = _is_close(reported, BIAS) or (
-        (left or not response.subject.restarts) and least < share < PART)
-    if left and (partly or not _is_learned(effects, reported)):
+    left_s = rms(apart[excitation.motion]) / SIZE
+    vanishes = left_s * SIZE < VANISHED * float(np.max(apart))
+    effects = np.abs(errors)[:1 + absolute, excitation.rests[[0, -2]]]
+    reported = _known(biased.biases - unbiased.biases)
+    findings.measures |= {'bias_error_s': left_s, 'bias_found': _share(reported)}
+    each_axis = not absolute or not _is_partial(reported)
+    if left_s > BIAS_LEFT_S and not (each_axis and _is_learned(effects, reported)):
+        seconds = (excitation.rests[-2] - excitation.rests[0]) / scenarios.SLOW.rate
         findings.faults.append(Fault(
             'no_bias_estimate', 'each deg/s of gyroscope bias leaves '
             f'{"an attitude" if absolute else "a tilt"} error of {left_s:.3g} deg: '
-            f'the bias is not learned{" about each axis" if partly else ""} in '
-            f'{(given.rests[-2] - given.rests[0]) / scenarios.SLOW.rate:.0f} s'))
-    elif not right and not math.isnan(share):
+            f'the bias is not learned {"" if each_axis else "about each axis "}in '
+            f'{seconds:.0f} s'))
+    elif _is_wrong(reported, left_s, vanishes, response.subject.restarts):
         findings.faults.append(Fault(
-            'bias_report', f'a gyroscope bias of {np.degrees(BIAS).round(2).tolist()} deg/s '
-            f'is learned, but the estimate is {np.degrees(found).round(2).tolist()} deg/s'))
-    elif response.subject.restarts and len(none) and not _is_close(none, 0.0):
+            'bias_report', f'a gyroscope bias of {_degrees(BIAS)} deg/s is learned, but the '
+            f'estimate is {_degrees(reported[-1])} deg/s'))
+    # A filter that has gone on for minutes has learned from runs with a bias.
+    elif response.subject.restarts and _distance(none := _known(unbiased.biases), 0.0) > BIAS_OFF:
         findings.faults.append(Fault(
             'bias_report', 'the gyroscope has no bias, but the estimate is '
-            f'{np.degrees(none[-1]).round(2).tolist()} deg/s'))
+            f'{_degrees(none[-1])} deg/s'))
+
+
+def _known(biases: Reals) -> Reals:
+    """Return the rows (n, 3) of estimates that a filter has told, or one of NaN."""
+    known = biases[np.isfinite(biases[:, 0])]
+    return known if len(known) else np.full((1, 3), math.nan)
+
+
+def _share(reported: Reals, at: int = -1) -> float:
+    """Return the share of BIAS in an estimate."""
+    return float(reported[at] @ BIAS) / SIZE ** 2
+
+
+def _is_partial(reported: Reals) -> bool:
+    """Return whether the estimate has the bias about one axis, but not about another."""
+    shares = reported[-1] / BIAS
+    return bool(min(shares) < BIAS_FOUND and max(shares) > LEARNED)
 
 
 def _is_learned(effects: Reals, reported: Reals) -> bool:
@@ -72,13 +81,26 @@ def _is_learned(effects: Reals, reported: Reals) -> bool:
     reported : estimates (n, 3) [rad/s], or one of NaN
     """
     early, late = effects.T
-    share, before = (reported[[-1, len(reported) // 4]] @ BIAS / SIZE ** 2).tolist()
+    grows = _share(reported) > max(BIAS_FOUND, 1.2 * _share(reported, len(reported) // 4))
     return bool(np.all(late < np.maximum(LEARNED * early, BIAS_LEFT_S * SIZE)) or (
         np.linalg.norm(late) < LEARNING * np.linalg.norm(early)
-        and (_is_close(reported, BIAS) or share > max(BIAS_FOUND, 1.2 * before))))
+        and (grows or _distance(reported, BIAS) < BIAS_OFF)))
 
 
-def _is_close(reported: Reals, bias: Reals | float) -> bool:
-    """Return whether the last eighth of the estimates is near a bias."""
+def _is_wrong(reported: Reals, left_s: float, vanishes: bool, restarts: bool) -> bool:
+    """Return whether the estimate is another bias than the one that is learned."""
+    if not _distance(reported, BIAS) >= BIAS_OFF:
+        return False
+    # Where an error is left, or minutes without a bias came before, it may be learned in part.
+    least = SHARE if vanishes else -BIAS_FOUND
+    return not ((left_s > BIAS_LEFT_S or not restarts) and least < _share(reported) < PART)
+
+
+def _distance(reported: Reals, bias: Reals | float) -> float:
+    """Return how far the last eighth of the estimates is from a bias, in sizes of BIAS."""
     last = reported[-len(reported) // 8:]
-    return bool(np.median(np.linalg.norm(last - bias, axis=1)) < BIAS_OFF * SIZE)
+    return float(np.median(np.linalg.norm(last - bias, axis=1))) / SIZE
+
+
+def _degrees(bias: Reals) -> list[float]:
+    return np.degrees(bias).round(2).tolist()

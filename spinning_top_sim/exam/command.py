@@ -37,6 +37,9 @@ from spinning_top_sim.installation import needed
 from spinning_top_sim.tools import cli, scene_file
 
 NORTHS = 'true', 'magnetic'
+# What is examined, by the arguments that say so.
+KINDS = {('log', 'topic'): 'a log', ('node', 'topic'): 'a node', ('topic',): 'a node',
+         ('filter',): '--filter', ('filter', 'data'): '--data'}
 # Options for each kind of subject.
 OPTIONS = {'a log': ('topic', 'truth', 'heading'), 'a node': ('topic', 'level', 'imu', 'seeds'),
            '--filter': ('level', 'imu', 'seeds'), '--data': ('data',)}
@@ -87,15 +90,13 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _kind(arguments: argparse.Namespace) -> str:
     """Return what is examined, a key of OPTIONS.  Raises ValueError where that is not clear."""
-    if ([arguments.log, arguments.node, arguments.filter].count(None) < 2
-            or (arguments.filter is None
-                and (arguments.topic is None or arguments.data is not None))):
+    given = tuple(name for name in ('log', 'node', 'filter', 'topic', 'data')
+                  if getattr(arguments, name) is not None)
+    if given not in KINDS:
         log = f'{arguments.log}: ' if arguments.log else ''
         raise ValueError(f'{log}give either a log and --topic, --node and --topic, --topic '
                          'alone, --filter, or --filter and --data')
-    return ('a log' if arguments.log is not None else
-            '--data' if arguments.data is not None else
-            '--filter' if arguments.filter is not None else 'a node')
+    return KINDS[given]
 
 
 def _report(arguments: argparse.Namespace) -> Report:
@@ -107,7 +108,7 @@ def _report(arguments: argparse.Namespace) -> Report:
         refusal = f'--{name} cannot be given with {kind}'
         raise ValueError(f'{refusal}: must be {others}' if others else refusal)
     if arguments.imu is not None:
-        (options['imu'],) = scene_file.chosen_files(argparse.Namespace(imu=arguments.imu))
+        options['imu'] = scene_file.file_of('imu', arguments.imu)
     if kind == 'a log':
         return _of_log(arguments.log, options)
     if kind == 'a node':

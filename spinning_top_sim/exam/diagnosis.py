@@ -60,7 +60,8 @@ def quality(outcomes: Sequence[Outcome], imu: Mapping[str, Any],
     rate, force, field = (imu.get(f'{name}noise_density', 0.0)
                           for name in ('imu.gyroscope_', 'imu.accelerometer_', 'mag.'))
     horizontal = math.hypot(*imu.get('mag.field', scenarios.FIELD)[:2])
-    unaided = [measures.unaided(one.run, slice(len(one.run.t) // 2, None)) for one in outcomes]
+    alone = [measures.gyroscope_alone(one.run, slice(len(one.run.t) // 2, None))
+             for one in outcomes]
     found: dict[str, float] = {}
     for what, variance in (('tilt', 2.0 * rate * force / scenarios.GRAVITY), (
             'heading', rate * field / max(horizontal, 1e-12)))[:1 + absolute]:
@@ -71,7 +72,7 @@ def quality(outcomes: Sequence[Outcome], imu: Mapping[str, Any],
                   f'{what}_to_bound_spread': float(np.std(errors, ddof=1)) / least
                   if len(errors) > 1 else math.nan,
                   f'{what}_to_gyroscope': float(np.mean(errors / [
-                      max(getattr(one, what), 1e-9) for one in unaided]))}
+                      max(getattr(one, what), 1e-9) for one in alone]))}
     return found
 
 

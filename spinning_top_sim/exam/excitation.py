@@ -43,7 +43,7 @@ class Excitation(NamedTuple):
     still: Run                      # without them
     # Last sample of each rest; at the first and the last but one the attitude is the same.
     rests: NDArray[np.intp]
-    turns: NDArray[np.intp]         # first sample of each turn
+    turn_begins: NDArray[np.intp]   # first sample of each turn
     motion: slice                   # where the slow motion is judged
     kicks: list[list[int]]          # first sample of each of KICKS at each of the last rests
     astray: slice                   # where the heading has been turned far off, up to the end

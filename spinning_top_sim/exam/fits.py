@@ -43,9 +43,9 @@ def turns_of(outcome: Outcome, begins: NDArray[np.intp]) -> Turns:
 
     def fit(length: int, late: int) -> tuple[Reals, float]:
         rows = (begins[:, np.newaxis] + np.arange(length)).ravel()
-        given, response = true[rows - late], estimated[rows]
-        matrix = np.linalg.lstsq(given, response, rcond=None)[0]
-        return matrix.T, rms(response - given @ matrix)
+        turned, response = true[rows - late], estimated[rows]
+        matrix = np.linalg.lstsq(turned, response, rcond=None)[0]
+        return matrix.T, rms(response - turned @ matrix)
 
     fits = [fit(WHOLE, late) for late in range(LATEST + 1)]
     late = int(np.argmin([left for _, left in fits]))
@@ -59,7 +59,7 @@ def from_identity(matrix: Reals) -> float:
     return float(np.max(np.abs(matrix - np.eye(3))))
 
 
-def answer_to_kicks(estimates: Reals, without: Reals, given: Excitation,
+def answer_to_kicks(estimates: Reals, without: Reals, excitation: Excitation,
                     absolute: bool) -> Reals:
     """
     Return the matrix from an attitude error at rest to what is left of it after ANSWER_S.
@@ -77,7 +77,7 @@ def answer_to_kicks(estimates: Reals, without: Reals, given: Excitation,
     errors = Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()
     kicks, axes = (slice(None), slice(None)) if absolute else (slice(1, None), slice(2))
     answers = []
-    for firsts in given.kicks:
+    for firsts in excitation.kicks:
         left = errors[np.append(firsts, firsts[-1] + n) - 1]
         left = left * left[0].inv()
         begin, end = (left[:-1] * Rotation.from_rotvec(KICKS)).as_rotvec(), left[1:].as_rotvec()
@@ -107,9 +107,9 @@ def not_corrected(answer: Reals) -> list[Fault]:
                 (STAYS < heading < GROWN, 'magnetometer', 'heading', heading)) if stays]
 
 
-def astray(outcome: Outcome, given: Excitation, absolute: bool) -> list[Fault]:
+def astray(outcome: Outcome, excitation: Excitation, absolute: bool) -> list[Fault]:
     """Return the fault of a filter that, turned far off north, turns farther."""
-    errors = np.abs(outcome.part(given.astray).errors.heading)
+    errors = np.abs(outcome.part(excitation.astray).errors.heading)
     if not absolute or np.max(errors) < max(ASTRAY, FARTHER * errors[0]):
         return []
     return [Fault('inaccurate', f'turned off north by {np.degrees(errors[0]):.0f} deg, it turns '

@@ -28,10 +28,10 @@ SIGNED = [sign * one for one in Rotation.create_group('O').as_matrix().round()
 class Hypothesis(NamedTuple):
     """A possible cause of errors, and its inverse."""
 
-    faults: tuple[str, ...]         # names; none if it is no fault
-    text: str                       # what its inverse is
-    given: ChangeReadings | None = None     # changes what is fed; None: nothing is fed again
-    read: ChangeRows = lambda estimates: estimates      # changes the attitudes that are returned
+    faults: tuple[str, ...] = ()    # names; none if it is no fault
+    text: str = ''                  # what its inverse is
+    on_readings: ChangeReadings | None = None       # the inverse; None: nothing is fed again
+    on_attitudes: ChangeRows = lambda estimates: estimates      # the inverse
     shift: bool = False             # it shifts the time: rates are compared without its inverse
 
 
@@ -53,11 +53,11 @@ def _turned(left: Sequence[float], right: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
 def wired(name: str, text: str, matrix: Any, offset: Any = 0.0,
           fault: str = '') -> Hypothesis:
     """Return the hypothesis that the readings of a sensor need this matrix and offset."""
-    return Hypothesis((fault or f'{name}_wiring',), text, given=changed(
+    return Hypothesis((fault or f'{name}_wiring',), text, on_readings=changed(
         (name,), lambda rows: rows @ matrix.T + offset))
 
 
-def moved(rows: Reals, samples: int) -> Reals:
+def shifted(rows: Reals, samples: int) -> Reals:
     """Return rows whose k-th is the one at k + samples; the first or the last is repeated."""
     return rows[np.clip(np.arange(len(rows)) + samples, 0, len(rows) - 1)]
 
@@ -93,19 +93,19 @@ def relabelled(matrix: Reals) -> Hypothesis:
     else:
         name = 'conjugated' if np.all(np.diag(matrix)) else 'component_order'
     return Hypothesis((name,), f'read with {axes(matrix)} of its vector part for x, y, z',
-                      read=lambda q: np.hstack((q[:, :3] @ matrix.T, q[:, 3:])))
+                      on_attitudes=lambda q: np.hstack((q[:, :3] @ matrix.T, q[:, 3:])))
 
 
 def delayed(names: Sequence[str], samples: float) -> Hypothesis:
     """Return the hypothesis that sensors are so many samples late, rounded."""
     return Hypothesis(('lag',), f'with the {" and ".join(names)} {round(samples)} samples earlier',
-                      given=changed(names, lambda rows: moved(rows, round(samples))))
+                      on_readings=changed(names, lambda rows: shifted(rows, round(samples))))
 
 
 def sharpened(names: Sequence[str], samples: float) -> Hypothesis:
     """Return the hypothesis of a low pass of first order with this time constant [samples]."""
     return Hypothesis(('lag',), f'with the inverse of a low pass of {samples:.3g} samples on the '
-                      f'{" and ".join(names)}', given=changed(
+                      f'{" and ".join(names)}', on_readings=changed(
                           names, lambda rows: rows + samples * np.diff(
                               rows, axis=0, prepend=rows[:1])))
 
@@ -115,24 +115,25 @@ CORRECTS_FIRST = delayed(('accelerometer', 'magnetometer'), -1)._replace(faults=
 _HALF = 0.5 ** 0.5
 _CONJUGATE, _W_LAST = np.array((-1.0, -1.0, -1.0, 1.0)), [1, 2, 3, 0]
 GRAVITY_SIGN = Hypothesis(('gravity_sign',), 'with the sign of the accelerometer changed',
-                          given=changed(('accelerometer',), np.negative))
+                          on_readings=changed(('accelerometer',), np.negative))
 # Of attitudes; nothing is fed again.
 MISREADINGS = (
-    Hypothesis(('component_order',), 'read as w, x, y, z', read=lambda q: q[:, _W_LAST]),
-    Hypothesis(('conjugated',), 'conjugated', read=lambda q: q * _CONJUGATE),
+    Hypothesis(('component_order',), 'read as w, x, y, z', on_attitudes=lambda q: q[:, _W_LAST]),
+    Hypothesis(('conjugated',), 'conjugated', on_attitudes=lambda q: q * _CONJUGATE),
     Hypothesis(('frame_ned',), 'read as attitude in a world north-east-down',
-               read=_turned((_HALF, _HALF, 0.0, 0.0))),
+               on_attitudes=_turned((_HALF, _HALF, 0.0, 0.0))),
     Hypothesis(('frame_ned',), 'read as attitude of axes forward-right-down in a world '
-               'north-east-down', read=_turned((_HALF, _HALF, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))),
+               'north-east-down',
+               on_attitudes=_turned((_HALF, _HALF, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))),
     Hypothesis(('frame_ned',), 'read as attitude in a world north-west-up',
-               read=_turned((0.0, 0.0, _HALF, _HALF))),
+               on_attitudes=_turned((0.0, 0.0, _HALF, _HALF))),
     Hypothesis(('conjugated', 'component_order'), 'read as w, x, y, z and conjugated',
-               read=lambda q: q[:, _W_LAST] * _CONJUGATE),
+               on_attitudes=lambda q: q[:, _W_LAST] * _CONJUGATE),
     *map(relabelled, SIGNED))
 UNITS = [wired('accelerometer', f'with the accelerometer multiplied by {by:.4g}', by * np.eye(3))
          for by in (GRAVITY, 1.0 / GRAVITY)]
 LEVEL = Hypothesis(('magnetometer_wiring',), 'with the field of a level sensor',
-                   given=untilted)
+                   on_readings=untilted)
 
 
 def ambiguous(one: Hypothesis, absolute: bool) -> Hypothesis:

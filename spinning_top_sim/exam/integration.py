@@ -34,8 +34,8 @@ def for_first_order(run: Run) -> Run:
 
 
 # Changes of what is fed, also on the way to the begin of a run.  They name no fault.
-FIRST_ORDER = Hypothesis((), '', given=for_first_order)
-WITHOUT_FIELD = Hypothesis((), '', given=changed(
+FIRST_ORDER = Hypothesis(on_readings=for_first_order)
+WITHOUT_FIELD = Hypothesis(on_readings=changed(
     ('magnetometer',), lambda rows: np.full_like(rows, np.nan)))
 
 
@@ -45,19 +45,20 @@ def judge_integration(response: Response) -> None:
     # A filter that goes on has the one rate of its IMU.
     factors = FACTORS if restarts else FACTORS[:1]
     runs = [_fast(response, factor) for factor in factors]
-    unaided: tuple[Hypothesis, ...] = (WITHOUT_FIELD,)
+    without_field: tuple[Hypothesis, ...] = (WITHOUT_FIELD,)
     try:
-        response.respond(runs[0].part(slice(10)), *unaided, shifted=False)
+        response.respond(runs[0].part(slice(10)), *without_field, shifted=False)
     except InvalidOutputError:
-        unaided = ()
-    outcomes = [response.respond(run, *unaided, shifted=False).last() for run in runs]
-    moved = [_error_of_turn(outcome) for outcome in outcomes]
-    findings.measures['order'] = measures.convergence_order(factors, moved)
-    findings.measures['integration_error_deg'] = math.degrees(moved[0])
+        without_field = ()
+    outcomes = [response.respond(run, *without_field, shifted=False).last() for run in runs]
+    errors = [_error_of_turn(outcome) for outcome in outcomes]
+    findings.measures['order'] = measures.convergence_order(factors, errors)
+    findings.measures['integration_error_deg'] = math.degrees(errors[0])
     if restarts:
-        _judge_steps(response, outcomes, unaided)
-    absolute = response.absolute and not unaided
-    fault = (_first_order(response, runs[0], diagnosis.error_of(outcomes[0], absolute), unaided)
+        _judge_steps(response, outcomes, without_field)
+    absolute = response.absolute and not without_field
+    before = diagnosis.error_of(outcomes[0], absolute)
+    fault = (_first_order(response, runs[0], before, without_field)
              or _left_over(response, runs, outcomes, absolute))
     findings.faults += filter(None, [fault])
 
@@ -74,13 +75,14 @@ def _error_of_turn(outcome: Outcome) -> float:
 
 
 def _judge_steps(response: Response, outcomes: Sequence[Outcome],
-                 unaided: Sequence[Hypothesis]) -> None:
+                 without_field: Sequence[Hypothesis]) -> None:
     """Judge whether the filter uses the step, or turns by the number of samples."""
-    findings, moved = response.findings, [one for one in response.shifts if one.given is None]
-    ahead = bool(moved)         # where the attitude is a step ahead, so are the turns
+    findings = response.findings
+    shifts = [one for one in response.shifts if one.on_readings is None]    # of the attitude
+    ahead = bool(shifts)        # where the attitude is a step ahead, so are the turns
     # With a delay, they would not be those of the same uneven steps.
-    uneven = None if any(one.faults for one in moved) else response.respond(
-        _fast(response, FINEST).merged(UNEVEN), *unaided)
+    uneven = None if any(one.faults for one in shifts) else response.respond(
+        _fast(response, FINEST).merged(UNEVEN), *without_field)
     judged = [*outcomes, uneven.last()] if uneven else outcomes
     lengths, gains = zip(*itertools.chain(*(gains_of(one, ahead) for one in judged)), strict=True)
     slow, fast = gains[:2]          # at 100 Hz and 200 Hz
@@ -88,7 +90,7 @@ def _judge_steps(response: Response, outcomes: Sequence[Outcome],
     by_samples = abs(fast / FACTORS[1] - slow) < 2.0 * STEP * abs(slow)
     if apart > STEP * max(abs(slow), STEP) and (by_samples or (
             abs(slow - 1.0) < STEP and uneven is not None
-            and _left_without(response, uneven, unaided, slow, ahead) < max(
+            and _left_without(response, uneven, without_field, slow, ahead) < max(
                 diagnosis.EXPLAINED * apart, SMALL))):
         # A wrong step turns up as a wrong scale at one rate.
         if 'time_step' in findings.names:
@@ -99,7 +101,7 @@ def _judge_steps(response: Response, outcomes: Sequence[Outcome],
             'sensor: the length of a step is misused'))
 
 
-def _left_without(response: Response, outcome: Outcome, unaided: Sequence[Hypothesis],
+def _left_without(response: Response, outcome: Outcome, without_field: Sequence[Hypothesis],
                   slow: float, ahead: bool) -> float:
     """
     Return the largest deviation of gains from `slow` when the lengths of steps are undone.
@@ -109,7 +111,7 @@ def _left_without(response: Response, outcome: Outcome, unaided: Sequence[Hypoth
     """
     shares = np.clip(_shares(outcome), 0.05, 20.0)[:, np.newaxis]
     again = response.respond(replace(outcome.run, gyroscope=outcome.run.gyroscope / np.vstack(
-        (shares[:1], shares))), *unaided).last()
+        (shares[:1], shares))), *without_field).last()
     before, after = (gains_of(one, ahead) for one in (outcome.last(), again))
     return max((abs(gain - slow) for (_, first), (_, gain) in zip(before, after, strict=True)
                 if abs(first) > STEP), default=0.0)
@@ -134,14 +136,14 @@ def gains_of(outcome: Outcome, ahead: bool = False) -> list[tuple[float, float]]
 
 
 def _first_order(response: Response, run: Run, before: float,
-                 unaided: Sequence[Hypothesis]) -> Fault | None:
+                 without_field: Sequence[Hypothesis]) -> Fault | None:
     """Return the fault if the error of a run is that of steps of first order."""
     # An error of the scale does not fall with the rate.
     if before <= diagnosis.FIRST_ORDER or response.findings.measures['order'] < 1.0:
         return None
     after = diagnosis.error_of(
-        response.respond(run, FIRST_ORDER, *unaided, shifted=False).last(),
-        response.absolute and not unaided)
+        response.respond(run, FIRST_ORDER, *without_field, shifted=False).last(),
+        response.absolute and not without_field)
     return None if after >= diagnosis.FIRST_ORDER_LEFT * before else Fault(
         'first_order_integration', 'integration is first order: correcting it reduces the error '
         f'on the fast motion from {degrees(before)} to {degrees(after)}')

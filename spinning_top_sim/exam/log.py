@@ -175,14 +175,14 @@ def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
     settled, found = outcome.last(), None
     before = diagnosis.error_of(settled, absolute)
     after, best = min(((diagnosis.error_of(replace(
-        settled, estimates=one.read(settled.estimates)), absolute), one)
+        settled, estimates=one.on_attitudes(settled.estimates)), absolute), one)
         for one in hypotheses.MISREADINGS), key=lambda pair: pair[0])
     if before > GROSS and after < diagnosis.EXPLAINED * before:
         found = hypotheses.ambiguous(best._replace(
             text=f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
             'measures are those after this correction'), absolute)
     corrected = outcome if found is None else replace(
-        outcome, estimates=found.read(outcome.estimates))
+        outcome, estimates=found.on_attitudes(outcome.estimates))
     offset = diagnosis.offset_of(corrected.last(), absolute)
     consistency = diagnosis.consistency([corrected], absolute)
     faults = [Fault(name, found.text) for name in found.faults] if found else []

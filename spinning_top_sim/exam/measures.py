@@ -63,7 +63,7 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
     return Rmse(*(math.degrees(rms(one)) for one in (total, errors.heading, errors.tilt)))
 
 
-def unaided(run: Run, rows: slice | NDArray[np.intp]) -> Rmse:
+def gyroscope_alone(run: Run, rows: slice | NDArray[np.intp]) -> Rmse:
     """Return the errors, to first order, of the gyroscope integrated from the truth."""
     apart = run.dt[:, np.newaxis] * run.gyroscope - increments(run.truth)
     error = np.cumsum(Rotation.from_quat(run.truth[1:]).apply(apart[1:]), axis=0)

@@ -69,7 +69,6 @@ class Response:
         self.shifts: list[Hypothesis] = []      # causes found that shift the time
         self._undone: list[Hypothesis] = []     # the others
         self.unclear = False    # an error is left that would pass for a lever arm's or a bias's
-        self._early = np.eye(3)                 # response to the begin of turns
         self.excitation = excite(subject.imu, subject.restarts)
         self._run, self._rests = self.excitation.run, self.excitation.rests
 
@@ -89,7 +88,7 @@ class Response:
             (self.shifts if one.shift else self._undone).insert(0, one)
             # A constant bias of the sensor is none about axes of the world, and longer steps raise
             # the gains of a filter.
-            self.unclear |= one.given is hypotheses.of_world or 'time_step' in one.faults
+            self.unclear |= one.on_readings is hypotheses.of_world or 'time_step' in one.faults
         clean = np.degrees(self._errors(self.outcome))
         self.findings.measures |= {'tilt_clean_deg': float(max(clean[::2])),
                                    'heading_clean_deg': float(max(clean[1::2]))}
@@ -121,16 +120,18 @@ class Response:
 
     def blamed(self, error: Fault) -> Fault:
         """Blame the gyroscope for an error if nothing else is wrong but the response to it."""
-        if self.findings.names - {'gyroscope_wiring'} or from_identity(self._early) <= SLIGHT:
+        early = self._turns(self.outcome).early
+        if self.findings.names - {'gyroscope_wiring'} or from_identity(early) <= SLIGHT:
             return error
-        return Fault('gyroscope_wiring', f'{words(self._early)}; {error.evidence}')
+        return Fault('gyroscope_wiring', f'{words(early)}; {error.evidence}')
 
     def _try(self, *hypotheses: Hypothesis, screened: bool = True) -> Iterator[Tried]:
         """Yield the hypotheses with their outcomes; `screened` leaves out what is in vain."""
         for one in hypotheses:
             with contextlib.suppress(InvalidOutputError):       # the filter rejects the readings
-                if one.given is None:
-                    yield one, replace(self.outcome, estimates=one.read(self.outcome.estimates))
+                if one.on_readings is None:
+                    yield one, replace(
+                        self.outcome, estimates=one.on_attitudes(self.outcome.estimates))
                 elif not (screened and self.subject.restarts and self._in_vain(one)):
                     yield one, self.respond(self._run, one)
 
@@ -142,7 +143,7 @@ class Response:
         return before > HEADING and after > LESS * before
 
     def _turns(self, outcome: Outcome) -> Turns:
-        return turns_of(outcome, self.excitation.turns)
+        return turns_of(outcome, self.excitation.turn_begins)
 
     def _cause(self) -> Tried | None:
         """
@@ -168,7 +169,7 @@ class Response:
         return found
 
     def _explanation(self, turns: Turns, gross: bool) -> Tried | None:
-        """Return the best hypothesis of the first group that explains the error, or None."""
+        """Return the best hypothesis of the first group with one that explains the error."""
         return (self._best(self._of_attitudes()) or self._best(self._of_delays(turns.late))
                 or self._best(self._of_gyroscope(turns), diagnosis.EXPLAINED if gross
                               else LITTLE_LEFT, mends_turns=gross)
@@ -177,7 +178,12 @@ class Response:
 
     def _best(self, tried: Iterator[Tried], share: float = diagnosis.EXPLAINED,
               mends_turns: bool = False) -> Tried | None:
-        """Return the one that leaves least, if it explains the error or mends wrong turns."""
+        """
+        Return the one that leaves the least error, if it explains the error.
+
+        It does if at most `share` of it is left or, with `mends_turns`, if the response to turns
+        is not grossly wrong any more.  Once SURE * share is left, no other one is tried.
+        """
         limit, least, best = share * self._error(self.outcome), math.inf, None
         for one, outcome in tried:
             error = self._error(outcome)
@@ -199,19 +205,19 @@ class Response:
         turned = Hypothesis(
             ('magnetometer_wiring' if abs(heading) > REVERSED else 'heading_offset',),
             f'turned by {-math.degrees(heading):.3g} deg about the vertical',
-            read=lambda q: (back * Rotation.from_quat(q)).as_quat())
+            on_attitudes=lambda q: (back * Rotation.from_quat(q)).as_quat())
         group = Rotation.create_group('O')
         square = group[int(np.argmin((group.inv() * in_sensor).magnitude()))]
-        tangents = [np.tan(0.5 * turns.magnitude()) for turns in (estimated, true)]
+        tangents = [np.tan(0.5 * one.magnitude()) for one in (estimated, true)]
         scale = max(float(np.median(tangents[0] / np.maximum(tangents[1], 1e-9))), 1e-3)
         return self._try(
             *hypotheses.MISREADINGS,
             Hypothesis(('frame_ned',), 'read as attitude of axes '
                        f'{hypotheses.axes(square.as_matrix())} of the sensor',
-                       read=lambda q: (Rotation.from_quat(q) * square.inv()).as_quat()),
+                       on_attitudes=lambda q: (Rotation.from_quat(q) * square.inv()).as_quat()),
             *([turned] if steady else []),
             Hypothesis(('inaccurate',), f'with the vector part of the attitude divided by '
-                       f'{scale:.4g}', read=lambda q: Rotation.from_quat(
+                       f'{scale:.4g}', on_attitudes=lambda q: Rotation.from_quat(
                            q / (scale, scale, scale, 1.0)).as_quat()))
 
     def _of_delays(self, late: int) -> Iterator[Tried]:
@@ -220,11 +226,11 @@ class Response:
             self.outcome.part(self.excitation.motion), self.absolute).seconds
         yield from self._try(         # the filter corrects before it takes the step
             hypotheses.CORRECTS_FIRST,
-            Hypothesis((), 'a step ahead', read=lambda q: hypotheses.moved(q, -1), shift=True))
+            Hypothesis(on_attitudes=lambda q: hypotheses.shifted(q, -1), shift=True))
         if not diagnosis.AHEAD <= offset <= diagnosis.DELAYED:
             yield from self._try(Hypothesis(
                 ('stamp_offset',), f'with the attitude {round(offset)} samples earlier',
-                read=lambda q: hypotheses.moved(q, round(offset)), shift=True))
+                on_attitudes=lambda q: hypotheses.shifted(q, round(offset)), shift=True))
         if late > 0:
             yield from self._try(delayed(('gyroscope',), late))
 
@@ -239,7 +245,7 @@ class Response:
                         fault='gyroscope_units') for text, by in (
                             ('pi/180', math.radians(1.0)), ('180/pi', math.degrees(1.0)))),
                 Hypothesis(('gyroscope_wiring',), 'with rates about axes of the world (a product '
-                           'on the wrong side)', given=hypotheses.of_world), screened=False)
+                           'on the wrong side)', on_readings=hypotheses.of_world), screened=False)
         for matrix_of in attrgetter('early'), attrgetter('whole'):
             matrix = matrix_of(turns)
             scale = float(np.trace(matrix)) / 3.0
@@ -247,7 +253,8 @@ class Response:
                 yield from self._inverses(matrix_of, scale * np.eye(3), lambda fed: Hypothesis(
                     ('gyroscope_wiring', 'time_step'), f'with steps {np.trace(fed) / 3.0:.4g} '
                     'times as long (scales of rates and steps cannot be told apart)',
-                    given=hypotheses.changed(('dt',), partial(np.multiply, np.trace(fed) / 3.0))))
+                    on_readings=hypotheses.changed(
+                        ('dt',), partial(np.multiply, np.trace(fed) / 3.0))))
             yield from self._inverses(matrix_of, matrix, lambda fed: wired(
                 'gyroscope', f'{words(np.linalg.inv(fed))}: with the inverse of that', fed))
 
@@ -296,7 +303,8 @@ class Response:
         found = self._at_rest(self.outcome)
 
         def fit(one: Reals) -> float:
-            there = np.concatenate([turns.apply(readings[rows] @ one.T) for turns, rows in found])
+            there = np.concatenate([
+                attitudes.apply(readings[rows] @ one.T) for attitudes, rows in found])
             return float(np.sum(there[:, axis]
                                 / np.linalg.norm(there[:, [axis, *level]], axis=1)))
 
@@ -330,8 +338,8 @@ class Response:
         found = [(Rotation.from_quat(outcome.estimates[self._rests]), self._rests)]
         if self.subject.restarts:
             # Within turns too, the readings are those of a rest in the same attitude.
-            turns = self.excitation.turns
-            starts = np.concatenate((self._rests, turns + 15, turns + 30))
+            begins = self.excitation.turn_begins
+            starts = np.concatenate((self._rests, begins + 15, begins + 30))
             still = np.full((START, 3), NEVER_ZERO)
             found.insert(0, (Rotation.from_quat([self.respond(replace(
                 self._run.part(np.full(START, row)), gyroscope=still), *more).estimates[-1]
@@ -349,8 +357,9 @@ class Response:
             if self._error(outcome) > LESS * before:
                 return
             before = self._error(outcome)
-            for turns, rows in self._at_rest(outcome, *tried):
-                change, left = fits.affine_of(readings[rows] / size, turns, level, offset_only)
+            for attitudes, rows in self._at_rest(outcome, *tried):
+                change, left = fits.affine_of(
+                    readings[rows] / size, attitudes, level, offset_only)
                 if left < FITS:
                     break
             if np.linalg.cond(change) > WORST:
@@ -387,7 +396,6 @@ class Response:
                 'in motion {} and {}').format(*map(degrees, clean))
         wrong = bool(np.any(clean > CLEAN))
         turns = self._turns(self.outcome)
-        self._early = turns.early
         attitudes = Rotation.from_quat(self.outcome.estimates)
         if np.max((attitudes * attitudes[0].inv()).magnitude()) < STUCK:
             return [Fault('inaccurate', 'the attitude hardly changes')]

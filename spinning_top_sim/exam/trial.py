@@ -135,13 +135,13 @@ def follow(make_filter: MakeFilter, run: Run, undone: Sequence[Hypothesis] = (),
     """
     fed = run
     for one in undone:
-        fed = one.given(fed) if one.given else fed
+        fed = one.on_readings(fed) if one.on_readings else fed
     try:
         estimates, covariances, biases = feed(make_filter, fed)
     except InvalidOutputError as error:
         raise InvalidOutputError(f'{run.name}: {error}') from error
     for one in reversed(undone):
-        estimates = one.read(estimates)
+        estimates = one.on_attitudes(estimates)
     return Outcome(run, estimates, covariances, biases)
 
 

@@ -94,9 +94,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     given = scene_file.given(arguments)
-    # An IMU alone names no scene.
-    files = [*scene_file.chosen_files(arguments)][:arguments.scene is not None]
-    files += map(Path, arguments.params)
+    # An IMU names no scene.
+    files = [*([scene_file.file_of('scene', arguments.scene)] if arguments.scene else ()),
+             *map(Path, arguments.params)]
     name = files[0].stem if files else 'spinning_top'
     if arguments.model:
         if arguments.output is None:

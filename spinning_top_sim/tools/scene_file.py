@@ -85,23 +85,19 @@ def given(arguments: argparse.Namespace) -> dict[str, object]:
 
 
 def chosen_files(arguments: argparse.Namespace) -> dict[Path, dict[str, object]]:
-    """
-    Return the parameter files of --scene and --imu, and what is in them.
+    """Return the files of --scene and --imu with what is in them.  Raises ValueError, OSError."""
+    paths = [file_of(kind, name) for kind in ('scene', 'imu')
+             if (name := getattr(arguments, kind, None)) is not None]
+    return {path: read_scene(path) for path in paths}
 
-    Raises ValueError for a name that is not there, or as `read_scene`.
-    """
-    found = {}
-    for kind in ('scene', 'imu'):
-        name = getattr(arguments, kind, None)
-        if name is None:
-            continue
-        files = parameter_files(kind)
-        if name not in files and '/' not in name and not name.endswith('.yaml'):
-            raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
-                             f'{", ".join(files)}')
-        path = files.get(name, Path(name))
-        found[path] = read_scene(path)
-    return found
+
+def file_of(kind: str, name: str) -> Path:
+    """Return a file of the kind scene or imu, given by path or name.  Raises ValueError."""
+    files = parameter_files(kind)
+    if name not in files and '/' not in name and not name.endswith('.yaml'):
+        raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
+                         f'{", ".join(files)}')
+    return files.get(name, Path(name))
 
 
 def read_scene(path: str | Path) -> dict[str, object]:
