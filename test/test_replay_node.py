@@ -104,9 +104,9 @@ class OwnReplay(InThisProcess):
         given = replay_node._parser().parse_args([str(file), *options])
         self.node = Replayer(open_log(given.file, given.partial), given)
         sinks = {}
-        for channel, publisher in self.node._outputs.items():
+        for channel, publisher in self.node._by_channel.items():
             sink = sinks.setdefault(publisher.topic_name, Sink(publisher))
-            self.node._outputs[channel] = sink
+            self.node._by_channel[channel] = sink
         self.node._senders = set(sinks.values())
         self.sinks = [sinks[name] for name, _ in topics]
 

@@ -117,7 +117,7 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
             assert abs(one - other) < max(1, abs(one)) * 1e-30
     for t, (alpha, beta, across, _) in (0, posture), (S, whole):
         states = motion.states(range(t, t + 1))
-        q = np.ravel(attitude.product(motion.vertical.rows, states.rows_quaternion))
+        q = np.ravel(attitude.product(motion.vertical.rotation, states.rows_quaternion))
         assert abs(q - [-beta.imag, beta.real, alpha.imag, alpha.real]).max() < 2e-15
         with pytest.raises(NotImplementedError, match='phi_dot'):      # of chained motions
             _ = states.psi_dot
@@ -129,7 +129,7 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
     line = np.array(acceleration) + np.array((0.0, 0.0, TOP.gravity))
     assert motion.top.gravity == pytest.approx(
         math.copysign(np.linalg.norm(line), motion.top.gravity), rel=1e-15)
-    z = np.array(attitude.axis_in_world(motion.vertical.rows)).ravel()
+    z = np.array(attitude.axis_in_world(motion.vertical.rotation)).ravel()
     assert abs(motion.top.gravity * z - line).max() <= 1e-15 * max(1.0, np.linalg.norm(line))
 
 

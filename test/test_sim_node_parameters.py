@@ -113,9 +113,9 @@ def test_streams_can_be_switched_off_and_on_and_only_subscribers_make_work(node)
     pose.encode = lambda *given: encoded.append(given) or encode(*given)
     node.step(5)
     assert encoded == [] and output.publish is None
-    kind = type(node.node._outputs.by_topic['pose'].msg_type())
+    kind = type(node.node._topics.by_topic['pose'].msg_type())
     subscription = node.node.create_subscription(kind, 'pose', print, 10)
-    wait_for('a subscriber', node.node._outputs.by_topic['pose'].get_subscription_count)
+    wait_for('a subscriber', node.node._topics.by_topic['pose'].get_subscription_count)
     node.step(5)
     assert encoded and output.publish is not None
     assert node.set(pose__enabled=False).successful

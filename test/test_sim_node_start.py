@@ -197,7 +197,7 @@ def test_remapping_and_qos_overrides_work(tmp_path):
                  'qos_overrides./ns/attitude.publisher.reliability:=best_effort', '-p',
                  'qos_overrides./ns/imu/data_raw.publisher.depth:=3']
     with OwnNode(tmp_path, *arguments, record__enabled=True) as node:
-        pose, imu = (node.node._outputs.by_topic[name] for name in ('pose', 'imu/data_raw'))
+        pose, imu = (node.node._topics.by_topic[name] for name in ('pose', 'imu/data_raw'))
         assert (pose.topic_name, pose.qos_profile.reliability.name) == (
             '/ns/attitude', 'BEST_EFFORT')
         assert (imu.qos_profile.depth, imu.qos_profile.reliability.name) == (3, 'RELIABLE')

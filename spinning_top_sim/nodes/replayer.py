@@ -47,8 +47,8 @@ class Replayer(Node):
         self._length_s = (end_ns - log_begin_ns) / NANOSECONDS
         if self._span_ns < 0:
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
-        self._outputs = self._open_publishers()     # by channel
-        self._senders = set(self._outputs.values())
+        self._by_channel = self._open_publishers()
+        self._senders = set(self._by_channel.values())
         self._playback = playback.Playback(self._begin_ns, paused=options.start_paused)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.declare_parameter('rate', 1.0, ParameterDescriptor(
@@ -141,22 +141,22 @@ class Replayer(Node):
             code = 2
         if self.context.ok():
             self._terminal.tell(
-                f'played {self._playback.sent} messages on {len(set(self._outputs.values()))} '
+                f'played {self._playback.sent} messages on {len(set(self._by_channel.values()))} '
                 f'topics, {self._playback.late} of them late')
             self.finished.set_result(code)
 
     def _messages(self) -> Iterator[playback.Message]:
         """Yield the messages to play, in endless repetition with --loop."""
         names = {channel.name for channel in self._reader.topics
-                 if channel.channel_id in self._outputs}
+                 if channel.channel_id in self._by_channel}
         start = self._begin_ns if self._options.start else None
         for number in itertools.count():
             shift_ns, is_empty = number * (self._span_ns + playback.ROUND_GAP_NS), True
             for message in self._reader.messages(names, start):
                 at_ns = message.log_time or self._begin_ns      # 0: before the first /clock
-                if message.channel_id in self._outputs:
+                if message.channel_id in self._by_channel:
                     is_empty = False
-                    yield (at_ns + shift_ns, self._outputs[message.channel_id].publish,
+                    yield (at_ns + shift_ns, self._by_channel[message.channel_id].publish,
                            message.data)
             if is_empty or not self._options.loop:
                 return

@@ -61,19 +61,19 @@ class Simulator(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._date = StampClock(self, parameters.is_enabled('clock', values))
         self.lock = FairLock()
-        self._outputs = StreamPublishers(self)
-        self._session = RecordingSession(simulation, self.lock, self._outputs.topics_to_record)
+        self._topics = StreamPublishers(self)
+        self._session = RecordingSession(simulation, self.lock, self._topics.topics_to_record)
         self.loop = TickLoop(
             simulation, values, self._session, warn=self._warn, error=self._tell_error,
-            update_subscribers=lambda: self._outputs.update_subscribers(simulation.outputs),
+            update_subscribers=lambda: self._topics.update_subscribers(simulation.outputs),
             source=self._date.now_ns if self._date.follows else time.monotonic_ns)
         self._pacer = DeadlineThread(self._tick, self._idle, lambda: self.loop.grid, self.fail)
         self._report = NodeStatus(simulation, self.loop, self._session)
         self._status_timer: Timer | None = None
         self._status_period = 0.0
-        self._outputs.check(simulation.outputs, values)
-        self._open_outputs(values)
-        self._diagnostics = self._outputs.create(DiagnosticArray, '/diagnostics')
+        self._topics.check(simulation.outputs, values)
+        self._open_topics(values)
+        self._diagnostics = self._topics.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         self.create_subscription(Twist, '~/cmd_vel', self._on_velocity, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
@@ -152,9 +152,9 @@ class Simulator(Node):
         with self.lock:
             wants_idle = self.loop.tick()
             if self.loop.state is not LoopState.RUNNING:
-                self._outputs.flush(at_once=self.loop.state is LoopState.ENDED)
+                self._topics.flush(at_once=self.loop.state is LoopState.ENDED)
         if self.loop.state is LoopState.ENDED and not self.finished.done():
-            wait_for_all_acked(self._outputs.by_topic.values(), 1.0)
+            wait_for_all_acked(self._topics.by_topic.values(), 1.0)
             if self.offers_actions:
                 time.sleep(LAST_ANSWERS_S)
             self.finished.set_result(None)
@@ -218,7 +218,7 @@ class Simulator(Node):
                 changed = {name: values[name] for name in rest}
                 self._session.write_event('parameters', **changed)
                 self.simulation.apply(changed)
-                self._open_outputs(values)
+                self._open_topics(values)
                 self.loop.set_pace(values)
         for effect in (Effect.RESET, Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
@@ -231,15 +231,15 @@ class Simulator(Node):
         if self._date.follows and parameters.is_enabled('clock', values):
             raise ValueError('clock.enabled, publish_clock: must be false while this node follows '
                              'another /clock (use_sim_time)')
-        self._outputs.check(self.simulation.outputs, values)
+        self._topics.check(self.simulation.outputs, values)
         lowest = self.simulation.lowest_imu_rate
         if values['imu.rate'] < lowest:
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
                              'means or increments are taken, published or recorded')
 
-    def _open_outputs(self, values: Mapping[str, Any]) -> None:
+    def _open_topics(self, values: Mapping[str, Any]) -> None:
         """Open the publishers and the status line that these parameters ask for."""
-        self._outputs.open(self.simulation.outputs, values)
+        self._topics.open(self.simulation.outputs, values)
         period = values['status_period']
         if period != self._status_period:
             self._status_period = period

@@ -72,8 +72,9 @@ class States:
 
     method: str
 
-    def __init__(self, top: Top, start: State, n: int, *, lz: Column | None = None,
-                 gravity: Column | None = None, torque: Column | None = None) -> None:
+    def __init__(self, top: Top, start: State, n: int, *, lz: Column | float | None = None,
+                 gravity: Column | float | None = None,
+                 torque: Column | float | None = None) -> None:
         self.top, self.start, self._n = top, start, n
         self._l3 = start.l3
         # Columns where the effective gravity of a moving pivot changes.

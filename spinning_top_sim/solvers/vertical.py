@@ -64,16 +64,16 @@ class Vertical(NamedTuple):
     gravity : downwards along z positive [m/s^2]
     top : in this gravity
     alpha, beta : Cayley-Klein parameters of the least rotation from the world to the frame
-    rows : the same rotation, q(world <- frame), in doubles
+    rotation : the same, q(world <- frame), in doubles
     """
 
     gravity: mpfr
     top: Top
     alpha: mpc
     beta: mpc
-    rows: Quaternion
+    rotation: Quaternion
 
-    def start(self, posture: Posture) -> PreciseState:
+    def state_of(self, posture: Posture) -> PreciseState:
         """Return a posture as a state in this frame."""
         top, transverse = self.top, posture.transverse
         alpha, beta = _product(self.alpha.conjugate(), -self.beta, posture.alpha, posture.beta)
@@ -200,7 +200,7 @@ def about_vertical(top: Top, posture: Posture, acceleration: Fractions,
         level = 2 * posture.alpha * posture.beta
         height = norm(posture.alpha) - norm(posture.beta)
         vertical = up if x * level.real + y * level.imag + z * height >= 0 else down
-        return vertical, vertical.start(posture)
+        return vertical, vertical.state_of(posture)
 
 
 def rounded(start: PreciseState) -> State:

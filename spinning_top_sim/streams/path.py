@@ -124,7 +124,7 @@ class Segment:
 
     def _in_world(self, states: States) -> States:
         ride = self.ride
-        return WorldStates(ride.top, states, ride.vertical.rows) if ride else states
+        return WorldStates(ride.top, states, ride.vertical.rotation) if ride else states
 
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time [ns]."""
@@ -169,7 +169,7 @@ def states_of(segments: Sequence[Segment], counts: Sequence[int],
     motions = [cast(AcceleratedMotion, segment.motion) for segment in segments]
     rides = [cast(Ride, segment.ride) for segment in segments]
     since_ns = times_ns - np.repeat([segment.start_ns for segment in segments], counts)
-    x, y, z, w = np.repeat(np.hstack([ride.vertical.rows for ride in rides]), counts, axis=1)
+    x, y, z, w = np.repeat(np.hstack([ride.vertical.rotation for ride in rides]), counts, axis=1)
     states = AcceleratedStates(motions, counts, Times.from_ns(since_ns))
     return WorldStates(rides[0].top, states, (x, y, z, w))
 

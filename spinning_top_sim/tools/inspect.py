@@ -63,20 +63,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     cli.check_output(arguments.plot, arguments.animate)
     with LogReader(arguments.log) as reader:
-        found, verdict = survey(reader), None
+        found, comparison = survey(reader), None
         exported: list[str] = []
         if found.run is not None:
             if arguments.verify:
                 begin_ns, end_ns = found.damage.start_ns, found.end_ns
                 with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
                                   quiet=arguments.json) as show:
-                    verdict = compare(found.run, reader, end_ns, lambda stamp_ns: show(
+                    comparison = compare(found.run, reader, end_ns, lambda stamp_ns: show(
                         (stamp_ns - begin_ns) / NANOSECONDS))
             exported += log_exports.write(reader, found.run, arguments.export)
     if arguments.json:
-        print(json.dumps(_as_json(found, verdict), indent=2, allow_nan=False))
+        print(json.dumps(_as_json(found, comparison), indent=2, allow_nan=False))
     else:
-        for line in _as_text(found, verdict):
+        for line in _as_text(found, comparison):
             cli.print_line(line)
     for line in exported:
         cli.print_line(line, sys.stderr if arguments.json else None)
@@ -84,7 +84,8 @@ def _run(arguments: argparse.Namespace) -> int:
         if found.run is None and getattr(arguments, option):
             raise LogError(f'--{option}: {found.foreign_reason}')
     _draw(arguments, found)
-    passed = found.whole and not found.damage.defects and (verdict is None or verdict.identical)
+    passed = found.whole and not found.damage.defects and (
+        comparison is None or comparison.identical)
     return cli.OK if passed else cli.FAILED
 
 
@@ -106,7 +107,7 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
                 raise
 
 
-def _as_json(found: Survey, verdict: Comparison | None) -> object:
+def _as_json(found: Survey, comparison: Comparison | None) -> object:
     """Return the findings for JSON; docs/log_format.md has the keys."""
     damage, run = found.damage, found.run
     content: dict[str, object] = {
@@ -131,9 +132,10 @@ def _as_json(found: Survey, verdict: Comparison | None) -> object:
                           **_fields_of(run, 'epoch_ns', 'begun_ns'), **run.environment}
         content['events'] = [{'event': event.name, **_fields_of(event, 'stamp_ns', 't_ns'),
                               **event.details} for event in run.events]
-    if verdict is not None:
-        content['verify'] = {'identical': verdict.identical, 'whole': found.whole,
-                             **asdict(verdict), 'first': verdict.first and verdict.first._asdict()}
+    if comparison is not None:
+        content['verify'] = {'identical': comparison.identical, 'whole': found.whole,
+                             **asdict(comparison),
+                             'first': comparison.first and comparison.first._asdict()}
     # Numbers that JSON does not have become null.
     return json.loads(json.dumps(content), parse_constant=lambda name: None)
 
@@ -142,7 +144,7 @@ def _fields_of(source: object, *names: str) -> dict[str, object]:
     return {name: getattr(source, name) for name in names}
 
 
-def _as_text(found: Survey, verdict: Comparison | None) -> Iterator[str]:
+def _as_text(found: Survey, comparison: Comparison | None) -> Iterator[str]:
     """Yield the findings as lines of text."""
     damage, run = found.damage, found.run
     state = ('whole' if found.whole and not damage.defects else
@@ -170,8 +172,8 @@ def _as_text(found: Survey, verdict: Comparison | None) -> Iterator[str]:
             [(topic, *(_number(found.drifts.get(topic, {}).get(name), 2)
                        for name in ('energy', 'l3', 'lz')), _number(found.errors.get(topic), 3))
              for topic in found.topics if topic in {**found.drifts, **found.errors}])
-    if verdict is not None:
-        yield from _verdict(verdict)
+    if comparison is not None:
+        yield from _about_comparison(comparison)
 
 
 def _journal(run: RunDescription) -> str:
@@ -217,21 +219,21 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
                'with; --verify compares each message')
 
 
-def _verdict(verdict: Comparison) -> Iterator[str]:
-    for warning in verdict.warnings:
+def _about_comparison(comparison: Comparison) -> Iterator[str]:
+    for warning in comparison.warnings:
         yield f'verify: {warning}: the last bits may differ for that'
-    compared = sum(verdict.compared.values())
-    if verdict.stopped:
-        yield f'verify: the run cannot be computed again: {verdict.stopped}'
-    if verdict.identical:
+    compared = sum(comparison.compared.values())
+    if comparison.stopped:
+        yield f'verify: the run cannot be computed again: {comparison.stopped}'
+    if comparison.identical:
         yield f'verify: identical, all {compared} messages byte for byte'
-    elif not (verdict.different or verdict.unexpected or verdict.stopped):
-        yield (f'verify: incomplete, {count(verdict.missing, "message")} missing; '
+    elif not (comparison.different or comparison.unexpected or comparison.stopped):
+        yield (f'verify: incomplete, {count(comparison.missing, "message")} missing; '
                f'the other {compared} are identical byte for byte')
     else:
-        yield (f'verify: DIFFERENT: {verdict.different} of {compared} messages differ, '
-               f'{verdict.missing} are missing, {verdict.unexpected} should not be there')
-    first = verdict.first
+        yield (f'verify: DIFFERENT: {comparison.different} of {compared} messages differ, '
+               f'{comparison.missing} are missing, {comparison.unexpected} should not be there')
+    first = comparison.first
     if first is not None:
         place = '' if first.byte is None else f', byte {first.byte}'
         yield (f'verify: first: {first.topic} at {stamp_text(first.stamp_ns)} s{place}, '

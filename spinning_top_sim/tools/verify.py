@@ -63,38 +63,38 @@ def compare(run: RunDescription, reader: LogReader, end_ns: int,
     show : takes the log time that is reached [ns]
     """
     topics = (*run.topics.values(), run.commands_topic)
-    verdict = Comparison(dict.fromkeys(filter(None, topics), 0), warnings=[
+    comparison = Comparison(dict.fromkeys(filter(None, topics), 0), warnings=[
         f'{what} was {run.environment[what]}, is {here}'
         for what, here in provenance.environment().items() if run.environment[what] != here])
     for stamp_ns, reason in run.broken:
-        verdict.different += 1
-        verdict.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
+        comparison.different += 1
+        comparison.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
     # What has not been met in the log.
     computed: _Computed = defaultdict(deque)
-    progress, before_ns = _compute(run, end_ns, computed, verdict, show), -math.inf
-    for message in reader.messages(topics=verdict.compared):
+    progress, before_ns = _compute(run, end_ns, computed, comparison, show), -math.inf
+    for message in reader.messages(topics=comparison.compared):
         while message.log_time >= before_ns:
             before_ns = next(progress)
-            _miss(computed, verdict, message.log_time)
+            _miss(computed, comparison, message.log_time)
         key = message.log_time, message.topic
         if key not in computed:
-            verdict.unexpected += 1
-            verdict.note(Difference(*key, 'message', 'there', 'no such message'))
+            comparison.unexpected += 1
+            comparison.note(Difference(*key, 'message', 'there', 'no such message'))
             continue
         stream, expected = computed[key].popleft()
         if not computed[key]:
             del computed[key]
-        verdict.compared[message.topic] += 1
+        comparison.compared[message.topic] += 1
         if message.data != expected:
-            verdict.different += 1
-            verdict.note(_difference(key, stream, message.data, expected))
+            comparison.different += 1
+            comparison.note(_difference(key, stream, message.data, expected))
     for _ in progress:
-        _miss(computed, verdict, math.inf)
-    _miss(computed, verdict, math.inf)
-    return verdict
+        _miss(computed, comparison, math.inf)
+    _miss(computed, comparison, math.inf)
+    return comparison
 
 
-def _compute(run: RunDescription, end_ns: int, computed: _Computed, verdict: Comparison,
+def _compute(run: RunDescription, end_ns: int, computed: _Computed, comparison: Comparison,
              show: Callable[[int], None]) -> Iterator[float]:
     """Compute the run; yield the log times before which all is computed, at last infinity."""
     try:
@@ -112,15 +112,15 @@ def _compute(run: RunDescription, end_ns: int, computed: _Computed, verdict: Com
             # Not up to it: another command at this very time may follow.
             yield reached_ns
     except MALFORMED as error:
-        verdict.stopped = reason_of(error)
+        comparison.stopped = reason_of(error)
     yield math.inf
 
 
-def _miss(computed: _Computed, verdict: Comparison, before_ns: float) -> None:
+def _miss(computed: _Computed, comparison: Comparison, before_ns: float) -> None:
     """Count the computed messages before a time that the log does not have."""
     for key in [key for key in computed if key[0] < before_ns]:
-        verdict.missing += len(computed.pop(key))
-        verdict.note(Difference(*key, 'message', 'no such message', 'there'))
+        comparison.missing += len(computed.pop(key))
+        comparison.note(Difference(*key, 'message', 'no such message', 'there'))
 
 
 def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,

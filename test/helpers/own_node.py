@@ -51,7 +51,7 @@ class OwnNode(InThisProcess):
     def listen(self, *topics):
         """Let these streams, and no others, have a subscriber."""
         self.heard |= {topic: [] for topic in topics}
-        self.node._outputs.update_subscribers = lambda outputs: [
+        self.node._topics.update_subscribers = lambda outputs: [
             setattr(one, 'publish', self.heard[one.stream.topic].append)
             for one in outputs if one.stream.topic in self.heard]
         return self
@@ -62,7 +62,7 @@ class OwnNode(InThisProcess):
         node._session.stop()
         before, node.values = node.values, dict(values)
         node._start_spin = {name: values[name] for name in SPIN}
-        node._open_outputs(values)
+        node._open_topics(values)
         node.remove_on_set_parameters_callback(node._on_set_parameters)
         node.set_parameters([
             Parameter(name, value=list(value) if isinstance(value, tuple) else value)
