@@ -185,8 +185,8 @@ def test_the_effective_potential_meets_the_energy_at_the_turning_points(shown):
     assert np.interp(turning.x, line.x, line.y) == pytest.approx(energy, abs=1e-3)
     still, moves = (plots.Plotted(track, stamp_ns, 0, stamp_ns, 0)
                     for track in (Track('', shown.values), shown))
-    assert plots.motion_plots([moves, still])[0].energy == pytest.approx(energy)
-    assert math.isnan(plots.motion_plots([still, moves])[0].energy)
+    assert plots.motion_plots([moves, still])[0].point == pytest.approx(energy)
+    assert math.isnan(plots.motion_plots([still, moves])[0].point)
 
 
 def test_a_plot_is_svg_with_title_units_and_its_points():

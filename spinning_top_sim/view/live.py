@@ -144,7 +144,7 @@ class LiveView(Node):
         track.detect_motion()
         if track.motions:
             self._controls.show_spin(track.motions[-1].l3, track.motions[-1].lz)
-        self._page.draw(newest_ns, self._epoch_ns or newest_ns)
+        self._page.draw(newest_ns, newest_ns if self._epoch_ns is None else self._epoch_ns)
 
     def _take_messages(self) -> None:
         """Add the messages of the inbox to the track."""

@@ -229,8 +229,9 @@ class Page:
     def plotted(self, page_ns: int, epoch_ns: int, begin_ns: int,
                 end_ns: int) -> list[plots.Plotted]:
         """Return what is plotted of the tops at a stamp, for a span of stamps of the page."""
-        return [plots.Plotted(top.track, *(stamp_ns + top.shift_ns for stamp_ns in (
-            page_ns, begin_ns, end_ns, epoch_ns))) for top in self._tops]
+        return [plots.Plotted(
+            top.track, stamp_ns=page_ns + top.shift_ns, begin_ns=begin_ns + top.shift_ns,
+            end_ns=end_ns + top.shift_ns, epoch_ns=epoch_ns + top.shift_ns) for top in self._tops]
 
     def words(self, page_ns: int, epoch_ns: int) -> str:
         """Return HTML about the motions and the samples that are drawn."""

@@ -61,7 +61,7 @@ def motion_plots(tops: Sequence[Plotted]) -> list[Plot]:
     theta = float(shapes.tilt(shapes.axis_of(present[1]))[0]) if present else math.nan
     return [plot for plot in (
         Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', potential, theta,
-             motion.energy if motion and motion.description else math.nan),
+             motion.energy if motion and motion.description else math.nan, 'tilt'),
         Plot('Energy', 'time t [s]', 'E [J]', energy, now),
         Plot('Tilt', 'time t [s]', 'θ [deg]', tilt, now),
         Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', rate, now)) if plot.lines]

@@ -4,7 +4,7 @@
 import html
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,8 @@ class Plot(NamedTuple):
     """
     A plot with a mark at x = now.
 
-    energy : with it x is the tilt [deg], and the mark has a point here unless it is NaN; without
-        it x is time [s]
+    point : where the mark has a point; NaN: nowhere
+    over : what x is, the time [s] or the tilt [deg]
     """
 
     title: str
@@ -38,7 +38,8 @@ class Plot(NamedTuple):
     y_label: str
     lines: list[Line]
     now: float
-    energy: float | None = None
+    point: float = math.nan
+    over: Literal['time', 'tilt'] = 'time'
 
 
 class _Frame(NamedTuple):
@@ -69,7 +70,7 @@ def draw(plot: Plot) -> str:
                    *_range([line.y for line in lines], 0.08))
     return (
         f'<svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{plot.title}" '
-        f'data-over="{"time" if plot.energy is None else "tilt"}" '
+        f'data-over="{plot.over}" '
         f'data-x="{frame.low:.9g} {frame.high:.9g}" data-px="{LEFT} {WIDTH - RIGHT}">'
         f'<text class="title" x="8" y="14">{plot.title}</text>'
         f'<text x="{WIDTH - RIGHT}" y="28" text-anchor="end">{_legend(lines)}</text>'
@@ -110,8 +111,8 @@ def _curve(frame: _Frame, line: Line) -> str:
 def _mark(frame: _Frame, plot: Plot) -> str:
     if not math.isfinite(plot.now):
         return ''
-    now, point = frame.place_one(plot.now, plot.energy or 0.0)
-    dot = '' if plot.energy is None or math.isnan(point) else f'<circle cy="{point}" r="5"/>'
+    now, point = frame.place_one(plot.now, plot.point)
+    dot = '' if math.isnan(point) else f'<circle cy="{point}" r="5"/>'
     return (f'<g class="now" transform="translate({now} 0)">'
             f'<path d="M0 {TOP}V{HEIGHT - BOTTOM}"/>{dot}</g>')
 
