@@ -214,8 +214,7 @@ def test_a_tiny_oscillation_has_its_rate_and_is_refused_below_what_doubles_hold(
     rate = math.sqrt(4.9)
     t = np.array([0.3, 0.9])
     motion = solve(top, start(1e-140, l3=0.0, lz=0.0), t)
-    assert motion.theta == pytest.approx(1e-140 * np.cos(rate * t), rel=1e-14,
-                                         abs=0.0)
+    assert motion.theta == pytest.approx(1e-140 * np.cos(rate * t), rel=1e-14, abs=0.0)
     assert np.abs(motion.theta_dot) == pytest.approx(
         1e-140 * rate * np.abs(np.sin(rate * t)), rel=1e-14, abs=0.0)
     with pytest.raises(ValueError, match=r'the amplitude of .* at least 1e-145'):

@@ -6,6 +6,7 @@ import math
 import os
 import re
 import sys
+import time
 from dataclasses import replace
 from functools import cache, partial
 from xml.etree import ElementTree
@@ -20,6 +21,7 @@ from spinning_top_sim.exam import diagnosis, examine, isolation, measures, pytes
 from spinning_top_sim.exam.adapters import FILTERS, Vqf
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.diagnosis import FAULTS
+from spinning_top_sim.exam.kicks import not_corrected
 from spinning_top_sim.exam.page import draw_page
 from spinning_top_sim.exam.pytest_plugin import pass_exam  # noqa: F401, a fixture
 from spinning_top_sim.exam.report import MEANINGS, Report
@@ -62,6 +64,14 @@ def test_the_gyroscope_reads_the_mean_over_its_step_and_a_delay_is_measured():
     offset = measures.time_offset(fine.truth[:-16], fine.truth[16:], fine.rates[16:], True)
     assert offset.seconds == pytest.approx(0.01, rel=0.01)
     assert offset.after < 0.1 * offset.before
+
+
+@pytest.mark.parametrize(('sensor', 'answer'), [
+    ('magnetometer', ((0.06, 0.0, 0.0), (0.0, 0.05, -0.22), (-0.08, 0.0, 0.997))),
+    ('accelerometer', ((0.06, 0.0, 0.0), (0.0, 1.0, 0.0), (-0.08, 2.15, 0.05)))])
+def test_a_kick_that_stays_blames_the_sensor_that_should_correct_it(sensor, answer):
+    found = not_corrected(np.array(answer), 4.0)
+    assert [fault.name for fault in found] == [f'{sensor}_wiring']
 
 
 def test_an_error_that_is_off_changes_no_limit(slow):
@@ -154,6 +164,7 @@ def test_vqf_passes_with_and_without_magnetometer(report):
     assert found.measures['tilt_rms_deg'] < 0.05 and 'nees' not in found.measures
     without = report('vqf-6d')
     assert without.passed and without.measures['heading_rms_deg'] < 0.1, without
+    assert examine(partial(Vqf, tauAcc=30.0), seeds=1, isolated=False).passed
 
 
 @pytest.fixture
@@ -272,13 +283,8 @@ def test_a_run_that_fails_leaves_the_others():
     assert report.measures['tilt_rms_deg'] < 0.05 and 'bias_error_s' in report.measures
 
 
-def update_for_ever():
-    while True:
-        pass
-
-
 @pytest.mark.parametrize(('said', 'says'), [
-    (update_for_ever, '100 updates take more than 1 s'),
+    (partial(time.sleep, 60.0), '100 updates take more than 1 s'),
     (lambda: ctypes.string_at(0), 'the filter ends the process: Segmentation fault'),
     (partial(os._exit, 3), 'the filter ends the process: exit code 3'),
     (partial(sys.exit, 3), 'update 1 of 100 raises SystemExit: 3')])

@@ -112,3 +112,5 @@ def test_a_level_is_a_part_of_full_and_needs_new_filters(monkeypatch):
     asked = examine(Vqf, 'field', seeds=[7], imu={'mag.field': (0.0, 2e-5, 0.0)}).measures
     assert 0.0 < asked['field_rms_deg'] < 10.0
     assert 'field_rms_deg' in examine(Vqf, 'full', seeds=1).measures
+    still = examine(type('Still', (), {'update': lambda *_: (0.0, 0.0, 0.0, 1.0)}), 'field')
+    assert still.faults == ['inaccurate'] and 'that of the gyroscope alone' in str(still)

@@ -129,8 +129,7 @@ def overlapping() -> bytes:
 
 def test_memory_has_a_ceiling(tmp_path):
     """Small files that unpack to much, read one after the other in one process."""
-    bombs = {tiny_messages: '300000', long_names: 'lost: chunk',
-             overlapping: 'overlap in time'}
+    bombs = {tiny_messages: '300000', long_names: 'lost: chunk', overlapping: 'overlap in time'}
     paths = []
     for bomb in bombs:
         paths.append(tmp_path / f'{bomb.__name__}.mcap')

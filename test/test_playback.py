@@ -56,15 +56,13 @@ def play(messages, rate=1.0, plan=None, cost_ns=0, **options):
         player = Playback(EPOCH_NS, **options)
         player._changed = fake
         player.set_rate(rate)
-        fake.at_rest = {77 + at: (lambda act=act: act(player))
-                        for at, act in (plan or {}).items()}
+        fake.at_rest = {77 + at: (lambda act=act: act(player)) for at, act in (plan or {}).items()}
         player.run((at_ns, send, data) for at_ns, _, data in messages)
     return sent, player, fake
 
 
 def messages_at(*offsets, send=None):
-    return [(EPOCH_NS + offset, send, str(index).encode())
-            for index, offset in enumerate(offsets)]
+    return [(EPOCH_NS + offset, send, str(index).encode()) for index, offset in enumerate(offsets)]
 
 
 @pytest.mark.parametrize('rate', [0.1, 3.0])
@@ -96,8 +94,7 @@ def test_a_pause_shifts_what_follows_and_catches_nothing_up():
 
 
 def test_a_new_rate_holds_from_its_moment_on():
-    sent, _, _ = play(messages_at(0, 1_000, 3_000), plan={
-        1_500: lambda p: p.set_rate(0.5)})
+    sent, _, _ = play(messages_at(0, 1_000, 3_000), plan={1_500: lambda p: p.set_rate(0.5)})
     assert [at for _, at in sent] == [0, 1_000, 1_500 + 3_000]
 
 

@@ -129,8 +129,7 @@ def test_two_nodes_that_start_in_the_same_second_take_different_names(tmp_path, 
     for number, node in enumerate(nodes):
         node.simulation.advance(number * SECOND)
     stem = 'spinning_top_2000-01-01_00-00-00'
-    assert {path.name for path in tmp_path.iterdir()} == {
-        f'{stem}.mcap', f'{stem}_2.mcap'}
+    assert {path.name for path in tmp_path.iterdir()} == {f'{stem}.mcap', f'{stem}_2.mcap'}
     assert [len(node.stop()[0]['/ns/pose']) for node in nodes] == [1, 101]
 
 

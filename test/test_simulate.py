@@ -78,8 +78,7 @@ def test_a_command_exactly_at_the_end_is_applied(tmp_path):
     assert inspect.main([str(path), '--verify']) == 0
     log, _ = read(path)
     assert list(log['/spinning_top/commands']) == [1_000_000_000]
-    events = [json.loads(data[8:].rstrip(b'\0'))
-              for data in log['/spinning_top/events'].values()]
+    events = [json.loads(data[8:].rstrip(b'\0')) for data in log['/spinning_top/events'].values()]
     assert [event['event'] for event in events] == ['start', 'command']
     assert events[1] == {'event': 'command', 't_ns': 1_000_000_000, 'sent_ns': 1_000_000_000,
                          'l3': 2.0, 'lz': 1.5}

@@ -65,8 +65,7 @@ def shown(log):
 def truth(shown, stamp_ns):
     """Return the exact state at a stamp before the command."""
     values = shown.values
-    return solve(shown.top, parameters.start_state(values),
-                 [(stamp_ns - shown.epoch_ns) * 1e-9])
+    return solve(shown.top, parameters.start_state(values), [(stamp_ns - shown.epoch_ns) * 1e-9])
 
 
 def test_a_log_shows_the_published_attitude_at_every_stamp(log, shown):
@@ -362,8 +361,7 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port(page):
     (['LOG', '--imu', 'bmi088'], '--imu bmi088: must be without a log, which has its own'),
     (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535')])
 def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
-    assert command.main([*(str(log) if word == 'LOG' else word
-                                   for word in arguments)]) == 2
+    assert command.main([*(str(log) if word == 'LOG' else word for word in arguments)]) == 2
     assert capsys.readouterr().err == f'spinning-top view: {told}\n'
 
 

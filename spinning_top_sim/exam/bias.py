@@ -16,12 +16,13 @@ from spinning_top_sim.tools.verdict import Fault
 BIAS = np.array((0.01, -0.01, 0.02))    # of the gyroscope [rad/s]
 SIZE = float(np.linalg.norm(BIAS))      # 1.4 deg/s
 # A bias counts as learned if at most LEARNED of its first effect on tilt and heading is left in
-# the same attitude later; LEARNING of the whole suffices if the filter's estimate grows.
+# the same attitude later; LEARNING of the whole suffices if the filter's estimate grows, and of
+# the largest effect at the end if it is right.
 LEARNED, LEARNING = 0.5, 0.9
 BIAS_FOUND = 0.05               # share of the bias in the estimate that is more than none
 # Where less than VANISHED of the largest effect is left, the estimate must have this share.
 VANISHED, SHARE = 0.3, 0.25
-BIAS_OFF, PART = 0.5, 0.8       # relative error of an estimate that is wrong; most of a part
+BIAS_OFF, PART = 0.3, 0.7       # relative error of an estimate that is wrong; most of a part
 
 
 def judge_bias(response: Response) -> None:
@@ -33,19 +34,19 @@ def judge_bias(response: Response) -> None:
     errors = measures.errors_of(biased.estimates, unbiased.estimates)
     apart = errors.judged(absolute)
     left_s = rms(apart[excitation.motion]) / SIZE
-    vanishes = left_s * SIZE < VANISHED * float(np.max(apart))
+    remaining = left_s * SIZE / max(float(np.max(apart)), 1e-12)
     effects = np.abs(errors)[:1 + absolute, excitation.rests[[0, -2]]]
     reported = _known(biased.biases - unbiased.biases)
     findings.measures |= {'bias_error_s': left_s, 'bias_found': _share(reported)}
     each_axis = not absolute or not _is_partial(reported)
-    if left_s > BIAS_LEFT_S and not (each_axis and _is_learned(effects, reported)):
+    if left_s > BIAS_LEFT_S and not (each_axis and _is_learned(effects, reported, remaining)):
         seconds = (excitation.rests[-2] - excitation.rests[0]) / scenarios.SLOW.rate
         findings.faults.append(Fault(
             'no_bias_estimate', 'each deg/s of gyroscope bias leaves '
             f'{"an attitude" if absolute else "a tilt"} error of {left_s:.3g} deg: '
             f'the bias is not learned {"" if each_axis else "about each axis "}in '
             f'{seconds:.0f} s'))
-    elif _is_wrong(reported, left_s, vanishes, response.subject.restarts):
+    elif _is_wrong(reported, left_s, remaining, response.subject.restarts):
         findings.faults.append(Fault(
             'bias_report', f'a gyroscope bias of {_degrees(BIAS)} deg/s is learned, but the '
             f'estimate is {_degrees(reported[-1])} deg/s'))
@@ -73,26 +74,27 @@ def _is_partial(reported: Reals) -> bool:
     return bool(min(shares) < BIAS_FOUND and max(shares) > LEARNED)
 
 
-def _is_learned(effects: Reals, reported: Reals) -> bool:
+def _is_learned(effects: Reals, reported: Reals, remaining: float) -> bool:
     """
-    Return whether the effects of BIAS disappear, or fall while the estimate grows.
+    Return whether the effects of BIAS disappear, or fall while the estimate grows or is right.
 
     effects : on the tilt and, unless it is not judged, the heading, each early and late [rad]
     reported : estimates (n, 3) [rad/s], or one of NaN
+    remaining : share of the largest effect at the end
     """
     early, late = effects.T
     grows = _share(reported) > max(BIAS_FOUND, 1.2 * _share(reported, len(reported) // 4))
     return bool(np.all(late < np.maximum(LEARNED * early, BIAS_LEFT_S * SIZE)) or (
-        np.linalg.norm(late) < LEARNING * np.linalg.norm(early)
-        and (grows or _distance(reported, BIAS) < BIAS_OFF)))
+        grows and np.linalg.norm(late) < LEARNING * np.linalg.norm(early)) or (
+        remaining < LEARNING and _distance(reported, BIAS) < BIAS_OFF))
 
 
-def _is_wrong(reported: Reals, left_s: float, vanishes: bool, restarts: bool) -> bool:
+def _is_wrong(reported: Reals, left_s: float, remaining: float, restarts: bool) -> bool:
     """Return whether the estimate is another bias than the one that is learned."""
     if not _distance(reported, BIAS) >= BIAS_OFF:
         return False
     # Where an error is left, or minutes without a bias came before, it may be learned in part.
-    least = SHARE if vanishes else -BIAS_FOUND
+    least = SHARE if remaining < VANISHED else -BIAS_FOUND
     return not ((left_s > BIAS_LEFT_S or not restarts) and least < _share(reported) < PART)
 
 

@@ -22,7 +22,9 @@ TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), 
 # Rates of these turns, and of the last one, so slow that a threshold would drop it or take it for
 # a bias [rad/s].  It has a ripple, relative, because steady rates count as rest in some filters.
 TURN_RATE, SLOW_RATE, RIPPLE = 2.6, 0.15, 0.3
-FIRST_S, REST_S, ANSWER_S, MOTION_S = 6.0, 3.0, 4.0, 16.0
+FIRST_S, REST_S, MOTION_S = 6.0, 3.0, 16.0
+# How long a kick is answered [s]; filters of long time constants are asked again.
+ANSWER_S, LONG_ANSWER_S = 4.0, 20.0
 # Some filters take no step while the rates are exactly zero [rad/s].
 NEVER_ZERO = 1e-6
 # Yaw, pitch and roll of the last rests [deg], the first of which is level, and a turn of the
@@ -46,10 +48,11 @@ class Excitation(NamedTuple):
     turn_begins: NDArray[np.intp]   # first sample of each turn
     motion: slice                   # where the slow motion is judged
     kicks: list[list[int]]          # first sample of each of KICKS at each of the last rests
+    answer_s: float                 # from each of KICKS to the next one [s]
     astray: slice                   # where the heading has been turned far off, up to the end
 
 
-def excite(imu: Mapping[str, Any], goes_astray: bool) -> Excitation:
+def excite(imu: Mapping[str, Any], goes_astray: bool, answer_s: float = ANSWER_S) -> Excitation:
     """
     Return the run for the IMU's place and field, sampled at the rate of the slow motion.
 
@@ -66,7 +69,7 @@ def excite(imu: Mapping[str, Any], goes_astray: bool) -> Excitation:
     ways[:-1] /= TURN_RATE
     ways[-1] /= SLOW_RATE
     lengths, rest, answer = (np.rint(seconds * rate).astype(int) for seconds in (
-        ways, REST_S, ANSWER_S))
+        ways, REST_S, answer_s))
     # Begin and end of each rest.
     ends = np.cumsum([FIRST_S * rate, *(lengths + 1 + rest)]).astype(int)
     begins = np.append(0, ends[1:] - rest)
@@ -93,4 +96,5 @@ def excite(imu: Mapping[str, Any], goes_astray: bool) -> Excitation:
     if goes_astray:
         run.gyroscope[far] += last[-1].inv().apply((0.0, 0.0, ASTRAY / ASTRAY_S))
     return Excitation(run, still, ends - 1, ends[:len(TURNS)],
-                      slice(end - len(motion.t) // 2, end), kicks, slice(far.stop, None))
+                      slice(end - len(motion.t) // 2, end), kicks, answer_s,
+                      slice(far.stop, None))

@@ -102,7 +102,7 @@ def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> ScoredRun:
     step = np.full(len(moves) // 2, 1e-9 * PERIOD_NS)
     run = Run(scene.name, np.cumsum(step), step, turns[1::2].as_quat(), rates[1::2], *readings)
     counts = np.flatnonzero(moves[1::2] > 0.5)
-    return ScoredRun(run, counts, gyroscope_alone(run, counts).total)
+    return ScoredRun(run, counts, gyroscope_alone(run, counts))
 
 
 def _device(random: np.random.Generator, scene: Scene,

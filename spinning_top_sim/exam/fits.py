@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the outcome of the excitation shows: fits of a filter's response to its inputs."""
+"""What the outcome of the excitation shows: fits of a filter's response to turns and at rest."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,20 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import scenarios
-from spinning_top_sim.exam.excitation import ANSWER_S, ASTRAY, KICKS, Excitation
 from spinning_top_sim.exam.hypotheses import AXES
 from spinning_top_sim.exam.measures import increments, rms
 from spinning_top_sim.exam.scenarios import Reals
 from spinning_top_sim.exam.trial import Outcome
-from spinning_top_sim.tools.verdict import Fault
 
 WHOLE, EARLY, LATEST = 90, 10, 25       # samples of a turn and its response; the longest delay
 DELAY_LEAVES = 0.5              # most of the residual of the response, without a delay it is 1
-# An error is not corrected if more than STAYS of it is left, and grows if more than GROWN; where
-# less than NEARLY is left, nothing is measured again.
-NEARLY, STAYS, GROWN = 0.9, 0.995, 1.02
-FARTHER = 1.03                  # of the error after the heading is turned: no right filter's
 
 
 class Turns(NamedTuple):
@@ -57,63 +50,6 @@ def turns_of(outcome: Outcome, begins: NDArray[np.intp]) -> Turns:
 def from_identity(matrix: Reals) -> float:
     """Return how far a matrix is from the identity."""
     return float(np.max(np.abs(matrix - np.eye(3))))
-
-
-def answer_to_kicks(estimates: Reals, without: Reals, excitation: Excitation,
-                    absolute: bool) -> Reals:
-    """
-    Return the matrix from an attitude error at rest to what is left of it after ANSWER_S.
-
-    An error is a rotation vector about axes of the world.  An eigenvalue of 1 is that of an error
-    that stays, such as one about an axis of the sensor that nothing corrects.
-
-    estimates, without : attitudes (n, 4) with kicks and without them
-    absolute : the matrix is (3, 3); otherwise (2, 2), of tilts
-
-    Of the matrices at two rests, that of the level one counts if an error stays there, else the
-    one with the larger spectral radius.
-    """
-    n = round(ANSWER_S * scenarios.SLOW.rate)
-    errors = Rotation.from_quat(estimates) * Rotation.from_quat(without).inv()
-    kicks, axes = (slice(None), slice(None)) if absolute else (slice(1, None), slice(2))
-    answers = []
-    for firsts in excitation.kicks:
-        left = errors[np.append(firsts, firsts[-1] + n) - 1]
-        left = left * left[0].inv()
-        begin, end = (left[:-1] * Rotation.from_rotvec(KICKS)).as_rotvec(), left[1:].as_rotvec()
-        answers.append(np.linalg.lstsq(begin[kicks, axes], end[kicks, axes], rcond=None)[0].T)
-    # At the second rest, heading and tilt are still moved by what earlier kicks have left.
-    answers[1][:2, 2:] = answers[1][2:, :2] = 0.0
-    return max(answers[:1] if most_left(answers[0]) > STAYS else answers, key=most_left)
-
-
-def most_left(answer: Reals) -> float:
-    """Return the spectral radius of what `answer_to_kicks` returns."""
-    return float(np.max(np.abs(np.linalg.eigvals(answer))))
-
-
-def not_corrected(answer: Reals) -> list[Fault]:
-    """Name the sensors that do not correct kicks; `answer` as from `answer_to_kicks`."""
-    most = most_left(answer)
-    if most > GROWN:        # by which sensor, and whether by the bias, is not known
-        return [Fault('inaccurate', f'an error grows to {most:.0%} in {ANSWER_S:g} s at rest')]
-    heading = float(np.linalg.norm(answer[:, 2])) if len(answer) == 3 else 0.0
-    tilt = np.sum(np.abs(np.linalg.eigvals(answer)) > STAYS) > (heading > STAYS)
-    return [Fault(f'{sensor}_wiring', f'{left:.1%} of an error of the {what} are left after '
-                  f'{ANSWER_S:g} s: the {sensor} does not correct it')
-            for stays, sensor, what, left in (
-                (tilt, 'accelerometer', 'tilt', most),
-                # One that grows is turned by a tilt that stays.
-                (STAYS < heading < GROWN, 'magnetometer', 'heading', heading)) if stays]
-
-
-def astray(outcome: Outcome, excitation: Excitation, absolute: bool) -> list[Fault]:
-    """Return the fault of a filter that, turned far off north, turns farther."""
-    errors = np.abs(outcome.part(excitation.astray).errors.heading)
-    if not absolute or np.max(errors) < max(ASTRAY, FARTHER * errors[0]):
-        return []
-    return [Fault('inaccurate', f'turned off north by {np.degrees(errors[0]):.0f} deg, it turns '
-                  f'to {np.degrees(np.max(errors)):.0f} deg')]
 
 
 def affine_of(readings: Reals, estimated: Rotation, level: Sequence[int],

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import diagnosis, fits, hypotheses, measures, scenarios
+from spinning_top_sim.exam import diagnosis, fits, hypotheses, kicks, scenarios
 from spinning_top_sim.exam.diagnosis import HEADING, TILT, degrees
 from spinning_top_sim.exam.excitation import NEVER_ZERO, excite
 from spinning_top_sim.exam.fits import Turns, from_identity, turns_of, words
@@ -45,7 +45,6 @@ SURE = 0.2                      # share of the limit of an explanation: nothing 
 LITTLE_LEFT = 0.1
 WORST = 30.0                    # condition of a matrix that can be inverted
 EARLY_RESTS = slice(2, 5)       # rests of a short run, when the error of the start is over
-NEAR = 0.5                      # largest error without a kick with which a kick is judged [rad]
 STUCK = np.radians(1.0)         # attitudes that differ less are always the same
 # The search for the affine change of a sensor, or for its delay.
 FITS = 0.1                      # share of the error at rest that a good fit leaves
@@ -145,6 +144,17 @@ class Response:
     def _turns(self, outcome: Outcome) -> Turns:
         return turns_of(outcome, self.excitation.turn_begins)
 
+    def _turns_wrongly(self) -> bool:
+        """Return whether filters that start before turns are right until these, then wrong."""
+        if not self.subject.restarts:
+            return True
+        rows = self.excitation.turn_begins[:, np.newaxis] + np.arange(-START, fits.WHOLE)
+        begins = START + rows.shape[1] * np.arange(len(rows))
+        outcome = replace(self.outcome.part(rows.ravel()), estimates=np.concatenate(
+            [self.respond(self._run.part(one)).estimates for one in rows]))
+        start = outcome.part(begins - 1).errors.judged(self.absolute)
+        return rms(start) < GROSS_REST and turns_of(outcome, begins).off > GROSS_GAIN
+
     def _cause(self) -> Tried | None:
         """
         Return a hypothesis that explains the error, and the outcome when it is undone.
@@ -172,23 +182,21 @@ class Response:
         """Return the best hypothesis of the first group with one that explains the error."""
         return (self._best(self._of_attitudes()) or self._best(self._of_delays(turns.late))
                 or self._best(self._of_gyroscope(turns), diagnosis.EXPLAINED if gross
-                              else LITTLE_LEFT, mends_turns=gross)
+                              else LITTLE_LEFT)
                 or self._best(self._of_accelerometer()) or self._best(self._of_magnetometer())
                 or self._best(self._of_smoothing(), LITTLE_LEFT))
 
-    def _best(self, tried: Iterator[Tried], share: float = diagnosis.EXPLAINED,
-              mends_turns: bool = False) -> Tried | None:
+    def _best(self, tried: Iterator[Tried],
+              share: float = diagnosis.EXPLAINED) -> Tried | None:
         """
-        Return the one that leaves the least error, if it explains the error.
+        Return the one that leaves the least error, if that is at most this share of the error.
 
-        It does if at most `share` of it is left or, with `mends_turns`, if the response to turns
-        is not grossly wrong any more.  Once SURE * share is left, no other one is tried.
+        Once SURE * share is left, no other one is tried.
         """
         limit, least, best = share * self._error(self.outcome), math.inf, None
         for one, outcome in tried:
             error = self._error(outcome)
-            if error < least and (error <= limit or (
-                    mends_turns and self._turns(outcome).off <= GROSS_GAIN)):
+            if error < least and error <= limit:
                 least, best = error, (hypotheses.ambiguous(one, self.absolute), outcome)
             if error <= SURE * limit:
                 break
@@ -276,7 +284,7 @@ class Response:
             return
         up, horizontal = 2, (0, 1)      # axes of the world
         # Another unit corrects nothing.
-        units = hypotheses.UNITS if self._kicks() != [] else ()
+        units = hypotheses.UNITS if self._uncorrected() != [] else ()
         yield from self._try(hypotheses.GRAVITY_SIGN)
         yield from (tried for tried in self._try(*units) if self._corrects(tried[1]))
         yield from self._permutations('accelerometer', up, horizontal)
@@ -371,23 +379,14 @@ class Response:
             for _, outcome in self._try(one):
                 yield one, outcome
 
-    def _kicks(self) -> list[Fault] | None:
-        """Name the sensors that do not correct a kick; None: it is too far off to tell."""
-        if fits.most_left(self._answer(self.outcome, self._run.truth)) < fits.NEARLY:
-            return []
-        without = self.respond(self.excitation.still).estimates     # has the same error
-        error = measures.errors_of(without, self._run.truth).judged(absolute=True)
-        # Far from the truth no filter is linear.
-        return fits.not_corrected(self._answer(self.outcome, without)) if error[
-            self.excitation.kicks[0][0]] < NEAR else None
+    def _uncorrected(self) -> list[Fault] | None:
+        """See `kicks.uncorrected`."""
+        return kicks.uncorrected(self.respond, self.outcome, self.excitation, self.absolute,
+                                 self.subject.imu, self.subject.restarts)
 
     def _corrects(self, outcome: Outcome) -> bool:
-        """Return whether no error stays after kicks."""
-        return fits.most_left(self._answer(outcome, self._run.truth)) < fits.STAYS
-
-    def _answer(self, outcome: Outcome, without: Reals) -> Reals:
-        """See `fits.answer_to_kicks`."""
-        return fits.answer_to_kicks(outcome.estimates, without, self.excitation, self.absolute)
+        """See `kicks.corrects`."""
+        return kicks.corrects(outcome, self.excitation, self.absolute)
 
     def _unexplained(self) -> list[Fault]:
         """Name what no hypothesis explains by where it shows."""
@@ -400,19 +399,15 @@ class Response:
         if np.max((attitudes * attitudes[0].inv()).magnitude()) < STUCK:
             return [Fault('inaccurate', 'the attitude hardly changes')]
         if turns.off > GROSS_GAIN:
-            if self.subject.restarts:       # what is wrong without turns is not the gyroscope's
-                attitudes, rows = self._at_rest(self.outcome)[0]
-                start = measures.errors_of(attitudes.as_quat(), self._run.truth[rows])
-                if rms(start.judged(self.absolute)) > GROSS_REST:
-                    return [Fault('inaccurate', f'{left}: no cause explains it')]
-            return [Fault('gyroscope_wiring', words(turns.early))]
+            return [Fault('gyroscope_wiring', words(turns.early)) if self._turns_wrongly()
+                    else Fault('inaccurate', f'{left}: no cause explains it')]
         if wrong and turns.late > 1:
             return [Fault('lag', f'turns are followed {turns.late} samples late; {left}')]
-        found = self._kicks() or []
+        found = self._uncorrected() or []
         if 'accelerometer_wiring' in [fault.name for fault in found]:
             for one, outcome in self._try(*hypotheses.UNITS, screened=False):
                 if self._corrects(outcome):
                     return [Fault(one.faults[0], f'{found[0].evidence}, but {one.text} it is')]
         if not found and wrong:
             return [Fault('inaccurate', f'{left}: no cause explains it')]
-        return found or fits.astray(self.outcome, self.excitation, self.absolute)
+        return found or kicks.astray(self.outcome, self.excitation, self.absolute)

@@ -129,7 +129,10 @@ def changed(values: Mapping[str, Any], changes: Mapping[str, Any],
             raise ValueError(f'{name}: cannot be unset while the node runs')
     spin = {name: value for name, value in changes.items() if name in SPIN}
     present, start = {name: values[name] for name in SPIN}, dict(start_spin)
-    (present if is_command(changes) else start).update(spin)
+    if is_command(changes):
+        present.update(spin)
+    else:
+        start.update(spin)
     # A reset combines `start` with the other parameters, so they are checked together.  The
     # present spin belongs to the present state, and `TickLoop.command` checks it.
     checked = parameters.checked({**values, **changes, **start})

@@ -108,8 +108,7 @@ class Runner:
         if block.language == 'python':
             said = io.StringIO()
             with contextlib.redirect_stdout(said):
-                exec(compile('\n' * block.line + block.text, self._name, 'exec'),
-                     self._namespace)
+                exec(compile('\n' * block.line + block.text, self._name, 'exec'), self._namespace)
             return said.getvalue()
         if block.language == 'bash':
             return self._shell(block)

@@ -60,8 +60,7 @@ def offset_com(offset):
         right, _ = right_torque(top, spin, across, up, height)
         weight, (x, y, z), (u, v) = top.mass * top.gravity, offset, (up.real, up.imag)
         more = complex(y * height - z * v, z * u - x * height)
-        return (right - weight / top.lambda1 * more,
-                -weight / top.lambda3 * (x * v - y * u))
+        return (right - weight / top.lambda1 * more, -weight / top.lambda3 * (x * v - y * u))
     return torque
 
 

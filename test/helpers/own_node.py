@@ -136,5 +136,4 @@ def run_main(main, capfd, *arguments):
         except SystemExit as error:         # of argparse
             code = error.code
     printed = capfd.readouterr()
-    return SimpleNamespace(code=code, out=printed.out,
-                           err=re.sub(r'\x1b\[\d*m', '', printed.err))
+    return SimpleNamespace(code=code, out=printed.out, err=re.sub(r'\x1b\[\d*m', '', printed.err))

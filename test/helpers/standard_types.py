@@ -72,8 +72,7 @@ TagsFilter = message('TagsFilter', {'tags': [str], 'filter_mode': int}, **number
     'FILTER_MODE_ANY FILTER_MODE_ALL'))
 EntityFilters = message('EntityFilters', {
     'filter': str, 'categories': [EntityCategory], 'tags': TagsFilter, 'bounds': Bounds})
-EntityInfo = message('EntityInfo', {
-    'category': EntityCategory, 'description': str, 'tags': [str]})
+EntityInfo = message('EntityInfo', {'category': EntityCategory, 'description': str, 'tags': [str]})
 EntityState = message('EntityState', {
     'header': Header, 'pose': Pose, 'twist': Twist, 'acceleration': Accel})
 

@@ -193,6 +193,7 @@ OWN = {     # and these
         'no gravity': ({'up': 0.0}, GRAVITY), 'no field': ({'north': 0.0}, FIELD),
         'field of a level sensor': ({'level': False}, FIELD),
         'heading by atan': ({'angle': lambda x, y: math.atan(x / y)}, OFF),
+        'heading from 0 on': ({'angle': lambda x, y: math.atan2(x, y) % math.tau}, OFF),
         'heading about z': ({'about': np.array((0.0, 0.0, 1.0))}, f'{FIELD} {OFF}'),
         'tilt about x as y': ({'felt': (X, X, Z)}, f'{OFF} {GRAVITY}'),
         'tilt about y as x': ({'felt': (Y, Y, Z)}, f'{OFF} {GRAVITY}'),

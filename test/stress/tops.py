@@ -319,8 +319,7 @@ def check_symmetries(found, case, motion, times):
     compare('mirrored', solve(top, mirrored, times), {
         **angles, 'phi': -motion.phi, 'psi': -motion.psi})
     backward = replace(start, theta_dot=-start.theta_dot, l3=-start.l3, lz=-start.lz)
-    compare('backward', solve(top, backward, -times), {
-        **angles, 'theta_dot': -motion.theta_dot})
+    compare('backward', solve(top, backward, -times), {**angles, 'theta_dot': -motion.theta_dot})
     # Powers of two scale without rounding.
     heavier = Top(lambda1=8.0 * top.lambda1, lambda3=8.0 * top.lambda3, mass=8.0 * top.mass,
                   com_distance=top.com_distance, gravity=top.gravity)
