@@ -44,8 +44,8 @@ def judge_bias(response: Response) -> None:
         findings.faults.append(Fault(
             'no_bias_estimate', 'each deg/s of gyroscope bias leaves '
             f'{"an attitude" if absolute else "a tilt"} error of {left_s:.3g} deg: '
-            f'the bias is not learned {"" if each_axis else "about each axis "}in '
-            f'{seconds:.0f} s'))
+            f'its effect does not vanish {"" if each_axis else "about each axis "}in '
+            f'{seconds:.0f} s; {_share(reported):.0%} of it are in the estimate'))
     elif _is_wrong(reported, left_s, remaining, response.subject.restarts):
         findings.faults.append(Fault(
             'bias_report', f'a gyroscope bias of {_degrees(BIAS)} deg/s is learned, but the '
