@@ -113,4 +113,4 @@ def test_a_level_is_a_part_of_full_and_needs_new_filters(monkeypatch):
     assert 0.0 < asked['field_rms_deg'] < 10.0
     assert 'field_rms_deg' in examine(Vqf, 'full', seeds=1).measures
     still = examine(type('Still', (), {'update': lambda *_: (0.0, 0.0, 0.0, 1.0)}), 'field')
-    assert still.faults == ['inaccurate'] and 'that of the gyroscope alone' in str(still)
+    assert still.faults == ['inaccurate'] and 'and that of the gyroscope' in str(still.found)

@@ -20,8 +20,7 @@ pytest.importorskip('xacro')
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp('reference') / 'new'
-    assert main(['export', '--reference', str(folder), '--duration', '1', '--rate', '50',
-                 '--imu', 'bmi088']) == 0
+    assert main(f'export --reference {folder} --duration 1 --rate 50 --imu bmi088'.split()) == 0
     return folder
 
 

@@ -15,14 +15,15 @@ from spinning_top_sim.tools.verdict import Fault
 
 BIAS = np.array((0.01, -0.01, 0.02))    # of the gyroscope [rad/s]
 SIZE = float(np.linalg.norm(BIAS))      # 1.4 deg/s
-# A bias counts as learned if at most LEARNED of its first effect on tilt and heading is left in
-# the same attitude later; LEARNING of the whole suffices if the filter's estimate grows, and of
-# the largest effect at the end if it is right.
+# A bias counts as learned if at most LEARNED of its first effect on tilt and on heading is left in
+# the same attitude later; or LEARNING of both together, and the filter's estimate grows; or
+# LEARNING of the largest effect at the end, and the estimate is right.
 LEARNED, LEARNING = 0.5, 0.9
 BIAS_FOUND = 0.05               # share of the bias in the estimate that is more than none
 # Where less than VANISHED of the largest effect is left, the estimate must have this share.
 VANISHED, SHARE = 0.3, 0.25
-BIAS_OFF, PART = 0.3, 0.7       # relative error of an estimate that is wrong; most of a part
+BIAS_OFF = 0.3                  # relative error of an estimate that is wrong
+PART = 0.9                      # share that an estimate may have while it is so wrong
 
 
 def judge_bias(response: Response) -> None:
@@ -45,12 +46,13 @@ def judge_bias(response: Response) -> None:
             'no_bias_estimate', 'each deg/s of gyroscope bias leaves '
             f'{"an attitude" if absolute else "a tilt"} error of {left_s:.3g} deg: '
             f'its effect does not vanish {"" if each_axis else "about each axis "}in '
-            f'{seconds:.0f} s; {_share(reported):.0%} of it are in the estimate'))
+            f'{seconds:.0f} s' + ('' if math.isnan(_share(reported)) else
+                                  f'; {_share(reported):.0%} of it are in the estimate')))
     elif _is_wrong(reported, left_s, remaining, response.subject.restarts):
         findings.faults.append(Fault(
             'bias_report', f'a gyroscope bias of {_degrees(BIAS)} deg/s is learned, but the '
             f'estimate is {_degrees(reported[-1])} deg/s'))
-    # A filter that has gone on for minutes has learned from runs with a bias.
+    # A filter that goes on keeps what it has learned in earlier runs.
     elif response.subject.restarts and _distance(none := _known(unbiased.biases), 0.0) > BIAS_OFF:
         findings.faults.append(Fault(
             'bias_report', 'the gyroscope has no bias, but the estimate is '
@@ -93,13 +95,14 @@ def _is_wrong(reported: Reals, left_s: float, remaining: float, restarts: bool) 
     """Return whether the estimate is another bias than the one that is learned."""
     if not _distance(reported, BIAS) >= BIAS_OFF:
         return False
-    # Where an error is left, or minutes without a bias came before, it may be learned in part.
+    # Where an error is left, or a filter goes on after minutes without a bias, it may be learned
+    # in part.
     least = SHARE if remaining < VANISHED else -BIAS_FOUND
     return not ((left_s > BIAS_LEFT_S or not restarts) and least < _share(reported) < PART)
 
 
 def _distance(reported: Reals, bias: Reals | float) -> float:
-    """Return how far the last eighth of the estimates is from a bias, in sizes of BIAS."""
+    """Return the median distance of the last eighth of the estimates from a bias, over SIZE."""
     last = reported[-len(reported) // 8:]
     return float(np.median(np.linalg.norm(last - bias, axis=1))) / SIZE
 

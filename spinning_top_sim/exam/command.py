@@ -95,7 +95,7 @@ def _kind(arguments: argparse.Namespace) -> str:
     if given not in KINDS:
         log = f'{arguments.log}: ' if arguments.log else ''
         raise ValueError(f'{log}give either a log and --topic, --node and --topic, --topic '
-                         'alone, --filter, or --filter and --data')
+                         f'alone, --filter, or --filter and --data, not {", ".join(given)}')
     return KINDS[given]
 
 
@@ -149,17 +149,16 @@ def _of_filter(name: str, options: Mapping[str, Any]) -> Report:
 
 
 def _own_filter(given: str) -> Callable[[], Filter]:
-    """Return the class FILE.py:CLASS.  Raises ValueError, with the reason."""
+    """Return the class FILE.py:CLASS.  Raises ValueError, or OSError if there is no file."""
     path, _, name = given.rpartition(':')
     if not path.endswith('.py'):
         raise ValueError(f'--filter {given}: must be FILE.py:CLASS, or one of '
                          f'{", ".join(FILTERS)}')
-    sys.path.insert(0, str(Path(path).resolve().parent))    # for what the file imports
+    folder = Path(path).resolve(strict=True).parent
+    sys.path.insert(0, str(folder))         # for what the file imports
     try:
         made: Callable[[], Filter] | None = runpy.run_path(path).get(name)
-    except (OSError, ImportError):
-        raise
-    except Exception as error:      # whatever the file does
+    except (Exception, SystemExit) as error:
         raise ValueError(f'--filter {given}: {path} raises {type(error).__name__}: '
                          f'{cli.one_line(error)}') from error
     if not callable(made):

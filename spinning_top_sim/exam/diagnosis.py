@@ -135,8 +135,9 @@ def noisy_limit(run: Run, absolute: bool, imu: Mapping[str, Any]) -> float:
     It is the limit without noise, or three standard deviations of attitudes from single samples,
     where a slow filter starts, if that is larger; at most DIVERGED.
     """
-    white = {*scenarios.CALIBRATED, 'mag.field', 'imu.rpy'}
-    if any(imu[name] != parameters.BY_NAME[name].default for name in imu.keys() - white):
+    white = {*scenarios.CALIBRATED, 'mag.field', 'imu.rpy', 'mag.enabled'}
+    if any(imu[name] != parameters.BY_NAME[name].default for name in imu.keys() - white
+           if not name.endswith(('_band', '_correlation_time'))):
         return DIVERGED             # the filter may still be learning biases
     last = run.part(slice(-len(run.t) // 4, None))
     single = measures.errors_of(

@@ -33,7 +33,9 @@ SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
 # estimate of a bias would have adapted to the force.
 ARM_S = 13.33, 14.33, 19.33
 # What begins the names of the parameters that the exam takes, and that only its scenes take.
-TAKEN = 'imu.gyroscope_', 'imu.accelerometer_', 'imu.bias_', *scenarios.OF_PLACE, 'mag.'
+TAKEN = ('imu.gyroscope_', 'imu.accelerometer_', 'imu.bias_', *scenarios.OF_PLACE, 'mag.enabled',
+         'mag.soft_iron', 'mag.hard_iron', 'mag.noise_density', 'mag.random_walk', 'mag.range',
+         'mag.resolution')
 OF_SCENES = 'imu.bandwidth', 'imu.vibration.', 'mag.disturbance.'
 
 
@@ -61,7 +63,7 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     imu : mapping or path, optional
         Parameters imu.* and mag.* by name, or the path of a parameter file such as those in
         config/imu.  The default, `scenarios.CALIBRATED`, is the noise of a calibrated device.
-        The scenes alone have a bandwidth, vibration and disturbed fields.
+        Only the scenes of the field have bandwidth, vibration and disturbed fields.
     seeds : int or iterable of int, optional
         Seeds of the noisy runs, or their number.  The default, SEEDS, depends on the level.
     subject : str, optional
@@ -90,7 +92,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
                         "spinning_top_sim.exam.adapters.FILTERS, such as FILTERS['vqf']")
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
-    values = _imu_parameters(imu, level)
+    has_scenes = level == 'field' or (level == 'full' and restart)
+    values = _imu_parameters(imu, has_scenes)
     numbers = list(SEEDS[level]) if seeds is None else _seed_numbers(seeds)
     if level == 'field' and not restart:
         raise ValueError("level = 'field': the filter must be made anew for each scene")
@@ -101,10 +104,11 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
                        feed=run_feed)
     if level == 'field':
         return in_field(numbers)
+    values = {name: value for name, value in values.items() if not name.startswith(OF_SCENES)}
     exam = _Exam(Subject(make_filter, run_feed, values, numbers[0]) if restart else
                  LastingSubject(make_filter, values, numbers[0]), numbers)
     exam.sit()
-    if level == 'full' and restart and exam.outcomes:
+    if has_scenes and exam.outcomes:
         scenes = in_field(numbers[:1])
         exam.findings.measures |= scenes.measures
         exam.findings.faults += scenes.found
@@ -112,7 +116,7 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
 
 
 def _imu_parameters(imu: Mapping[str, Any] | str | Path | None,
-                    level: str) -> Mapping[str, Any]:
+                    has_scenes: bool) -> Mapping[str, Any]:
     if imu is None:
         return scenarios.CALIBRATED
     given = imu if isinstance(imu, Mapping) else read_scene(imu)
@@ -121,10 +125,11 @@ def _imu_parameters(imu: Mapping[str, Any] | str | Path | None,
     for name in given:
         if not name.startswith(('imu.', 'mag.')):
             raise ValueError(f'{source} has {name}: must have parameters imu.* and mag.* only')
-        taken = level != 'quick' if name.startswith(OF_SCENES) else name.startswith(TAKEN)
-        if not taken and checked[name] != parameters.BY_NAME[name].default:
-            raise ValueError(f'{source} has {name} = {given[name]!r}: must have its default, as '
-                             f'level {level!r} leaves it out')
+        taken = has_scenes if name.startswith(OF_SCENES) else name.startswith(TAKEN)
+        default = parameters.BY_NAME[name].default
+        if not taken and checked[name] != default:
+            raise ValueError(f'{source} has {name} = {given[name]!r}: must be {default!r}, '
+                             'because this exam has no run with it')
     if not any(checked['mag.field'][:2]):
         raise ValueError(f'{source} has mag.field = {given["mag.field"]!r}: must have a '
                          'horizontal part, which shows north')

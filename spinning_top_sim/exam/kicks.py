@@ -23,31 +23,38 @@ from spinning_top_sim.tools.verdict import Fault
 # An error is not corrected if more than STAYS of it is left and later more than STILL; it grows if
 # more than GROWN is left in ANSWER_S.  Where less than NEARLY is left, nothing is measured again.
 NEARLY, STAYS, STILL, GROWN = 0.9, 0.995, 0.9, 1.02
-OF_HEADING = 0.3                # share of the heading in kicks whose error is that of the heading
+OF_HEADING = 0.3                # least share of the heading in what the magnetometer must correct
 FARTHER = 1.03                  # of the error after the heading is turned: no right filter's
 NEAR = 0.5                      # largest error without a kick with which a kick is judged [rad]
 
 
 def corrects(outcome: Outcome, excitation: Excitation, absolute: bool,
              limit: float = STAYS) -> bool:
-    """Return whether at most this share of an error is left after kicks, or the error is large."""
-    return most_left(answer_of(outcome, excitation.run.truth, excitation, absolute)) < limit
+    """
+    Return whether less than this share of kicks is left.
+
+    The attitudes without kicks are not fed: they count as right.
+    """
+    return most_left(answer_of(outcome, excitation.run.truth, excitation, absolute, limit)) < limit
 
 
 def uncorrected(respond: Callable[[Run], Outcome], outcome: Outcome, excitation: Excitation,
-                absolute: bool, imu: Mapping[str, Any], goes_astray: bool) -> list[Fault] | None:
+                absolute: bool, imu: Mapping[str, Any]) -> list[Fault] | None:
     """
     Name the sensors that do not correct a kick; None: the error is too large to tell.
 
+    If a kick stays, another excitation waits longer for the answer.
+
     respond : returns the outcome of a run
-    outcome : of `excitation`, which `imu` and `goes_astray` make
+    outcome : of `excitation`, whose sensor `imu` describes
+    absolute : whether the heading is judged
     """
     if corrects(outcome, excitation, absolute, NEARLY):
         return []
     found = _uncorrected(respond, outcome, excitation, absolute, STAYS)
     if not found or found[0].name == 'inaccurate':
         return found
-    longer = excite(imu, goes_astray, LONG_ANSWER_S)
+    longer = excite(imu, goes_astray=False, answer_s=LONG_ANSWER_S)
     return _uncorrected(respond, respond(longer.run), longer, absolute, STILL)
 
 
@@ -57,12 +64,12 @@ def _uncorrected(respond: Callable[[Run], Outcome], outcome: Outcome, excitation
     error = measures.errors_of(without, excitation.run.truth).judged(absolute=True)
     if error[excitation.kicks[0][0]] >= NEAR:           # where no filter is linear
         return None
-    return not_corrected(answer_of(outcome, without, excitation, absolute), excitation.answer_s,
-                         limit)
+    return not_corrected(answer_of(outcome, without, excitation, absolute, limit),
+                         excitation.answer_s, limit)
 
 
-def answer_of(outcome: Outcome, without: Reals, excitation: Excitation,
-              absolute: bool) -> Reals:
+def answer_of(outcome: Outcome, without: Reals, excitation: Excitation, absolute: bool,
+              limit: float) -> Reals:
     """
     Return the matrix from an attitude error at rest to what is left of it after the answer.
 
@@ -72,8 +79,8 @@ def answer_of(outcome: Outcome, without: Reals, excitation: Excitation,
     without : attitudes (n, 4) without kicks
     absolute : the matrix is (3, 3); otherwise (2, 2), of tilts
 
-    Of the matrices at two rests, that of the level one counts if an error stays there, else the
-    one with the larger spectral radius.
+    Of the matrices at two rests, that of the level one counts if more than the share `limit` of an
+    error is left there, else the one with the larger spectral radius.
     """
     n = round(excitation.answer_s * scenarios.SLOW.rate)
     errors = Rotation.from_quat(outcome.estimates) * Rotation.from_quat(without).inv()
@@ -86,7 +93,7 @@ def answer_of(outcome: Outcome, without: Reals, excitation: Excitation,
         answers.append(np.linalg.lstsq(begin[kicks, axes], end[kicks, axes], rcond=None)[0].T)
     # At the second rest, heading and tilt are still moved by what earlier kicks have left.
     answers[1][:2, 2:] = answers[1][2:, :2] = 0.0
-    return max(answers[:1] if most_left(answers[0]) > STAYS else answers, key=most_left)
+    return max(answers[:1] if most_left(answers[0]) > limit else answers, key=most_left)
 
 
 def most_left(answer: Reals) -> float:
@@ -94,7 +101,7 @@ def most_left(answer: Reals) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(answer))))
 
 
-def not_corrected(answer: Reals, answer_s: float, limit: float = STAYS) -> list[Fault]:
+def not_corrected(answer: Reals, answer_s: float, limit: float) -> list[Fault]:
     """
     Name the sensors that do not correct kicks.
 
@@ -107,11 +114,13 @@ def not_corrected(answer: Reals, answer_s: float, limit: float = STAYS) -> list[
         return [Fault('inaccurate', f'an error grows to {most:.0%} in {answer_s:g} s at rest')]
     left: dict[bool, float] = {}
     values, vectors = np.linalg.eig(answer.T)
-    for value, kick in zip(values, vectors.T, strict=True):     # a unit kick, and what is left
-        is_heading = float(np.linalg.norm(kick[2:])) > OF_HEADING
+    # The component of an error along such a vector becomes `value` times as large, whatever the
+    # rest of the error is.
+    for value, along in zip(values, vectors.T, strict=True):
+        is_heading = float(np.linalg.norm(along[2:])) > OF_HEADING
         left[is_heading] = max(float(np.abs(value)), left.get(is_heading, 0.0))
     return [Fault(f'{sensor}_wiring', f'{left[is_heading]:.1%} of an error of the {what} are left '
-                  f'after {answer_s:g} s: the {sensor} does not correct it')
+                  f'after {answer_s:g} s, above {limit:.1%}: the {sensor} does not correct it')
             for is_heading, sensor, what in (
                 (False, 'accelerometer', 'tilt'), (True, 'magnetometer', 'heading'))
             if left.get(is_heading, 0.0) > limit]

@@ -13,7 +13,8 @@ from scipy.special import gammainccinv, gammaincinv, ndtr, stdtrit
 from spinning_top_sim.exam.scenarios import Reals, Run
 
 CONVERGED_DEG = 1.0
-CONSISTENT, RIGHT = 0.9999, 1.1     # probability of the NEES band; a covariance may be so far off
+CONSISTENT = 0.9999             # probability of the NEES band
+TOLERATED = 1.1                 # factor by which a covariance may be wrong
 WINDOW = 3.0                    # autocorrelation times over which correlations are summed
 
 
@@ -136,14 +137,15 @@ class Nees(NamedTuple):
     @property
     def band(self) -> tuple[float, float]:
         """
-        The limits between which a ratio lies with the probability CONSISTENT.
+        The limits of a ratio that is right.
 
-        They hold for covariances that are consistent but for the factor RIGHT.
+        A consistent ratio lies between them with the probability CONSISTENT; they are wider by
+        the factor TOLERATED.
         """
         # Student's t for the estimate: as many standard deviations of a known chi-squared.
         tail, half = ndtr(-stdtrit(self.known, 0.5 + 0.5 * CONSISTENT)), 0.5 * self.degrees
-        return (float(gammaincinv(half, tail) / half) / RIGHT,
-                float(gammainccinv(half, tail) / half) * RIGHT)
+        return (float(gammaincinv(half, tail) / half) / TOLERATED,
+                float(gammainccinv(half, tail) / half) * TOLERATED)
 
 
 def nees_of(runs: Sequence[tuple[Reals, Reals, Reals]], absolute: bool) -> Nees | None:

@@ -34,8 +34,8 @@ from spinning_top_sim.tools.verdict import Fault
 # Errors of a right filter: tilt and heading at rest, then in motion, rms [rad].
 CLEAN = np.array((TILT, HEADING, TILT, HEADING))
 # How far the response to turns may be from the identity.  Above GAIN the gyroscope is examined;
-# above SLIGHT it is blamed for an error.  Above GROSS_GAIN nothing else is judged; but if filters
-# that start at rest are off by GROSS_REST, too, it is not the gyroscope.
+# above SLIGHT it is blamed for an error.  Above GROSS_GAIN nothing else is judged, and it is
+# blamed if filters that start before turns are off by less than GROSS_REST until then, not later.
 GAIN, SLIGHT, GROSS_GAIN, GROSS_REST = 0.003, 0.01, 0.25, np.radians(10.0)
 REVERSED = 3.0                  # heading of a filter whose field has the opposite sign [rad]
 MOST_CAUSES = 4
@@ -119,10 +119,11 @@ class Response:
 
     def blamed(self, error: Fault) -> Fault:
         """Blame the gyroscope for an error if nothing else is wrong but the response to it."""
-        early = self._turns(self.outcome).early
-        if self.findings.names - {'gyroscope_wiring'} or from_identity(early) <= SLIGHT:
+        if self.findings.names - {'gyroscope_wiring'}:      # perhaps there is no outcome
             return error
-        return Fault('gyroscope_wiring', f'{words(early)}; {error.evidence}')
+        early = self._turns(self.outcome).early
+        return error if from_identity(early) <= SLIGHT else Fault(
+            'gyroscope_wiring', f'{words(early)}; {error.evidence}')
 
     def _try(self, *hypotheses: Hypothesis, screened: bool = True) -> Iterator[Tried]:
         """Yield the hypotheses with their outcomes; `screened` leaves out what is in vain."""
@@ -382,7 +383,7 @@ class Response:
     def _uncorrected(self) -> list[Fault] | None:
         """See `kicks.uncorrected`."""
         return kicks.uncorrected(self.respond, self.outcome, self.excitation, self.absolute,
-                                 self.subject.imu, self.subject.restarts)
+                                 self.subject.imu)
 
     def _corrects(self, outcome: Outcome) -> bool:
         """See `kicks.corrects`."""

@@ -22,7 +22,8 @@ class ScoredRun(NamedTuple):
 
     run: Run
     counts: NDArray[np.intp]    # samples of a known truth in motion
-    alone: Rmse = Rmse(math.nan, math.nan, math.nan)    # there, of the gyroscope alone
+    # Of the gyroscope alone [deg]; NaN: unknown.
+    alone: Rmse = Rmse(math.nan, math.nan, math.nan)
 
     def follow(self, make_filter: MakeFilter, feed: Feed = feed_apart) -> Outcome:
         """Return the outcome of a new filter, the samples that count.  Raises as `follow`."""
@@ -50,8 +51,10 @@ def report_of(make_filter: MakeFilter, runs: Iterable[ScoredRun], kind: str, sub
         means = dict(zip(names, of_filter.tolist(), strict=True))
         tilts = np.radians((of_filter[2], alone[2])).tolist()
         if tilts[0] > DIVERGED and tilts[0] > tilts[1]:
-            faults.append(Fault('inaccurate', 'in the scenes the tilt error is {} in the mean, '
-                                'that of the gyroscope alone {}'.format(*map(degrees, tilts))))
+            faults.append(Fault(
+                'inaccurate', 'in the scenes the tilt error is {} in the mean, above {} and that '
+                'of the gyroscope alone, {}'.format(*map(
+                    degrees, (tilts[0], DIVERGED, tilts[1])))))
     for name, same in found.items():
         totals, of_gyroscope = np.array(same)[:, :, 0].T
         means |= {f'{kind}_rms_{name}_deg': float(np.mean(totals)),

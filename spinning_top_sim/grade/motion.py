@@ -69,7 +69,7 @@ class Trajectory:
     def of(cls, said: Any, times: Any = None) -> Self:
         """Return what a run has said, by default at its `t`.  Raises InvalidTrajectoryError."""
         if hasattr(said, 'attitudes'):
-            said = {name: getattr(said, name, None) for name in cls.__dataclass_fields__}
+            said = {name: getattr(said, name, None) for name in (*_PARTS, 't', 'covariance')}
         elif not isinstance(said, Mapping):
             said = {'attitudes': said}
         said = {str(name): part for name, part in said.items() if part is not None}

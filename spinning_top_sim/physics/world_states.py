@@ -39,6 +39,7 @@ class WorldStates(States):
     rows_angular_acceleration = cached_property(attrgetter('_moved.rows_angular_acceleration'))
 
     def __init__(self, top: Top, moved: States, rotation: Quaternion) -> None:
+        # Of the frame: what uses them is overridden here.
         super().__init__(top, moved.start, len(moved), lz=moved._lz, gravity=moved._gravity,
                          torque=moved._torque)
         self.method, self._moved, self._rotation = moved.method, moved, rotation

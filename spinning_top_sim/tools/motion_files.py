@@ -58,7 +58,7 @@ UNITS = {
     ACCELERATIONS: {'': 1.0, 'm/s^2': 1.0, 'm/s/s': 1.0, 'g': _G, 'mg': 1e-3 * _G},
     MAGNETOMETER: {'': 1.0, 'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7,
                    'gauss': 1e-4}}
-SIGNS = str.maketrans({'µ': 'u', 'μ': 'u', '°': 'deg', '²': '2'})
+SIGNS = str.maketrans({'µ': 'u', 'μ': 'u', '°': 'deg', '⁻': '-', '¹': '1', '²': '2', '³': '3'})
 SUFFIXES = {'rad', 'deg', 'dps', *SECONDS} - {''}       # units without brackets
 # In the order of preference.
 MESSAGES = [f'{package}/msg/{name}' for package, name in (
@@ -261,8 +261,8 @@ def _parts(columns: Table) -> tuple[NDArray[np.object_], dict[str, Part]]:
 
 def _unit(name: str, unit: str, known: Collection[str]) -> str:
     """Return the known unit that is spelled like `unit`; `name` is that of the column."""
-    def spelled(text: str) -> str:      # without signs between, and without exponents of -1
-        return re.sub('[^a-z02-9\ufffd]', '', text.translate(SIGNS).lower())
+    def spelled(text: str) -> str:      # without signs between, an exponent of -1, and the unit 1
+        return re.sub('-1(?![0-9])|^1$|[^a-z0-9\ufffd]', '', text.translate(SIGNS).lower())
 
     for one in known:
         if spelled(one) == spelled(unit):
