@@ -39,20 +39,19 @@ def corrects(outcome: Outcome, excitation: Excitation, absolute: bool,
 
 
 def uncorrected(respond: Callable[[Run], Outcome], outcome: Outcome, excitation: Excitation,
-                absolute: bool, imu: Mapping[str, Any]) -> list[Fault] | None:
+                absolute: bool, imu: Mapping[str, Any], again: bool) -> list[Fault] | None:
     """
     Name the sensors that do not correct a kick; None: the error is too large to tell.
-
-    If a kick stays, another excitation waits longer for the answer.
 
     respond : returns the outcome of a run
     outcome : of `excitation`, whose sensor `imu` describes
     absolute : whether the heading is judged
+    again : whether another excitation waits longer for the answer to a kick that stays
     """
     if corrects(outcome, excitation, absolute, NEARLY):
         return []
     found = _uncorrected(respond, outcome, excitation, absolute, STAYS)
-    if not found or found[0].name == 'inaccurate':
+    if not again or not found or found[0].name == 'inaccurate':
         return found
     longer = excite(imu, goes_astray=False, answer_s=LONG_ANSWER_S)
     return _uncorrected(respond, respond(longer.run), longer, absolute, STILL)

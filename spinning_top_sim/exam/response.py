@@ -285,7 +285,7 @@ class Response:
             return
         up, horizontal = 2, (0, 1)      # axes of the world
         # Another unit corrects nothing.
-        units = hypotheses.UNITS if self._uncorrected() != [] else ()
+        units = hypotheses.UNITS if self._uncorrected(again=False) != [] else ()
         yield from self._try(hypotheses.GRAVITY_SIGN)
         yield from (tried for tried in self._try(*units) if self._corrects(tried[1]))
         yield from self._permutations('accelerometer', up, horizontal)
@@ -380,10 +380,10 @@ class Response:
             for _, outcome in self._try(one):
                 yield one, outcome
 
-    def _uncorrected(self) -> list[Fault] | None:
+    def _uncorrected(self, again: bool = True) -> list[Fault] | None:
         """See `kicks.uncorrected`."""
         return kicks.uncorrected(self.respond, self.outcome, self.excitation, self.absolute,
-                                 self.subject.imu)
+                                 self.subject.imu, again)
 
     def _corrects(self, outcome: Outcome) -> bool:
         """See `kicks.corrects`."""
