@@ -3,11 +3,11 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property, reduce
 from itertools import pairwise
 from operator import attrgetter
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,8 @@ from spinning_top_sim.physics.world_states import WorldStates
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ClosedForm
 from spinning_top_sim.solvers.propagator import Motion
-from spinning_top_sim.solvers.times import Times
 from spinning_top_sim.solvers.vertical import (
     AcceleratedMotion,
-    AcceleratedStates,
     Posture,
     Vertical,
     posture_at,
@@ -65,7 +63,7 @@ class Segment:
                  jumps: bool) -> None:
         self.motion, self.start_ns, self.ride, self.jumps = motion, start_ns, ride, jumps
         self.start, self.l3, self.lz = motion.start, motion.start.l3, motion.start.lz
-        self.chains = isinstance(motion, AcceleratedMotion) and motion.constants.chains
+        self.chains = False
         self.filter_state: NDArray[np.float64] | None = None
 
     @cached_property
@@ -116,15 +114,16 @@ class Segment:
 
     def states(self, times: range | NDArray[np.int64]) -> States:
         """Return the states in the world at ascending times [ns]."""
-        return self._in_world(self.own_states(times))
+        return self._in_world(self.own_states(times), times)
 
     def own_states(self, times: range | NDArray[np.int64]) -> States:
         """Return the states about the vertical of the segment at ascending times [ns]."""
         return self.motion.states(self._since_start(times))
 
-    def _in_world(self, states: States) -> States:
+    def _in_world(self, states: States, times: range | NDArray[np.int64]) -> States:
         ride = self.ride
-        return WorldStates(ride.top, states, ride.vertical.rotation) if ride else states
+        return WorldStates(ride.top, states, ride.vertical.rotation, ride.piece,
+                           np.asarray(times)) if ride else states
 
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time [ns]."""
@@ -147,8 +146,8 @@ class Segment:
             return np.zeros(len(times))
         if self.closed_form is None:
             return np.full(len(times), math.nan)
-        truth = self._in_world(self.closed_form.states(self._since_start(times))).rows_quaternion
-        return attitude.angle_between(states.rows_quaternion, truth)
+        truth = self._in_world(self.closed_form.states(self._since_start(times)), times)
+        return attitude.angle_between(states.rows_quaternion, truth.rows_quaternion)
 
     def exact_point(self, times_ns: NDArray[np.int64], along: float) -> attitude.Vector:
         """Return where a point of the axis is at times (n,) [ns]; the start's where not known."""
@@ -156,22 +155,11 @@ class Segment:
                   else self.closed_form.states(times_ns - self.start_ns))
         # Of the first state alone, one value for all times.
         x, y, z = (along * np.broadcast_to(part, times_ns.shape)
-                   for part in self._in_world(states).rows_axis)
+                   for part in self._in_world(states, times_ns).rows_axis)
         if self.ride:
             a, b, c = self.pivot(times_ns).position
             x, y, z = x + a, y + b, z + c
         return x, y, z
-
-
-def states_of(segments: Sequence[Segment], counts: Sequence[int],
-              times_ns: NDArray[np.int64]) -> States:
-    """Return the states in the world in segments that chain, in each at so many times [ns]."""
-    motions = [cast(AcceleratedMotion, segment.motion) for segment in segments]
-    rides = [cast(Ride, segment.ride) for segment in segments]
-    since_ns = times_ns - np.repeat([segment.start_ns for segment in segments], counts)
-    x, y, z, w = np.repeat(np.hstack([ride.vertical.rotation for ride in rides]), counts, axis=1)
-    states = AcceleratedStates(motions, counts, Times.from_ns(since_ns))
-    return WorldStates(rides[0].top, states, (x, y, z, w))
 
 
 class Path:

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.pivot import Kinematics
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
-from spinning_top_sim.streams.path import Path, Segment, states_of
+from spinning_top_sim.streams.path import Path, Segment
 from spinning_top_sim.streams.timing import Timing
 
 Result = TypeVar('Result')
@@ -54,7 +54,7 @@ class Samples:
     def states(self) -> States:
         if len(self.shares) == 1:
             return self._segments[0].states(self.times)
-        return states_of(self._segments, self._counts, self.t_ns)
+        return joined([segment.states(times) for segment, times in self.shares])
 
     @cached_property
     def pivot(self) -> Kinematics:
