@@ -65,7 +65,13 @@ MOST_KEPT = 50_000
 
 
 class IntegrationError(RuntimeError):
-    """The integration cannot go on; the message says where, why and what to do instead."""
+    """
+    The integration cannot go on; the message says where, why and what to do instead.
+
+    reached_ns : last simulated time of which a `Piece` still gives states [ns]
+    """
+
+    reached_ns = 0
 
 
 StepFunction = Callable[..., tuple[Unknowns, Unknowns, Unknowns]]
