@@ -90,6 +90,11 @@ class Piece:
             raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
 
     @property
+    def is_exact(self) -> bool:
+        """Whether the states are those of `truth`."""
+        return self._motion.closed_form is self._motion
+
+    @property
     def steps(self) -> int:
         return self._motion.steps
 

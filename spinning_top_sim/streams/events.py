@@ -19,6 +19,7 @@ COMMANDS, EVENTS = '~/commands', '~/events'
 # Topics and types, recorded behind the channels, in this order.
 TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/String'}
 # What an event of each kind has besides its times, and how that is read.
+MOTIONS = ('command', 'state', 'drive')     # events that begin another motion, on the same clock
 _NUMBERS: Callable[..., dict[str, Callable[[Any], Any]]] = lambda *names: dict.fromkeys(
     names, float)
 _DETAILS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
@@ -51,8 +52,12 @@ class Event:
 
     @property
     def begins_motion(self) -> bool:
-        """Whether another motion begins at `t_ns`, on the same clock."""
-        return self.kind in {'command', 'state', 'drive'}
+        return self.kind in MOTIONS
+
+    def repeats(self, last: 'Event') -> bool:
+        """Return whether this is a drive that puts off the end of another, and does no more."""
+        return (self.kind == last.kind == 'drive' and self.t_ns < last.details['stop_ns']
+                and all(self.details[axis] == last.details[axis] for axis in 'xyz'))
 
     def as_mapping(self) -> dict[str, Any]:
         return {'event': self.kind, 't_ns': self.t_ns, 'sent_ns': self.sent_ns, **self.details}

@@ -8,7 +8,7 @@ URDF roll-pitch-yaw.
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, reduce
 from itertools import pairwise
 from typing import Any, Self
@@ -174,13 +174,8 @@ class Readings:
     def motion(self) -> tuple[Vector, Quaternion, Vector]:
         """Position [m] and orientation in the world, velocity in the IMU's frame [m/s]."""
         states, mounting = self._states, self._imu.mounting
-        turned = states.rows_quaternion
-        (x, y, z), (v1, v2, v3) = (attitude.rotated(turned, mounting.lever_arm),
-                                   states.velocity(mounting.lever_arm))
-        (a, b, c), velocity, _ = states.pivot
-        u, v, w = attitude.rotated_back(turned, (velocity[0], velocity[1], velocity[2]))
-        return ((x + a, y + b, z + c), self.orientation,
-                mounting.from_body((v1 + u, v2 + v, v3 + w)))
+        return (states.position(mounting.lever_arm), self.orientation,
+                mounting.from_body(states.world_velocity(mounting.lever_arm)))
 
     @cached_property
     def _seconds(self) -> Column:
@@ -254,9 +249,9 @@ def _within(piece: Piece, begins: range, length_ns: int, point: Point) -> Increm
     """Return the increments over intervals within a piece, which begin at these times [ns]."""
     count = integrals.panels(piece.fastest_rate, length_ns)
     edges = [length_ns * k // count for k in range(count + 1)]
-    return reduce(Increments.then, [piece.increments(
-        range(begins.start + begin, begins.stop + begin, begins.step), end - begin, point)
-        for begin, end in pairwise(edges)])
+    return reduce(Increments.then, [integrals.increments(
+        piece.states, range(begins.start + begin, begins.stop + begin, begins.step), end - begin,
+        point, piece.fastest_rate) for begin, end in pairwise(edges)])
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:

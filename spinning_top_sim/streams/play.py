@@ -1,47 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run: the parameters, the motion with its commands, and the samples of its streams."""
+"""A run: parameters, motion and events, and the one place where its messages are computed."""
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import astuple
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from spinning_top_sim.physics.pivot import NEVER_NS, PivotPath
-from spinning_top_sim.physics.regimes import Description
-from spinning_top_sim.physics.states import States, relative_drift
-from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
-from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
-from spinning_top_sim.solvers.propagator import propagate, propagate_accelerated
-from spinning_top_sim.solvers.vertical import Posture
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.blocks import Block, blocks, span_of
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams import parameters, trajectory
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.channel import Channel, Rows, Samples, Stamps, period_ns
+from spinning_top_sim.streams.events import Event
 from spinning_top_sim.streams.imu import LONGEST_NS, Imu
-from spinning_top_sim.streams.path import Path, Ride, Segment
-from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.streams.topics import all_streams
+from spinning_top_sim.streams.topics import all_channels
+from spinning_top_sim.streams.trajectory import Trajectory
 
-FIRST_STEPS = 500               # that the first nanosecond of a motion may take
-# Limits of a block offline.
-OFFLINE_STEPS = 2000            # their interpolants stay in the cache
-OFFLINE_BYTES = 4 << 20
-LONGEST_OFFLINE_NS = 100 * NANOSECONDS      # for the sake of progress
-MOST_BLOCKS = 20_000            # of a run; then they are longer
-# Turns a second whose phases doubles hold up to the last stamp.
-MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
+BLOCK_BYTES = 4 << 20                       # of a block offline
+LONGEST_BLOCK_NS = 100 * NANOSECONDS        # for the sake of progress
+MOST_BLOCKS = 20_000                        # of a run; then they are longer
 
 
-class Drive(NamedTuple):
-    """A velocity of the pivot in the world [m/s], applied at a time, and when it brakes [ns]."""
+class Block(NamedTuple):
+    """
+    The messages of some channels after the block before and up to `until_ns`.
 
-    t_ns: int
-    x: float
-    y: float
-    z: float
-    stop_ns: int
+    messages : (channel, times (n,) [ns], rows (n, size)) of each channel that has any
+    """
+
+    until_ns: int
+    messages: Sequence[tuple[Channel, Stamps, Rows]]
 
 
 class Simulation:
@@ -49,269 +36,153 @@ class Simulation:
     One top in motion.  Times are integer nanoseconds since the start.
 
     values : checked parameters of the run, as it started
-    top : the top that they describe
-    streams : every stream, whether it is switched on or not
-    path : the motion
+    trajectory : the motion
+    imu, channels : the sensor and all streams, with their present rates
     now_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
-    history : what was applied since the start: time [ns], then L3 and Lz of a command, the fields
-        of a `State`, the rate of the IMU [Hz], or those of a `Drive`.  Logs have it as lists of
-        numbers, told apart by their lengths alone
-    pivot_path : of the pivot; None while it rests at the origin
-    lz : as last commanded, about the vertical of the world [kg m^2/s]
+    history : the events since the start
     epoch_ns : stamp of t = 0 [ns]
-    version : counts changes that make samples after `now_ns` other than they would have been; a
-        change of `epoch_ns` is not counted
 
     Raises ValueError where there is no motion from the start state.
     """
 
-    _driven_path: Callable[..., PivotPath]      # of the newest `Drive`, from its `stop_ns`
-
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
-        self.version = 0
-        self.epoch_ns = epoch_ns
-        self._load(values)
-
-    def restart(self, values: Mapping[str, Any]) -> None:
-        """
-        Go back to the start state of these parameters; counts of steps and stamps go on.
-
-        Raises ValueError where there is no motion from there; then the present one goes on.
-        """
-        before = self.path
-        self._load(values)
-        self.path.gone_steps, self.path.gone_evaluations = before.steps, before.evaluations
-
-    def _load(self, values: Mapping[str, Any]) -> None:
-        # Whatever may be refused comes first, before anything changes.
-        for stamp_ns in (self.epoch_ns, self.epoch_ns + round(values['duration'] * NANOSECONDS)):
-            if not 0 <= stamp_ns <= LAST_STAMP_NS:
-                raise ValueError(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be >= 0 and '
-                                 f'< {2 ** 31} s, in January 2038')
-        top, start = parameters.top_of(values), parameters.start_state(values)
-        pivot = parameters.pivot_path(values)
-        segment = _segment(top, start, 0, values, pivot)
-        self.imu = Imu(values)
-        self.values, self.top = dict(values), top
-        self.streams = all_streams(values, self.imu)
-        self.history: list[tuple[int, *tuple[float, ...]]] = []
         self.now_ns = -1
-        # The trace of the markers, intervals of the IMU and late fixes reach back across commands.
-        trace_ns = round(values['markers.trace_length'] * NANOSECONDS)
-        self.pivot_path, self.lz = pivot, start.lz
-        self.path = Path(segment, self._follow, self.imu.carry,
-                         keep_ns=max(trace_ns, LONGEST_NS), keep_steps_ns=self.imu.keep_ns)
-        self.version += 1
+        self._restart(values, epoch_ns)
 
-    @property
-    def segment(self) -> Segment:
-        """The motion since the last command, or since the pivot last changed its acceleration."""
-        return self.path.after(self.now_ns)
+    def _restart(self, values: Mapping[str, Any], epoch_ns: int) -> None:
+        # Whatever may be refused comes first, before anything changes.
+        check_stamps(epoch_ns, values['duration'])
+        motion = Trajectory(
+            parameters.top_of(values), parameters.start_state(values),
+            parameters.pivot_path(values),
+            {name: values[f'solver.{name}'] for name in ('method', 'equations', 'rtol', 'atol')},
+            most_acceleration=values['pivot.max_acceleration'])
+        imu = Imu(values, period_ns(values['imu.rate']))
+        self.channels = all_channels(values, imu)
+        self.trajectory, self.imu, self.epoch_ns = motion, imu, epoch_ns
+        self.values, self._rates = dict(values), dict(values)
+        self.history: list[Event] = []
+        self.now_ns = -1
+        # The trace of the markers, intervals of the IMU and late fixes reach back across events.
+        self._keep_ns = max(round(values['markers.trace_length'] * NANOSECONDS), LONGEST_NS)
 
-    @property
-    def l3(self) -> float:
-        """L3 as last commanded [kg m^2/s]."""
-        return self.segment.l3
+    def apply(self, kind: str, **details: Any) -> Event:
+        """
+        Let something change the run now; return the event, with the time at which it acts.
 
-    @property
-    def steps(self) -> int:
-        return self.path.steps
+        kind, details : of an `Event`; a drive needs no `stop_ns`, which is then now +
+            `pivot.cmd_timeout`
 
-    @property
-    def evaluations(self) -> int:
-        return self.path.evaluations
+        Raises ValueError naming what is off; the run goes on unchanged.
+        """
+        sent_ns = self.now_ns
+        if kind == 'reset':
+            self._restart(details['parameters'], details['epoch_ns'])
+            return Event(kind, 0, sent_ns, details)
+        event = Event(kind, max(sent_ns, 0), sent_ns, details)
+        if event.begins_motion:
+            self.trajectory = self.trajectory.then(event)
+            self.now_ns = event.t_ns
+        elif kind == 'parameters':
+            self._set_rates(details)
+        elif kind == 'epoch':
+            check_stamps(details['epoch_ns'], 0.0)
+            self.epoch_ns = details['epoch_ns']
+        self._remember(event)
+        return event
+
+    def _remember(self, event: Event) -> None:
+        """Add an event to the history, or let a drive that is repeated last longer."""
+        last = self.history[-1] if self.history else None
+        if last and event.repeats(last):
+            self.history[-1] = replace(last, details=event.details)
+        else:
+            self.history.append(event)
+
+    def _set_rates(self, changes: Mapping[str, Any]) -> None:
+        """Take over new rates of channels after `now_ns`."""
+        self._rates |= {name: value for name, value in changes.items() if name.endswith('.rate')}
+        self.imu = self.imu.at_period(period_ns(self._rates['imu.rate']), max(self.now_ns, 0))
+        self.channels = all_channels(self._rates, self.imu)
+
+    def drive_details(self, velocity: Sequence[float]) -> dict[str, Any] | None:
+        """
+        Return the details of a drive to a velocity of the pivot in the world [m/s] from now on.
+
+        None if the pivot rests and is to rest.  Raises ValueError.
+        """
+        details = trajectory.drive_details(velocity, max(self.now_ns, 0),
+                                           self.values['pivot.cmd_timeout'])
+        is_rest = self.trajectory.pivot is None and not any(details[axis] for axis in 'xyz')
+        return None if is_rest else details
 
     def state(self) -> States:
-        """Return the state (n = 1) at `now_ns`, or at the start before the first sample."""
-        return self.segment.states(self._now())
+        """Return the state (n = 1) in which the motion goes on after `now_ns`."""
+        now_ns = max(self.now_ns, 0)
+        return self.trajectory.after(now_ns).states(range(now_ns, now_ns + 1))
 
-    def _now(self) -> range:
-        now_ns = max(self.now_ns, self.segment.start_ns)
-        return range(now_ns, now_ns + 1)
-
-    @property
-    def energy_drift(self) -> float:
-        """The energy's relative drift since the segment began, absolute where it was 0."""
-        return float(relative_drift(self.state().energy, self.segment.energy)[0])
-
-    @property
-    def orientation_error(self) -> float:
+    def block(self, channels: Sequence[Channel], after_ns: int, until_ns: int) -> Block:
         """
-        The angle between the present attitude and the exact one [rad]; NaN: not known.
+        Return the messages of channels that are due after one time and up to another.
 
-        The exact one starts where the segment does.
+        Where the motion ends before, the block does too.  A message depends on the parameters,
+        the events and its own time alone, never on the block that it is computed in.
+
+        Raises IntegrationError if the motion does not go on at all.
         """
-        return float(self.segment.orientation_error(self.state(), self._now())[0])
+        last_ns = LAST_STAMP_NS - self.epoch_ns
+        if last_ns <= after_ns:
+            raise IntegrationError(f'the stamp {(self.epoch_ns + until_ns) / NANOSECONDS:.12g} s: '
+                                   f'must be < {2 ** 31} s, in January 2038', reached_ns=last_ns)
+        until_ns = self.reach(after_ns, min(until_ns, last_ns))
+        samples: dict[tuple[int, int], Samples] = {}
+        messages = []
+        for channel in channels:
+            if channel.grid not in samples:
+                samples[channel.grid] = Samples(
+                    self.trajectory, self.imu, channel.times(after_ns, until_ns), self.epoch_ns)
+            if samples[channel.grid].times:
+                t_ns, rows = channel.encode(samples[channel.grid])
+                if len(t_ns):           # a sensor may lose all samples of a block
+                    messages.append((channel, t_ns, rows))
+        return Block(until_ns, messages)
 
-    def describe(self) -> Description | None:
-        """Return the motion in numbers; None if it has no closed form or the pivot moves."""
-        solution = self.segment.closed_form
-        if self.segment.ride or not isinstance(solution, ExactSolution):
-            return None
-        return solution.describe()
+    def reach(self, after_ns: int, until_ns: int) -> int:
+        """Return the last time up to `until_ns` that the motion has; as `block`, raise if none."""
+        try:
+            self.trajectory.evaluate(range(until_ns, until_ns + 1))
+        except IntegrationError as error:
+            if error.reached_ns <= after_ns:
+                raise
+            return error.reached_ns
+        return until_ns
 
-    def play(self, streams: Sequence[Stream], until_ns: int) -> Iterator[Block]:
+    def play(self, channels: Sequence[Channel], until_ns: int) -> Iterator[Block]:
         """
-        Move on to `until_ns`; yield the messages of these streams on the way, block by block.
+        Move on to `until_ns`; yield the messages of these channels on the way, block by block.
 
         `now_ns` is the end of the block that is yielded.  Raises IntegrationError behind the last
         block if the motion does not go on.
         """
-        span_ns = max(span_of(streams, OFFLINE_BYTES, LONGEST_OFFLINE_NS),
+        per_ns = sum(len(channel.encoder) / channel.period_ns for channel in channels)
+        span_ns = max(1, int(BLOCK_BYTES / max(per_ns, BLOCK_BYTES / LONGEST_BLOCK_NS)),
                       (until_ns - self.now_ns) // MOST_BLOCKS)
-        for block in blocks(self.path, streams, self.epoch_ns, self.now_ns, until_ns,
-                            span_ns=span_ns, most_steps=OFFLINE_STEPS):
-            if block is not None:
-                self.now_ns = block.until_ns
-                yield block
-                self.path.release(self.now_ns)
+        while self.now_ns < until_ns:
+            block = self.block(channels, self.now_ns, min(until_ns, self.now_ns + span_ns))
+            self.now_ns = block.until_ns
+            yield block
+            self.forget()
 
-    def apply(self, changes: Mapping[str, Any]) -> None:
-        """Take over new rates of streams after `now_ns`."""
-        imu, rate = self.imu, changes.get('imu.rate')
-        if rate is not None and imu.set_rate(rate, max(self.now_ns, 0)):
-            self.path.keep_steps_ns = imu.keep_ns
-            self.history.append((max(self.now_ns, 0), rate))
-        for stream in self.streams:
-            stream.apply(changes)
-        self.version += 1
-
-    def command(self, l3: float, lz: float) -> None:
-        """
-        Let L3 and Lz jump now [kg m^2/s]: an impulsive torque.  Angles and theta' stay.
-
-        Raises ValueError naming what is off; the motion goes on unchanged.
-        """
-        for name, value in (('l3', l3), ('lz', lz)):
-            if not math.isfinite(value):
-                raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
-        self._settle()
-        now = self.state()
-        theta = float(now.theta[0])
-        pole = pole_momentum(abs(theta), l3)
-        if pole is not None and lz != pole:
-            raise ValueError(
-                f'lz = {lz!r} kg m^2/s with l3 = {l3!r}: the axis is at a pole (theta = '
-                f'{theta!r} rad), where lz must equal {pole!r}; command both together')
-        self._continue(ContinuedState(
-            theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
-            psi=float(now.psi[0]), l3=l3, lz=lz))
-        self.history.append((self.now_ns, l3, lz))
-
-    def set_state(self, state: State) -> None:
-        """
-        Let the top be in another state from now on; the simulated time goes on.
-
-        Raises ValueError if no motion begins there; then the present one goes on unchanged.
-        """
-        self._settle()
-        self._continue(state)
-        self.history.append((self.now_ns, *astuple(state)))
-
-    def drive(self, velocity: Sequence[float], stop_ns: int | None = None) -> int | None:
-        """
-        Let the pivot go to a velocity in the world [m/s] from now on.
-
-        It accelerates by `pivot.max_acceleration`, and brakes to rest at a time.  To repeat a
-        command before that only puts this off.
-
-        stop_ns : when it begins to brake [ns]; None: after `pivot.cmd_timeout`
-        Returns that time; None if the pivot rests and is to rest.
-
-        Raises ValueError naming what is off; the motion goes on unchanged.
-        """
-        target = checked_velocity(velocity)
-        self._settle()
-        if self.pivot_path is None and not any(target):
-            return None
-        if stop_ns is None:
-            timeout_ns = round(self.values['pivot.cmd_timeout'] * NANOSECONDS)
-            stop_ns = self.now_ns + timeout_ns if timeout_ns else NEVER_NS
-        last = self.history[-1] if self.history else None
-        if isinstance(last, Drive) and last[1:4] == target and self.now_ns < last.stop_ns:
-            # The motion up to now is the same.
-            self.pivot_path, segment = self._driven_path(stop_ns=stop_ns), self.segment
-            assert segment.ride is not None
-            segment.ride = segment.ride._replace(piece=self.pivot_path.lasting(segment.start_ns))
-            if self.path.end_after(self.now_ns):
-                self.version += 1
-            self.history[-1] = last._replace(stop_ns=stop_ns)
-            return stop_ns
-        pivot = self.segment.pivot(np.array([self.now_ns]))
-        self._driven_path = partial(
-            PivotPath.to_velocity, target, position=pivot.position[:, 0].tolist(),
-            velocity=pivot.velocity[:, 0].tolist(), start_ns=self.now_ns,
-            most_acceleration=self.values['pivot.max_acceleration'])
-        self._continue(self.segment.posture(self.now_ns), self._driven_path(stop_ns=stop_ns))
-        self.history.append(Drive(self.now_ns, *target, stop_ns))
-        return stop_ns
-
-    def _settle(self) -> None:
-        """Let the solver reach `now_ns`, and be at t = 0 at least."""
-        self.now_ns = max(self.now_ns, 0)
-        self.segment.reach(self.now_ns)
-
-    def _continue(self, start: State | Posture, pivot: PivotPath | None = None) -> None:
-        """Go on from another state, or from the present posture on another path of the pivot."""
-        pivot = pivot or self.pivot_path
-        segment = _segment(self.top, start, self.now_ns, self.values, pivot)
-        self.pivot_path = pivot
-        if isinstance(start, State):
-            self.lz = start.lz
-        self.path.go_on_with(segment)
-        self.version += 1
-
-    def _follow(self, last: Segment) -> Segment:
-        """Return the segment behind the end of one: the pivot changes its acceleration."""
-        last.reach(last.end_ns)
-        return _segment(self.top, last.posture(last.end_ns), last.end_ns, self.values,
-                        self.pivot_path)
+    def forget(self) -> None:
+        """Forget what no sample after `now_ns` needs."""
+        memory_ns = self.imu.memory_ns
+        self.trajectory.forget(self.now_ns - max(self._keep_ns, memory_ns),
+                               self.now_ns - memory_ns)
 
 
-def checked_velocity(velocity: Sequence[float]) -> tuple[float, float, float]:
-    """Return a velocity of the pivot [m/s].  Raises ValueError."""
-    x, y, z = target = tuple(map(float, velocity))
-    if not all(abs(part) <= parameters.FASTEST for part in target):
-        raise ValueError(f'linear = {list(target)!r} m/s: each must be finite and within '
-                         f'{parameters.FASTEST:g} m/s')
-    return x, y, z
-
-
-def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
-             pivot: PivotPath | None) -> Segment:
-    """Return the motion from a start.  Raises ValueError if its first nanosecond shows none."""
-    try:
-        with np.errstate(over='ignore', invalid='ignore'):
-            segment = _new_segment(top, start, start_ns, values, pivot)
-            # Caches `energy` now: the first step, from which it is read, is forgotten later.
-            if ((isinstance(start, State) or values['solver.method'] != 'exact')
-                    and not math.isfinite(segment.energy)):
-                raise ValueError(f'the energy would be {segment.energy!r} J')
-        if not segment.reach(start_ns + 1, FIRST_STEPS):
-            raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
-        spin = abs(start.l3) / top.lambda3 / math.tau
-        if spin > MOST_RATE:
-            raise ValueError(f'it turns too fast: {spin:.3g} times a second, must be at most '
-                             f'{MOST_RATE:.2g}')
-        ns_limit = segment.motion.ns_limit
-        if ns_limit < LAST_STAMP_NS:
-            raise ValueError(f'it turns too fast: its phases are known for '
-                             f'{ns_limit / NANOSECONDS:.3g} s, must be for '
-                             f'{LAST_STAMP_NS / NANOSECONDS:g} s')
-    except (ArithmeticError, RuntimeError, ValueError) as error:
-        whence = (f'theta = {start.theta!r} rad, theta_dot = {start.theta_dot!r} rad/s with l3 = '
-                  f'{start.l3!r}, lz = {start.lz!r} kg m^2/s' if isinstance(start, State)
-                  else f't = {start_ns / NANOSECONDS!r} s on with another acceleration')
-        raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
-    return segment
-
-
-def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
-                 pivot: PivotPath | None) -> Segment:
-    settings = {name: values[f'solver.{name}'] for name in ('method', 'equations', 'rtol', 'atol')}
-    if pivot is None:
-        assert isinstance(start, State)
-        return Segment(propagate(top, start, **settings), start_ns, jumps=True)
-    piece = pivot.lasting(start_ns)
-    motion, vertical = propagate_accelerated(top, start, piece.acceleration, **settings)
-    return Segment(motion, start_ns, Ride(top, vertical, piece), jumps=isinstance(start, State))
+def check_stamps(epoch_ns: int, duration: float) -> None:
+    """Raise ValueError if ROS has no stamp for t = 0 [ns] or for the end of a run [s]."""
+    for stamp_ns in (epoch_ns, epoch_ns + round(duration * NANOSECONDS)):
+        if not 0 <= stamp_ns <= LAST_STAMP_NS:
+            raise ValueError(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be >= 0 and '
+                             f'< {2 ** 31} s, in January 2038')

@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Vector
 from spinning_top_sim.physics.pivot import NEVER_NS, REST, Kinematics, PivotPath, kinematics
 from spinning_top_sim.physics.states import Point, States, joined
@@ -108,7 +109,7 @@ class Trajectory:
     def velocity_jump(self, t_ns: int, point: Point) -> Vector:
         """Return by how much the velocity of a point of the body jumps at a time, (1,) each."""
         if t_ns not in self._jumps:
-            return 3 * (np.zeros(1),)       # type: ignore[return-value]
+            return np.zeros(1), np.zeros(1), np.zeros(1)
         moment = range(t_ns, t_ns + 1)
         before, after = self.evaluate(moment), self.after(t_ns).states(moment)
         (u1, u2, u3), (v1, v2, v3) = before.velocity(point), after.velocity(point)
@@ -126,9 +127,17 @@ class Trajectory:
         return kinematics([piece.ride for piece, _ in found],
                           [len(times) for _, times in found], np.asarray(t_ns))
 
-    def truth(self, t_ns: Times) -> list[tuple[Times, States | None]]:
-        """Return times with the exact states there; None where doubles cannot hold the solution."""
-        return [(times, piece.truth(times)) for piece, times in self.pieces(t_ns)]
+    def orientation_error(self, states: States, t_ns: Times) -> NDArray[np.float64]:
+        """Return the angles (n,) [rad] of states to the exact ones; NaN: these are not known."""
+        angles, begin = np.zeros(len(t_ns)), 0
+        for piece, times in self.pieces(t_ns):
+            part = slice(begin, begin := begin + len(times))
+            if not piece.is_exact:
+                truth = piece.truth(times)
+                x, y, z, w = (column[part] for column in states.rows_quaternion)
+                angles[part] = math.nan if truth is None else attitude.angle_between(
+                    (x, y, z, w), truth.rows_quaternion)
+        return angles
 
     def then(self, event: Event) -> Self:
         """
@@ -146,7 +155,8 @@ class Trajectory:
         t_ns, details = event.t_ns, event.details
         state = now.states(range(t_ns, t_ns + 1))
         if event.kind == 'drive':
-            repeats, self._drive = self._is_repeated(event), event
+            repeats = self._drive is not None and event.repeats(self._drive)
+            self._drive = event
             self.pivot = self._driven_path(stop_ns=details['stop_ns']) if repeats else (
                 self._path_of(event))
             if repeats:         # the motion up to now is the same
@@ -160,12 +170,6 @@ class Trajectory:
         self._pieces.append(self._begin(start, t_ns))
         if isinstance(start, State):
             self.lz, self._jumps = start.lz, (*self._jumps, t_ns)
-
-    def _is_repeated(self, event: Event) -> bool:
-        """Return whether a drive puts off the end of the one before it, and does nothing else."""
-        last = self._drive
-        return (last is not None and event.t_ns < last.details['stop_ns']
-                and all(last.details[axis] == event.details[axis] for axis in 'xyz'))
 
     def _path_of(self, event: Event) -> PivotPath:
         place = self.place(range(event.t_ns, event.t_ns + 1))
@@ -213,6 +217,7 @@ def drive_details(velocity: Sequence[float], now_ns: int, timeout: float) -> dic
     """
     x, y, z = target = [float(part) for part in velocity]
     if not all(abs(part) <= FASTEST for part in target):
-        raise ValueError(f'linear = {target!r} m/s: each must be finite and within {FASTEST:g} m/s')
+        raise ValueError(f'linear = {target!r} m/s: each must be finite and within '
+                         f'{FASTEST:g} m/s')
     stop_ns = now_ns + round(timeout * NANOSECONDS) if timeout else NEVER_NS
     return {'x': x, 'y': y, 'z': z, 'stop_ns': stop_ns}
