@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from spinning_top_sim.streams.stream import Stream
 
 # Importing these takes long, so that is left to the opening of a log.
 if TYPE_CHECKING:
-    from spinning_top_sim.recording.recorder import McapRecorder
+    from spinning_top_sim.recording.recorder import Recorder
 
 MOST_PENDING = 20_000       # stamps whose messages wait while a file is being opened
 RECORDER, RECORDED_FILE = 'recorder', 'recorded file'        # keys in /diagnostics
@@ -40,7 +41,7 @@ class RecordingSession:
                  topics: Callable[[Sequence[Stream]], list[Topic]]) -> None:
         self.error: str | None = None       # why the last recording stopped early or did not start
         self._simulation, self._lock, self._topics = simulation, lock, topics
-        self._recorder: McapRecorder | None = None
+        self._recorder: Recorder | None = None
         self._pending: list[Sequence[Entry]] = []       # while a log is being opened
         self._write: Write | None = None        # writes into the recorder, or into `_pending`
         # Streams, their topics and the run, of a log that is to be opened
@@ -78,9 +79,9 @@ class RecordingSession:
                 raise RecordingError(str(error)) from error
             with self._lock:
                 for entries in self._pending:
-                    recorder.write_all(entries)
+                    _write_all(recorder, entries)
                 self._recorder, self.error = recorder, None
-                self._feed(recorder.write_all, streams)
+                self._feed(partial(_write_all, recorder), streams)
         return f'recording to {recorder.path}'
 
     def _feed(self, write: Write | None, streams: Sequence[Stream] = ()) -> None:
@@ -161,30 +162,26 @@ class RecordingSession:
                 'possible loss [s]': f'{recorder.possible_loss:.3f}'}
 
 
-def _open_log(topics: Sequence[Topic], run: Mapping[str, Any]) -> McapRecorder:
-    """Open the log that `record.uri` names; in a folder, under the first free name."""
+def _write_all(recorder: Recorder, entries: Sequence[Entry]) -> None:
+    from spinning_top_sim.recording.recorder import single  # noqa: PLC0415
+
+    recorder.write([single(*entry) for entry in entries])
+
+
+def _open_log(topics: Sequence[Topic], run: Mapping[str, Any]) -> Recorder:
+    """Open the log that `record.uri` names."""
     with needed('a recording'):
         from spinning_top_sim.recording.provenance import run_metadata  # noqa: PLC0415
-        from spinning_top_sim.recording.recorder import McapRecorder  # noqa: PLC0415
+        from spinning_top_sim.recording.recorder import Recorder  # noqa: PLC0415
         from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
 
     values, metadata = run['values_at_recording'], run_metadata(**run)
     recorded = [RecordedTopic(*topic) for topic in topics]
-    folder = path = Path(values['record.uri']).expanduser().absolute()
-    if values['record.uri'].endswith('/'):
-        folder.mkdir(parents=True, exist_ok=True)
-    named = values['record.uri'] and not path.is_dir()
-    stem, number = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S'), 1
-    while True:
-        if not named:
-            path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
-        try:
-            return McapRecorder(
-                path, recorded, metadata, max_loss=values['record.max_loss'],
-                compression=values['record.compression'],
-                min_free_bytes=values['record.min_free_bytes'])
-        except RecordingError as error:
-            # Another node may take a name at any time, so only opening shows whether it is free.
-            if named or not isinstance(error.__cause__, FileExistsError):
-                raise
-        number += 1
+    recorder = Recorder(
+        values['record.uri'], recorded, metadata, max_loss=values['record.max_loss'],
+        compression=values['record.compression'], min_free_bytes=values['record.min_free_bytes'])
+    while recorder.state == 'opening':
+        time.sleep(0.01)
+    if recorder.error:
+        raise RecordingError(recorder.error)
+    return recorder

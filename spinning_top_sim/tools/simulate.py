@@ -19,8 +19,9 @@ from typing import Any
 
 from spinning_top_sim.recording.provenance import run_metadata
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recorder import create_file
+from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import journal, parameters
 from spinning_top_sim.streams.blocks import Block
@@ -172,22 +173,20 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                for name, type_name in types.items()],
         run_metadata(values, epoch_ns, -1, (), values), compression=values['record.compression'])
     try:
-        file.append(topics.index(journal.EVENTS), epoch_ns, journal.event('start', 0, -1))
+        file.add(*single(topics.index(journal.EVENTS), epoch_ns, journal.event('start', 0, -1)))
         for done in _play(simulation, streams, stops, show):
             if isinstance(done, Block):
-                file.append_rows([(streams.index(stream), epoch_ns + t_ns, rows)
-                                  for stream, t_ns, rows in done.messages])
+                for stream, t_ns, rows in done.messages:
+                    file.add(streams.index(stream), epoch_ns + t_ns, rows)
+                file.flush()
             else:
                 for topic, data in journal.command_entries(simulation.now_ns, *done):
-                    file.append(topics.index(topic), epoch_ns + simulation.now_ns, data)
+                    file.add(*single(topics.index(topic), epoch_ns + simulation.now_ns, data))
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(f'{path} holds the run up to t = '
                                 f'{simulation.now_ns / NANOSECONDS:g} s') from interrupt
     finally:
-        try:
-            file.flush()
-        finally:
-            file.finish()
+        file.finish()
     return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
 
 
