@@ -2,13 +2,15 @@
 """The clock that dates a simulation."""
 
 import time
-from collections.abc import Callable
+from typing import cast
 
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock, ClockType, ROSClock
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from spinning_top_sim.nodes.tick_loop import EPOCH_GRID_NS
+from spinning_top_sim.nodes.clock import EPOCH_GRID_NS
 
 PATIENCE_S = 2.0        # a /clock that does not change for longer has stopped
 
@@ -17,18 +19,33 @@ class StampClock:
     """The clock of the system or, with `use_sim_time`, the /clock of another node."""
 
     def __init__(self, node: Node, publishes_clock: bool) -> None:
+        uses_clock = node.get_parameter('use_sim_time').value
         # Whether it is a /clock; a node does not follow its own.
-        self.follows = bool(node.get_parameter('use_sim_time').value) and not publishes_clock
+        self.follows = bool(uses_clock) and not publishes_clock
+        self._node, self._topic = node, ''
+        self._ros_clock = cast(ROSClock, node.get_clock())
         self._clock = (node.get_clock() if self.follows
                        else Clock(clock_type=ClockType.SYSTEM_TIME))
         self._newest_ns, self._changed_at = 0, time.monotonic()
-        for subscription in node.subscriptions:
-            if subscription.msg_type is ClockMessage:
-                subscription.callback = _without_negative_times(subscription.callback)
+        if uses_clock:          # rclpy's subscription raises an error for times before 0
+            for subscription in [*node.subscriptions]:
+                if subscription.msg_type is ClockMessage:
+                    node.destroy_subscription(subscription)
+            self._topic = node.create_subscription(
+                ClockMessage, '/clock', self._take,
+                QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)).topic_name
+
+    def _take(self, message: ClockMessage) -> None:
+        if message.clock.sec >= 0:
+            self._ros_clock.set_ros_time_override(Time.from_msg(message.clock))
 
     def now_ns(self) -> int:
         """Return the date [ns]; 0 before the first message on /clock."""
         return int(self._clock.now().nanoseconds)
+
+    def publishers(self) -> int:
+        """Return how many nodes publish on the /clock that is followed."""
+        return int(self._node.count_publishers(self._topic))
 
     def first_ns(self) -> int:
         """Return the date of a t = 0 that begins now [ns]."""
@@ -42,12 +59,3 @@ class StampClock:
         if date_ns != self._newest_ns:
             self._newest_ns, self._changed_at = date_ns, now
         return self.follows and (date_ns == 0 or now > self._changed_at + PATIENCE_S)
-
-
-def _without_negative_times(take: Callable[[ClockMessage], object],
-                            ) -> Callable[[ClockMessage], None]:
-    """Return a callback that ignores times before 0, for which rclpy raises an error."""
-    def call(message: ClockMessage) -> None:
-        if message.clock.sec >= 0:
-            take(message)
-    return call
