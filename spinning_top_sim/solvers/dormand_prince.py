@@ -71,7 +71,9 @@ class IntegrationError(RuntimeError):
     reached_ns : last simulated time of which a `Piece` still gives states [ns]
     """
 
-    reached_ns = 0
+    def __init__(self, text: str, *, reached_ns: int = 0) -> None:
+        super().__init__(text)
+        self.reached_ns = reached_ns
 
 
 StepFunction = Callable[..., tuple[Unknowns, Unknowns, Unknowns]]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import integrals, pivot
 from spinning_top_sim.physics.pivot import NANOSECONDS, REST
+from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.physics.world_states import WorldStates
@@ -88,6 +89,21 @@ class Piece:
                                  f'most {FASTEST_RATE:.2g}')
         except (ArithmeticError, IntegrationError, ValueError) as error:
             raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
+
+    @property
+    def start(self) -> State:
+        """The state at the start, about the line of effective gravity."""
+        return self._motion.start
+
+    @property
+    def rests(self) -> bool:
+        """Whether the pivot has always rested."""
+        return self._rotation is None
+
+    def describe(self) -> Description | None:
+        """Return the motion in numbers; None if it has no closed form or the pivot moves."""
+        return (self._exact.describe() if self.rests and isinstance(self._exact, ExactSolution)
+                else None)
 
     @property
     def is_exact(self) -> bool:

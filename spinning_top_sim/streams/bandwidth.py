@@ -83,7 +83,7 @@ class LowPass:
 
     def _reading(self, trajectory: Trajectory, t_ns: NDArray[np.int64],
                  edges: NDArray[np.float64], signal: Signal) -> NDArray[np.float64]:
-        """Return the readings (columns, n), of samples whose panels have these edges [ns before]."""
+        """Return the readings (columns, n) of samples with these edges of panels [ns before]."""
         lengths = np.diff(edges)[:, np.newaxis]
         before = (edges[:-1, np.newaxis] + lengths * self._nodes).ravel()
         weights = 1e-9 * (lengths * self._weights).ravel() * self._response(1e-9 * before)

@@ -25,11 +25,11 @@ Field = NDArray[Any] | Sequence[NDArray[Any] | float]
 
 
 class Place(NamedTuple):
-    """Where a field stands in a message: its name, code of `struct`, count, and offset."""
+    """Where a field stands in a message: its name, code of `struct`, how many, and offset."""
 
     name: str
     code: str
-    count: int
+    numbers: int
     offset: int
 
 
@@ -96,8 +96,9 @@ class Template:
         self._buffer = bytes(writer.buffer + bytes(-len(writer.buffer) % 4))
         self.fields, self._stamps_at = tuple(writer.fields), writer.stamps_at
         # A message as a type of NumPy: the fields by number, then the stamps.
-        places = [(f'{i}', (f'<{one.code}', (one.count,)), one.offset)
-                  for i, one in enumerate(self.fields)]
+        places: list[tuple[str, Any, int]] = [
+            (f'{i}', (f'<{one.code}', (one.numbers,)), one.offset)
+            for i, one in enumerate(self.fields)]
         for at in self._stamps_at:
             places += [(f'sec{at}', '<i4', at), (f'nanosec{at}', '<u4', at + 4)]
         names, formats, offsets = zip(*places, strict=True)

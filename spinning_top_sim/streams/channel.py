@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field
+from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.imu import Imu, Readings
 from spinning_top_sim.streams.trajectory import Trajectory
 
@@ -68,8 +68,9 @@ class Channel:
     period_ns : time between two samples [ns]
     encoder : of its messages
     fields : returns the numbers that go into the fields of `encoder`
-    stamps : returns the stamps (n,) of samples [ns]; None: they are right
-    copies : returns how many messages each sample has (n,), 0 if it is lost; None: 1
+    stamps : returns the stamps (n,) [ns] of samples, from that of t = 0 and their times [ns];
+        None: they are right
+    copies : returns how many messages samples at times (n,) [ns] have, 0 if lost; None: 1
     delay_ns : time from a sample to its message [ns]
     """
 
@@ -79,9 +80,15 @@ class Channel:
     period_ns: int
     encoder: Encoder
     fields: Callable[[Samples], Sequence[Field]]
-    stamps: Callable[[Samples], Stamps] | None = None
-    copies: Callable[[Samples], NDArray[np.int64]] | None = None
+    stamps: Callable[[int, Stamps], Stamps] | None = None
+    copies: Callable[[Stamps], NDArray[np.int64]] | None = None
     delay_ns: int = 0
+
+    @property
+    def template(self) -> Template:
+        """The encoder of a channel of messages."""
+        assert isinstance(self.encoder, Template)
+        return self.encoder
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -104,16 +111,20 @@ class Channel:
         rows : (n, size)
             The messages.
         """
-        stamps = samples.epoch_ns + samples.t_ns if self.stamps is None else self.stamps(samples)
+        stamps = (samples.epoch_ns + samples.t_ns if self.stamps is None
+                  else self.stamps(samples.epoch_ns, samples.t_ns))
         try:
             rows = self.encoder.encode(stamps, self.fields(samples))
         except ValueError as error:
             raise ValueError(f'fields of {self.topic}: {error}') from error
-        t_ns = samples.t_ns + self.delay_ns
-        if self.copies is None:
-            return t_ns, rows
-        copies = self.copies(samples)
-        return np.repeat(t_ns, copies), np.repeat(rows, copies, axis=0)
+        if self.copies is not None:
+            rows = np.repeat(rows, self.copies(samples.t_ns), axis=0)
+        return self.due(samples.t_ns), rows
+
+    def due(self, t_ns: Stamps) -> Stamps:
+        """Return when the messages of samples at times (n,) are due [ns]."""
+        due_ns = t_ns + self.delay_ns
+        return due_ns if self.copies is None else np.repeat(due_ns, self.copies(t_ns))
 
 
 def period_ns(rate: float) -> int:

@@ -20,13 +20,11 @@ COMMANDS, EVENTS = '~/commands', '~/events'
 TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/String'}
 # What an event of each kind has besides its times, and how that is read.
 MOTIONS = ('command', 'state', 'drive')     # events that begin another motion, on the same clock
-_NUMBERS: Callable[..., dict[str, Callable[[Any], Any]]] = lambda *names: dict.fromkeys(
-    names, float)
 _DETAILS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     'start': {},
-    'command': _NUMBERS('l3', 'lz'),
-    'state': _NUMBERS(*(one.name for one in fields(State))),
-    'drive': {**_NUMBERS('x', 'y', 'z'), 'stop_ns': operator.index},
+    'command': {'l3': float, 'lz': float},
+    'state': {one.name: float for one in fields(State)},
+    'drive': {'x': float, 'y': float, 'z': float, 'stop_ns': operator.index},
     'epoch': {'epoch_ns': operator.index},
     'reset': {'epoch_ns': operator.index, 'parameters': parameters.checked}}
 

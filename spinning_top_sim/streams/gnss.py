@@ -25,7 +25,8 @@ def channels(values: Mapping[str, Any]) -> list[Channel]:
     """Return fixes and velocities as the receiver measures them, each with its truth."""
     period = period_ns(values['gnss.rate'])
     delay_ns = round(values['gnss.latency'] * NANOSECONDS)
-    edges_ns = outage_edges_ns(values)
+    # Begin and end of each outage, in turn.
+    edges_ns = np.rint(np.array(values['gnss.outages']) * NANOSECONDS).astype(np.int64)
     channel = partial(Channel, 'gnss', period_ns=period)
     fix = partial(channel, type_name='sensor_msgs/msg/NavSatFix',
                   encoder=messages.nav_sat_fix(values['body_frame']))
@@ -43,20 +44,13 @@ def channels(values: Mapping[str, Any]) -> list[Channel]:
             fields=partial(_fix, values, position_noise, edges_ns)),
         fix('ground_truth/gnss/fix', fields=partial(_fix, values, none, edges_ns[:0])),
         velocity('gnss/velocity', velocity_noise, delay_ns=delay_ns,
-                 copies=lambda samples: 1 - _is_out(edges_ns, samples)),
+                 copies=lambda t_ns: 1 - _is_out(edges_ns, t_ns)),
         velocity('ground_truth/gnss/velocity', none)]
 
 
-def outage_edges_ns(values: Mapping[str, Any]) -> NDArray[np.int64]:
-    """Return begin and end of each outage, in turn [ns]."""
-    edges: NDArray[np.int64] = np.rint(np.array(values['gnss.outages']) * NANOSECONDS).astype(
-        np.int64)
-    return edges
-
-
-def _is_out(edges_ns: NDArray[np.int64], samples: Samples) -> NDArray[np.int64]:
-    """Return 1 for each sample in an outage: an odd number of edges is past then."""
-    return np.searchsorted(edges_ns, samples.t_ns, 'right') % 2
+def _is_out(edges_ns: NDArray[np.int64], t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return 1 for each time in an outage: an odd number of edges is past then."""
+    return np.searchsorted(edges_ns, t_ns, 'right') % 2
 
 
 def _measured(values: Mapping[str, Any], deviations: tuple[float, float], purpose: noise.Purpose,
@@ -75,7 +69,7 @@ def _fix(values: Mapping[str, Any], deviations: tuple[float, float],
     from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
     position = _measured(values, deviations, noise.Purpose.GNSS_POSITION, samples,
                          samples.trajectory.place(samples.times).position)
-    is_out = _is_out(edges_ns, samples) == 1
+    is_out = _is_out(edges_ns, samples.t_ns) == 1
     geodetic = [np.where(is_out, np.nan, part)
                 for part in enu2geodetic(*position, *values['gnss.origin'])]
     covariance = np.where(is_out[:, np.newaxis], 0.0, messages.diagonal(*_variances(deviations)))

@@ -238,7 +238,8 @@ class Readings:
         """
         point, trajectory = self._imu.mounting.lever_arm, self._trajectory
         parts = []
-        for begin, end in pairwise(sorted({begin_ns, *trajectory.starts(begin_ns, end_ns), end_ns})):
+        edges = {begin_ns, *trajectory.starts(begin_ns, end_ns), end_ns}
+        for begin, end in pairwise(sorted(edges)):
             parts.append(integrals.impulse(trajectory.velocity_jump(begin, point)))
             parts.append(_within(trajectory.after(begin), range(begin, begin + 1), end - begin,
                                  point))

@@ -10,7 +10,7 @@ import numpy as np
 
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.streams import gnss, messages, parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field
+from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
 from spinning_top_sim.streams.channel import Channel, Samples, period_ns
 from spinning_top_sim.streams.imu import Imu, Mounting
 from spinning_top_sim.streams.magnetometer import Magnetometer
@@ -78,7 +78,7 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
     world, body, frame = values['world_frame'], values['body_frame'], values['imu.frame_id']
     mounting, timing = imu.mounting, Timing(values, imu.period_ns)
 
-    def channel(name: str, topic: str, type_name: str, encoder: messages.Template,
+    def channel(name: str, topic: str, type_name: str, encoder: Template,
                 fields: Callable[[Samples], Sequence[Field]] = lambda _: (),
                 rate: str = '') -> Channel:
         return Channel(name, topic, type_name, period_ns(values[rate or f'{name}.rate']), encoder,
@@ -88,8 +88,7 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
         """Return the channel with the stamps and the losses of the IMU."""
         faults = Timing(values, one.period_ns)
         return one if faults.is_right else replace(
-            one, stamps=lambda samples: faults.stamps(samples.epoch_ns, samples.t_ns),
-            copies=lambda samples: faults.copies(samples.t_ns))
+            one, stamps=faults.stamps, copies=faults.copies)
 
     of_imu = partial(channel, type_name=IMU)
     noisy = imu_noise_covariances(imu)
@@ -141,10 +140,14 @@ def imu_noise_covariances(imu: Imu) -> list[tuple[float, ...]]:
 
 
 def recorded(channels: Sequence[Channel], values: Mapping[str, Any]) -> list[Channel]:
-    """Return the channels that are switched on and that `record.streams` chooses."""
+    """Return the channels that are recorded."""
+    return [channel for channel in channels if is_recorded(channel.name, values)]
+
+
+def is_recorded(name: str, values: Mapping[str, Any]) -> bool:
+    """Return whether channels are switched on and `record.streams` chooses them."""
     chosen = values['record.streams']
-    return [channel for channel in channels if parameters.is_enabled(channel.name, values)
-            and ('all' in chosen or channel.name in chosen)]
+    return parameters.is_enabled(name, values) and ('all' in chosen or name in chosen)
 
 
 def resolve_topic(topic: str, namespace: str) -> str:

@@ -18,7 +18,8 @@ from spinning_top_sim.physics.pivot import NEVER_NS, REST, Kinematics, PivotPath
 from spinning_top_sim.physics.states import Point, States, joined
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.handover import Piece, Posture
+from spinning_top_sim.solvers.handover import Piece
+from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.streams.parameters import FASTEST
