@@ -195,3 +195,14 @@ def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,
         while (publisher.get_subscription_count() and time.monotonic() < end and not stopped()
                 and not publisher.wait_for_all_acked(Duration(seconds=0.02))):
             pass
+
+
+def answers_later(service):
+    send = service.send_response
+    from rclpy.task import Future
+    def send_when_done(response, header):
+        if isinstance(response, Future):
+            response.add_done_callback(lambda done: send(done.result(), header))
+        else:
+            send(response, header)
+    setattr(service, 'send_response', send_when_done)
