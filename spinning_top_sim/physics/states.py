@@ -297,7 +297,7 @@ class States:
             Without matplotlib.
         """
         with needed('a picture', 'plot'):
-            from spinning_top_sim.physics import pictures  # noqa: PLC0415 - matplotlib is slow
+            from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
         return pictures.plot(self)
 
     def animate(self, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
@@ -324,7 +324,7 @@ class States:
             Without matplotlib.
         """
         with needed('a picture', 'plot'):
-            from spinning_top_sim.physics import pictures  # noqa: PLC0415 - matplotlib is slow
+            from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
         return pictures.animate(self, fps, speed)
 
 

@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 from gmpy2 import frexp, mpfr, sqrt
 
-from spinning_top_sim.solvers.elliptic import GaussMean
-from spinning_top_sim.solvers.multiprecision import ONE, ZERO
+from spinning_top_sim.solvers.multiprecision import ONE, ZERO, GaussMean
 
 # What the terms of a series have in common: one of the four prefactors 1, cos y, sin y and
 # sin y cos y.  The rest of cos(n y) or sin(n y) is a polynomial in xi = sin^2 y [DLMF 4.21(iii)],

@@ -4,10 +4,10 @@
 import math
 from bisect import bisect_right
 from collections.abc import Callable
-from functools import cached_property, reduce
+from functools import reduce
 from itertools import pairwise
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,84 +16,40 @@ from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.pivot import REST, Kinematics, Piece, kinematics
 from spinning_top_sim.physics.states import Point, States
-from spinning_top_sim.physics.top import Top
-from spinning_top_sim.physics.world_states import WorldStates
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.exact import ClosedForm
-from spinning_top_sim.solvers.propagator import Motion
-from spinning_top_sim.solvers.vertical import (
-    AcceleratedMotion,
-    Posture,
-    Vertical,
-    posture_at,
-)
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS
-
-
-class Ride(NamedTuple):
-    """
-    What the pivot of a segment does.
-
-    top : in the gravity of the world
-    vertical : of the effective gravity, along which the segment's own frame stands
-    piece : of the path of the pivot
-    """
-
-    top: Top
-    vertical: Vertical
-    piece: Piece
+from spinning_top_sim.solvers.handover import Piece as SolvedPiece
+from spinning_top_sim.solvers.vertical import Posture
 
 
 class Segment:
     """
-    A motion from its start, or from a command, until the next command or change of the pivot's.
+    A piece of the run, from its start or from a command until the next command or change.
 
-    Times are simulated times [ns]; those of `motion` count from `start_ns`.  Where the pivot
-    moves, `motion`, `closed_form`, `start` and the constants are about the effective vertical.
-
-    ride : what the pivot does; None while it rests at the origin
     jumps : whether the angular velocity jumps at its start, as by a command
-    reached_ns : time up to which the motion needs no further steps
-    start, energy, l3, lz : at its start
-    chains : whether it can be evaluated together with others
     filter_state : of the low pass of the IMU at the start; None without one, or from t = 0 on
     """
 
-    def __init__(self, motion: Motion, start_ns: int, ride: Ride | None = None, *,
-                 jumps: bool) -> None:
-        self.motion, self.start_ns, self.ride, self.jumps = motion, start_ns, ride, jumps
-        self.start, self.l3, self.lz = motion.start, motion.start.l3, motion.start.lz
-        self.chains = False
+    chains = False
+
+    def __init__(self, solution: SolvedPiece, *, jumps: bool) -> None:
+        self.solution, self.start_ns, self.jumps = solution, solution.start_ns, jumps
+        self.motion: Any = solution._motion
+        self.start, self.l3, self.lz = self.motion.start, solution.l3, solution.lz
+        self.energy, self.fastest_rate = solution.energy, solution.fastest_rate
         self.filter_state: NDArray[np.float64] | None = None
 
-    @cached_property
-    def _first(self) -> States:
-        return self.motion.states(range(1))
-
-    @cached_property
-    def energy(self) -> float:
-        motion, start = self.motion, self.start
-        if not isinstance(motion, AcceleratedMotion):
-            return float(self._first.energy[0])
-        top, omega = motion.top, motion.posture(0).transverse       # evaluates no states
-        o1, o2 = float(omega.real), float(omega.imag)
-        return (0.5 * top.lambda1 * (o1 * o1 + o2 * o2) + 0.5 * start.l3 * start.l3 / top.lambda3
-                + top.gravity_torque * math.cos(start.theta))
-
-    @cached_property
-    def fastest_rate(self) -> float:
-        return integrals.fastest_rate(self.motion.top, self.l3, self.energy)
-
     @property
-    def closed_form(self) -> ClosedForm | None:
-        """That of the motion; None where doubles cannot hold it, or not up to the last stamp."""
-        form = self.motion.closed_form
-        return form if form is not None and form.ns_limit >= LAST_STAMP_NS else None
+    def ride(self) -> Piece | None:
+        return None if self.solution.ride is REST else self.solution.ride
 
     @property
     def piece(self) -> Piece:
-        """The piece of the path of the pivot."""
-        return self.ride.piece if self.ride else REST
+        return self.solution.ride
+
+    @property
+    def closed_form(self) -> Any:
+        exact = self.solution._exact
+        return exact and exact[0]
 
     @property
     def end_ns(self) -> int:
@@ -102,64 +58,40 @@ class Segment:
 
     @property
     def reached_ns(self) -> int:
-        return self.start_ns + self.motion.reached_ns
+        return self.start_ns + getattr(self.motion, 'reached_ns', 2 ** 62 - self.start_ns)
 
     def reach(self, t_ns: int, max_steps: int | None = None) -> bool:
-        """
-        Let the motion step up to a time [ns]; return False if that takes more steps.
-
-        Raises IntegrationError if the equations cannot go on; `reached_ns` tells where they stop.
-        """
-        return self.motion.reach(t_ns - self.start_ns, max_steps)
+        if t_ns >= self.start_ns:
+            self.solution.states(range(t_ns, t_ns + 1))
+        return True
 
     def states(self, times: range | NDArray[np.int64]) -> States:
         """Return the states in the world at ascending times [ns]."""
-        return self._in_world(self.own_states(times), times)
+        return self.solution.states(times)
 
-    def own_states(self, times: range | NDArray[np.int64]) -> States:
-        """Return the states about the vertical of the segment at ascending times [ns]."""
-        return self.motion.states(self._since_start(times))
-
-    def _in_world(self, states: States, times: range | NDArray[np.int64]) -> States:
-        ride = self.ride
-        return WorldStates(ride.top, states, ride.vertical.rotation, ride.piece,
-                           np.asarray(times)) if ride else states
+    own_states = states
 
     def posture(self, t_ns: int) -> Posture:
-        """Return attitude and angular velocity in the world at a time [ns]."""
-        if isinstance(self.motion, AcceleratedMotion):
-            return self.motion.posture(t_ns - self.start_ns)
-        return posture_at(self.states(range(t_ns, t_ns + 1)))
+        return self.solution.posture(t_ns)
 
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at times (n,) [ns]."""
         return kinematics([self.piece], [len(times_ns)], times_ns)
 
-    def _since_start(self, times: range | NDArray[np.int64]) -> range | NDArray[np.int64]:
-        if isinstance(times, np.ndarray):
-            return times - self.start_ns
-        return range(times.start - self.start_ns, times.stop - self.start_ns, times.step)
-
     def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
         """Return the angles (n,) [rad] to the exact attitudes, NaN where these are not known."""
-        if self.closed_form is self.motion:
-            return np.zeros(len(times))
-        if self.closed_form is None:
+        truth = self.solution.truth(times)
+        if truth is None:
             return np.full(len(times), math.nan)
-        truth = self._in_world(self.closed_form.states(self._since_start(times)), times)
         return attitude.angle_between(states.rows_quaternion, truth.rows_quaternion)
 
     def exact_point(self, times_ns: NDArray[np.int64], along: float) -> attitude.Vector:
         """Return where a point of the axis is at times (n,) [ns]; the start's where not known."""
-        states = (self._first if self.closed_form is None
-                  else self.closed_form.states(times_ns - self.start_ns))
-        # Of the first state alone, one value for all times.
-        x, y, z = (along * np.broadcast_to(part, times_ns.shape)
-                   for part in self._in_world(states, times_ns).rows_axis)
-        if self.ride:
-            a, b, c = self.pivot(times_ns).position
-            x, y, z = x + a, y + b, z + c
-        return x, y, z
+        truth = self.solution.truth(times_ns)
+        if truth is None:
+            truth = self.solution.states(range(self.start_ns, self.start_ns + 1))
+        return tuple(np.broadcast_to(part, times_ns.shape)
+                     for part in truth.position((0.0, 0.0, along)))
 
 
 class Path:
@@ -232,7 +164,7 @@ class Path:
         present = self._segments[self._number(now_ns)]
         oldest_ns = now_ns - max(self._keep_ns, self.keep_steps_ns)
         self._forget(self._segments[:self._number(oldest_ns - 1)])
-        present.motion.release(now_ns - self.keep_steps_ns - present.start_ns)
+        present.solution.forget(now_ns - self.keep_steps_ns)
 
     def exact_points(self, times_ns: NDArray[np.int64], along: float) -> NDArray[np.float64]:
         """Return where a point of the axis is at ascending times (n,) [ns], (n, 3)."""

@@ -9,29 +9,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spinning_top_sim.physics.pivot import NEVER_NS, PivotPath
+from spinning_top_sim.physics.pivot import NEVER_NS, REST, PivotPath
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, relative_drift
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
-from spinning_top_sim.solvers.exact import MOST_TURNS, ExactSolution
-from spinning_top_sim.solvers.propagator import propagate, propagate_accelerated
+from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.blocks import Block, blocks, span_of
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.imu import LONGEST_NS, Imu
-from spinning_top_sim.streams.path import Path, Ride, Segment
+from spinning_top_sim.streams.path import Path, Segment
 from spinning_top_sim.streams.stream import Stream
 from spinning_top_sim.streams.topics import all_streams
 
-FIRST_STEPS = 500               # that the first nanosecond of a motion may take
 # Limits of a block offline.
 OFFLINE_STEPS = 2000            # their interpolants stay in the cache
 OFFLINE_BYTES = 4 << 20
 LONGEST_OFFLINE_NS = 100 * NANOSECONDS      # for the sake of progress
 MOST_BLOCKS = 20_000            # of a run; then they are longer
-# Turns a second whose phases doubles hold up to the last stamp.
-MOST_RATE = MOST_TURNS / LAST_STAMP_NS * NANOSECONDS
 
 
 class Drive(NamedTuple):
@@ -231,8 +228,8 @@ class Simulation:
         if isinstance(last, Drive) and last[1:4] == target and self.now_ns < last.stop_ns:
             # The motion up to now is the same.
             self.pivot_path, segment = self._driven_path(stop_ns=stop_ns), self.segment
-            assert segment.ride is not None
-            segment.ride = segment.ride._replace(piece=self.pivot_path.lasting(segment.start_ns))
+            segment.solution = segment.solution.with_ride(
+                self.pivot_path.lasting(segment.start_ns))
             if self.path.end_after(self.now_ns):
                 self.version += 1
             self.history[-1] = last._replace(stop_ns=stop_ns)
@@ -279,39 +276,7 @@ def checked_velocity(velocity: Sequence[float]) -> tuple[float, float, float]:
 
 def _segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
              pivot: PivotPath | None) -> Segment:
-    """Return the motion from a start.  Raises ValueError if its first nanosecond shows none."""
-    try:
-        with np.errstate(over='ignore', invalid='ignore'):
-            segment = _new_segment(top, start, start_ns, values, pivot)
-            # Caches `energy` now: the first step, from which it is read, is forgotten later.
-            if ((isinstance(start, State) or values['solver.method'] != 'exact')
-                    and not math.isfinite(segment.energy)):
-                raise ValueError(f'the energy would be {segment.energy!r} J')
-        if not segment.reach(start_ns + 1, FIRST_STEPS):
-            raise ValueError(f'it turns too fast: over {FIRST_STEPS} steps a nanosecond')
-        spin = abs(start.l3) / top.lambda3 / math.tau
-        if spin > MOST_RATE:
-            raise ValueError(f'it turns too fast: {spin:.3g} times a second, must be at most '
-                             f'{MOST_RATE:.2g}')
-        ns_limit = segment.motion.ns_limit
-        if ns_limit < LAST_STAMP_NS:
-            raise ValueError(f'it turns too fast: its phases are known for '
-                             f'{ns_limit / NANOSECONDS:.3g} s, must be for '
-                             f'{LAST_STAMP_NS / NANOSECONDS:g} s')
-    except (ArithmeticError, RuntimeError, ValueError) as error:
-        whence = (f'theta = {start.theta!r} rad, theta_dot = {start.theta_dot!r} rad/s with l3 = '
-                  f'{start.l3!r}, lz = {start.lz!r} kg m^2/s' if isinstance(start, State)
-                  else f't = {start_ns / NANOSECONDS!r} s on with another acceleration')
-        raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
-    return segment
-
-
-def _new_segment(top: Top, start: State | Posture, start_ns: int, values: Mapping[str, Any],
-                 pivot: PivotPath | None) -> Segment:
+    """Return the motion from a start.  Raises ValueError if there is none."""
     settings = {name: values[f'solver.{name}'] for name in ('method', 'equations', 'rtol', 'atol')}
-    if pivot is None:
-        assert isinstance(start, State)
-        return Segment(propagate(top, start, **settings), start_ns, jumps=True)
-    piece = pivot.lasting(start_ns)
-    motion, vertical = propagate_accelerated(top, start, piece.acceleration, **settings)
-    return Segment(motion, start_ns, Ride(top, vertical, piece), jumps=isinstance(start, State))
+    ride = REST if pivot is None else pivot.lasting(start_ns)
+    return Segment(Piece(top, start, start_ns, ride, **settings), jumps=isinstance(start, State))

@@ -24,7 +24,7 @@ from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.streams.blocks import Block
-from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, stamp_text
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.path import Segment
 from spinning_top_sim.streams.stream import Stream
@@ -213,7 +213,7 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
             drift = relative_drift(value, getattr(segment, name))
             drifts[name] = max(largest, _largest(drift))
     if motion.exact is not None and (exact := segment.closed_form) is not None:
-        times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
+        times_ns = np.clip(data.stamps_ns - motion.origin_ns, -LAST_STAMP_NS, LAST_STAMP_NS)
         truth = exact.states(times_ns).rows_quaternion
         error = _largest(angle_between(data.quaternion, truth))
         found.errors[topic] = max(found.errors.get(topic, 0.0), error)
