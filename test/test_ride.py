@@ -38,9 +38,8 @@ RIDE = PivotPath([]).lasting(0)
 
 def kinematics(path, times_ns):
     """Return position, velocity and acceleration (n, 3) of a pivot at times [ns]."""
-    pieces = [path.piece(int(t)) for t in times_ns]
-    found = pivot.kinematics(pieces, len(pieces) * [1], np.array(times_ns))
-    return Kinematics(*(part.T for part in found))
+    found = [pivot.kinematics(path.piece(int(t)), np.array([t])) for t in times_ns]
+    return Kinematics(*(np.hstack(rows).T for rows in zip(*found, strict=True)))
 
 
 def sample(segment, t_ns, point):

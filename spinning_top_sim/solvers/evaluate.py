@@ -16,6 +16,7 @@ import math
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from operator import sub
+from typing import NamedTuple
 
 import numpy as np
 from gmpy2 import const_pi, mpfr, rint
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number
 from spinning_top_sim.physics.pivot import NANOSECONDS
-from spinning_top_sim.solvers.constants import Factor, ThetaMotion
+from spinning_top_sim.solvers.constants import ThetaMotion
 from spinning_top_sim.solvers.multiprecision import double_double, precision
 from spinning_top_sim.solvers.theta_series import SIN_ODD
 
@@ -40,14 +41,7 @@ SPLITTER = 134217729.0
 np.empty(2 ** 22, np.uint8)
 
 
-def halves(x: Number) -> tuple[Number, Number]:
-    """Split doubles into two of 26 bits each; products of such halves are exact."""
-    big = SPLITTER * x
-    high = big - (big - x)
-    return high, x - high
-
-
-class Times:
+class Times(NamedTuple):
     """
     Times since the start of a motion, as sums of two doubles.
 
@@ -55,8 +49,9 @@ class Times:
     high, low : (n,) nearest doubles, and what they leave out, which may be one 0
     """
 
-    def __init__(self, per_second: int, high: Column, low: Column | float = 0.0) -> None:
-        self.per_second, self.high, self.low = per_second, high, low
+    per_second: int
+    high: Column
+    low: Column | float = 0.0
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
@@ -81,16 +76,18 @@ class Times:
 
     @property
     def seconds(self) -> Column:
-        if self.per_second == 1:
-            return self.high
         return self.high / self.per_second + self.low / self.per_second
 
-    def __len__(self) -> int:
-        return len(self.high)
+    def part(self, rows: slice) -> Times:
+        return self._replace(high=self.high[rows], low=self.low if isinstance(self.low, float)
+                             else self.low[rows])
 
-    def __getitem__(self, part: slice) -> Times:
-        low = self.low if isinstance(self.low, float) else self.low[part]
-        return Times(self.per_second, self.high[part], low)
+
+def halves(x: Number) -> tuple[Number, Number]:
+    """Split doubles into two of 26 bits each; products of such halves are exact."""
+    big = SPLITTER * x
+    high = big - (big - x)
+    return high, x - high
 
 
 class ThetaArrays:
@@ -129,8 +126,13 @@ class ThetaArrays:
             [float(scale * x) for x in one.polynomial(motion.size)]
             for row, factor in zip(rows, 2 * factors, strict=True)
             for one, scale in zip(row, factor.scales, strict=True)).reshape(-1, 4, 2)
-        _check_amplitude('alpha', motion.alpha)
-        _check_amplitude('beta', motion.beta)
+        for name, factor in (('alpha', motion.alpha), ('beta', motion.beta)):
+            size = min(abs(scale) * max(map(abs, real.weights)) for (real, _), scale in zip(
+                factor.parts, factor.scales, strict=True))
+            if 0 < size < LEAST_AMPLITUDE:
+                raise ValueError(
+                    f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
+                    f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
         self.on_line = [k for k, factor in enumerate(factors) if not factor.pole_rate]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
                       if SIN_ODD in pair}
@@ -362,15 +364,6 @@ class ThetaValues:
             cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
         return np.stack((self.theta_dot, self.across, cos[0] * cos[1] + sin[0] * sin[1],
                          sin[0] * cos[1] - cos[0] * sin[1]))
-
-
-def _check_amplitude(name: str, factor: Factor) -> None:
-    for (real, _), scale in zip(factor.parts, factor.scales, strict=True):
-        size = abs(scale) * max(map(abs, real.weights))
-        if 0 < size < LEAST_AMPLITUDE:
-            raise ValueError(
-                f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
-                f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
 
 
 def _reduced(turned: Matrix, turned_rest: Matrix,

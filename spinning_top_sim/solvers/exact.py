@@ -247,7 +247,7 @@ class _ExactStates(States):
     method = 'exact'
 
     def __init__(self, solution: ExactSolution, times: Times) -> None:
-        super().__init__(solution.top, solution.start, len(times))
+        super().__init__(solution.top, solution.start, len(times.high))
         self._solution, self._times = solution, times
 
     @cached_property
@@ -263,7 +263,7 @@ class _ExactStates(States):
     def _rows(self, name: str) -> NDArray[np.float64]:
         """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
         blocks = (self._block,) if len(self) <= TIMES_TOGETHER else (
-            ThetaValues(self._solution.arrays, self._times[first:first + TIMES_TOGETHER])
+            ThetaValues(self._solution.arrays, self._times.part(slice(first, first + TIMES_TOGETHER)))
             for first in range(0, len(self), TIMES_TOGETHER))
         rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
         return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import integrals, pivot
 from spinning_top_sim.physics.pivot import REST
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.states import States, WorldStates
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.physics.world_states import WorldStates
 from spinning_top_sim.solvers.dormand_prince import IntegrationError, SteppedMotion
 from spinning_top_sim.solvers.solve import (
     UNSUITED,

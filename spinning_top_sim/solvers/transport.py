@@ -258,31 +258,11 @@ class _TransportStates(States):
     @cached_property
     def _projected(self) -> Components:
         """The unknowns on the invariants, in the body's own frame."""
-        motion, y, pole_share = self._motion, self._stepped, POLE_SHARE
-        if not all(motion.momenta[:2]):     # the meridian of the axis is known
-            y, pole_share = self._on_lines(y, motion.uniform_rates[0] * self.t), 0.0
-        a, b, c, d, m_real, m_imag = motion.project(y, pole_share)
-        spin = 0.5 * motion.spin_rate * self.t
+        a, b, c, d, m_real, m_imag = self._motion.project(self._stepped, POLE_SHARE)
+        spin = 0.5 * self._motion.spin_rate * self.t
         cosine, sine = np.cos(spin), np.sin(spin)
         return (a * cosine - b * sine, b * cosine + a * sine,
                 c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
-
-    def _on_lines(self, y: Components, uniform: Column) -> Components:
-        """Return y with alpha or beta moved onto the line through zero, and m turned with them."""
-        moved = list(y[:4])
-        moduli, phases = self._motion.polar(y, uniform)
-        for k, part in enumerate((uniform, -uniform)):
-            if not self._motion.momenta[k]:
-                moved[2 * k] = moduli[k] * np.cos(phases[k] + part)
-                moved[2 * k + 1] = moduli[k] * np.sin(phases[k] + part)
-        x, z = half_axis(*y[:4])
-        u, v = half_axis(*moved)
-        # Next to the pole m is known better than the axis.
-        away = x * x + z * z > POLE_SHARE
-        scale = np.where(away, np.hypot(x, z) * np.hypot(u, v), 1.0)
-        cosine = np.where(away, (x * u + z * v) / scale, 1.0)
-        sine = np.where(away, (x * v - z * u) / scale, 0.0)
-        return *moved, y[4] * cosine - y[5] * sine, y[4] * sine + y[5] * cosine
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
@@ -315,11 +295,11 @@ class _TransportStates(States):
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        first, second, _ = attitude.rotated_back(self.rows_quaternion, (*self._momentum, self._lz))
+        first, second, _ = attitude.rotated_back(self.rows_quaternion, (*self._momentum, self.start.lz))
         return first / self.top.lambda1, second / self.top.lambda1
 
     @cached_property
     def l3(self) -> Column:
         x, y, z = self.rows_axis
         lx, ly = self._momentum
-        return lx * x + ly * y + self._lz * z
+        return lx * x + ly * y + self.start.lz * z

@@ -76,7 +76,7 @@ class Segment:
 
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at times (n,) [ns]."""
-        return kinematics([self.piece], [len(times_ns)], times_ns)
+        return kinematics(self.piece, times_ns)
 
     def orientation_error(self, states: States, times: range) -> NDArray[np.float64]:
         """Return the angles (n,) [rad] to the exact attitudes, NaN where these are not known."""
@@ -182,8 +182,8 @@ class Path:
     def pivot(self, times_ns: NDArray[np.int64]) -> Kinematics:
         """Return what the pivot does at ascending times (n,) [ns], those before now too."""
         found = self._times_of_segments(times_ns) or [(self._segments[-1], times_ns)]
-        return kinematics([segment.piece for segment, _ in found],
-                          [len(times) for _, times in found], times_ns)
+        return Kinematics(*(np.concatenate(rows, axis=1) for rows in zip(
+            *(kinematics(segment.piece, times) for segment, times in found), strict=True)))
 
     def increments(self, begin_ns: int, end_ns: int, point: Point, count: int = 1,
                    step_ns: int = 1) -> Increments:
