@@ -62,26 +62,24 @@ from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.multiprecision import (
     BITS,
+    COS_EVEN,
+    MOST_TERMS,
+    NOTHING,
     ONE,
+    SIN_ODD,
     ZERO,
     GaussMean,
+    Parts,
     Roots,
     RootsTooCloseError,
+    Series,
+    ThetaForm,
     argument,
     as_mpfr,
     atan2,
     cubic_roots,
     phase,
     precision,
-)
-from spinning_top_sim.solvers.theta_series import (
-    COS_EVEN,
-    MOST_TERMS,
-    NOTHING,
-    SIN_ODD,
-    Parts,
-    Series,
-    ThetaForm,
 )
 from spinning_top_sim.solvers.vertical import PreciseState
 

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import Column, Number
 from spinning_top_sim.physics.pivot import NANOSECONDS
 from spinning_top_sim.solvers.constants import ThetaMotion
-from spinning_top_sim.solvers.multiprecision import double_double, precision
-from spinning_top_sim.solvers.theta_series import SIN_ODD
+from spinning_top_sim.solvers.multiprecision import SIN_ODD, double_double, precision
 
 Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
@@ -260,13 +259,6 @@ class ThetaValues:
         for k in self._arrays.on_line:
             moduli[k] = self._real[k]
         return moduli
-
-    @cached_property
-    def half_theta(self) -> Matrix:
-        """Cosine and sine of theta/2, (2, n)."""
-        alpha, beta = self.moduli
-        scale: Column = 1.0 / np.sqrt(alpha * alpha + beta * beta)
-        return self.moduli * scale
 
     @cached_property
     def _rotations(self) -> tuple[Matrix, Matrix]:

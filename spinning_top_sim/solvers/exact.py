@@ -28,8 +28,7 @@ from spinning_top_sim.physics.states import TIMES_TOGETHER, States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set_up
 from spinning_top_sim.solvers.evaluate import ThetaArrays, ThetaValues, Times
-from spinning_top_sim.solvers.multiprecision import as_mpfr, phase, precision
-from spinning_top_sim.solvers.theta_series import SIN_ODD
+from spinning_top_sim.solvers.multiprecision import SIN_ODD, as_mpfr, phase, precision
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
@@ -170,13 +169,14 @@ class ExactSolution:
                 'phase of this motion reaches 2^52 turns')
         return _ExactStates(self, times)
 
-    def posture(self, t_ns: int) -> Posture:
+    def posture(self, t_ns: int, vertical: Vertical | None = None) -> Posture:
         """
         Return attitude and angular velocity at a time [ns], in multiprecision.
 
         They are right to 38 digits, times what the motion makes of such an error.
+
+        vertical : that of the motion, if it is not the world's
         """
-        sign = -1 if self.turns % 2 else 1
         with precision():
             start = self._precise_start
             found = start.posture(self.top)
@@ -190,30 +190,19 @@ class ExactSolution:
                                                    abs(alpha) ** 2)
                     transverse = -(momentum / as_mpfr(self.top.lambda1) + 1j * u_dot) / product
                 found = Posture(alpha, beta, transverse, found.l3)
-            return found._replace(alpha=sign * found.alpha, beta=sign * found.beta)
+            if self.turns % 2:
+                found = found._replace(alpha=-found.alpha, beta=-found.beta)
+            return vertical.to_world(found) if vertical else found
 
 
-class ExactPiece(ExactSolution):
-    """
-    The exact motion while the pivot accelerates uniformly, in the frame of `vertical`.
-
-    start : State or Posture
-        In the world.
-    acceleration : (3,)
-        Of the pivot in the world [m/s^2].
-    """
-
-    def __init__(self, top: Top, start: State | Posture, acceleration: Fractions) -> None:
-        with precision():
-            self._first = start if isinstance(start, Posture) else precise(start).posture(top)
-            self.vertical = vertical = Vertical.of(top, self._first, acceleration, mpfr)
-            precise_start = vertical.state_of(vertical.to_frame(self._first), mpfr)
-        super().__init__(vertical.top, precise_start, vertical.gravity)
-
-    def posture(self, t_ns: int) -> Posture:
-        """Return the posture in the world at a time [ns] since the start."""
-        with precision():
-            return self.vertical.to_world(super().posture(t_ns)) if t_ns else self._first
+def exact_about(top: Top, start: State | Posture,
+                acceleration: Fractions) -> tuple[ExactSolution, Vertical]:
+    """Return the motion while the pivot accelerates so [m/s^2], and the vertical it is about."""
+    with precision():
+        posture = start if isinstance(start, Posture) else precise(start).posture(top)
+        vertical = Vertical.of(top, posture, acceleration, mpfr)
+        state = vertical.state_of(vertical.to_frame(posture), mpfr)
+    return ExactSolution(vertical.top, state, vertical.gravity), vertical
 
 
 def _at(motion: ThetaMotion, t: mpfr) -> tuple[mpc, mpc, mpfr]:
@@ -263,8 +252,8 @@ class _ExactStates(States):
     def _rows(self, name: str) -> NDArray[np.float64]:
         """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
         blocks = (self._block,) if len(self) <= TIMES_TOGETHER else (
-            ThetaValues(self._solution.arrays, self._times.part(slice(first, first + TIMES_TOGETHER)))
-            for first in range(0, len(self), TIMES_TOGETHER))
+            ThetaValues(self._solution.arrays, self._times.part(slice(k, k + TIMES_TOGETHER)))
+            for k in range(0, len(self), TIMES_TOGETHER))
         rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
         return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
 
@@ -272,11 +261,6 @@ class _ExactStates(States):
     def rows_quaternion(self) -> Quaternion:
         x, y, z, w = self._rows('quaternion')
         return (-x, -y, -z, -w) if self._solution.turns % 2 else (x, y, z, w)
-
-    @cached_property
-    def half_angle_squares(self) -> tuple[Column, Column]:
-        cosine, sine = self._rows('half_theta')
-        return cosine * cosine, sine * sine
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:

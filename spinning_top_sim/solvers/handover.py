@@ -7,7 +7,7 @@ import math
 from contextlib import suppress
 from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,7 @@ from spinning_top_sim.physics.pivot import REST
 from spinning_top_sim.physics.states import States, WorldStates
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import IntegrationError, SteppedMotion
-from spinning_top_sim.solvers.solve import (
-    UNSUITED,
-    checked_tolerance,
-    motion_of,
-    stepped,
-    takes_steps,
-)
+from spinning_top_sim.solvers.solve import motion_of
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical, posture_at
 
 if TYPE_CHECKING:
@@ -78,8 +72,8 @@ class Piece:
         self.top, self.start_ns, self.ride, self._start = top, start_ns, ride, start
         try:
             with np.errstate(over='ignore', invalid='ignore'):
-                self._solution = self._begun(method, equations, rtol, atol)
-                self._motion = self._solution[0]
+                self._solution = self._begun(method, equations=equations, rtol=rtol, atol=atol)
+                self._motion, self._vertical = self._solution
                 self.l3, self.lz = self._motion.start.l3, self._motion.start.lz
                 self.energy = float(self._motion.states(range(1)).energy[0])
                 self.fastest_rate = integrals.fastest_rate(
@@ -91,31 +85,21 @@ class Piece:
             whence = start if isinstance(start, State) else f't = {start_ns * 1e-9!r} s on'
             raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
 
-    def _begun(self, method: str, equations: str, rtol: float, atol: float) -> Solution:
+    def _begun(self, method: str, **settings: Any) -> Solution:
         top, start = self.top, self._start
-        atol = checked_tolerance(method, equations, rtol, atol)
         if self.ride is REST and isinstance(start, State):
-            return motion_of(top, start, method=method, equations=equations, rtol=rtol,
-                             atol=atol), None
+            return motion_of(top, start, method=method, **settings), None
         if method == 'exact':
-            return self._exactly()
-        first = (PreciseState.of(start).posture(top) if isinstance(start, State)
-                 else start.in_doubles())
-        vertical = Vertical.of(top, first, self.ride.acceleration, float)
-        posture = vertical.to_frame(first)
+            from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
+
+            return exact_about(top, start, self.ride.acceleration)
+        posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
+                   else start.in_doubles())
+        vertical = Vertical.of(top, posture, self.ride.acceleration, float)
+        posture = vertical.to_frame(posture)
         state = vertical.state_of(posture, float).rounded()
-        if not takes_steps(vertical.top, state, equations):
-            with suppress(*UNSUITED):
-                return self._exactly()
-        return stepped(vertical.top, state, equations, rtol, atol, posture), vertical
-
-    def _exactly(self) -> Solution:
-        from spinning_top_sim.solvers.exact import ExactPiece, ExactSolution  # noqa: PLC0415 - gmpy2
-
-        if self.ride is REST and isinstance(self._start, State):
-            return ExactSolution(self.top, self._start), None
-        piece = ExactPiece(self.top, self._start, self.ride.acceleration)
-        return piece, piece.vertical
+        return motion_of(vertical.top, state, method=method, posture=posture,
+                         **settings), vertical
 
     @property
     def steps(self) -> int:
@@ -150,15 +134,15 @@ class Piece:
     def _exact(self) -> Solution | None:
         if not isinstance(self._motion, SteppedMotion):
             return self._solution
-        with suppress(*UNSUITED):
-            return self._exactly()
+        with suppress(ImportError, ValueError):
+            return self._begun('exact')
         return None
 
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time, for what follows."""
         if isinstance(self._motion, SteppedMotion):
             return posture_at(self.states(range(t_ns, t_ns + 1)))
-        return self._motion.posture(t_ns - self.start_ns)
+        return self._motion.posture(t_ns - self.start_ns, self._vertical)
 
     def forget(self, before_ns: int) -> None:
         """Forget the steps that only earlier times need."""

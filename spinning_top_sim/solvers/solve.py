@@ -23,62 +23,38 @@ if TYPE_CHECKING:
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
-# Why 'rk45' goes on without the closed form.
-UNSUITED = ValueError, ImportError
 # Doubles do not hold the products of larger numbers.
 LARGEST_NUMBER = 1e290
 
 
 def motion_of(top: Top, start: State, *, method: str, equations: str = 'transport',
-              rtol: float = 1e-11, atol: float | None = None) -> ExactSolution | SteppedMotion:
+              rtol: Any = 1e-11, atol: Any = None,
+              posture: Posture | None = None) -> ExactSolution | SteppedMotion:
     """
     Return the motion that begins at `start`; `solve` explains the settings.
+
+    Motions without torque or nutation take no steps: 'rk45' leaves them to the closed form, where
+    that can hold them and gmpy2 is installed.  The transport equations scale their unknowns to 1
+    and tolerate atol + rtol; the Euler equations tolerate atol + rtol |angle|.
+
+    posture : of `start` in the same frame, in doubles that know more of it
 
     Raises ValueError for a bad setting, or a motion that doubles cannot hold, and IntegrationError
     if the Euler equations cannot start.
     """
-    atol = checked_tolerance(method, equations, rtol, atol)
-    if method == 'exact' or not takes_steps(top, start, equations):
-        with suppress(*(() if method == 'exact' else UNSUITED)):
-            from spinning_top_sim.solvers.exact import ExactSolution  # noqa: PLC0415 - gmpy2
-
-            return ExactSolution(top, start)
-    return stepped(top, start, equations, rtol, atol)
-
-
-def checked_tolerance(method: str, equations: str, rtol: Any, atol: Any) -> float:
-    """Return `atol`, rtol/10 by default.  Raises ValueError for a setting that is not allowed."""
+    atol = 0.1 * rtol if atol is None and isinstance(rtol, float) else atol
     for name, value, allowed in (('method', method, METHODS), ('equations', equations, EQUATIONS)):
         if value not in allowed:
             raise ValueError(f'{name} = {value!r}: must be one of {", ".join(allowed)}')
     for name, value, least in (('rtol', rtol, 1e-14), ('atol', atol, 0.0)):
-        if name == 'atol' and value is None:
-            return 0.1 * float(rtol)
         if not (isinstance(value, int | float) and least <= value <= 1e-2):
             raise ValueError(f'{name} = {shown(value)}: must be in [{least:g}, 1e-2]')
-    return float(atol)
+    if method == 'exact' or (equations == 'transport' and (
+            top.gravity_torque == 0.0 or axis_rests(top, start))):
+        with suppress(*(() if method == 'exact' else (ImportError, ValueError))):
+            from spinning_top_sim.solvers.exact import ExactSolution  # noqa: PLC0415 - gmpy2
 
-
-def takes_steps(top: Top, start: State, equations: str) -> bool:
-    """
-    Return whether 'rk45' takes steps.
-
-    Motions without torque or nutation it leaves to the closed form, where that can hold them and
-    gmpy2 is installed.
-    """
-    return equations == 'euler' or not (top.gravity_torque == 0.0 or axis_rests(top, start))
-
-
-def stepped(top: Top, start: State, equations: str, rtol: float, atol: float,
-            posture: Posture | None = None) -> SteppedMotion:
-    """
-    Return the motion by steps; `motion_of` says what it raises.
-
-    The transport equations scale their unknowns to 1 and tolerate atol + rtol; the Euler equations
-    tolerate atol + rtol |angle|.
-
-    posture : of `start` in the same frame, in doubles that know more of it
-    """
+            return ExactSolution(top, start)
     try:
         with np.errstate(over='raise', divide='raise', invalid='raise'):
             motion: SteppedMotion = (

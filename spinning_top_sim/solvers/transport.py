@@ -295,7 +295,8 @@ class _TransportStates(States):
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        first, second, _ = attitude.rotated_back(self.rows_quaternion, (*self._momentum, self.start.lz))
+        momentum = *self._momentum, self.start.lz
+        first, second, _ = attitude.rotated_back(self.rows_quaternion, momentum)
         return first / self.top.lambda1, second / self.top.lambda1
 
     @cached_property
