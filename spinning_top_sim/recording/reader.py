@@ -6,64 +6,42 @@ The summary of a whole file leads to its messages; any other file is read from r
 """
 
 import contextlib
-import functools
 import itertools
 import os
 import zlib
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from io import BytesIO, FileIO
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mcap import records
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
-from mcap.records import (
-    Channel,
-    Chunk,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Message,
-    Metadata,
-    Schema,
-)
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording import records
+from spinning_top_sim.recording import decoding, rosbag2
+from spinning_top_sim.recording.decoding import CompleteReads, LogMessage, Messages
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.records import (
-    HEAD,
-    UNREADABLE,
-    CompleteReads,
-    LogMessage,
-    Messages,
-)
-from spinning_top_sim.recording.rosbag2 import (
-    BAG_METADATA,
-    Compression,
-    Qos,
-    compression_of,
-    qos_profiles,
-)
-from spinning_top_sim.recording.writer import INDEX_HEAD, record_bytes, time_span
+from spinning_top_sim.recording.writer import record_bytes, time_span
 
 MAX_BYTES = 256 << 20       # of one record or one uncompressed chunk in memory
 MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are read together
-MAGIC_SIZE, FOOTER_SIZE, DATA_END_SIZE = len(MCAP0_MAGIC), HEAD.size + 20, HEAD.size + 4
+RUN_BYTES = 1 << 20         # of messages outside of chunks that are read together, about
+MAGIC_SIZE = len(MCAP0_MAGIC)
+FOOTER_SIZE = 9 + 8 + 8 + 4
 INDEXES = b'', bytes([Opcode.MESSAGE_INDEX]), bytes([Opcode.DATA_END])
 FIRST_DATE = 10 ** 17       # [ns], in 1973
-RUN_BYTES = 1 << 20         # of messages outside of chunks that are read at a time
 UNPACK = {b'\x28\xb5\x2f\xfd': 'zstd -d {} -o {}', b'\x04\x22\x4d\x18': 'lz4 -d {} {}'}
 
-Found = tuple[McapRecord, int, int]     # a record, where it begins, and where it ends
+Found = tuple[records.McapRecord, int, int]     # a record, where it begins, and where it ends
 
 
 @dataclass(frozen=True)
@@ -75,7 +53,7 @@ class LogTopic:
     schema: str                 # the definition with its dependencies
     schema_encoding: str        # such as 'ros2msg'
     encoding: str               # of the messages, such as 'cdr'
-    qos: tuple[Qos, ...]        # offered profiles, each with the keys of `rosbag2.DEFAULT_QOS`
+    qos: tuple[rosbag2.Qos, ...]    # offered profiles, with the keys of `rosbag2.DEFAULT_QOS`
     metadata: Mapping[str, str]
     channel_id: int
 
@@ -84,11 +62,11 @@ class LogTopic:
 class Damage:
     """What is wrong with a log."""
 
-    torn: bool = False          # it does not end as an MCAP file ends
+    torn: bool                  # it does not end as an MCAP file ends
     lost_bytes: int = 0         # that cannot be read; indexes do not count
     reasons: list[str] = field(default_factory=list)
 
-    def lose(self, offset: int, end: int, reason: object) -> None:
+    def lose(self, offset: int, end: int, reason: str) -> None:
         self.lost_bytes += end - offset
         self.reasons.append(f'found: {end - offset} bytes at byte {offset}: {reason}')
 
@@ -99,9 +77,9 @@ class Damage:
 
 
 class Part(NamedTuple):
-    """A record, or adjacent messages outside of chunks, of which `record` is the last."""
+    """A record, or adjacent messages outside of chunks, the last of which is `record`."""
 
-    record: McapRecord
+    record: records.McapRecord
     messages: Messages
     offset: int
     end: int
@@ -140,7 +118,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         What its header says: such as 'ros2', and the program that wrote it.
     whole : bool
         Whether the file was closed and its summary, if any, is right; see also `damage`.
-    metadata : dict of dict
+    metadata : dict
         The metadata records by name; of several with one name, the last.
     schemas, channels : dict
         mcap's records by id.
@@ -155,20 +133,28 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
         self.path, self._max_bytes, self.left_out = _file_of(Path(path)), max_bytes, 0
-        self._small_bytes = 0       # of schemas, channels and metadata
         self.metadata: dict[str, dict[str, str]] = {}
+        self._small_bytes = 0       # of schemas, channels and metadata
         try:
             if self.path.exists() and not self.path.is_file():     # opening a pipe would block
                 raise LogError(f'cannot read {self.path}: it is no regular file')
             self._file = CompleteReads(FileIO(self.path))
         except OSError as error:
             raise LogError(f'cannot read {self.path}: {error.strerror}') from error
-        self.size = self._file.size
+        self.size = self._data_end = self._file.size
         try:
             header = self._read_header()
             self.profile, self.library = header.profile, header.library
-            self._problem = self._read_summary()
+            self._torn, self._summary, self._problem = True, Summary(), ''
+            try:
+                self._read_summary()
+            except decoding.UNREADABLE as error:
+                self._problem = f'found: the summary is not used: {str(error) or "damaged"}'
+                if self._torn:
+                    self._problem = 'found: the file does not end as an MCAP file ends'
             self.whole = not self._problem
+            self.schemas, self.channels = self._summary.schemas, self._summary.channels
+            self._damage: Damage | None = None
             self._places = self._find_places()
         except BaseException:
             self.close()
@@ -184,32 +170,34 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     @property
     def topics(self) -> tuple[LogTopic, ...]:
         """The channels of the log, in the order of their ids."""
-        none = Schema(id=0, data=b'', encoding='', name='')
+        none = records.Schema(id=0, data=b'', encoding='', name='')
         return tuple(LogTopic(
             name=channel.topic, type_name=schema.name,
             schema=schema.data.decode(errors='replace'), schema_encoding=schema.encoding,
-            encoding=channel.message_encoding, qos=qos_profiles(channel),
+            encoding=channel.message_encoding, qos=rosbag2.qos_profiles(channel),
             metadata=channel.metadata, channel_id=number)
             for number, channel in sorted(self.channels.items())
             for schema in [self.schemas.get(channel.schema_id, none)])
 
     @property
-    def compression(self) -> Compression:
+    def compression(self) -> rosbag2.Compression:
         """How rosbag2 has compressed the messages, by its record or the bag's metadata.yaml."""
-        text = self.metadata.get(BAG_METADATA, {}).get('serialized_metadata', '')
+        text = self.metadata.get(rosbag2.BAG_METADATA, {}).get('serialized_metadata', '')
         beside = self.path.with_name('metadata.yaml')
         if not text and beside.is_file():
             text = beside.read_text(errors='replace')
-        return compression_of(text)
+        return rosbag2.compression_of(text)
 
-    @functools.cached_property
+    @property
     def damage(self) -> Damage:
-        """What is wrong with the file; reads all of it."""
-        for _ in self.parts():
-            pass
+        """What is wrong with the file; reads all of it at the first use."""
+        if self._damage is None:
+            for _ in self.parts():
+                pass
+        assert self._damage is not None
         return self._damage
 
-    @functools.cached_property
+    @cached_property
     def span(self) -> tuple[int, int]:
         """
         The earliest and the latest log time [ns]; both 0 without messages.
@@ -247,33 +235,33 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         wanted = {number: channel.topic for number, channel in self.channels.items()
                   if names is None or channel.topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
-        compression = self.compression
-        # What is read and not yet passed: log time, place and offset there.
-        held: list[tuple[int, int, int, str, Messages]] = []
-        opened: list[tuple[int, int]] = []      # last log time and size of chunks
-        for place in [*sorted(self._places), Place(1 << 64, 1 << 64, 0, 0, frozenset())]:
-            passed = bisect_left(held, (place.start_ns,))
-            for time_ns, _, offset, topic, messages in held[:passed]:
+        mode, compression = self.compression
+        # What is read and not yet passed: log time, place and offset there
+        held: list[tuple[int, int, int, Messages]] = []
+        opened: list[tuple[int, int]] = []      # latest log time and size of chunks
+        for place in [*sorted(self._places), None]:
+            passed = len(held) if place is None else bisect_left(held, (place.start_ns,))
+            for time_ns, _, offset, messages in held[:passed]:
                 if time_ns in times:
-                    message = messages.message(topic, offset)
-                    yield message if compression.mode != 'MESSAGE' else self._decompressed(
-                        message, compression.format)
+                    message = messages.message(wanted, offset)
+                    yield message if mode != 'MESSAGE' else self._decompressed(
+                        message, compression)
             del held[:passed]
-            if (place.end_ns < times.start or place.start_ns >= times.stop
+            if (place is None or place.end_ns < times.start or place.start_ns >= times.stop
                     or place.channel_ids.isdisjoint(wanted)):
                 continue
             try:
                 messages = self._messages(place.offset, place.end)
-            except UNREADABLE:
+            except decoding.UNREADABLE:
                 self.left_out += 1
                 continue
             opened = [one for one in opened if one[0] >= place.start_ns]
-            opened.append((time_span(messages.entries)[1], len(messages.plain)))
+            opened.append((place.end_ns, len(messages.plain)))
             if sum(size for _, size in opened) > 2 * self._max_bytes:
                 raise LogError(f'cannot read {self.path}: chunks that overlap in time have more '
                                f'than {2 * self._max_bytes} bytes')
             for number in wanted.keys() & messages.entries.keys():
-                held += ((time_ns, place.offset, offset, wanted[number], messages)
+                held += ((time_ns, place.offset, offset, messages)
                          for time_ns, offset in messages.entries[number].tolist())
             held.sort()
 
@@ -287,7 +275,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def _decompressed(self, message: LogMessage, compression: str) -> LogMessage:
         try:
-            data = records.decompress(message.data, compression or 'unknown', self._max_bytes)
+            data = decoding.decompress(message.data, compression or 'unknown', self._max_bytes)
         except McapError as error:
             raise LogError(f'cannot read {self.path}: a message of {message.topic}: {error}'
                            ) from None
@@ -297,64 +285,65 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def parts(self) -> Iterator[Part]:
         """Yield what can be read, in file order; then `damage` tells what cannot."""
-        self._damage = Damage(self._torn, reasons=[self._problem] * (not self.whole))
-        self._small_bytes, self._index_bytes = 0, DATA_END_SIZE
+        damage = Damage(self._torn, reasons=[self._problem] * (not self.whole))
+        self._small_bytes = 0
         for is_run, found in itertools.groupby(
-                self._records(), lambda one: isinstance(one[0], Message)):
+                self._records(damage), lambda one: isinstance(one[0], records.Message)):
             for record, offset, end in _runs(found) if is_run else found:
                 try:
-                    messages = (self._messages(offset, end) if is_run or isinstance(record, Chunk)
+                    messages = (self._messages(offset, end)
+                                if is_run or isinstance(record, records.Chunk)
                                 else Messages(b'', {}, [record]))
                     self._declare(messages)
-                    if messages.entries:
-                        self._index_bytes = sum(INDEX_HEAD.size + numbers.nbytes
-                                                for numbers in messages.entries.values())
                     yield Part(record, messages, offset, end)
-                except UNREADABLE as error:
-                    self._damage.lose(offset, end, error)
+                except decoding.UNREADABLE as error:
+                    damage.lose(offset, end, str(error))
+        self._damage = damage
 
-    def _records(self) -> Iterator[Found]:
-        """Yield the records up to the first that cannot be read, and where they begin and end."""
-        end = MAGIC_SIZE
+    def _records(self, damage: Damage) -> Iterator[Found]:
+        """Yield the records up to the first that cannot be read."""
         self._file.seek(0)
         stream = StreamReader(self._file, emit_chunks=True, validate_crcs=True,
                               record_size_limit=self._max_bytes)
+        end, index_bytes = MAGIC_SIZE, 0
         try:
             for record in stream.records:
                 offset, end = end, self._file.tell()
-                if isinstance(record, DataEnd):
+                if isinstance(record, records.DataEnd):
                     return
+                if isinstance(record, records.Chunk):
+                    index_bytes = record.uncompressed_size      # at most
                 yield record, offset, end
                 self._file.seek(end)
         except CRCValidationError:
-            self._damage.reasons.append('found: the checksum of the data section is wrong')
-        except UNREADABLE as error:
-            # Nothing is lost by a truncated index of the last chunk, or a data end.
-            if not self._torn or self.size - end > self._index_bytes or self._file.at(
+            damage.reasons.append('found: the checksum of the data section is wrong')
+        except decoding.UNREADABLE as error:
+            # Nothing is lost by a truncated index of the last chunk.
+            if not self._torn or self.size - end > index_bytes or self._file.at(
                     end, min(end + 1, self.size)) not in INDEXES:
-                self._damage.lose(end, self._data_end, str(error) or 'no whole record')
+                damage.lose(end, self._data_end, str(error) or 'no whole record')
 
     def is_declared(self, channel_id: int) -> bool:
         """Return whether a channel and its schema, if it has one, are known."""
         channel = self.channels.get(channel_id)
-        return channel is not None and (channel.schema_id == 0
-                                        or channel.schema_id in self.schemas)
+        return channel is not None and channel.schema_id in {0, *self.schemas}
 
     def _declare(self, messages: Messages) -> None:
         """Note schemas, channels and metadata.  Raises McapError if messages lack a channel."""
         for record in messages.declared:
-            if isinstance(record, Schema | Channel | Metadata):
-                self._small_bytes += len(record_bytes(record))
-                if self._small_bytes > records.MAX_SMALL:
-                    raise McapError(f'schemas, channels and metadata have more than '
-                                    f'{records.MAX_SMALL} bytes')
-            if isinstance(record, Metadata):
+            known: Any
+            if isinstance(record, records.Metadata):
                 self.metadata[record.name] = record.metadata
-            elif isinstance(record, Schema | Channel):
-                known: dict[int, Any] = (
-                    self.schemas if isinstance(record, Schema) else self.channels)
+            elif isinstance(record, records.Schema | records.Channel):
+                known = self.schemas if isinstance(record, records.Schema) else self.channels
                 if known.setdefault(record.id, record) != record:
                     raise McapError(f'it changes {type(record).__name__.lower()} {record.id}')
+            else:
+                continue
+            self._small_bytes += len(record_bytes(record))
+            if self._small_bytes > decoding.MAX_SMALL:
+                raise McapError(f'more than {decoding.MAX_SMALL} bytes of schemas, channels and '
+                                'metadata are not read')
         if not all(map(self.is_declared, messages.entries)):
             raise McapError('no whole record declares a channel of its messages')
 
@@ -363,8 +352,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         raw = self._file.at(offset, min(end, offset + self._max_bytes))
         record = next(StreamReader(CompleteReads(BytesIO(raw)), skip_magic=True,
                                    emit_chunks=True).records)
-        return (records.open_chunk(record, self._max_bytes) if isinstance(record, Chunk)
-                else records.find_messages(raw))
+        return (decoding.open_chunk(record, self._max_bytes)
+                if isinstance(record, records.Chunk) else decoding.find_messages(raw))
 
     def _find_places(self) -> list[Place]:
         summary = self._summary
@@ -373,21 +362,21 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 for one in summary.chunk_indexes):
             return [Place(*time_span(entries), part.offset, part.end, frozenset(entries))
                     for part in self.parts() if (entries := part.messages.entries)]
-        with contextlib.suppress(*UNREADABLE):
+        with contextlib.suppress(*decoding.UNREADABLE):
             for one in summary.metadata_indexes:
-                self._declare(Messages(b'', {}, records.parse_all(
+                self._declare(Messages(b'', {}, decoding.parse_all(
                     self._file.at(one.offset, one.offset + one.length))))
         return [Place(one.message_start_time, one.message_end_time, one.chunk_start_offset,
                       one.chunk_start_offset + one.chunk_length,
                       frozenset(one.message_index_offsets)) for one in summary.chunk_indexes]
 
-    def _read_header(self) -> Header:
+    def _read_header(self) -> records.Header:
         """Return the header.  Raises LogError for no MCAP file."""
         magic, reason = self._file.read(min(MAGIC_SIZE, self.size)), 'it is no MCAP file'
         if magic == MCAP0_MAGIC:
-            with contextlib.suppress(*UNREADABLE):
+            with contextlib.suppress(*decoding.UNREADABLE):
                 header = next(StreamReader(self._file, skip_magic=True).records)
-                if isinstance(header, Header):
+                if isinstance(header, records.Header):
                     return header
             reason = 'its header is damaged'
         elif not magic:
@@ -397,32 +386,20 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 self.path, self.path.with_suffix(''))
         raise LogError(f'cannot read {self.path}: {reason}')
 
-    def _read_summary(self) -> str:
-        """Read the summary, if there is one; return what is wrong with the end of the file."""
-        self._torn, self._summary, self._data_end = True, Summary(), self.size
-        self.schemas, self.channels = self._summary.schemas, self._summary.channels
-        place = self.size - MAGIC_SIZE - FOOTER_SIZE
-        try:
-            end = CompleteReads(BytesIO(self._file.at(place, self.size)))
-            footer = next(StreamReader(end, skip_magic=True).records)
-            if end.read(MAGIC_SIZE) != MCAP0_MAGIC or not isinstance(footer, Footer):
-                raise EndOfFile
-        except UNREADABLE:
-            return 'found: the file does not end as an MCAP file ends'
-        self._torn, start = False, footer.summary_start or place
-        try:
-            section = self._file.at(start, self.size)
-            if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
-                raise McapError('its checksum is wrong')
-            if len(section) <= records.MAX_SMALL:       # else it is read from record to record
-                self._summary = NonSeekingReader(
-                    CompleteReads(BytesIO(MCAP0_MAGIC + section))).get_summary() or Summary()
-                self.schemas, self.channels = self._summary.schemas, self._summary.channels
-        except UNREADABLE as error:
-            self._summary = Summary()
-            return f'found: the summary is not used: {error or "it is damaged"}'
+    def _read_summary(self) -> None:
+        """Read the summary, if there is one.  UNREADABLE if it is damaged or the file is torn."""
+        footer_at = self.size - MAGIC_SIZE - FOOTER_SIZE
+        footer, = decoding.parse_all(self._file.at(footer_at, self.size - MAGIC_SIZE))
+        if self._file.read(MAGIC_SIZE) != MCAP0_MAGIC or not isinstance(footer, records.Footer):
+            raise EndOfFile
+        self._torn, start = False, footer.summary_start or footer_at
+        section = self._file.at(start, self.size)
+        if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
+            raise McapError('its checksum is wrong')
         self._data_end = start
-        return ''
+        if len(section) <= decoding.MAX_SMALL:      # else it is read from record to record
+            self._summary = NonSeekingReader(
+                CompleteReads(BytesIO(MCAP0_MAGIC + section))).get_summary() or Summary()
 
 
 def _runs(messages: Iterator[Found]) -> Iterator[Found]:

@@ -40,7 +40,7 @@ def _run(arguments: argparse.Namespace) -> int:
         log = reader.path
         output: Path = arguments.output or log.parent / f'{log.stem}_recovered.mcap'
         recovered = recover(reader, output, show)
-    damage = reader.damage
+        damage = reader.damage
     for line in damage.lines():
         cli.print_line(line)
     kept = 'kept' if damage.lost_bytes else 'kept all'

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
+from spinning_top_sim.recording.decoding import LogMessage
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import Damage, LogReader
-from spinning_top_sim.recording.records import LogMessage
 from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.streams.imu import Imu

@@ -9,6 +9,7 @@ read is complete, and sizes have limits.
 import struct
 import zlib
 from array import array
+from collections.abc import Mapping
 from io import SEEK_END, BufferedReader, BytesIO, FileIO
 from typing import BinaryIO, NamedTuple
 
@@ -51,11 +52,11 @@ class Messages(NamedTuple):
     entries: dict[int, NDArray[np.uint64]]
     declared: list[McapRecord]              # schemas and channels
 
-    def message(self, topic: str, offset: int) -> LogMessage:
-        """Return the message at a place."""
+    def message(self, topics: Mapping[int, str], offset: int) -> LogMessage:
+        """Return the message at a place; `topics` are names by channel id."""
         _, length, channel_id, sequence, log_time, publish_time = MESSAGE.unpack_from(
             self.plain, offset)
-        return LogMessage(topic, log_time, publish_time, sequence,
+        return LogMessage(topics[channel_id], log_time, publish_time, sequence,
                           self.plain[offset + MESSAGE.size:offset + HEAD.size + length],
                           channel_id)
 
@@ -129,8 +130,9 @@ def parse_all(raw: bytes) -> list[McapRecord]:
     """Return records that follow one another.  UNREADABLE, also if they are too large."""
     if len(raw) > MAX_SMALL:
         raise McapError(f'schemas, channels and metadata of {len(raw)} bytes are not read')
-    stream, found = CompleteReads(BytesIO(raw)), []
-    records = StreamReader(stream, skip_magic=True).records
+    stream = CompleteReads(BytesIO(raw))
+    records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
+    found = []
     while stream.tell() < len(raw):
         found.append(next(records))
     return found
