@@ -107,8 +107,8 @@ def open_chunk(chunk: Chunk, max_bytes: int) -> Messages:
 def find_messages(plain: bytes) -> Messages:
     """Return the messages and declarations in records that follow one another; UNREADABLE."""
     entries: dict[int, array[int]] = {}     # millions of tiny messages fit into a chunk
-    declared = bytearray()
-    offset = 0
+    declared: list[McapRecord] = []
+    declared_bytes = offset = 0
     while offset < len(plain):
         opcode, length = HEAD.unpack_from(plain, offset)
         end = offset + HEAD.size + length
@@ -120,22 +120,22 @@ def find_messages(plain: bytes) -> Messages:
                 entries[channel_id] = array('Q')
             entries[channel_id].extend((log_time, offset))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            declared += plain[offset:end]
+            declared_bytes += length
+            if declared_bytes > MAX_SMALL:
+                raise McapError('its schemas and channels are too large')
+            declared.append(parse(plain[offset:end]))
         offset = end
     return Messages(plain, {number: np.frombuffer(numbers, np.uint64).reshape(-1, 2)
-                            for number, numbers in entries.items()}, parse_all(bytes(declared)))
+                            for number, numbers in entries.items()}, declared)
 
 
-def parse_all(raw: bytes) -> list[McapRecord]:
-    """Return records that follow one another.  UNREADABLE, also if they are too large."""
-    if len(raw) > MAX_SMALL:
-        raise McapError(f'schemas, channels and metadata of {len(raw)} bytes are not read')
+def parse(raw: bytes) -> McapRecord:
+    """Return a record of a known kind from all of its bytes; UNREADABLE."""
     stream = CompleteReads(BytesIO(raw))
-    records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
-    found = []
-    while stream.tell() < len(raw):
-        found.append(next(records))
-    return found
+    record = next(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
+    if stream.tell() != len(raw):
+        raise McapError('a length in it is wrong')
+    return record
 
 
 def decompress(data: bytes, compression: str, most: int) -> bytes:

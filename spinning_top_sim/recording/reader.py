@@ -19,15 +19,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcap import records
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
-from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import decoding, rosbag2
-from spinning_top_sim.recording.decoding import CompleteReads, LogMessage, Messages
+from spinning_top_sim.recording.decoding import HEAD, CompleteReads, LogMessage, Messages
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.writer import record_bytes, time_span
 
@@ -36,8 +35,7 @@ MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are read together
 RUN_BYTES = 1 << 20         # of messages outside of chunks that are read together, about
 MAGIC_SIZE = len(MCAP0_MAGIC)
-FOOTER_SIZE = 9 + 8 + 8 + 4
-INDEXES = b'', bytes([Opcode.MESSAGE_INDEX]), bytes([Opcode.DATA_END])
+FOOTER_SIZE = HEAD.size + 8 + 8 + 4
 FIRST_DATE = 10 ** 17       # [ns], in 1973
 UNPACK = {b'\x28\xb5\x2f\xfd': 'zstd -d {} -o {}', b'\x04\x22\x4d\x18': 'lz4 -d {} {}'}
 
@@ -149,7 +147,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             try:
                 self._read_summary()
             except decoding.UNREADABLE as error:
-                self._problem = f'found: the summary is not used: {str(error) or "damaged"}'
+                self._problem = f'found: the summary is not used: {error}'
                 if self._torn:
                     self._problem = 'found: the file does not end as an MCAP file ends'
             self.whole = not self._problem
@@ -301,27 +299,51 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self._damage = damage
 
     def _records(self, damage: Damage) -> Iterator[Found]:
-        """Yield the records up to the first that cannot be read."""
-        self._file.seek(0)
-        stream = StreamReader(self._file, emit_chunks=True, validate_crcs=True,
-                              record_size_limit=self._max_bytes)
-        end, index_bytes = MAGIC_SIZE, 0
-        try:
-            for record in stream.records:
-                offset, end = end, self._file.tell()
-                if isinstance(record, records.DataEnd):
-                    return
-                if isinstance(record, records.Chunk):
-                    index_bytes = record.uncompressed_size      # at most
-                yield record, offset, end
-                self._file.seek(end)
-        except CRCValidationError:
+        """Yield the records of the data section, but for indexes, up to one that has no end."""
+        offset, index_bytes = MAGIC_SIZE, 0
+        while offset < self._data_end:
+            opcode, end = self._head(offset)
+            if opcode == 0 or end > self._data_end:
+                # Nothing is lost by a truncated index of the last chunk.
+                if not self._torn or opcode not in (Opcode.MESSAGE_INDEX, Opcode.DATA_END) or (
+                        self.size - offset > index_bytes):
+                    damage.lose(offset, self._data_end, 'no whole record')
+                return
+            # Opcodes that are unknown belong to an application.
+            if opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE_INDEX:
+                try:
+                    record = decoding.parse(self._raw(offset, end))
+                except decoding.UNREADABLE as error:
+                    damage.lose(offset, end, str(error))
+                else:
+                    if isinstance(record, records.DataEnd):
+                        self._check_data(offset, record.data_section_crc, damage)
+                        return
+                    if isinstance(record, records.Chunk):
+                        index_bytes = record.uncompressed_size      # at most
+                    yield record, offset, end
+            offset = end
+        if not self._torn:
+            damage.reasons.append('found: the data section has no end')
+
+    def _head(self, offset: int) -> tuple[int, int]:
+        """Return opcode and end of the record there; a head that is not whole has no end."""
+        head = self._file.at(offset, min(offset + HEAD.size, self.size))
+        opcode, length = HEAD.unpack(head.ljust(HEAD.size, b'\xff'))
+        return opcode, offset + HEAD.size + length
+
+    def _raw(self, offset: int, end: int) -> bytes:
+        if end - offset > self._max_bytes:
+            raise McapError(f'more than {self._max_bytes} bytes are not read')
+        return self._file.at(offset, end)
+
+    def _check_data(self, end: int, expected: int, damage: Damage) -> None:
+        """Compare the checksum of the data section, if there is one."""
+        crc = 0
+        for begin in range(0, end if expected else 0, RUN_BYTES):
+            crc = zlib.crc32(self._file.at(begin, min(begin + RUN_BYTES, end)), crc)
+        if crc != expected:
             damage.reasons.append('found: the checksum of the data section is wrong')
-        except decoding.UNREADABLE as error:
-            # Nothing is lost by a truncated index of the last chunk.
-            if not self._torn or self.size - end > index_bytes or self._file.at(
-                    end, min(end + 1, self.size)) not in INDEXES:
-                damage.lose(end, self._data_end, str(error) or 'no whole record')
 
     def is_declared(self, channel_id: int) -> bool:
         """Return whether a channel and its schema, if it has one, are known."""
@@ -349,11 +371,13 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def _messages(self, offset: int, end: int) -> Messages:
         """Return the messages of a chunk, or of what stands outside of chunks; UNREADABLE."""
-        raw = self._file.at(offset, min(end, offset + self._max_bytes))
-        record = next(StreamReader(CompleteReads(BytesIO(raw)), skip_magic=True,
-                                   emit_chunks=True).records)
-        return (decoding.open_chunk(record, self._max_bytes)
-                if isinstance(record, records.Chunk) else decoding.find_messages(raw))
+        raw = self._raw(offset, end)
+        if raw[:1] == bytes([Opcode.MESSAGE]):
+            return decoding.find_messages(raw)
+        chunk = decoding.parse(raw)
+        if not isinstance(chunk, records.Chunk):
+            raise McapError('it is no chunk')
+        return decoding.open_chunk(chunk, self._max_bytes)
 
     def _find_places(self) -> list[Place]:
         summary = self._summary
@@ -364,8 +388,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                     for part in self.parts() if (entries := part.messages.entries)]
         with contextlib.suppress(*decoding.UNREADABLE):
             for one in summary.metadata_indexes:
-                self._declare(Messages(b'', {}, decoding.parse_all(
-                    self._file.at(one.offset, one.offset + one.length))))
+                record = decoding.parse(self._raw(one.offset, one.offset + one.length))
+                self._declare(Messages(b'', {}, [record]))
         return [Place(one.message_start_time, one.message_end_time, one.chunk_start_offset,
                       one.chunk_start_offset + one.chunk_length,
                       frozenset(one.message_index_offsets)) for one in summary.chunk_indexes]
@@ -375,7 +399,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         magic, reason = self._file.read(min(MAGIC_SIZE, self.size)), 'it is no MCAP file'
         if magic == MCAP0_MAGIC:
             with contextlib.suppress(*decoding.UNREADABLE):
-                header = next(StreamReader(self._file, skip_magic=True).records)
+                header = decoding.parse(self._raw(MAGIC_SIZE, self._head(MAGIC_SIZE)[1]))
                 if isinstance(header, records.Header):
                     return header
             reason = 'its header is damaged'
@@ -389,9 +413,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def _read_summary(self) -> None:
         """Read the summary, if there is one.  UNREADABLE if it is damaged or the file is torn."""
         footer_at = self.size - MAGIC_SIZE - FOOTER_SIZE
-        footer, = decoding.parse_all(self._file.at(footer_at, self.size - MAGIC_SIZE))
+        footer = decoding.parse(self._file.at(footer_at, self.size - MAGIC_SIZE))
         if self._file.read(MAGIC_SIZE) != MCAP0_MAGIC or not isinstance(footer, records.Footer):
-            raise EndOfFile
+            raise McapError
         self._torn, start = False, footer.summary_start or footer_at
         section = self._file.at(start, self.size)
         if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
