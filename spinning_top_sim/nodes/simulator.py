@@ -20,7 +20,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import ros_parameters
-from spinning_top_sim.nodes.executable import wait_for_all_acked
+from spinning_top_sim.nodes.endpoints import wait_for_all_acked
 from spinning_top_sim.nodes.node_status import NodeStatus
 from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
 from spinning_top_sim.nodes.publishers import StreamPublishers
