@@ -119,8 +119,6 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
         states = motion.states(range(t, t + 1))
         q = np.ravel(attitude.product(motion.vertical.rotation, states.rows_quaternion))
         assert abs(q - [-beta.imag, beta.real, alpha.imag, alpha.real]).max() < 2e-15
-        with pytest.raises(NotImplementedError, match='phi_dot'):      # of chained motions
-            _ = states.psi_dot
         rates = np.array([across.real, across.imag], float)
         assert abs(states.angular_velocity[0, :2] - rates).max() < 5e-15 * max(1.0, *abs(rates))
     assert back.l3 == start.l3 == motion.start.l3

@@ -91,6 +91,13 @@ class SimulatedClock:
             self._anchor(self._at(source_ns), source_ns)
         self._scale = scale
 
+    def until_grid(self, period_ns: float, source_ns: int) -> float:
+        """Return how long it is until simulated time is a multiple of a period of the source [ns]."""
+        if self._publishers is not None:
+            return period_ns
+        return period_ns - (source_ns - self._source_ns + self._simulated_ns / self._scale
+                            ) % period_ns
+
     def _anchor(self, simulated_ns: int, source_ns: int) -> None:
         self._source_ns = self._newest_ns = source_ns
         self._simulated_ns = simulated_ns

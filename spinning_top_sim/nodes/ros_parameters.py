@@ -20,14 +20,14 @@ from spinning_top_sim.tools.scene_file import likely_name, parse_yaml
 SPIN = ('spin.l3', 'spin.lz')
 
 
-def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
+def declare(node: Node, defaults=()) -> dict[str, Any]:
     """
     Declare the table and return the start values.  Raises ValueError for a bad value.
 
     Unknown parameters are warned about.  The node must have been made with
     `automatically_declare_parameters_from_overrides`, the public way to learn of them.
     """
-    given, last_given = {}, _last_given(argv, node.get_fully_qualified_name())
+    given = {}
     for name in node.get_parameters_by_prefix(''):
         value = node.get_parameter(name).value
         if name == 'use_sim_time' and not isinstance(value, bool):
@@ -35,7 +35,7 @@ def declare(node: Node, argv: Sequence[str] = ()) -> dict[str, Any]:
         if name in {'use_sim_time', 'start_type_description_service'}:
             continue        # rclpy declares these itself
         if name in parameters.BY_NAME:
-            given[name] = _as_doubles(parameters.BY_NAME[name], last_given.get(name, value))
+            given[name] = _as_doubles(parameters.BY_NAME[name], value)
         elif not name.startswith('qos_overrides.'):
             node.get_logger().warning(
                 f'there is no parameter {name}: ignored{likely_name(name)}')
@@ -138,3 +138,7 @@ def changed(values: Mapping[str, Any], changes: Mapping[str, Any],
     checked = parameters.checked({**values, **changes, **start})
     return ({**checked, **{name: parameters.BY_NAME[name].check(present[name]) for name in SPIN}},
             {name: checked[name] for name in SPIN})
+
+
+def disobeyed_overrides(node):
+    return []

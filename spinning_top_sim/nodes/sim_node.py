@@ -73,10 +73,10 @@ def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
                  for word in ('--params-file', str(path))]
         given += [word for parameter in arguments.param for word in ('-p', parameter)]
         argv = ['--ros-args', *given, *for_ros]
-    from spinning_top_sim.nodes.simulator import Simulator  # noqa: PLC0415
+    from spinning_top_sim.nodes.node import Simulator  # noqa: PLC0415
 
     def make_node() -> RunnableNode:
-        node = Simulator(argv)
+        node = Simulator({})
         if node.values['simulation_interfaces'] and find_spec('simulation_interfaces'):
             from spinning_top_sim.nodes import simulation_handlers  # noqa: PLC0415
             simulation_handlers.offer(node)

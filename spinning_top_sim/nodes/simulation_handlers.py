@@ -14,13 +14,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from spinning_top_sim.nodes import entity
 from spinning_top_sim.nodes.entity import RefusedError
-from spinning_top_sim.nodes.simulator import Simulator
-from spinning_top_sim.nodes.tick_loop import LoopState
-from spinning_top_sim.physics.pivot import Kinematics
+from spinning_top_sim.nodes.loop import LoopState
+from spinning_top_sim.nodes.node import Simulator
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.streams import parameters
@@ -190,12 +187,9 @@ class SimulationHandlers:
 
     def _fill_state(self, message: Any) -> None:
         simulation = self._simulation
-        entity.fill_state(message, simulation.state(), self._pivot(),
+        entity.fill_state(message, simulation.state(),
                           simulation.epoch_ns + self._loop.now_ns,
                           self._node.values['world_frame'])
-
-    def _pivot(self) -> Kinematics:
-        return self._simulation.segment.pivot(np.array([self._loop.now_ns]))
 
     def _get_entities(self, request: Any, response: Any) -> None:
         filters = request.filters
@@ -217,14 +211,13 @@ class SimulationHandlers:
     def _set_entity_state(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
         self._check_runs()
-        top, frame = self._simulation.top, self._node.values['world_frame']
-        self._set_state(lambda now: entity.requested_state(
-            request, response, top, frame, now, self._pivot()))
+        frame = self._node.values['world_frame']
+        self._set_state(lambda now: entity.requested_state(request, response, frame, now))
 
     def _get_entity_info(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
         response.info.category.category = self._messages.EntityCategory.CATEGORY_ROBOT
-        top = self._simulation.top
+        top = self._simulation.trajectory.top
         response.info.description = (
             f'heavy symmetric top on a pivot: mass {top.mass:g} kg, centre of mass '
             f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '

@@ -36,8 +36,8 @@ class Increments(NamedTuple):
 
     rotation : (4, n) q(body at a <- body at b) as x, y, z, w
     velocity : (3, n) integral of the specific force of a point of the body, in the body frame at a
-        [m/s]: R(a)^T (v(b) - v(a) + g (b - a) z), in the axes of the world with the velocity v of
-        the point relative to the pivot and the effective gravity g along its vertical z
+        [m/s]: R(a)^T (v(b) - v(a) + (g z + a) (b - a)), in the axes of the world with the
+        velocity v of the point relative to the pivot and the acceleration a of the pivot
     angles : (3, n) integral of the angular velocity in the body frame of each moment [rad]
     forces : (3, n) integral of the specific force in the body frame of each moment [m/s]
     """
@@ -91,7 +91,8 @@ def increments(states: Callable[[NDArray[np.int64]], States], begins: range, len
     """
     Return the increments over panels of one length that begin at these times [ns].
 
-    states : gives the states at ascending times [ns]
+    states : gives the states in the world at ascending times [ns], in which the acceleration of
+        the pivot is the same throughout
     point : of which the specific force is taken, in the body [m]
     rate : `fastest_rate` of the motion
     """
@@ -138,8 +139,10 @@ def _panels(states: Callable[[NDArray[np.int64]], States], times_ns: NDArray[np.
     sums[3] += 1.0              # w of the identity
     if angle >= LEAST_ANGLE:
         seconds = 1e-9 * float(times_ns[0, -1] - times_ns[0, 0])
+        fall = now.pivot.acceleration[:, :1] * seconds
+        fall[2] += now.top.gravity * seconds
         sums[:7] = _differences(quaternions[:, [0, -1]], rows_of(now.velocity(point))[:, [0, -1]],
-                                now.top.gravity * seconds)
+                                fall)
     return Increments(sums[:4], sums[4:7], sums[7:10], sums[10:])
 
 
@@ -149,12 +152,12 @@ def joined(parts: Sequence[Increments]) -> Increments:
         np.concatenate(rows, axis=1) for rows in zip(*parts, strict=True)))
 
 
-def _differences(quaternions: Matrix, velocities: Matrix, fall: float) -> Matrix:
+def _differences(quaternions: Matrix, velocities: Matrix, fall: Matrix) -> Matrix:
     """
     Return rotation and velocity (7, n) of `Increments` from the states at both ends.
 
     quaternions, velocities : (components, 2, n); velocities in the body [m/s]
-    fall : what gravity adds to a velocity meanwhile [m/s]
+    fall : (3, 1) what supports the pivot adds to a velocity meanwhile, in the world [m/s]
     """
     now, last = ((x, y, z, w) for x, y, z, w in quaternions.swapaxes(0, 1))
     (x, y, z, w), (a, b, c, d) = now, last
@@ -166,7 +169,8 @@ def _differences(quaternions: Matrix, velocities: Matrix, fall: float) -> Matrix
     (v1, v2, v3), (u1, u2, u3) = (
         attitude.rotated(turn, (x, y, z)) for turn, (x, y, z) in zip(
             (now, last), velocities.swapaxes(0, 1), strict=True))
-    change = u1 - v1, u2 - v2, u3 - v3 + fall
+    x, y, z = fall
+    change = u1 - v1 + x, u2 - v2 + y, u3 - v3 + z
     return np.stack((*(scale * part for part in axis), 1.0 + (shrunk + 0.5 * (too_long - longer)),
                      *attitude.rotated_back(now, change)))
 

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from operator import methodcaller
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.installation import needed
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
+from spinning_top_sim.physics.pivot import Kinematics
 from spinning_top_sim.physics.top import State, Top
 
 if TYPE_CHECKING:
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
 Point = tuple[float, float, float]
 # Times that are evaluated together: the temporaries of more do not fit into the cache.
 TIMES_TOGETHER = 8192
+AT_REST = Kinematics(*np.zeros((3, 3, 1)))
 _LARGEST = np.finfo(float).max
 
 
@@ -63,6 +67,8 @@ class States:
         Kinetic energy + P cos(theta) [J].
     l3, lz : (n,) array
         Angular momentum along the axis and along the vertical [kg m^2/s].
+    pivot : Kinematics
+        Position, velocity and acceleration of the pivot, rows that broadcast to (3, n).
     norm_error : (n,) array
         ``|q| - 1``.
     rows_quaternion, rows_axis, rows_vertical, rows_angular_velocity : tuple of (n,) array
@@ -72,15 +78,13 @@ class States:
 
     method: str
 
-    def __init__(self, top: Top, start: State, n: int, *, lz: Column | float | None = None,
-                 gravity: Column | float | None = None,
-                 torque: Column | float | None = None) -> None:
+    # Of the pivot in the world [m/s^2].
+    _acceleration = 0.0, 0.0, 0.0
+
+    def __init__(self, top: Top, start: State, n: int) -> None:
         self.top, self.start, self._n = top, start, n
-        self._l3 = start.l3
-        # Columns where the effective gravity of a moving pivot changes.
-        self._lz = start.lz if lz is None else lz
-        self._gravity = top.gravity if gravity is None else gravity
-        self._torque = top.gravity_torque if torque is None else torque
+        self._l3: Column | float = start.l3
+        self._lz = start.lz
 
     def __len__(self) -> int:
         return self._n
@@ -139,11 +143,9 @@ class States:
 
     @cached_property
     def phi_dot(self) -> Column:
-        """Eq. (31) of "Analysis of Symmetric Spinning Top"; NotImplementedError for several Lz."""
-        lz = self._lz
-        if isinstance(lz, np.ndarray):
-            raise NotImplementedError('phi_dot about several verticals: WorldStates has it')
-        return attitude.precession_rate(self.top, self._l3, lz, *self.half_angle_squares)
+        """Eq. (31) of "Analysis of Symmetric Spinning Top"."""
+        return attitude.precession_rate(self.top, self.start.l3, self._lz,
+                                        *self.half_angle_squares)
 
     @cached_property
     def psi_dot(self) -> Column:
@@ -186,18 +188,44 @@ class States:
     @cached_property
     def rows_angular_acceleration(self) -> Vector:
         """By Euler's equations."""
-        top, (w1, w2, w3), (z1, z2, _) = self.top, self.rows_angular_velocity, self.rows_vertical
+        top, (w1, w2, w3), (f1, f2, _) = self.top, self.rows_angular_velocity, self._support
         gyroscopic = (top.lambda1 - top.lambda3) * w3
-        return ((gyroscopic * w2 + self._torque * z2) / top.lambda1,
-                -(gyroscopic * w1 + self._torque * z1) / top.lambda1, 0.0)
+        return ((gyroscopic * w2 + top.mass * f2 * top.com_distance) / top.lambda1,
+                -(gyroscopic * w1 + top.mass * f1 * top.com_distance) / top.lambda1, 0.0)
+
+    @cached_property
+    def _support(self) -> Vector:
+        """Specific force of the pivot in the body [m/s^2]: g z + its acceleration."""
+        x, y, z = self._acceleration
+        upward = self.top.gravity + z
+        if x or y:
+            return attitude.rotated_back(self.rows_quaternion, (x, y, upward))
+        z1, z2, z3 = self.rows_vertical
+        return upward * z1, upward * z2, upward * z3
 
     @cached_property
     def angular_acceleration(self) -> NDArray[np.float64]:
         return np.stack(np.broadcast_arrays(*self.rows_angular_acceleration), axis=-1)
 
+    @cached_property
+    def pivot(self) -> Kinematics:
+        """What the pivot does: rows that broadcast to (3, n)."""
+        return AT_REST
+
+    def position(self, point: Point) -> Vector:
+        """Return where a point of the body [m] is in the world [m], as components (n,)."""
+        (x, y, z), (a, b, c) = attitude.rotated(self.rows_quaternion, point), self.pivot.position
+        return x + a, y + b, z + c
+
+    def world_velocity(self, point: Point) -> Vector:
+        """Return the velocity of a point of the body [m] in the world, in body axes [m/s]."""
+        (v1, v2, v3), (u, v, w) = self.velocity(point), self.pivot.velocity
+        u1, u2, u3 = attitude.rotated_back(self.rows_quaternion, (u, v, w))
+        return v1 + u1, v2 + u2, v3 + u3
+
     def velocity(self, point: Point) -> Vector:
         """
-        Return the velocity omega x r of a point of the body.
+        Return the velocity omega x r of a point of the body relative to the pivot.
 
         Parameters
         ----------
@@ -216,8 +244,8 @@ class States:
         """
         Return what an ideal accelerometer at a point of the body measures.
 
-        It is f = omega' x r + omega x (omega x r) + g z with the upward vertical z: at rest +g
-        upwards, as REP-145 has it.
+        It is f = omega' x r + omega x (omega x r) + g z + a with the upward vertical z and the
+        acceleration a of the pivot: at rest +g upwards, as REP-145 has it.
 
         Parameters
         ----------
@@ -229,24 +257,25 @@ class States:
         tuple of three (n,) array
             Components in the body frame [m/s^2].
         """
-        gravity, (z1, z2, z3) = self._gravity, self.rows_vertical
+        f1, f2, f3 = self._support
         if not any(point):          # the point is the pivot: no rate is needed
-            return gravity * z1, gravity * z2, gravity * z3
+            return f1, f2, f3
         r1, r2, r3 = point
         w1, w2, w3 = self.rows_angular_velocity
         a1, a2, a3 = self.rows_angular_acceleration
         along = w1 * r1 + w2 * r2 + w3 * r3
         square = w1 * w1 + w2 * w2 + w3 * w3
-        return (a2 * r3 - a3 * r2 + w1 * along - r1 * square + gravity * z1,
-                a3 * r1 - a1 * r3 + w2 * along - r2 * square + gravity * z2,
-                a1 * r2 - a2 * r1 + w3 * along - r3 * square + gravity * z3)
+        return (a2 * r3 - a3 * r2 + w1 * along - r1 * square + f1,
+                a3 * r1 - a1 * r3 + w2 * along - r2 * square + f2,
+                a1 * r2 - a2 * r1 + w3 * along - r3 * square + f3)
 
     @cached_property
     def energy(self) -> Column:
-        omega1, omega2, _ = self.rows_angular_velocity
-        return (0.5 * self.top.lambda1 * (omega1 * omega1 + omega2 * omega2)
-                + 0.5 * self._l3 * self._l3 / self.top.lambda3
-                + self._torque * self.rows_vertical[2])
+        top, (w1, w2) = self.top, self.transverse_velocity
+        # In this order only what is too large itself overflows, not the square of a rate.
+        kinetic: Column = 0.5 * (top.lambda1 * w1 * w1 + top.lambda1 * w2 * w2
+                                 + self._l3 / top.lambda3 * self._l3)
+        return kinetic + top.mass * self._support[2] * top.com_distance
 
     def plot(self) -> Figure:
         """
@@ -297,3 +326,42 @@ class States:
         with needed('a picture', 'plot'):
             from spinning_top_sim.physics import pictures  # noqa: PLC0415 - matplotlib is slow
         return pictures.animate(self, fps, speed)
+
+
+def joined(parts: Sequence[States]) -> States:
+    """Return the states of one top at the times of all parts, in their order."""
+    return parts[0] if len(parts) == 1 else _Joined(parts)
+
+
+class _Joined(States):
+    """Every column is that of the parts, so no value depends on what it is joined with."""
+
+    def __init__(self, parts: Sequence[States]) -> None:
+        super().__init__(parts[0].top, parts[0].start, sum(map(len, parts)))
+        self._parts, self.method = parts, parts[0].method
+        self._l3 = np.concatenate([np.broadcast_to(one._l3, (len(one),)) for one in parts])
+
+    def _column(self, name: str) -> Any:
+        return np.concatenate([getattr(one, name) for one in self._parts])
+
+    def _rows(self, name: str) -> Any:
+        """Return a tuple of columns, of which some parts may have one number for all times."""
+        return tuple(np.concatenate([
+            np.broadcast_to(np.asarray(row), (len(one),))
+            for one, row in zip(self._parts, rows, strict=True)])
+            for rows in zip(*(getattr(one, name) for one in self._parts), strict=True))
+
+    t, theta_dot, phi_dot, l3, lz, energy = (
+        cached_property(methodcaller('_column', name)) for name in (
+            't', 'theta_dot', 'phi_dot', 'l3', 'lz', 'energy'))
+    angles, rows_quaternion, transverse_velocity, half_angle_squares, _support = (
+        cached_property(methodcaller('_rows', name)) for name in (
+            'angles', 'rows_quaternion', 'transverse_velocity', 'half_angle_squares',
+            '_support'))
+
+    @cached_property
+    def pivot(self) -> Kinematics:
+        return Kinematics(*(np.concatenate([
+            np.broadcast_to(rows, (3, len(one)))
+            for one, rows in zip(self._parts, parts, strict=True)], axis=1)
+            for parts in zip(*(one.pivot for one in self._parts), strict=True)))

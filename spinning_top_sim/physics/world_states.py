@@ -7,10 +7,12 @@ from functools import cached_property
 from operator import attrgetter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
-from spinning_top_sim.physics.states import Point, States
+from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.pivot import Kinematics, Piece, kinematics
+from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import Top
 
 
@@ -28,33 +30,35 @@ class WorldStates(States):
         In the gravity of the world.
     moved : States
         In the frame of the vertical.
-    rotation : (4, 1) or (4, n)
+    rotation : (4, 1)
         q(world <- frame) as x, y, z, w.
+    ride : Piece
+        What the pivot does.
+    times_ns : (n,)
+        Simulated times [ns], on which the pivot depends.
     """
 
     # What is the same.
-    t, energy, l3, lz = (cached_property(attrgetter(f'_moved.{name}')) for name in (
-        't', 'energy', 'l3', 'lz'))
-    transverse_velocity = cached_property(attrgetter('_moved.transverse_velocity'))
-    rows_angular_acceleration = cached_property(attrgetter('_moved.rows_angular_acceleration'))
+    t, l3, lz, transverse_velocity = (cached_property(attrgetter(f'_moved.{name}')) for name in (
+        't', 'l3', 'lz', 'transverse_velocity'))
 
-    def __init__(self, top: Top, moved: States, rotation: Quaternion) -> None:
-        # Of the frame: what uses them is overridden here.
-        super().__init__(top, moved.start, len(moved), lz=moved._lz, gravity=moved._gravity,
-                         torque=moved._torque)
+    def __init__(self, top: Top, moved: States, rotation: Quaternion, ride: Piece,
+                 times_ns: NDArray[np.int64]) -> None:
+        super().__init__(top, moved.start, len(moved))
         self.method, self._moved, self._rotation = moved.method, moved, rotation
+        self._ride, self._times_ns = ride, times_ns
+        self._acceleration = tuple(ride.begins[6:].tolist())
+
+    @cached_property
+    def pivot(self) -> Kinematics:
+        return kinematics([self._ride], [len(self)], self._times_ns)
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
-        moved, (*_, w) = self._moved.rows_quaternion, self._rotation
-        is_identity = len(w) == 1 and w[0] == 1.0
-        # Without -0.0, which a product with the identity may leave or not.
-        x, y, z, w = (part + 0.0 for part in (
-            moved if is_identity else attitude.product(self._rotation, moved)))
+        # Without -0.0, which a product with the identity leaves or not.
+        x, y, z, w = (part + 0.0 for part in attitude.product(
+            self._rotation, self._moved.rows_quaternion))
         return x, y, z, w
-
-    def specific_force(self, point: Point) -> Vector:
-        return self._moved.specific_force(point)
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:

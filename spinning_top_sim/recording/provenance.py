@@ -12,9 +12,11 @@ from spinning_top_sim.installation import version
 METADATA_NAME = 'spinning_top_sim'
 OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
 
+LIBRARIES = ('numpy', 'mcap', 'gmpy2', 'pymap3d')   # those installed decide the last bits
+
 
 def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: int,
-                 history: Iterable[tuple[int, *tuple[float, ...]]],
+                 history: Iterable[Mapping[str, Any]],
                  values_at_recording: Mapping[str, Any]) -> dict[str, str]:
     """
     Return the metadata record METADATA_NAME.
@@ -22,18 +24,17 @@ def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: in
     values_at_start : parameters at the start of the motion (the last reset)
     epoch_ns : stamp of t = 0
     begun_ns : simulated time at which the recording begins
-    history : commands, states, rates of the IMU and velocities of the pivot applied before, as
-        `Simulation.history`
+    history : the events before, as in ~/events: 'event', 't_ns', ...
     values_at_recording : parameters when the recording begins, with later changes
     """
     return {
-        'format': '1',      # version of these keys
+        'format': '2',      # version of these keys
         'parameters': json.dumps(dict(values_at_start), default=list, sort_keys=True),
         'parameters_now': json.dumps(dict(values_at_recording), default=list, sort_keys=True),
         'seed': str(values_at_start['seed']),
         'epoch_ns': str(epoch_ns),
         'begun_ns': str(begun_ns),
-        'history': json.dumps(list(history)),
+        'history': json.dumps(list(history), default=list),
         **environment(),
     }
 
@@ -45,5 +46,6 @@ def environment() -> dict[str, str]:
         'platform': f'{platform.machine()} {platform.system()} '
                     f'{platform.python_implementation()} {platform.python_version()} '
                     f'{sys.byteorder}',
-        'libraries': json.dumps({name: version(name) for name in ('numpy', 'mcap')}),
+        'libraries': json.dumps({name: found for name in LIBRARIES
+                                 if (found := version(name)) != 'unknown'}),
     }

@@ -2,45 +2,50 @@
 """
 Recording while the simulation runs: bounded loss, bounded memory, and no waiting for a disk.
 
-The simulation's thread only appends to a queue.  One other thread makes chunks, compresses and
-writes them, at least every half `max_loss`, so that a SIGKILL takes no more.  A third brings them
-to the disk meanwhile; `possible_loss` tells what a power loss would take.
+The caller only appends to a queue.  The recorder's thread opens the file, makes chunks and writes
+them, at least every half `max_loss`, so that a SIGKILL takes no more, and closes the file.
+Another thread brings them to the disk meanwhile; `possible_loss` tells what a power loss would
+take.
 """
+
+from __future__ import annotations
 
 import atexit
 import contextlib
-import os
+import itertools
 import threading
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from mcap.records import Channel, Header, Metadata, Schema
+import numpy as np
+from numpy.typing import NDArray
 
-from spinning_top_sim.installation import version
-from spinning_top_sim.recording.chunks import CHUNK_BYTES
-from spinning_top_sim.recording.definitions import find_definition
-from spinning_top_sim.recording.errors import RecordingError, why_not_written
-from spinning_top_sim.recording.mcap_writer import McapWriter, sync_directory
-from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
-from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
+from spinning_top_sim.installation import needed
+from spinning_top_sim.recording.errors import RecordingError, text_of, why_not_written
 
-QUEUE_BYTES = 32_000_000            # of a full queue; a burst that began with room may go on
+# What writes is imported by the recorder's thread: that takes 0.1 s.
+if TYPE_CHECKING:
+    from spinning_top_sim.recording.rosbag2 import RecordedTopic
+    from spinning_top_sim.recording.writer import McapWriter
 
-_ENTRY_BYTES = 128  # what a queued message costs besides its data, about
+QUEUE_BYTES = 32_000_000    # of a full queue; a burst that began with room may go on
+BATCH_BYTES = 1_000_000     # of messages that make a chunk of their own, about
 
-# A message: its topic, an index of the recorder's `topics`; log time [ns]; CDR.
-Entry = tuple[int, int, bytes]
+_ENTRY_BYTES = 300          # what queued rows cost besides their data, about
+
+# The next messages of a topic: its index, log times (n,) [ns], serialized messages (n, size).
+Rows = tuple[int, NDArray[np.int64], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
 class RecordingSummary:
     """What a recording has come to."""
 
-    path: Path
+    path: Path | None       # None before the file is open
     bytes: int              # size of the file
     counts: dict[str, int]  # messages in it by topic name
     queued: int             # messages accepted, not yet in the file
@@ -49,36 +54,58 @@ class RecordingSummary:
 
     @property
     def messages(self) -> int:
+        """Number of messages in the file."""
         return sum(self.counts.values())
 
 
-class McapRecorder:
+class Recorder:
     """
-    A running recording into a new file, until `close`.
+    A recording into a new file, from now on until `close`; returns at once.
 
+    Messages may be handed over at once: they wait in memory while the file is being opened.
     Trouble with the disk never reaches the caller: the recording stops, `state` becomes 'failed'
     and `error` says why, naming the path.  What was written up to then stays readable.
+
+    Parameters
+    ----------
+    uri : str
+        The file, which must not exist; or a folder, in which a name with the date is taken.  A
+        folder is made if its name ends with '/'.  '': the working directory.
+    topics : sequence of RecordedTopic
+        A message refers to a topic by its index here.
+    metadata : mapping
+        The metadata record of the run; see `provenance.run_metadata`.
+    max_loss : float
+        Most wall time whose messages a SIGKILL or a power loss may take [s], > 0.
+    compression : str
+        'zstd', 'lz4' or 'none'.
+    min_free_bytes : int
+        The recording stops if the disk has less left than this.
+
+    Attributes
+    ----------
+    state : str
+        'opening', 'recording', 'closed' or 'failed'.
+    error : str or None
+        Why it failed.
+    path : Path or None
+        The file; None before it is open.
     """
 
-    def __init__(self, path: str | os.PathLike[str], topics: Sequence[RecordedTopic],
-                 metadata: Mapping[str, str], *, max_loss: float = 0.5,
-                 compression: str = 'zstd', min_free_bytes: int = 100_000_000) -> None:
-        """
-        Create the file and start recording; raises as `create_file`.
-
-        max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
-        """
-        self.path = Path(path)
-        self._file = create_file(self.path, topics, metadata, compression=compression,
-                                 min_free_bytes=min_free_bytes)
-        self.state: Literal['recording', 'closed', 'failed'] = 'recording'
+    def __init__(self, uri: str, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
+                 max_loss: float = 0.5, compression: str = 'zstd',
+                 min_free_bytes: int = 100_000_000) -> None:
+        self.state: Literal['opening', 'recording', 'closed', 'failed'] = 'opening'
         self.error: str | None = None
-        self._names = [topic.name for topic in topics]
+        self.path: Path | None = None
+        self._uri, self._topics, self._metadata = uri, topics, metadata
         self._max_loss = max_loss
+        self._compression = compression
         self._min_free_bytes = min_free_bytes
 
+        self._file: McapWriter | None = None
         # Appending to a deque and taking from its other end need no lock between threads.
-        self._queue: deque[tuple[Sequence[Entry], int]] = deque()     # entries, and their bytes
+        self._queue: deque[tuple[Sequence[Rows], int]] = deque()     # rows, and their bytes
         self._bytes_in = self._bytes_out = 0    # of the queue, ever
         self._offered = 0              # messages handed over, ever
         self._accepting = True
@@ -90,9 +117,9 @@ class McapRecorder:
         self._taken = threading.Event()
         # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
         # exit handler runs before daemons are stopped and closes the file properly.
+        atexit.register(self.close)
         self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
         self._thread.start()
-        atexit.register(self.close)
 
     @property
     def room(self) -> bool:
@@ -103,7 +130,7 @@ class McapRecorder:
     def possible_loss(self) -> float:
         """Wall time whose messages a power loss would take now, but for one tick [s]."""
         since, bytes_on_disk = self._on_disk
-        if self.state != 'recording' or self._bytes_in == bytes_on_disk:
+        if self.state in ('closed', 'failed') or self._bytes_in == bytes_on_disk:
             return 0.0
         return time.monotonic() - since
 
@@ -112,30 +139,36 @@ class McapRecorder:
         """What to tell the user while the disk is too slow for `max_loss`."""
         loss = self.possible_loss
         return None if loss <= self._max_loss else (
-            f'the disk of {self.path} is slow: a power loss would take the last {loss:.1f} s, '
-            f'more than max_loss = {self._max_loss:g} s')
+            f'the disk of {self.path or self._uri} is slow: a power loss would take the last '
+            f'{loss:.1f} s, more than max_loss = {self._max_loss:g} s')
 
     @property
     def counters(self) -> RecordingSummary:
-        running = self.state == 'recording'     # read first: nothing is written after it
-        counts = dict(zip(self._names, self._file.message_counts.values(), strict=True))
+        """What the recording has come to so far."""
+        running = self.state in ('opening', 'recording')    # read first: nothing is written after
+        file = self._file
+        numbers = file.message_counts.values() if file else itertools.repeat(0)
+        counts = {topic.name: number for topic, number in zip(self._topics, numbers, strict=False)}
         missing = self._offered - sum(counts.values())
         return RecordingSummary(
-            path=self.path, bytes=self._file.size, counts=counts,
+            path=self.path, bytes=file.size if file else 0, counts=counts,
             queued=missing if running else 0, lost=0 if running else missing,
             error=self.error)
 
-    def write_all(self, entries: Sequence[Entry]) -> None:
+    def write(self, rows: Sequence[Rows]) -> None:
         """
-        Hand over messages, from one thread at a time; they keep their order.
+        Hand over messages, from one thread at a time; those of a topic keep their order.
 
-        Never waits for the disk, never raises for its sake.  After the recording stopped the
-        messages are only counted, as lost.
+        rows : the topic's index, log times (n,) [ns] and serialized messages (n, size), n >= 1;
+            the arrays must not change afterwards
+
+        Never waits, never raises for the disk's sake.  After the recording stopped the messages
+        are only counted, as lost.
         """
-        self._offered += len(entries)
+        self._offered += sum(len(times_ns) for _, times_ns, _ in rows)
         if self._accepting:
-            size = sum(_ENTRY_BYTES + len(data) for _, _, data in entries)
-            self._queue.append((entries, size))
+            size = sum(_ENTRY_BYTES + messages.nbytes for _, _, messages in rows)
+            self._queue.append((rows, size))
             self._bytes_in += size
             if self._bytes_in - self._bytes_out >= QUEUE_BYTES // 2 and not self._wake.is_set():
                 self._wake.set()
@@ -148,6 +181,11 @@ class McapRecorder:
             self._taken.wait(timeout)
         return self.room
 
+    def end(self) -> None:
+        """Have the file closed; does not wait for it."""
+        self._accepting = False
+        self._wake.set()
+
     def close(self, timeout: float = 10.0) -> RecordingSummary:
         """
         Bring everything to the disk, write the summary, and return what the file holds.
@@ -155,56 +193,107 @@ class McapRecorder:
         May be called again.  Where the disk does not finish within `timeout` [s], the summary's
         `error` says so and the file goes on being closed in the background.
         """
-        atexit.unregister(self.close)
-        self._accepting = False
-        self._wake.set()
+        self.end()
         self._thread.join(timeout)
         if self._thread.is_alive():
-            late = f'{self.path} could not be closed within {timeout:g} s'
+            late = f'{self.path or self._uri} could not be closed within {timeout:g} s'
             return replace(self.counters, error=self.error or late)
         return self.counters
 
+    # ----------------------------------------------------------------- in the recorder's thread
+
     def _run(self) -> None:
-        """Record until closed or something fails; in the recorder's own thread."""
         try:
-            self._record()
+            self._file = self._open()
+            self.state = 'recording'
+            self._record(self._file)
             self.state = 'closed'
         except Exception as error:  # whatever it is, the simulation goes on without a log
-            self._accepting = False
-            self.error = f'recording to {self.path} stopped: {why_not_written(self.path, error)}'
-            self._queue.clear()
-            self._bytes_out = self._bytes_in
-            self._taken.set()
-            self.state = 'failed'
-            # Cutting off the truncated chunk may have freed enough space for the summary.
-            with contextlib.suppress(Exception):
-                if self._syncing is not None:
-                    self._syncing.join()
+            self._fail(error)
+        finally:
+            atexit.unregister(self.close)
+
+    def _fail(self, error: Exception) -> None:
+        self._accepting = False
+        self.error = text_of(error) if self.path is None else (
+            f'recording to {self.path} stopped: {why_not_written(self.path, error)}')
+        self.state = 'failed'
+        self._queue.clear()
+        self._bytes_out = self._bytes_in
+        self._taken.set()
+        # Cutting off the truncated chunk may have freed enough space for the summary.
+        with contextlib.suppress(Exception):
+            if self._syncing is not None:
+                self._syncing.join()
+            if self._file is not None:
                 self._file.finish()
 
-    def _record(self) -> None:
+    def _open(self) -> McapWriter:
+        """Return the file that `uri` names; in a folder, under the first free name."""
+        with needed('a recording'):
+            from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415
+
+        folder = path = Path(self._uri).expanduser().absolute()
+        if self._uri.endswith('/'):
+            folder.mkdir(parents=True, exist_ok=True)
+        named = self._uri and not path.is_dir()
+        stem = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S')
+        for number in itertools.count(1):
+            if not named:
+                path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
+            try:
+                file = create_file(path, self._topics, self._metadata,
+                                   compression=self._compression,
+                                   min_free_bytes=self._min_free_bytes)
+            except RecordingError as error:
+                # Another node may take a name at any time, so only opening shows whether it is
+                # free.
+                if named or not isinstance(error.__cause__, FileExistsError):
+                    raise
+            else:
+                self.path = path
+                return file
+        raise AssertionError
+
+    def _record(self, file: McapWriter) -> None:
         interval = self._max_loss / 2.0
         next_flush = time.monotonic() + interval
         while True:
             self._wake.clear()
             closing = not self._accepting  # read before the queue: once set, nothing more comes
             now = time.monotonic()
-            self._write_queued()
+            self._write_queued(file)
             if closing or now >= next_flush:
                 next_flush = now + interval
-                self._file.flush()
+                file.flush()
                 if closing and self._syncing is not None:
                     self._syncing.join()
                 if self._sync_error is not None:
                     raise self._sync_error
-                self._file.check_disk(self._min_free_bytes)
+                file.check_disk(self._min_free_bytes)
                 if closing:
-                    self._file.finish()
+                    file.finish()
                     return
-                self._begin_sync(now)
+                self._begin_sync(file, now)
             self._wake.wait(max(0.0, next_flush - time.monotonic()))
 
-    def _begin_sync(self, now: float) -> None:
+    def _write_queued(self, file: McapWriter) -> None:
+        batch: list[Rows] = []
+        batch_bytes = 0
+        for _ in range(len(self._queue)):
+            rows, size = self._queue.popleft()
+            batch += rows
+            batch_bytes += size
+            self._bytes_out += size
+            if batch_bytes >= BATCH_BYTES:
+                _add(file, batch)
+                file.flush()
+                batch, batch_bytes = [], 0
+        _add(file, batch)
+        if self.room:
+            self._taken.set()
+
+    def _begin_sync(self, file: McapWriter, now: float) -> None:
         """Bring what is in the file to the disk, in a thread that may hang as the disk does."""
         if self._syncing is not None and self._syncing.is_alive():
             return
@@ -213,68 +302,30 @@ class McapRecorder:
             self._on_disk = written
         else:
             self._syncing = threading.Thread(
-                target=self._sync, args=(written,), name='recorder sync', daemon=True)
+                target=self._sync, args=(file, written), name='recorder sync', daemon=True)
             self._syncing.start()
 
-    def _sync(self, written: tuple[float, int]) -> None:
+    def _sync(self, file: McapWriter, written: tuple[float, int]) -> None:
         try:
-            self._file.sync()
+            file.sync()
         except Exception as error:
             self._sync_error = error
             self._wake.set()
         else:
             self._on_disk = written
 
-    def _write_queued(self) -> None:
-        batch: list[Entry] = []
-        batch_bytes = 0
-        for _ in range(len(self._queue)):
-            entries, size = self._queue.popleft()
-            if batch_bytes + size > CHUNK_BYTES:
-                self._file.append_all(batch, batch_bytes)
-                batch, batch_bytes = [], 0
-            batch += entries
-            batch_bytes += size
-            self._bytes_out += size
-        self._file.append_all(batch, batch_bytes)
-        if self.room:
-            self._taken.set()
+
+def single(topic_index: int, log_time_ns: int, data: bytes) -> Rows:
+    """Return one message as rows."""
+    return topic_index, np.array([log_time_ns]), np.frombuffer(data, np.uint8)[np.newaxis]
 
 
-def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
-                compression: str, min_free_bytes: int = 0) -> McapWriter:
-    """
-    Create a log, which must not exist, and bring its head to the disk.
-
-    topics : all stand before the first chunk, so that a truncated file tells them in any case
-    metadata : the `spinning_top_sim` record at the head of the file
-    compression : 'zstd', 'lz4' or 'none'
-    min_free_bytes : a recording stops if the disk has less left than this, >= 0
-
-    Raises ValueError for a topic that is listed twice, RecordingError naming path or type.
-    """
-    names = [topic.name for topic in topics]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f'topic {name!r} is listed twice: once is allowed')
-    definitions = {     # text and type hash
-        name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
-    try:
-        header = Header(profile='ros2', library=OUR_LIBRARY + version())
-        file = McapWriter(path, header=header, compression=compression)
-        with file.discarded_on_failure():
-            file.check_disk(min_free_bytes)
-            file.write(Metadata(METADATA_NAME, dict(metadata)))
-            for number, (name, (text, _)) in enumerate(definitions.items(), start=1):
-                file.write(Schema(id=number, name=name, encoding='ros2msg', data=text.encode()))
-            for number, topic in enumerate(topics, start=1):
-                file.write(Channel(
-                    id=number, topic=topic.name, message_encoding='cdr',
-                    schema_id=1 + list(definitions).index(topic.type_name),
-                    metadata={'offered_qos_profiles': offered_qos_yaml(topic),
-                              'topic_type_hash': definitions[topic.type_name][1]}))
-            file.sync()
-            sync_directory(path.parent)
-    except (OSError, ValueError) as error:
-        raise RecordingError(f'cannot record to {path}: {why_not_written(path, error)}') from error
-    return file
+def _add(file: McapWriter, batch: Sequence[Rows]) -> None:
+    """Add messages in as few arrays as there are topics, where those of a topic have one size."""
+    by_topic: defaultdict[int, list[Rows]] = defaultdict(list)
+    for rows in batch:
+        by_topic[rows[0]].append(rows)
+    for topic_index, group in by_topic.items():
+        for _, alike in itertools.groupby(group, key=lambda rows: rows[2].shape[1]):
+            _, times_ns, messages = zip(*alike, strict=True)
+            file.add(topic_index, np.concatenate(times_ns), np.concatenate(messages))

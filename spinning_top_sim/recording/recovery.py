@@ -5,14 +5,16 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Chunk, Header, Metadata
 
 from spinning_top_sim.recording.errors import LogError, why_not_written
-from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.scan import Part, Scan
+from spinning_top_sim.recording.writer import McapWriter
 
 
 def recover(reader: LogReader, output: str | os.PathLike[str],
@@ -73,11 +75,11 @@ def _copy_messages(reader: LogReader, part: Part, writer: McapWriter) -> None:
         assert isinstance(chunk, Chunk)
         chunk.message_start_time, chunk.message_end_time = part.start_ns, part.end_ns
         writer.flush()                  # what came before stays before
-        writer.write_chunk(chunk, messages.entries)
+        writer.write_chunk(chunk, {number: np.frombuffer(numbers, np.uint64).reshape(-1, 2)
+                                   for number, numbers in messages.entries.items()})
         return
     for message in messages.in_order(topics):
-        writer.copy_message(message.channel_id, message.sequence, message.log_time,
-                            message.publish_time, message.data)
+        writer.add(*single(message.channel_id - 1, message.log_time, message.data))
 
 
 def _copy_record(reader: LogReader, part: Part, writer: McapWriter) -> None:

@@ -65,7 +65,15 @@ MOST_KEPT = 50_000
 
 
 class IntegrationError(RuntimeError):
-    """The integration cannot go on; the message says where, why and what to do instead."""
+    """
+    The integration cannot go on; the message says where, why and what to do instead.
+
+    reached_ns : last simulated time of which a `Piece` still gives states [ns]
+    """
+
+    def __init__(self, text: str, *, reached_ns: int = 0) -> None:
+        super().__init__(text)
+        self.reached_ns = reached_ns
 
 
 StepFunction = Callable[..., tuple[Unknowns, Unknowns, Unknowns]]

@@ -222,17 +222,12 @@ def axis_rate(bottom_rate: float, top_rate: float, cosine: Number, sine: Number)
 
 
 class ThetaStates(States):
-    """
-    States by the theta functions of a motion, or of several, each at its own times.
-
-    columns : those of `States`, where they are not those of the start
-    """
+    """States by the theta functions of a motion."""
 
     method = 'exact'
 
-    def __init__(self, top: Top, start: State, arrays: ConstantArrays, times: Times,
-                 **columns: Column) -> None:
-        super().__init__(top, start, len(times), **columns)
+    def __init__(self, top: Top, start: State, arrays: ConstantArrays, times: Times) -> None:
+        super().__init__(top, start, len(times))
         self._arrays, self._times = arrays, times
 
     @cached_property

@@ -11,7 +11,6 @@ rounding, and the phase would drift by that much times the angle that follows.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -27,7 +26,6 @@ from spinning_top_sim.solvers.exact import ClosedForm, ThetaStates, axis_rate
 from spinning_top_sim.solvers.multiprecision import IMAGINARY, ONE, ZERO, as_mpfr, phase, precision
 from spinning_top_sim.solvers.theta_point import cayley_klein, transverse_velocity
 from spinning_top_sim.solvers.theta_setup import PreciseState, set_up
-from spinning_top_sim.solvers.theta_values import ConstantArrays
 from spinning_top_sim.solvers.times import Times
 
 # An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
@@ -127,7 +125,7 @@ class AcceleratedMotion(ClosedForm):
         return rounded(self.precise_start)
 
     def _states_at(self, times: Times) -> States:
-        return AcceleratedStates([self], None, times)
+        return AcceleratedStates(self, times)
 
     def posture(self, ns: int) -> Posture:
         """
@@ -146,23 +144,16 @@ class AcceleratedMotion(ClosedForm):
 
 
 class AcceleratedStates(ThetaStates):
-    """States of a motion, or of several motions that chain, of each at so many of the times."""
+    """States of such a motion."""
 
-    def __init__(self, motions: Sequence[AcceleratedMotion], counts: Sequence[int] | None,
-                 times: Times) -> None:
-        first = motions[0]
-        arrays = first.arrays if counts is None else ConstantArrays(
-            [one.constants for one in motions], counts)
-        lz, gravity, torque, *self._rates = arrays.columns([
-            (float(one.precise_start.lz), one.top.gravity, one.top.gravity_torque, one.bottom_rate,
-             one.top_rate) for one in motions])
-        super().__init__(first.top, first.start, arrays, times, lz=lz, gravity=gravity,
-                         torque=torque)
+    def __init__(self, motion: AcceleratedMotion, times: Times) -> None:
+        super().__init__(motion.top, motion.start, motion.arrays, times)
+        self._rates = motion.bottom_rate, motion.top_rate
 
     def _across(self) -> Column:
         (cosine, sine), (bottom_rate, top_rate) = self._rows('half_theta'), self._rates
         if self._arrays.on_line or not self._arrays.u_dot.any():
-            return axis_rate(float(bottom_rate[0]), float(top_rate[0]), cosine, sine)
+            return axis_rate(bottom_rate, top_rate, cosine, sine)
         # Of two sums that may cancel, the one with the smaller terms.  The usual one cancels
         # where a fast top hardly precesses.
         one, two = self._rows('across_terms')

@@ -9,9 +9,8 @@ elements, then the elements.  Padding is zero, so that equal messages have equal
 """
 
 import struct
-from collections.abc import Iterable, Sequence
-from functools import cached_property
-from typing import Any, Self
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,16 @@ NANOSECONDS = 1_000_000_000
 LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
 
 # The numbers of a field in n messages: an array (n, count), or `count` columns or numbers.
-Field = NDArray[np.float64] | Sequence[NDArray[np.float64] | float]
+Field = NDArray[Any] | Sequence[NDArray[Any] | float]
+
+
+class Place(NamedTuple):
+    """Where a field stands in a message: its name, code of `struct`, how many, and offset."""
+
+    name: str
+    code: str
+    numbers: int
+    offset: int
 
 
 def stamp_text(time_ns: int) -> str:
@@ -35,13 +43,13 @@ class CdrWriter:
     Appends the parts of a message in the order of its definition; its methods return itself.
 
     stamps_at : offset of each stamp
-    fields : offset and number of doubles of each field, which differ from message to message
+    fields : the numbers that differ from message to message
     """
 
     def __init__(self) -> None:
         self.buffer = bytearray(ENCAPSULATION)
         self.stamps_at: list[int] = []
-        self.fields: list[tuple[int, int]] = []
+        self.fields: list[Place] = []
 
     def append(self, code: str, *values: float) -> Self:
         """Append numbers of one type, a format character of `struct`, aligned to its size."""
@@ -51,11 +59,11 @@ class CdrWriter:
         self.buffer += struct.pack(f'<{len(values)}{code}', *values)
         return self
 
-    def field(self, *counts: int) -> Self:
-        """Append fields of so many doubles each."""
-        for count in counts:
-            self.append('d', *(count * (0.0,)))
-            self.fields.append((len(self.buffer) - 8 * count, count))
+    def field(self, name: str, count: int, code: str = 'd') -> Self:
+        """Append a field, under its name in the definition."""
+        self.append(code, *(count * (0,)))
+        self.fields.append(Place(name, code, count, len(self.buffer) - count * struct.calcsize(
+            '<' + code)))
         return self
 
     def stamp(self) -> Self:
@@ -80,57 +88,42 @@ class Template:
     """
     A serialized message whose stamps and fields are replaced, many messages at a time.
 
-    counts : how many numbers each field has
+    fields : in the order in which `encode` takes them
     """
 
     def __init__(self, writer: CdrWriter) -> None:
         # RTPS pads to four bytes; a template does so too, so that logs have what subscribers get.
-        self._buffer = writer.buffer + bytes(-len(writer.buffer) % 4)
-        self._stamps_at, self._fields = writer.stamps_at, writer.fields
-        self.counts = tuple(count for _, count in self._fields)
-        self._rows: NDArray[np.void] = np.empty(0, np.void)
-
-    @cached_property
-    def _row_type(self) -> np.dtype[np.void]:
-        """A message as a numpy type: the fields, and the stamps if there are any."""
-        columns: list[tuple[str, object, int]] = [
-            (f'field{i}', ('<f8', (count,)), at) for i, (at, count) in enumerate(self._fields)]
+        self._buffer = bytes(writer.buffer + bytes(-len(writer.buffer) % 4))
+        self.fields, self._stamps_at = tuple(writer.fields), writer.stamps_at
+        # A message as a type of NumPy: the fields by number, then the stamps.
+        places: list[tuple[str, Any, int]] = [
+            (f'{i}', (f'<{one.code}', (one.numbers,)), one.offset)
+            for i, one in enumerate(self.fields)]
         for at in self._stamps_at:
-            columns += [(f'sec{at}', '<i4', at), (f'nanosec{at}', '<u4', at + 4)]
-        names, formats, offsets = zip(*columns, strict=True) if columns else ((), (), ())
-        return np.dtype({'names': names, 'formats': formats, 'offsets': offsets,
-                         'itemsize': len(self._buffer)})
+            places += [(f'sec{at}', '<i4', at), (f'nanosec{at}', '<u4', at + 4)]
+        names, formats, offsets = zip(*places, strict=True)
+        self._row_type = np.dtype({'names': names, 'formats': formats, 'offsets': offsets,
+                                   'itemsize': len(self._buffer)})
 
     def __len__(self) -> int:
         return len(self._buffer)
 
-    def encode(self, stamps_ns: NDArray[np.int64], *values: Field) -> NDArray[np.uint8]:
-        """Return messages (n, size) with stamps (n,) [ns]; they are valid until the next call."""
-        return self.encode_runs(stamps_ns, ((len(stamps_ns), values),))
-
-    def encode_runs(self, stamps_ns: NDArray[np.int64],
-                    runs: Iterable[tuple[int, Sequence[Field]]]) -> NDArray[Any]:
-        """
-        Return messages as `encode` does, from consecutive runs of them.
-
-        runs : of each the number of its messages, and their fields
-        """
+    def encode(self, stamps_ns: NDArray[np.int64], fields: Sequence[Field]) -> NDArray[np.uint8]:
+        """Return messages (n, size) with stamps (n,) [ns]."""
         count = len(stamps_ns)
-        if len(self._rows) < count:
-            self._rows = np.frombuffer(count * self._buffer, self._row_type)
-        rows = self._rows[:count]
+        rows = np.frombuffer(bytearray(count * self._buffer), self._row_type)
         for at in self._stamps_at:
             rows[f'sec{at}'], rows[f'nanosec{at}'] = np.divmod(stamps_ns, NANOSECONDS)
-        fill([rows[f'field{i}'] for i in range(len(self._fields))], runs)
+        fill([rows[f'{i}'] for i in range(len(self.fields))], fields)
         return rows.view(np.uint8).reshape(count, len(self))
 
-    def encode_one(self, stamp_ns: int, *values: Field) -> bytes:
-        return self.encode(np.array([stamp_ns]), *values).tobytes()
+    def encode_one(self, stamp_ns: int, *fields: Field) -> bytes:
+        return self.encode(np.array([stamp_ns]), fields).tobytes()
 
-    def decode(self, data: bytes | NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:
+    def decode(self, data: bytes | NDArray[np.uint8]) -> tuple[NDArray[Any], ...]:
         """Return the fields, (n, count) each, of n concatenated messages."""
         rows = np.frombuffer(data, self._row_type)
-        return tuple(rows[f'field{i}'] for i in range(len(self._fields)))
+        return tuple(rows[f'{i}'] for i in range(len(self.fields)))
 
     def stamps_ns(self, data: bytes) -> NDArray[np.int64]:
         """Return the stamps (n,) [ns] of n concatenated messages."""
@@ -139,31 +132,28 @@ class Template:
         stamps += rows[f'nanosec{at}']
         return stamps
 
-    def field_at(self, at: int) -> tuple[int, int, int] | None:
-        """
-        Return what the byte at an offset belongs to: field, element, and offset of the element.
-
-        The field is -1 for a stamp; None is returned for a byte that is the same in all messages.
-        """
+    def shown_at(self, at: int, *messages: bytes) -> tuple[str, list[str]]:
+        """Return the name of what the byte at an offset belongs to, and its value in messages."""
         for stamp_at in self._stamps_at:
             if 0 <= at - stamp_at < 8:
-                return -1, 0, stamp_at
-        for field, (begin, count) in enumerate(self._fields):
-            if 0 <= at - begin < 8 * count:
-                return field, (at - begin) // 8, at - (at - begin) % 8
-        return None
+                return 'header.stamp', [
+                    '{}.{:09d}'.format(*struct.unpack_from('<iI', one, stamp_at))
+                    for one in messages]
+        for name, code, count, offset in self.fields:
+            size = struct.calcsize('<' + code)
+            if 0 <= at - offset < count * size:
+                element = (at - offset) // size
+                return f'{name}[{element}]', [
+                    repr(*struct.unpack_from('<' + code, one, offset + element * size))
+                    for one in messages]
+        return f'byte {at}', [f'0x{one[at]:02x}' for one in messages]
 
 
-def fill(fields: Sequence[NDArray[np.float64]],
-         runs: Iterable[tuple[int, Sequence[Field]]]) -> None:
-    """Fill fields (n, count) from runs, as those of `Template.encode_runs`."""
-    begin = 0
-    for size, values in runs:
-        for field, value in zip(fields, values, strict=True):
-            rows = field[begin:begin + size]
-            if isinstance(value, np.ndarray):
-                rows[:] = value
-            else:
-                for column, numbers in zip(rows.T, value, strict=True):
-                    column[:] = numbers
-        begin += size
+def fill(rows: Sequence[NDArray[Any]], fields: Sequence[Field]) -> None:
+    """Fill fields (n, count) from those of n messages."""
+    for row, field in zip(rows, fields, strict=True):
+        if isinstance(field, np.ndarray):
+            row[:] = field
+        else:
+            for column, numbers in zip(row.T, field, strict=True):
+                column[:] = numbers

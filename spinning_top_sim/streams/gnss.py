@@ -6,107 +6,83 @@ Axes of noise and covariances are those of the world: east, north, up.  docs/sen
 delay and outages.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Vector
 from spinning_top_sim.streams import messages, noise
-from spinning_top_sim.streams.cdr import NANOSECONDS, Template
-from spinning_top_sim.streams.stream import Encoded, Samples, Stream
+from spinning_top_sim.streams.cdr import NANOSECONDS, Field
+from spinning_top_sim.streams.channel import Channel, Samples, period_ns
 
-NAN = 3 * (np.nan,)
-
-
-class Gnss(Stream):
-    """
-    Fixes or velocities of the pivot, as a receiver measures them or exact.
-
-    A measurement at t = k * period_ns is stamped with t, and sent `gnss.latency` later.
-
-    is_exact : no noise, delay or outages
-    """
-
-    type_name: str
-    _index: int             # of position or velocity in `Kinematics`
-    _noise: str             # parameter of the standard deviations
-    _purpose: noise.Purpose
-
-    def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
-        level, vertical = (0.0, 0.0) if is_exact else values[self._noise]
-        super().__init__(values, 'gnss', topic, self.type_name, self._template_of(
-            values, (level ** 2, level ** 2, vertical ** 2)))
-        self._seed = values['seed']
-        self._deviation = np.array([[level], [level], [vertical]])
-        self.late_ns = 0 if is_exact else round(values['gnss.latency'] * NANOSECONDS)
-        # Begin and end of each outage, in turn; an odd number of them is past within an outage.
-        self._edges_ns = np.rint(np.array(() if is_exact else values['gnss.outages'])
-                                 * NANOSECONDS).astype(np.int64)
-
-    @staticmethod
-    def _template_of(values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
-        raise NotImplementedError
-
-    def times(self, after_ns: int, until_ns: int) -> range:
-        valid = super().times(max(after_ns - self.late_ns, -1), until_ns - self.late_ns)
-        return range(valid.start + self.late_ns, valid.stop + self.late_ns, valid.step)
-
-    def _measured(self, *samples: Samples) -> tuple[
-            NDArray[np.int64], NDArray[np.int64], Vector, NDArray[np.bool_]]:
-        """Return times and stamps of messages [ns], measurements, and which are in an outage."""
-        t_ns = np.concatenate([one.t_ns for one in samples])
-        valid_ns = t_ns - self.late_ns
-        x, y, z = value = samples[0].path.pivot(valid_ns)[self._index]
-        if self._deviation.any():
-            x, y, z = value + self._deviation * noise.white(
-                self._seed, self._purpose, valid_ns // self.period_ns, 3)
-        return (t_ns, samples[0].epoch_ns + valid_ns, (x, y, z),
-                np.searchsorted(self._edges_ns, valid_ns, 'right') % 2 == 1)
+NO_FIX, FIX = -1, 0         # sensor_msgs/NavSatStatus
+UNKNOWN, DIAGONAL_KNOWN = 0, 2      # sensor_msgs/NavSatFix
 
 
-class Fix(Gnss):
-    """sensor_msgs/NavSatFix; in an outage without a fix, and NaN."""
+def channels(values: Mapping[str, Any]) -> list[Channel]:
+    """Return fixes and velocities as the receiver measures them, each with its truth."""
+    period = period_ns(values['gnss.rate'])
+    delay_ns = round(values['gnss.latency'] * NANOSECONDS)
+    # Begin and end of each outage, in turn.
+    edges_ns = np.rint(np.array(values['gnss.outages']) * NANOSECONDS).astype(np.int64)
+    channel = partial(Channel, 'gnss', period_ns=period)
+    fix = partial(channel, type_name='sensor_msgs/msg/NavSatFix',
+                  encoder=messages.nav_sat_fix(values['body_frame']))
+    position_noise, velocity_noise = values['gnss.position_noise'], values['gnss.velocity_noise']
+    none = 0.0, 0.0
 
-    type_name = 'sensor_msgs/msg/NavSatFix'
-    _index, _noise, _purpose = 0, 'gnss.position_noise', noise.Purpose.GNSS_POSITION
+    def velocity(topic: str, deviations: tuple[float, float], **more: Any) -> Channel:
+        return channel(topic, 'geometry_msgs/msg/TwistWithCovarianceStamped',
+                       encoder=messages.twist_with_covariance(
+                           values['world_frame'], _variances(deviations)),
+                       fields=partial(_velocity, values, deviations), **more)
 
-    def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
-        super().__init__(values, topic, is_exact=is_exact)
-        self._origin = values['gnss.origin']
-        self._no_fix = messages.nav_sat_fix(values['body_frame'], None)
-
-    @staticmethod
-    def _template_of(values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
-        return messages.nav_sat_fix(values['body_frame'], messages.diagonal(*variances))
-
-    def encode(self, *samples: Samples) -> Encoded:
-        from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
-        t_ns, stamps_ns, position, is_out = self._measured(*samples)
-        rows = self.template.encode(stamps_ns, enu2geodetic(*position, *self._origin))
-        if is_out.any():
-            rows = rows.copy()      # the template's own rows keep what is the same in all
-            rows[is_out] = self._no_fix.encode(stamps_ns[is_out], NAN)
-        return t_ns, rows
+    return [
+        fix('gnss/fix', delay_ns=delay_ns,
+            fields=partial(_fix, values, position_noise, edges_ns)),
+        fix('ground_truth/gnss/fix', fields=partial(_fix, values, none, edges_ns[:0])),
+        velocity('gnss/velocity', velocity_noise, delay_ns=delay_ns,
+                 copies=lambda t_ns: 1 - _is_out(edges_ns, t_ns)),
+        velocity('ground_truth/gnss/velocity', none)]
 
 
-class Velocity(Gnss):
-    """geometry_msgs/TwistWithCovarianceStamped in the axes of the world; none in an outage."""
+def _is_out(edges_ns: NDArray[np.int64], t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return 1 for each time in an outage: an odd number of edges is past then."""
+    return np.searchsorted(edges_ns, t_ns, 'right') % 2
 
-    type_name = 'geometry_msgs/msg/TwistWithCovarianceStamped'
-    _index, _noise, _purpose = 1, 'gnss.velocity_noise', noise.Purpose.GNSS_VELOCITY
 
-    def __init__(self, values: Mapping[str, Any], topic: str, *, is_exact: bool = False) -> None:
-        super().__init__(values, topic, is_exact=is_exact)
-        edges_ns = self._edges_ns.tolist()
-        self.silences_ns = list(zip(edges_ns[::2], edges_ns[1::2], strict=True))
+def _measured(values: Mapping[str, Any], deviations: tuple[float, float], purpose: noise.Purpose,
+              samples: Samples, exact: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return measurements (3, n); deviations are those of a horizontal axis and the vertical."""
+    if not any(deviations):
+        return exact
+    level, vertical = deviations
+    return exact + np.array([[level], [level], [vertical]]) * noise.white(
+        values['seed'], purpose, samples.t_ns // samples.times.step, 3)
 
-    @staticmethod
-    def _template_of(values: Mapping[str, Any], variances: tuple[float, ...]) -> Template:
-        return messages.twist_with_covariance(values['world_frame'], variances)
 
-    def encode(self, *samples: Samples) -> Encoded:
-        t_ns, stamps_ns, velocity, is_out = self._measured(*samples)
-        rows = self.template.encode(stamps_ns, velocity)
-        return t_ns[~is_out], rows[~is_out]
+def _fix(values: Mapping[str, Any], deviations: tuple[float, float],
+         edges_ns: NDArray[np.int64], samples: Samples) -> Sequence[Field]:
+    """Return status, position, covariance and its kind; in an outage NaN, without a fix."""
+    from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
+    position = _measured(values, deviations, noise.Purpose.GNSS_POSITION, samples,
+                         samples.trajectory.place(samples.times).position)
+    is_out = _is_out(edges_ns, samples.t_ns) == 1
+    geodetic = [np.where(is_out, np.nan, part)
+                for part in enu2geodetic(*position, *values['gnss.origin'])]
+    covariance = np.where(is_out[:, np.newaxis], 0.0, messages.diagonal(*_variances(deviations)))
+    return ([np.where(is_out, NO_FIX, FIX)], geodetic, covariance,
+            [np.where(is_out, UNKNOWN, DIAGONAL_KNOWN)])
+
+
+def _velocity(values: Mapping[str, Any], deviations: tuple[float, float],
+              samples: Samples) -> Sequence[Field]:
+    return list(_measured(values, deviations, noise.Purpose.GNSS_VELOCITY, samples,
+                          samples.trajectory.place(samples.times).velocity)),
+
+
+def _variances(deviations: tuple[float, float]) -> tuple[float, float, float]:
+    level, vertical = deviations
+    return level ** 2, level ** 2, vertical ** 2

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The inertial measurement unit (IMU) on the body: what its sensor feels, and its increments.
+The inertial measurement unit (IMU) on the body: where it is, what it feels, and what it reads.
 
 Conventions: REP-145 (at rest an accelerometer reads +g upwards), REP-103 (x, y, z right-handed),
 URDF roll-pitch-yaw.
@@ -8,7 +8,10 @@ URDF roll-pitch-yaw.
 
 import itertools
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from itertools import pairwise
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,184 +19,240 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.integrals import Increments
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.states import Point, States
+from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams.bandwidth import LowPass
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.inertial_sensor import Sensor
 from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
-from spinning_top_sim.streams.path import Segment
-from spinning_top_sim.streams.stream import Samples, period_ns
+from spinning_top_sim.streams.trajectory import Trajectory
 from spinning_top_sim.streams.vibration import Vibration
 
 # The longest interval over which means and increments are taken [ns].
 LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
 
 
+@dataclass(frozen=True)
+class Mounting:
+    """
+    Where a sensor is on the body.
+
+    lever_arm : its position in the body [m]
+    rotation : q(body <- sensor) as columns x, y, z, w with one row; None: the axes of the body
+    """
+
+    lever_arm: tuple[float, float, float]
+    rotation: Quaternion | None
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Self:
+        rpy = values['imu.rpy']
+        return cls(values['imu.lever_arm'], _quaternion(*rpy) if any(rpy) else None)
+
+    def orientation(self, states: States) -> Quaternion:
+        """Return q(world <- sensor) as columns x, y, z, w."""
+        return (states.rows_quaternion if self.rotation is None
+                else attitude.product(states.rows_quaternion, self.rotation))
+
+    def from_body(self, vector: Vector) -> Vector:
+        """Return a vector given in the body frame in the frame of the sensor."""
+        return vector if self.rotation is None else attitude.rotated_back(self.rotation, vector)
+
+    def to_body(self, orientation: Quaternion, rates: Vector) -> tuple[Quaternion, Vector]:
+        """Return orientation and angular velocity of the body from those of the sensor."""
+        if self.rotation is None:
+            return orientation, rates
+        x, y, z, w = self.rotation
+        inverse = -x, -y, -z, w
+        return attitude.product(orientation, inverse), attitude.rotated_back(inverse, rates)
+
+    def felt(self, states: States) -> tuple[Vector, Vector]:
+        """Return angular velocity [rad/s] and specific force [m/s^2] in the sensor's frame."""
+        return (self.from_body(states.rows_angular_velocity),
+                self.from_body(states.specific_force(self.lever_arm)))
+
+
 class Imu:
     """
-    The IMU at `imu.lever_arm` [m] with orientation `imu.rpy` [rad] on the body.
+    An IMU that takes a sample every `period_ns`, since a change of its rate.
 
-    `true`, `means` and `increments` are exact, `felt` adds bandwidth and vibration, `sensor` the
-    errors.
-
-    sensor : the errors of its readings
+    mounting, sensor : where it is, and the errors of its readings
     takes_means : whether a sample is the mean over the interval before it (`imu.sampling`)
-    length_ns : period of its samples [ns]
+    memory_ns : the time before a sample that its reading depends on [ns]
 
-    Intervals [t - length, t) end with the samples.  The first one is empty, as the motion begins
+    Intervals [t - period, t) end with the samples.  The first one is empty, as the motion begins
     with the first sample.  After a change of the rate the first one begins with the last sample of
     the old rate, so that no motion is left out.
     """
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._lever_arm: tuple[float, float, float] = values['imu.lever_arm']
-        self._is_rotated = any(values['imu.rpy'])
-        self._mounting = _quaternion(*values['imu.rpy'])
-        self.takes_means = values['imu.sampling'] == 'mean'
-        self._values, self.length_ns = values, period_ns(values['imu.rate'])
-        self.sensor = Sensor(values, self.length_ns)
+    def __init__(self, values: Mapping[str, Any], period_ns: int, *, since_ns: int = 0,
+                 first_begin_ns: int = 0) -> None:
+        self._values, self.period_ns = values, period_ns
         # When this rate began, and where the first interval after that begins [ns].
-        self._since_ns = self._first_begin_ns = 0
+        self.since_ns, self.first_begin_ns = since_ns, first_begin_ns
+        self.mounting = Mounting.of(values)
+        self.takes_means = values['imu.sampling'] == 'mean'
+        self.sensor = Sensor(values, period_ns)
         bandwidth = values['imu.bandwidth']
-        self._low_pass = (LowPass(bandwidth, values['imu.bandwidth_order']) if bandwidth
-                          else None)
-        self._vibration = Vibration(
-            values, self._low_pass.response if self._low_pass else np.ones_like)
+        self.low_pass = LowPass(bandwidth, values['imu.bandwidth_order']) if bandwidth else None
+        self.vibration = Vibration(
+            values, self.low_pass.response if self.low_pass else np.ones_like)
 
     @property
-    def keep_ns(self) -> int:
-        """The time before a sample that its reading may need [ns]."""
-        interval_ns = min(self.length_ns, LONGEST_NS) + self._since_ns - self._first_begin_ns
-        return max(interval_ns, self._low_pass.memory_ns if self._low_pass else 0)
+    def memory_ns(self) -> int:
+        interval_ns = min(self.period_ns, LONGEST_NS) + self.since_ns - self.first_begin_ns
+        return max(interval_ns, self.low_pass.memory_ns if self.low_pass else 0)
 
-    def set_rate(self, rate: float, now_ns: int) -> bool:
-        """Take samples at this rate [Hz] after `now_ns`; return whether the period changes."""
-        length_ns = period_ns(rate)
-        if length_ns == self.length_ns:
-            return False
-        last_ns = now_ns // self.length_ns * self.length_ns
-        if last_ns <= self._since_ns:       # no sample since the change before this one
-            last_ns = self._first_begin_ns
-        self.length_ns, self._since_ns = length_ns, now_ns
-        self.sensor = Sensor(self._values, length_ns)
-        self._first_begin_ns = max(last_ns, now_ns - LONGEST_NS)
-        return True
+    def at_period(self, period_ns: int, now_ns: int) -> 'Imu':
+        """Return the IMU that takes samples with another period after `now_ns`."""
+        if period_ns == self.period_ns:
+            return self
+        last_ns = now_ns // self.period_ns * self.period_ns
+        if last_ns <= self.since_ns:        # no sample since the change before this one
+            last_ns = self.first_begin_ns
+        return Imu(self._values, period_ns, since_ns=now_ns,
+                   first_begin_ns=max(last_ns, now_ns - LONGEST_NS))
 
-    def _begin_ns(self, end_ns: int) -> int:
+    def begin_ns(self, end_ns: int) -> int:
         """Return where the interval that ends with a sample begins [ns]."""
-        begin_ns = end_ns - self.length_ns
-        return begin_ns if begin_ns > self._since_ns else self._first_begin_ns
+        begin_ns = end_ns - self.period_ns
+        return begin_ns if begin_ns > self.since_ns else self.first_begin_ns
 
-    def _lengths(self, times: range) -> Column:
-        """Return the lengths (n,) [s] of the intervals that end at these times [ns]."""
-        return np.array([time - self._begin_ns(time) for time in times]) * 1e-9
 
-    def orientation(self, states: States) -> Quaternion:
-        """Return q(world <- IMU) as columns x, y, z, w."""
-        if not self._is_rotated:
-            return states.rows_quaternion
-        return attitude.product(states.rows_quaternion, self._mounting)
+class Readings:
+    """
+    What an IMU reads in a motion at some times, and what is true there.
 
-    def in_body(self, orientation: Quaternion, rates: Vector) -> tuple[Quaternion, Vector]:
-        """Return orientation and angular velocity of the body from those of the IMU."""
-        x, y, z, w = self._mounting
-        inverse = -x, -y, -z, w
-        return attitude.product(orientation, inverse), attitude.rotated_back(inverse, rates)
+    imu, trajectory : the sensor and the motion
+    times : of the samples [ns]
+    states : at these times
+    """
 
-    def true(self, states: States) -> tuple[Vector, Vector]:
-        """Return angular velocity [rad/s] and specific force [m/s^2] in the frame of the IMU."""
-        return (self.from_body(states.rows_angular_velocity),
-                self.from_body(states.specific_force(self._lever_arm)))
+    def __init__(self, imu: Imu, trajectory: Trajectory, times: range, states: States) -> None:
+        self._imu, self._trajectory, self._times, self._states = imu, trajectory, times, states
 
-    def means(self, samples: Samples) -> tuple[Vector, Vector]:
-        """Return the means of `true` over the intervals that end at these samples."""
-        increments = samples.once(self._body_increments)
-        seconds = self._lengths(samples.times)
+    @cached_property
+    def orientation(self) -> Quaternion:
+        """q(world <- IMU) as columns x, y, z, w."""
+        return self._imu.mounting.orientation(self._states)
+
+    @cached_property
+    def exact(self) -> tuple[Vector, Vector]:
+        """Rates and forces of a perfect sensor: values or means, as `imu.sampling` says."""
+        return self._means if self._imu.takes_means else self._imu.mounting.felt(self._states)
+
+    @cached_property
+    def read(self) -> tuple[Vector, Vector]:
+        """Rates [rad/s] and forces [m/s^2] as the sensor reads them."""
+        return self._imu.sensor.read(self._felt, self._times)
+
+    @cached_property
+    def bias(self) -> tuple[Vector, Vector]:
+        """The biases that are in `read`."""
+        return self._imu.sensor.bias(self._times)
+
+    @cached_property
+    def estimated_orientation(self) -> Quaternion:
+        """`orientation` with the noise of an IMU that estimates it."""
+        return self._imu.sensor.orientation(self.orientation, self._times)
+
+    @cached_property
+    def increments(self) -> tuple[Quaternion, Vector]:
+        """Measured rotation and velocity increment [m/s] over the intervals that end there."""
+        imu, sensor = self._imu, self._imu.sensor
+        x, y, z, w = self._body_increments.rotation
+        v1, v2, v3 = self._body_increments.velocity
+        if imu.mounting.rotation is not None:
+            x, y, z = attitude.rotated_back(imu.mounting.rotation, (x, y, z))
+        exact = (x, y, z, w), imu.mounting.from_body((v1, v2, v3))
+        if sensor.is_perfect and imu.vibration.is_off:
+            return exact
+        felt = imu.vibration.add(self._means, np.array(self._times), self._seconds)
+        return sensor.disturb(exact, self._means, sensor.read(felt, self._times), self._seconds)
+
+    @cached_property
+    def motion(self) -> tuple[Vector, Quaternion, Vector]:
+        """Position [m] and orientation in the world, velocity in the IMU's frame [m/s]."""
+        states, mounting = self._states, self._imu.mounting
+        return (states.position(mounting.lever_arm), self.orientation,
+                mounting.from_body(states.world_velocity(mounting.lever_arm)))
+
+    @cached_property
+    def _seconds(self) -> Column:
+        """Lengths (n,) of the intervals that end with the samples [s]."""
+        return np.array([end_ns - self._imu.begin_ns(end_ns) for end_ns in self._times]) * 1e-9
+
+    @cached_property
+    def _means(self) -> tuple[Vector, Vector]:
+        """Means of rates and forces over the intervals that end with the samples."""
+        seconds, increments = self._seconds, self._body_increments
+        mounting, states = self._imu.mounting, self._states
         # The mean over an empty interval is the value itself.
         divisor = np.where(seconds > 0.0, seconds, 1.0)
-        states = samples.states
         w1, w2, w3, f1, f2, f3 = (
             np.where(seconds > 0.0, integral / divisor, value) for integral, value in zip(
                 (*increments.angles, *increments.forces),
-                (*states.rows_angular_velocity, *states.specific_force(self._lever_arm)),
+                (*states.rows_angular_velocity, *states.specific_force(mounting.lever_arm)),
                 strict=True))
-        return self.from_body((w1, w2, w3)), self.from_body((f1, f2, f3))
+        return mounting.from_body((w1, w2, w3)), mounting.from_body((f1, f2, f3))
 
-    def sampled(self, samples: Samples) -> tuple[Vector, Vector]:
-        """Return the readings of a perfect sensor: values or means, as `imu.sampling` says."""
-        return samples.once(self.means) if self.takes_means else self.true(samples.states)
-
-    def felt(self, samples: Samples) -> tuple[Vector, Vector]:
-        """Return `sampled` with bandwidth and vibration of the sensor, before its errors."""
-        if self._low_pass is None:
-            exact = self.sampled(samples)
-        else:
-            w1, w2, w3, f1, f2, f3 = np.concatenate([
-                self._low_pass.filtered(segment, times, self._signal)
-                for segment, times in samples.shares], axis=1)
+    @property
+    def _felt(self) -> tuple[Vector, Vector]:
+        """`exact` with bandwidth and vibration of the sensor, before its errors."""
+        imu, exact = self._imu, self.exact
+        if imu.low_pass is not None:
+            w1, w2, w3, f1, f2, f3 = imu.low_pass.filtered(
+                self._trajectory, self._times, self._signal)
             exact = (w1, w2, w3), (f1, f2, f3)
-        if self._vibration.is_off:
+        if imu.vibration.is_off:
             return exact
-        return self._vibration.add(exact, samples.t_ns, self._lengths(samples.times)
-                                   if self.takes_means else 0.0)
+        return imu.vibration.add(exact, np.array(self._times),
+                                 self._seconds if imu.takes_means else 0.0)
 
     def _signal(self, states: States) -> NDArray[np.float64]:
-        return np.stack(np.broadcast_arrays(*itertools.chain(*self.true(states))))
+        return np.stack(np.broadcast_arrays(
+            *itertools.chain(*self._imu.mounting.felt(states)), np.zeros(len(states)))[:6])
 
-    def carry(self, before: Segment, after: Segment) -> None:
-        """Let a segment begin with the state of the filter at the end of the one before it."""
-        if self._low_pass is not None:
-            after.filter_state = self._low_pass.carried(before, after.start_ns, self._signal)
-
-    def measured_increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
-        """Return `increments` with the errors of the sensor and its vibration."""
-        exact, sensor = self.increments(samples), self.sensor
-        if sensor.is_perfect and self._vibration.is_off:
-            return exact
-        means, seconds = samples.once(self.means), self._lengths(samples.times)
-        felt = self._vibration.add(means, samples.t_ns, seconds)
-        return sensor.disturb(exact, means, sensor.read(felt, samples.times), seconds)
-
-    def increments(self, samples: Samples) -> tuple[Quaternion, Vector]:
-        """Return rotation and velocity increment [m/s] over the intervals that end there."""
-        increments = samples.once(self._body_increments)
-        x, y, z, w = increments.rotation
-        v1, v2, v3 = increments.velocity
-        if self._is_rotated:
-            x, y, z = attitude.rotated_back(self._mounting, (x, y, z))
-        return (x, y, z, w), self.from_body((v1, v2, v3))
-
-    def _body_increments(self, samples: Samples) -> Increments:
-        """Return the increments over the intervals that end at these samples, n of each."""
-        path, point = samples.path, self._lever_arm
-        found: list[Increments] = []
-        for segment, times in samples.shares:
+    @cached_property
+    def _body_increments(self) -> Increments:
+        """Increments over the intervals that end with the samples, in the frame of the body."""
+        imu, period_ns, found = self._imu, self._imu.period_ns, []
+        for piece, times in self._trajectory.pieces(self._times):
             # Those that may be shorter, reach back or contain a jump are computed one by one.
-            since_ns = max(self._since_ns + 1, segment.start_ns + segment.jumps)
-            single = len(range(times.start, since_ns + self.length_ns, times.step))
-            found += [path.increments(self._begin_ns(end_ns), end_ns, point)
+            since_ns = max(imu.since_ns, piece.start_ns) + 1
+            single = len(range(int(times[0]), since_ns + period_ns, self._times.step))
+            found += [self._increments(imu.begin_ns(end_ns), end_ns)
                       for end_ns in times[:single]]
             if single < len(times):
-                first_ns = times[single]
-                found.append(path.increments(self._begin_ns(first_ns), first_ns, point,
-                                             len(times) - single, times.step))
+                begins = range(int(times[single]) - period_ns, int(times[-1]) - period_ns + 1,
+                               self._times.step)
+                found.append(_within(piece, begins, period_ns, imu.mounting.lever_arm))
         return integrals.joined(found)
 
-    def motion(self, samples: Samples) -> tuple[Vector, Quaternion, Vector]:
-        """Return position [m] and orientation in the world, velocity in the IMU's frame [m/s]."""
-        states = samples.states
-        x, y, z = attitude.rotated(states.rows_quaternion, self._lever_arm)
-        v1, v2, v3 = states.velocity(self._lever_arm)
-        if samples.pivot_moves:
-            (a, b, c), (u, v, w), _ = samples.pivot
-            x, y, z = x + a, y + b, z + c
-            u, v, w = attitude.rotated_back(states.rows_quaternion, (u, v, w))
-            v1, v2, v3 = v1 + u, v2 + v, v3 + w
-        return (x, y, z), self.orientation(states), self.from_body((v1, v2, v3))
+    def _increments(self, begin_ns: int, end_ns: int) -> Increments:
+        """
+        Return the increments over an interval that events may divide (n = 1).
 
-    def from_body(self, vector: Vector) -> Vector:
-        """Return a vector given in the body frame in the frame of the IMU."""
-        return attitude.rotated_back(self._mounting, vector) if self._is_rotated else vector
+        The impulsive torque of a command lets the velocity of the IMU jump; the jump counts toward
+        the interval [begin, end) that contains it.
+        """
+        point, trajectory = self._imu.mounting.lever_arm, self._trajectory
+        parts = []
+        edges = {begin_ns, *trajectory.starts(begin_ns, end_ns), end_ns}
+        for begin, end in pairwise(sorted(edges)):
+            parts.append(integrals.impulse(trajectory.velocity_jump(begin, point)))
+            parts.append(_within(trajectory.after(begin), range(begin, begin + 1), end - begin,
+                                 point))
+        return reduce(Increments.then, parts or [integrals.impulse(3 * (np.zeros(1),))])
+
+
+def _within(piece: Piece, begins: range, length_ns: int, point: Point) -> Increments:
+    """Return the increments over intervals within a piece, which begin at these times [ns]."""
+    count = integrals.panels(piece.fastest_rate, length_ns)
+    edges = [length_ns * k // count for k in range(count + 1)]
+    return reduce(Increments.then, [integrals.increments(
+        piece.states, range(begins.start + begin, begins.stop + begin, begins.step), end - begin,
+        point, piece.fastest_rate) for begin, end in pairwise(edges)])
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:

@@ -1,238 +1,276 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A simulation that sends its samples in time.
+A simulation that sends its messages in time.
 
-Samples up to `now_ns` are sent, those up to `computed_ns` are sent or in the queue.  `advance`
-moves the one to the time that is due, `prepare` the other ahead of it.  All that changes samples
-after `now_ns` empties the queue.
+Messages up to `now_ns` are sent.  The channels of one grid are computed together, a short time
+ahead, and wait as rows.  An event, another rate or another listener drops what waits.
 """
 
 import contextlib
 import time
-from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from operator import attrgetter, itemgetter
 from typing import Any
 
-from spinning_top_sim.physics.pivot import NEVER_NS
+import numpy as np
+
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.blocks import Block, blocks, span_of
-from spinning_top_sim.streams.simulation import Simulation
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams.channel import Channel, Rows, Stamps
+from spinning_top_sim.streams.events import MOTIONS, Event
+from spinning_top_sim.streams.play import Simulation
 
-# Samples of the fastest stream in a block.  A command makes what is computed useless, and the next
-# one may come soon: after it, blocks begin small and double.
-LARGEST_BLOCK, SMALLEST_BLOCK = 256, 16
-MOST_BYTES, MOST_STEPS = 4 << 20, 256           # of a block
-LONGEST_AHEAD_NS = 300_000_000                  # from the last sample that is sent
+MOST_SAMPLES, MOST_BYTES = 256, 4 << 20     # of a channel that are computed together
+# How far ahead is computed: little behind an event, as the next one may come soon.
+FIRST_SPAN_NS, LONGEST_SPAN_NS = 20_000_000, 300_000_000
+# The solver goes on in strides; the first one is tiny, as the pace of a motion is not known
+# before it is tried.  Each is at most so many times as long as the one before.
+FIRST_STRIDE_NS, GROWTH = 1_000, 16.0
+PIECE_SECONDS = 5e-3        # of work, between two questions whether to give way
+BLOCKED_SECONDS = 1.0       # a reader that stalls holds every call for 0.1 s: it gets a rest
 
-# A message for a log: number of the stream in the log, stamp [ns], CDR.
-Entry = tuple[int, int, bytes]
-# Takes messages of one stamp for a log.
-Write = Callable[[Sequence[Entry]], object]
+# Messages of a topic for a log: its number there, stamps (n,) [ns], messages (n, size).
+LogRows = tuple[int, Stamps, Rows]
 
 
 @dataclass(eq=False)
 class Output:
     """
-    Where the samples of a stream go.
+    Where the messages of a channel go.
 
-    publish : takes each message in time; None while there are no subscribers
-    log_index : number of the stream in the log, None if it is not recorded
-    sent, skipped : samples that were published, and those that were too late for that
+    publish : takes each message in time, and may raise; None while there are no subscribers
+    log_index : number of the topic in the log, None if it is not recorded
+    sent, skipped, failed : messages that were published, that were too late for that, and that
+        `publish` refused
     """
 
-    stream: Stream
+    channel: Channel
     publish: Callable[[bytes], object] | None = None
     log_index: int | None = None
     sent: int = 0
     skipped: int = 0
+    failed: int = 0
+    # What waits to be sent: times [ns], messages as rows and as bytes, and how many are sent.
+    _times: list[int] = field(default_factory=list)
+    _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
+    _data: bytes = b''
+    _cursor: int = 0
+    _blocked_until: float = 0.0     # on the monotonic clock [s]
 
     @property
     def is_used(self) -> bool:
-        """Whether anybody takes the samples: else they are not computed."""
+        """Whether anybody takes the messages: else they are not computed."""
         return self.publish is not None or self.log_index is not None
 
+    def clear(self) -> None:
+        self._times, self._cursor = [], 0
 
-# The messages of one time: for the log, and of outputs with subscribers.
-Instant = tuple[list[Entry], list[tuple[Output, bytes]]]
+    def add(self, t_ns: Stamps, rows: Rows) -> None:
+        """Put messages behind those that wait."""
+        if self._cursor < len(self._times):
+            rows = np.concatenate((self._rows[self._cursor:], rows))
+        self._times = self._times[self._cursor:] + t_ns.tolist()
+        self._rows, self._data, self._cursor = rows, rows.tobytes(), 0
+
+    def take(self, until_ns: int, epoch_ns: int, publish_from_ns: int,
+             ) -> tuple[list[tuple[int, bytes]], list[LogRows]]:
+        """Return what waits up to a time: to publish, with the times [ns]; and for the log."""
+        begin = self._cursor
+        end = self._cursor = bisect_right(self._times, until_ns, begin)
+        if begin == end:
+            return [], []
+        logged = [] if self.log_index is None else [
+            (self.log_index, epoch_ns + np.array(self._times[begin:end]), self._rows[begin:end])]
+        if self.publish is None:
+            return [], logged
+        first = bisect_right(self._times, publish_from_ns - 1, begin, end)
+        self.skipped += first - begin
+        size = self._rows.shape[1]
+        return [(self._times[k], self._data[k * size:(k + 1) * size])
+                for k in range(first, end)], logged
+
+    def send(self, message: bytes) -> None:
+        """Publish a message; what the middleware refuses is counted."""
+        assert self.publish is not None
+        if time.monotonic() >= self._blocked_until:
+            try:
+                self.publish(message)
+            except Exception:       # rclpy raises RCLError, which it does not export
+                self._blocked_until = time.monotonic() + BLOCKED_SECONDS
+            else:
+                self.sent += 1
+                return
+        self.failed += 1
 
 
 class LiveSimulation(Simulation):
     """
-    A simulation with an output for each stream.
+    A simulation with an output for each channel.
 
-    What is sent does not depend on when it is computed, or on how often `advance` is called.
+    What is sent does not depend on when it is computed, or on how often `send` is called.
 
-    outputs : of each stream, in the order in which the samples of one time are sent
-    computed_ns : see the head of this module
+    outputs : of each channel, in the order in which the messages of one time are sent
     """
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         super().__init__(values, epoch_ns)
-        self.outputs = [Output(stream) for stream in self.streams]
-        self.computed_ns = -1
-        self._write: Write = lambda entries: None
-        self._queue: deque[tuple[int, Instant]] = deque()       # by time [ns]
-        self._used: list[Output] = []               # those whose samples are in the queue
-        # The queue is right as long as these are as they were when it was computed: `version`,
-        # `epoch_ns`, and which outputs had no subscribers.
-        self._holds_for: tuple[int, int, list[bool]] = -1, 0, []
-        self._work: Iterator[Block | None] | None = None
-        self._block_size = SMALLEST_BLOCK
+        self.outputs = [Output(channel) for channel in self.channels]
+        self._write: Callable[[Sequence[LogRows]], object] = lambda rows: None
+        self._used: list[tuple[int, Output]] = []   # outputs in use, with their numbers
+        self._groups: list[_Group] = []             # of these
+        self._span_ns = FIRST_SPAN_NS               # of what is computed ahead
+        self._stride_ns = FIRST_STRIDE_NS           # of the solver
+        self._reached_ns = -1                       # how far the motion has gone
 
-    def restart(self, values: Mapping[str, Any]) -> None:
-        super().restart(values)
-        for output, stream in zip(self.outputs, self.streams, strict=True):
-            output.stream = stream
-
-    def log_to(self, write: Write | None, streams: Sequence[Stream] = ()) -> None:
+    def log_to(self, write: Callable[[Sequence[LogRows]], object] | None,
+               channels: Sequence[Channel] = ()) -> None:
         """
-        Record these streams after `now_ns`, and no others.
+        Record these channels after `now_ns`, and no others.
 
-        write : takes their messages, in the order of time
-        streams : the position of a stream is its number in the log
+        write : takes their messages; the position of a channel is its number in the log
         """
-        if write is not None:
-            self._write = write
+        self._write = write or self._write
         for output in self.outputs:
-            output.log_index = streams.index(output.stream) if output.stream in streams else None
-        self.version += 1
+            output.log_index = (channels.index(output.channel) if output.channel in channels
+                                else None)
+        self.refresh()
+
+    def apply(self, kind: str, **details: Any) -> Event:
+        if self.now_ns < 0 and kind in MOTIONS:     # the sample of t = 0 comes before them
+            self.send(0)
+        event = super().apply(kind, **details)
+        for output, channel in zip(self.outputs, self.channels, strict=True):
+            output.channel = channel
+        if event.begins_motion or kind == 'reset':
+            self._stride_ns, self._reached_ns = FIRST_STRIDE_NS, self.now_ns
+        self.refresh()
+        return event
+
+    def refresh(self) -> None:
+        """Compute anew what waits: the motion, or who takes the messages, has changed."""
+        self._used = [(number, output) for number, output in enumerate(self.outputs)
+                      if output.is_used]
+        grid = attrgetter('channel.grid')
+        self._groups = [_Group(list(group), self.now_ns) for _, group in groupby(
+            sorted((output for _, output in self._used), key=grid), grid)]
+        self._span_ns = FIRST_SPAN_NS
 
     @property
     def lowest_imu_rate(self) -> float:
         """The lowest `imu.rate` [Hz] with which means and increments in use can go on."""
         uses = self.imu.takes_means or any(
-            output.stream.parameter == 'increments' and output.is_used for output in self.outputs)
+            output.channel.name == 'increments' and output.is_used for output in self.outputs)
         return parameters.LOWEST_RATE_OF_INTERVALS if uses else 0.0
 
-    def advance(self, target_ns: int, publish_from_ns: int = 0,
-                give_way: Callable[[], bool] = lambda: False) -> bool:
+    def send(self, due_ns: int, publish_from_ns: int = 0,
+             give_way: Callable[[], bool] = lambda: False) -> bool:
         """
-        Send every sample due up to `target_ns`; return whether that was reached.
+        Send every message due up to a time; return whether that was reached.
 
-        publish_from_ns : earlier samples are too late to be published; they are recorded
-        give_way : asked between blocks of samples; True ends the call early.
-            Nothing is lost: the next call goes on there.
+        publish_from_ns : earlier messages are too late to be published; they are recorded
+        give_way : asked between pieces of work; True ends the call early, and the next one goes
+            on there
 
-        Raises IntegrationError if the motion does not go on.
+        Raises IntegrationError if the motion does not go on; what comes before is sent.
         """
-        begin_ns = self.now_ns
-        self._refresh()
-        queue = self._queue
-        try:
-            while True:
-                while queue and queue[0][0] <= target_ns:
-                    self._send(*queue.popleft(), publish_from_ns)
-                if self.computed_ns >= target_ns:
-                    self.now_ns = max(self.now_ns, target_ns)
-                    return True
-                self.now_ns = max(self.now_ns, self.computed_ns)
-                if self.now_ns > begin_ns and give_way():
-                    return False
-                self._compute(target_ns, publish_from_ns)
-        finally:        # also what was sent before an error
-            if publish_from_ns > begin_ns + 1:
-                until_ns = min(self.now_ns, publish_from_ns - 1)
-                for output in self.outputs:
-                    if output.publish is not None:
-                        output.skipped += len(output.stream.times(begin_ns, until_ns))
-
-    def prepare(self, until_ns: int, budget_ns: int | None = None) -> bool:
-        """
-        Compute a block ahead, if samples up to `until_ns` are not computed.
-
-        Return False only if the block takes longer than `budget_ns`: the next call goes on there.
-        """
-        self._refresh()
-        if self._work is None and self.computed_ns < until_ns:
-            ahead_ns = min(self._span_ns(self._used, self._block_size), LONGEST_AHEAD_NS)
-            self._block_size = min(2 * self._block_size, LARGEST_BLOCK)
-            self._begin_block(self._used, max(until_ns, self.computed_ns + ahead_ns))
-        if self._work is None:
-            return True
-        # An error is met again by `advance`, when the time has come.
-        with contextlib.suppress(IntegrationError):
-            return self._go_on(None if budget_ns is None else time.monotonic_ns() + budget_ns)
+        while self.now_ns < due_ns:
+            failure = None
+            try:
+                self._go_ahead(due_ns, PIECE_SECONDS)
+            except IntegrationError as error:
+                failure = error
+            until_ns = min(due_ns, self._reached_ns, *(
+                group.until_ns(publish_from_ns) for group in self._groups))
+            for group in self._groups:
+                self._compute(group, until_ns, publish_from_ns)
+            self._send(until_ns, publish_from_ns)
+            if failure is not None and self.now_ns >= self._reached_ns:
+                raise failure
+            if self.now_ns < due_ns and give_way():
+                return False
         return True
 
-    def _settle(self) -> None:
-        """Send the samples up to now, at least that of t = 0, before the motion changes."""
-        self.advance(max(self.now_ns, 0))
+    def look_ahead(self, until_ns: int, seconds: float) -> None:
+        """
+        Compute some of what is due up to a time, for one grid.
 
-    def _refresh(self) -> None:
-        """Empty the queue if the motion or the outputs have changed."""
-        holds_for = (self.version, self.epoch_ns,
-                     [output.publish is None for output in self.outputs])
-        if holds_for != self._holds_for:
-            self._holds_for = holds_for
-            self._used = [output for output in self.outputs if output.is_used]
-            self._queue.clear()
-            self._work, self.computed_ns, self._block_size = None, self.now_ns, SMALLEST_BLOCK
+        seconds : time that this may take; what is computed at once is chosen so that it does
+        """
+        behind = min(self._groups, key=lambda group: group.computed_ns, default=None)
+        if behind is None or behind.computed_ns >= until_ns:
+            return
+        begin = time.monotonic()
+        goal_ns = min(behind.computed_ns + self._span_ns, behind.until_ns(0))
+        with contextlib.suppress(IntegrationError):     # `send` meets it when the time has come
+            self._go_ahead(goal_ns, 0.5 * seconds)
+            self._compute(behind, min(goal_ns, self._reached_ns), 0)
+        taken = time.monotonic() - begin
+        self._span_ns = max(1, min(LONGEST_SPAN_NS, self._span_ns * 2) if taken < 0.5 * seconds
+                            else int(self._span_ns * 0.7))
 
-    def _send(self, t_ns: int, instant: Instant, publish_from_ns: int) -> None:
-        """Send the messages of one time, to the log before others."""
-        entries, publications = instant
-        if entries:
-            self._write(entries)
-        self.now_ns = t_ns
-        if t_ns >= publish_from_ns:
-            for output, message in publications:
-                assert output.publish is not None       # `_refresh` sees when it is not
-                output.publish(message)
-                output.sent += 1
+    def _go_ahead(self, until_ns: int, seconds: float) -> None:
+        """Let the solver go on up to a time, or for about so long."""
+        now = begin = time.monotonic()
+        while self._reached_ns < until_ns and now < begin + seconds:
+            goal_ns = min(until_ns, self._reached_ns + self._stride_ns)
+            stride_ns, called = goal_ns - self._reached_ns, now
+            self._reached_ns = self.reach(self._reached_ns, goal_ns)
+            now = time.monotonic()
+            self._stride_ns = max(1, int(stride_ns * min(
+                GROWTH, 0.5 * seconds / max(now - called, 1e-6))))
+        self.forget()
 
-    def _compute(self, target_ns: int, publish_from_ns: int) -> None:
-        """Finish the block under way, or compute one up to `target_ns` at most."""
-        if self._work is None:
-            used = self._used
-            if self.computed_ns < publish_from_ns - 1:      # nobody takes the others
-                used = [output for output in used if output.log_index is not None]
-                target_ns = min(target_ns, publish_from_ns - 1)
-            self._begin_block(used, target_ns)
-        self._go_on(None)
+    def _compute(self, group: '_Group', until_ns: int, publish_from_ns: int) -> None:
+        """Compute the messages of a grid up to a time that the motion has reached."""
+        late_ns = min(until_ns, publish_from_ns - 1)
+        if group.computed_ns < late_ns:     # nobody takes these unless they are recorded
+            for output in group.outputs:
+                if output.log_index is None:
+                    output.skipped += len(output.channel.times(group.computed_ns, late_ns))
+            self._add(group, [output for output in group.outputs
+                              if output.log_index is not None], late_ns)
+        if group.computed_ns < until_ns:
+            self._add(group, group.outputs, until_ns)
 
-    @staticmethod
-    def _span_ns(used: Sequence[Output], count: int) -> int:
-        """Return the time of a block with so many samples of the fastest stream [ns]."""
-        streams = [output.stream for output in used]
-        shortest_ns = min((stream.period_ns for stream in streams), default=NEVER_NS)
-        return min((count - 1) * shortest_ns, span_of(streams, MOST_BYTES, NEVER_NS))
+    def _add(self, group: '_Group', outputs: Sequence[Output], until_ns: int) -> None:
+        by_channel = {output.channel: output for output in outputs}
+        block = self.block([*by_channel], group.computed_ns, until_ns)
+        for channel, t_ns, rows in block.messages:
+            by_channel[channel].add(t_ns, rows)
+        group.computed_ns = block.until_ns
 
-    def _begin_block(self, used: Sequence[Output], until_ns: int) -> None:
-        until_ns = min(until_ns, self.computed_ns + self._span_ns(used, LARGEST_BLOCK))
-        self.path.release(self.now_ns)
-        self._work = blocks(self.path, [output.stream for output in used], self.epoch_ns,
-                            self.computed_ns, until_ns, span_ns=NEVER_NS, most_steps=MOST_STEPS)
+    def _send(self, until_ns: int, publish_from_ns: int) -> None:
+        """Send what waits up to a time, to the log before others."""
+        logged: list[LogRows] = []
+        due: list[tuple[int, int, bytes]] = []
+        for number, output in self._used:
+            messages, rows = output.take(until_ns, self.epoch_ns, publish_from_ns)
+            logged += rows
+            due += [(t_ns, number, data) for t_ns, data in messages]
+        if logged:
+            self._write(logged)
+        self.now_ns = until_ns
+        for _, number, data in sorted(due, key=itemgetter(0, 1)):
+            self.outputs[number].send(data)
 
-    def _go_on(self, end_ns: int | None) -> bool:
-        """Compute pieces of the block under way until a time; return whether it is complete."""
-        assert self._work is not None
-        try:
-            for block in self._work:
-                if block is not None:
-                    self._append(block)
-                    break
-                if end_ns is not None and time.monotonic_ns() >= end_ns:
-                    return False
-        except BaseException:
-            self._work = None
-            raise
-        self._work = None
-        return True
 
-    def _append(self, block: Block) -> None:
-        """Put the messages of a block into the queue; what is done here is not done by a tick."""
-        instants: defaultdict[int, Instant] = defaultdict(lambda: ([], []))
-        for stream, times_ns, rows in block.messages:
-            output = next(one for one in self.outputs if one.stream is stream)
-            data, size = rows.tobytes(), stream.size
-            for t_ns, begin in zip(times_ns.tolist(), range(0, len(data), size), strict=True):
-                (entries, publications), message = instants[t_ns], data[begin:begin + size]
-                if output.log_index is not None:
-                    entries.append((output.log_index, self.epoch_ns + t_ns, message))
-                if output.publish is not None:
-                    publications.append((output, message))
-        self._queue.extend(sorted(instants.items()))
-        self.computed_ns = block.until_ns
+@dataclass(eq=False)
+class _Group:
+    """The outputs in use of one grid, whose messages are computed together up to `computed_ns`."""
+
+    outputs: list[Output]
+    computed_ns: int
+
+    def __post_init__(self) -> None:
+        for output in self.outputs:
+            output.clear()
+
+    def until_ns(self, publish_from_ns: int) -> int:
+        """Return how far MOST_SAMPLES behind those that are computed reach."""
+        channels = [output.channel for output in self.outputs]
+        largest = max(len(channel.encoder) for channel in channels)
+        return (max(self.computed_ns, publish_from_ns - 1)
+                + max(1, min(MOST_SAMPLES, MOST_BYTES // largest)) * channels[0].period_ns)

@@ -2,8 +2,8 @@
 """
 Templates of the messages that the simulator sends.
 
-Their parts are in the order of the .msg definitions (ROS 2 Jazzy, common_interfaces 5.3); a test
-compares every template with the serializer of rclpy.
+Their parts are in the order of the .msg definitions (ROS 2 Jazzy, common_interfaces 5.3), their
+fields have the names there; a test compares every template with the serializer of rclpy.
 """
 
 from functools import lru_cache, partial
@@ -18,26 +18,6 @@ BODY_COLOR = (0.20, 0.40, 0.70, 1.0)            # red, green, blue, alpha
 AXIS_COLOR = (0.95, 0.75, 0.20, 1.0)
 TRACE_COLOR = (0.90, 0.30, 0.20, 1.0)
 ORIGIN, NO_ROTATION = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-# Names in the message definitions of the fields of a template, by type.
-FIELDS = {
-    'geometry_msgs/msg/PoseStamped': ('pose.position', 'pose.orientation'),
-    'tf2_msgs/msg/TFMessage': ('transforms[0].transform.translation',
-                               'transforms[0].transform.rotation'),
-    'sensor_msgs/msg/JointState': ('position', 'velocity'),
-    'sensor_msgs/msg/Imu': ('orientation', 'angular_velocity', 'linear_acceleration'),
-    'sensor_msgs/msg/MagneticField': ('magnetic_field', 'magnetic_field_covariance'),
-    'sensor_msgs/msg/NavSatFix': ('position',),
-    'geometry_msgs/msg/TwistWithCovarianceStamped': ('twist.twist.linear',),
-    'nav_msgs/msg/Odometry': ('pose.pose.position', 'pose.pose.orientation',
-                              'twist.twist.linear', 'twist.twist.angular'),
-    'geometry_msgs/msg/QuaternionStamped': ('quaternion',),
-    'geometry_msgs/msg/Vector3Stamped': ('vector',),
-    'rosgraph_msgs/msg/Clock': (),
-    'std_msgs/msg/Float64MultiArray': ('data',),
-    'visualization_msgs/msg/MarkerArray': (
-        'markers[0].pose.position', 'markers[0].pose.orientation',
-        'markers[1].pose.position', 'markers[1].pose.orientation', 'markers[2].points'),
-}
 
 
 def diagonal(*variances: float) -> tuple[float, ...]:
@@ -51,85 +31,107 @@ EXACT = diagonal(0.0, 0.0, 0.0)
 
 
 @lru_cache(64)      # ensembles make it in every run
-def stamped(frame_id: str, *counts: int) -> Template:
-    """
-    A header and fields with so many numbers.
+def pose(frame_id: str) -> Template:
+    """geometry_msgs/PoseStamped; quaternions are x, y, z, w everywhere."""
+    return Template(CdrWriter().header(frame_id).field('pose.position', 3)
+                    .field('pose.orientation', 4))
 
-    geometry_msgs/PoseStamped (3, 4), Vector3Stamped (3) and QuaternionStamped (4), and
-    sensor_msgs/MagneticField (3, 9): the field and its covariance; quaternions are x, y, z, w.
-    """
-    return Template(CdrWriter().header(frame_id).field(*counts))
+
+@lru_cache(64)
+def vector(frame_id: str) -> Template:
+    """geometry_msgs/Vector3Stamped."""
+    return Template(CdrWriter().header(frame_id).field('vector', 3))
+
+
+@lru_cache(64)
+def quaternion(frame_id: str) -> Template:
+    """geometry_msgs/QuaternionStamped."""
+    return Template(CdrWriter().header(frame_id).field('quaternion', 4))
+
+
+@lru_cache(64)
+def magnetic_field(frame_id: str) -> Template:
+    """sensor_msgs/MagneticField."""
+    return Template(CdrWriter().header(frame_id).field('magnetic_field', 3)
+                    .field('magnetic_field_covariance', 9))
 
 
 @lru_cache(64)
 def joint_state(names: tuple[str, ...]) -> Template:
-    """sensor_msgs/JointState without effort; fields: positions, velocities."""
+    """sensor_msgs/JointState without effort."""
     count = len(names)
     writer = CdrWriter().header('').append('I', count).string(*names)
-    for _ in ('position', 'velocity'):
-        writer.append('I', count).field(count)
+    for field in ('position', 'velocity'):
+        writer.append('I', count).field(field, count)
     return Template(writer.append('I', 0))
 
 
 @lru_cache(64)
-def imu(frame_id: str, *covariances: tuple[float, ...]) -> Template:
-    """sensor_msgs/Imu; fields: orientation x, y, z, w, angular velocity, linear acceleration."""
+def imu(frame_id: str, orientation: tuple[float, ...], *covariances: tuple[float, ...],
+        ) -> Template:
+    """
+    sensor_msgs/Imu.
+
+    orientation, covariances : covariances of orientation, angular velocity and specific force;
+        with UNKNOWN_ORIENTATION there is no orientation, and no field of it
+    """
     writer = CdrWriter().header(frame_id)
-    for count, covariance in zip((4, 3, 3), covariances, strict=True):
-        writer.field(count).append('d', *covariance)
+    if orientation == UNKNOWN_ORIENTATION:
+        writer.append('d', *NO_ROTATION)
+    else:
+        writer.field('orientation', 4)
+    writer.append('d', *orientation)
+    for field, covariance in zip(('angular_velocity', 'linear_acceleration'), covariances,
+                                 strict=True):
+        writer.field(field, 3).append('d', *covariance)
     return Template(writer)
 
 
 @lru_cache(64)
-def nav_sat_fix(frame_id: str, covariance: tuple[float, ...] | None) -> Template:
-    """
-    sensor_msgs/NavSatFix of GPS; fields: latitude and longitude [deg], altitude [m].
-
-    covariance : east, north, up [m^2]; None: there is no fix
-    """
-    status, kind = (-1, 0) if covariance is None else (0, 2)    # 2: the diagonal is known
-    writer = CdrWriter().header(frame_id).append('b', status).append('H', 1).field(3)
-    return Template(writer.append('d', *(covariance or 9 * (0.0,))).append('B', kind))
+def nav_sat_fix(frame_id: str) -> Template:
+    """sensor_msgs/NavSatFix of GPS; latitude and longitude [deg], altitude [m]."""
+    return Template(CdrWriter().header(frame_id).field('status.status', 1, 'b').append('H', 1)
+                    .field('position', 3).field('position_covariance', 9)
+                    .field('position_covariance_type', 1, 'B'))
 
 
 @lru_cache(64)
 def twist_with_covariance(frame_id: str, variances: tuple[float, ...]) -> Template:
     """
-    geometry_msgs/TwistWithCovarianceStamped; fields: linear velocity.
+    geometry_msgs/TwistWithCovarianceStamped without angular velocity.
 
     variances : of the linear velocity; those of the angular one are -1, as ublox_gps has it
     """
     covariance = diagonal(*variances, *3 * (-1.0,))
-    return Template(CdrWriter().header(frame_id).field(3).append('d', *ORIGIN, *covariance))
+    return Template(CdrWriter().header(frame_id).field('twist.twist.linear', 3)
+                    .append('d', *ORIGIN, *covariance))
 
 
 @lru_cache(64)
 def odometry(frame_id: str, child_frame_id: str) -> Template:
-    """
-    nav_msgs/Odometry with exact values.
-
-    Fields: position, orientation; velocity and angular velocity in the child frame.
-    """
-    writer = CdrWriter().header(frame_id).string(child_frame_id)
-    for count in (4, 3):
-        writer.field(3, count).append('d', *diagonal(*6 * (0.0,)))
-    return Template(writer)
+    """nav_msgs/Odometry with exact values; the twist is in the child frame."""
+    exact = diagonal(*6 * (0.0,))
+    return Template(
+        CdrWriter().header(frame_id).string(child_frame_id).field('pose.pose.position', 3)
+        .field('pose.pose.orientation', 4).append('d', *exact).field('twist.twist.linear', 3)
+        .field('twist.twist.angular', 3).append('d', *exact))
 
 
 @lru_cache(64)
 def transform(frame_id: str, child_frame_id: str) -> Template:
-    """tf2_msgs/TFMessage with one transform; fields: translation, rotation x, y, z, w."""
+    """tf2_msgs/TFMessage with one transform."""
     return Template(CdrWriter().append('I', 1).header(frame_id).string(child_frame_id)
-                    .field(3, 4))
+                    .field('transforms[0].transform.translation', 3)
+                    .field('transforms[0].transform.rotation', 4))
 
 
 @lru_cache(64)
 def float64_multi_array(labels: tuple[str, ...]) -> Template:
-    """std_msgs/Float64MultiArray, one dimension labelled with its columns; fields: the data."""
+    """std_msgs/Float64MultiArray, one dimension labelled with its columns."""
     count = len(labels)
     # Number of dimensions; label, size and stride; offset of the data, their number.
     return Template(CdrWriter().append('I', 1).string(','.join(labels))
-                    .append('I', count, count, 0, count).field(count))
+                    .append('I', count, count, 0, count).field('data', count))
 
 
 @lru_cache(64)
@@ -144,22 +146,20 @@ def markers(frame_id: str, size: tuple[float, ...], lines: tuple[float, ...], li
     """
     visualization_msgs/MarkerArray: a cylinder, lines on it, and a trace if it has points.
 
-    Fields: position and orientation of the cylinder, and of the lines; points of the trace.
-
     size : diameters and height of the cylinder [m]
     lines : x, y and z of begin and end of each line, in the body frame [m]
     line_width : [m]; the trace is half as wide
     """
     writer = CdrWriter().append('I', 3 if trace_points else 2)
     marker = partial(_append_marker, writer, frame_id)
-    marker('body', CYLINDER, size, BODY_COLOR, 0)
-    marker('axis', LINE_LIST, (line_width, 0.0, 0.0), AXIS_COLOR, len(lines) // 3, lines)
+    marker(0, 'body', CYLINDER, size, BODY_COLOR, 0)
+    marker(1, 'axis', LINE_LIST, (line_width, 0.0, 0.0), AXIS_COLOR, len(lines) // 3, lines)
     if trace_points:
-        marker('trace', LINE_STRIP, (0.5 * line_width, 0.0, 0.0), TRACE_COLOR, trace_points)
+        marker(2, 'trace', LINE_STRIP, (0.5 * line_width, 0.0, 0.0), TRACE_COLOR, trace_points)
     return Template(writer)
 
 
-def _append_marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int,
+def _append_marker(writer: CdrWriter, frame_id: str, number: int, namespace: str, kind: int,
                    scale: tuple[float, ...], color: tuple[float, ...], count: int,
                    points: tuple[float, ...] = ()) -> None:
     """Append a visualization_msgs/Marker; `count` points that are not given: a field."""
@@ -167,7 +167,8 @@ def _append_marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int,
     if kind == LINE_STRIP:
         writer.append('d', *ORIGIN, *NO_ROTATION)
     else:
-        writer.field(3, 4)
+        writer.field(f'markers[{number}].pose.position', 3)
+        writer.field(f'markers[{number}].pose.orientation', 4)
     writer.append('d', *scale).append('f', *color)
     writer.append('I', 0, 0)                                # lifetime: for ever
     writer.append('?', False)                               # frame_locked
@@ -175,7 +176,7 @@ def _append_marker(writer: CdrWriter, frame_id: str, namespace: str, kind: int,
     if points:
         writer.append('d', *points)
     elif count:
-        writer.field(3 * count)
+        writer.field(f'markers[{number}].points', 3 * count)
     writer.append('I', 0)                                   # colors
     writer.string('')                                       # texture_resource
     writer.append('I', 0, 0)                                # texture: stamp, frame, format, data

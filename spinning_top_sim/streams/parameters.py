@@ -40,7 +40,9 @@ STREAM_DEFAULTS: tuple[tuple[str, float | None, bool, str], ...] = (
     ('clock', 100.0, False, '/clock (rosgraph_msgs/Clock)'),
 )
 # Second parameter that switches a stream on.
-OTHER_SWITCH = {'clock': 'publish_clock', 'ground_truth_imu_odom': 'increments.enabled'}
+OTHER_SWITCH = {'ground_truth_imu_odom': 'increments.enabled'}
+# In logs of 1.x.
+REMOVED = ('pacing', 'max_error', 'publish_clock')
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HIGHEST_RATE = 10_000.0
 LOWEST_RATE_OF_INTERVALS = 1.0      # of increments and means: the motion is kept for a second
@@ -122,13 +124,10 @@ TABLE: tuple[Parameter, ...] = (
               choices=EQUATIONS),
     _at_reset('solver.rtol', 1e-11, 'rk45: relative tolerance of a step', '', 1e-14, 1e-2),
     _at_reset('solver.atol', 1e-12, 'rk45: absolute tolerance of a step', '', 0.0, 1e-2),
-    _at_once('max_error', 1e-6, 'rk45: warn in /diagnostics when the orientation is further '
-             'from the exact solution; 0 = do not look', 'rad', 0.0, 1e6),
     _at_once('tick_rate', 200.0, 'How often due samples are sent; below 4, it is 4', 'Hz', 1e-2,
              HIGHEST_RATE),
     _at_once('time_scale', 1.0, 'Simulated over real time', '', 1e-6, 1e6),
     _at_start('start_paused', False, 'Wait for ~/set_pause or ~/step'),
-    _at_start('publish_clock', False, 'Publish /clock (the same as clock.enabled)'),
     _at_start('simulation_interfaces', True, 'Offer the services of simulation_interfaces if that '
               'package is installed'),
     _at_start('world_frame', 'world', 'Frame of the world, z up; its origin is the pivot at '
@@ -229,13 +228,7 @@ BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in T
 
 def checked(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return all parameters: these values, else defaults.  Raises ValueError for bad values."""
-    result = {parameter.name: parameter.default for parameter in TABLE}
-    for name, value in values.items():
-        if name == 'pacing':        # in logs of 1.0; it had no effect
-            continue
-        if name not in BY_NAME:
-            raise ValueError(f'{name} = {shown(value)}: there is no such parameter')
-        result[name] = BY_NAME[name].check(value)
+    result = {parameter.name: parameter.default for parameter in TABLE} | checked_changes(values)
     _check_together(result)
     if result['gnss.enabled'] and find_spec('pymap3d') is None:
         raise ValueError('gnss.enabled = True: needs pymap3d, which is not installed: '
@@ -243,6 +236,15 @@ def checked(values: Mapping[str, Any]) -> dict[str, Any]:
     for describe in (top_of, start_state, pivot_path):      # they refuse what cannot be
         describe(result)
     return result
+
+
+def checked_changes(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return these values, each checked alone.  Raises ValueError."""
+    for name, value in values.items():
+        if name not in BY_NAME and name not in REMOVED:
+            raise ValueError(f'{name} = {shown(value)}: there is no such parameter')
+    return {name: BY_NAME[name].check(value) for name, value in values.items()
+            if name not in REMOVED}
 
 
 def _check_together(values: Mapping[str, Any]) -> None:

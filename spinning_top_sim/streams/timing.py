@@ -19,14 +19,17 @@ FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_r
 
 class Timing:
     """
-    The stamps of an IMU, and the number of messages that are sent for each of its samples.
+    The clock of an IMU, and its losses.
 
-    Offset, drift and jitter of its clock depend on the seed, the number of the sample and its
-    time alone.
+    Offset, drift and jitter of its stamps, and what is lost or doubled, depend on the seed, the
+    number of the sample and its time alone.
+
+    period_ns : of its samples [ns]
+    is_right : whether there are no faults
     """
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._seed = values['seed']
+    def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
+        self._seed, self._period_ns = values['seed'], period_ns
         self._offset_ns = round(values['imu.stamp_offset'] * NANOSECONDS)
         self._jitter_ns = values['imu.stamp_jitter'] * NANOSECONDS
         self._drift = values['imu.clock_drift'] * 1e-6
@@ -34,27 +37,22 @@ class Timing:
         self._dropped_below, self._repeated_below = (
             NormalDist().inv_cdf(rate) if rate else -np.inf
             for rate in (values['imu.drop_rate'], values['imu.duplicate_rate']))
+        self.is_right = not any(map(values.get, FAULTS))
 
-    def stamps_ns(self, epoch_ns: int, t_ns: NDArray[np.int64], period_ns: int,
-                  ) -> NDArray[np.int64]:
+    def stamps(self, epoch_ns: int, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the stamps (n,) [ns] of samples at times (n,) [ns]; epoch_ns is that of t = 0."""
-        jitter, _, _ = self._draw(t_ns, period_ns)
-        most = MOST_JITTER * period_ns
+        jitter, _, _ = self._draw(t_ns)
+        most = MOST_JITTER * self._period_ns
         errors = self._drift * t_ns + np.clip(self._jitter_ns * jitter, -most, most)
         stamps: NDArray[np.int64] = (
             epoch_ns + self._offset_ns + t_ns + np.rint(errors).astype(np.int64))
         return np.clip(stamps, 0, LAST_STAMP_NS)
 
-    def copies(self, t_ns: NDArray[np.int64], period_ns: int) -> NDArray[np.int64]:
+    def copies(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return how many messages are sent for each of the samples: 0, 1 or 2."""
-        _, drop, repeat = self._draw(t_ns, period_ns)
+        _, drop, repeat = self._draw(t_ns)
         return np.where(drop < self._dropped_below, 0,
                         np.where(repeat < self._repeated_below, 2, 1))
 
-    def _draw(self, t_ns: NDArray[np.int64], period_ns: int) -> NDArray[np.float64]:
-        return noise.white(self._seed, noise.Purpose.TIMING, t_ns // period_ns, 3)
-
-
-def timing_of(values: Mapping[str, Any]) -> Timing | None:
-    """Return the timing of an IMU with faults, None if it has none."""
-    return Timing(values) if any(map(values.get, FAULTS)) else None
+    def _draw(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        return noise.white(self._seed, noise.Purpose.TIMING, t_ns // self._period_ns, 3)

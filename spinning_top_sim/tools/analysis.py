@@ -80,7 +80,7 @@ def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
     """Return the attitudes in the decoded fields of a stream, None if it has none."""
     rows = [field.T for field in fields]
     if name in ('ground_truth/imu', 'imu/data'):
-        rows = list(map(np.vstack, imu.in_body(tuple(rows[0]), tuple(rows[1]))))
+        rows = list(map(np.vstack, imu.mounting.to_body(tuple(rows[0]), tuple(rows[1]))))
         if imu.takes_means:         # the rates are not those at the stamps
             del rows[1]
     elif name == 'joint_states':

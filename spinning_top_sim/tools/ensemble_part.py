@@ -9,7 +9,8 @@ import contextlib
 import itertools
 import json
 import platform
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,12 +21,10 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import reason_of
-from spinning_top_sim.streams import journal
-from spinning_top_sim.streams.cdr import NANOSECONDS, CdrWriter, Field, Template, fill
-from spinning_top_sim.streams.messages import FIELDS
-from spinning_top_sim.streams.simulation import Simulation
-from spinning_top_sim.streams.stream import Stream
-from spinning_top_sim.streams.topics import ARRAY, INVARIANTS, JOINTS, TIMING
+from spinning_top_sim.streams.cdr import NANOSECONDS, Field, fill
+from spinning_top_sim.streams.channel import Channel, Rows, Stamps
+from spinning_top_sim.streams.play import Simulation
+from spinning_top_sim.streams.topics import ARRAY, INVARIANTS, JOINTS, TIMING, recorded
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
 from spinning_top_sim.tools.simulate import write_log
 
@@ -41,8 +40,9 @@ DATA = 'data'                   # folder of the files of a dataset
 FAILED_KEY = b'failed'
 # Names of the numbers in the fields of a topic, where they are not x, y, z and w.
 GEODETIC = ('latitude', 'longitude', 'altitude')
-LABELS = {'joint_states': JOINTS, '~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING,
-          'gnss/fix': GEODETIC, 'ground_truth/gnss/fix': GEODETIC}
+LABELS = {('joint_states', 'position'): JOINTS, ('joint_states', 'velocity'): JOINTS,
+          ('~/invariants', 'data'): INVARIANTS, ('ground_truth/imu_timing', 'data'): TIMING,
+          ('gnss/fix', 'position'): GEODETIC, ('ground_truth/gnss/fix', 'position'): GEODETIC}
 
 
 @cache
@@ -52,29 +52,30 @@ def versions() -> dict[str, str]:
             **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}
 
 
-def _column_names(stream: Stream) -> Sequence[str]:
-    """Return the names of the numbers in a message, '' for those that are not kept."""
-    if stream.type_name == ARRAY and stream.topic not in LABELS:
-        raise ValueError(f'{stream.topic}: its numbers have no names, which must be in LABELS')
+def _column_names(channel: Channel) -> list[str]:
+    """Return the names of the numbers in the fields of a message."""
     names = []
-    for field, count in zip(FIELDS[stream.type_name], stream.template.counts, strict=True):
-        labels = LABELS.get(stream.topic) or ('xyzw'[:count] if count <= 4 else range(count))
-        # REP-145: a message may say that it has no orientation.
-        is_kept = field != 'orientation' or getattr(stream, 'has_orientation', True)
-        names += [f'{field}.{label}' if is_kept else '' for label in labels]
+    for name, _, count, _ in channel.template.fields:
+        labels: Any = LABELS.get((channel.topic, name)) or (
+            [''] if count == 1 else 'xyzw'[:count] if count <= 4 else range(count))
+        if channel.type_name == ARRAY and (channel.topic, name) not in LABELS:
+            raise ValueError(f'{channel.topic}: its numbers need names in LABELS')
+        names += [f'{name}.{label}'.rstrip('.') for label in labels]
     return names
 
 
-class _Columns(Template):
-    """The fields of messages alone, as the rows of a table, (n, numbers)."""
+class _Columns:
+    """Encodes fields as the rows of a table, (n, numbers)."""
 
     def __init__(self, counts: Sequence[int]) -> None:
-        super().__init__(CdrWriter().field(*counts))
+        self._counts = counts
 
-    def encode_runs(self, stamps_ns: NDArray[np.int64],
-                    runs: Iterable[tuple[int, Sequence[Field]]]) -> NDArray[Any]:
-        columns = np.empty((sum(self.counts), len(stamps_ns)))
-        fill([field.T for field in np.split(columns, np.cumsum(self.counts)[:-1])], runs)
+    def __len__(self) -> int:
+        return 8 * sum(self._counts)
+
+    def encode(self, stamps_ns: Stamps, fields: Sequence[Field]) -> Rows:
+        columns = np.empty((sum(self._counts), len(stamps_ns)))
+        fill([field.T for field in np.split(columns, np.cumsum(self._counts)[:-1])], fields)
         return columns.T
 
 
@@ -86,23 +87,26 @@ def samples(specification: Specification, simulation: Simulation) -> Samples:
     have the same columns.  Raises IntegrationError if the motion ends early.
     """
     values = simulation.values
-    names = {stream: _column_names(stream) for stream in simulation.streams
-             if stream.parameter in specification.kept}
-    times: dict[Stream, list[NDArray[np.int64]]] = {stream: [] for stream in names}
-    numbers: dict[Stream, list[NDArray[np.float64]]] = {stream: [] for stream in names}
-    for stream in names:
-        stream.template = _Columns(stream.template.counts)
-    recorded = journal.recorded_streams(list(names), values)
-    for block in simulation.play(recorded, round(values['duration'] * NANOSECONDS)):
-        for stream, times_ns, rows in block.messages:
-            times[stream].append(times_ns)
-            numbers[stream].append(rows.T)
+    names: dict[str, list[str]] = {}
+    tables: list[Channel] = []
+    for channel in simulation.channels:
+        if channel.name in specification.kept:
+            names[channel.topic] = _column_names(channel)
+            tables.append(replace(channel, encoder=_Columns(
+                [field.numbers for field in channel.template.fields])))
+    times: dict[str, list[Stamps]] = {topic: [] for topic in names}
+    numbers: dict[str, list[Rows]] = {topic: [] for topic in names}
+    for block in simulation.play(recorded(tables, values),
+                                 round(values['duration'] * NANOSECONDS)):
+        for channel, times_ns, rows in block.messages:
+            times[channel.topic].append(times_ns)
+            numbers[channel.topic].append(rows.T)
     every_ns = np.sort(_joined([*itertools.chain(*times.values())], 0, np.int64), kind='stable')
     rows_ns = every_ns[np.diff(every_ns, prepend=-1) > 0]
     columns = {'t': (rows_ns / NANOSECONDS, np.zeros(len(rows_ns), bool))}
-    for stream, labels in names.items():
-        times_ns = _joined(times[stream], 0, np.int64)
-        cells = _joined(numbers[stream], (len(labels), 0))
+    for topic, labels in names.items():
+        times_ns = _joined(times[topic], 0, np.int64)
+        cells = _joined(numbers[topic], (len(labels), 0))
         absent = np.zeros(len(rows_ns), bool)
         if not np.array_equal(times_ns, rows_ns):
             # A faulty sensor sends some samples twice; they share a row.
@@ -111,8 +115,8 @@ def samples(specification: Specification, simulation: Simulation) -> Samples:
             cells[:, present] = sent
             absent[:] = True
             absent[present] = False
-        columns.update((f'{stream.topic}.{name}', (column, absent))
-                       for name, column in zip(labels, cells, strict=True) if name)
+        columns.update((f'{topic}.{name}', (column, absent))
+                       for name, column in zip(labels, cells, strict=True))
     return columns
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from spinning_top_sim.physics.top import shown
-from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams import parameters, topics
 from spinning_top_sim.streams.parameter import Effect, Parameter
 from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_scene
 
@@ -122,7 +122,7 @@ class Specification:
     def kept(self) -> Sequence[str]:
         """Names of the streams that any of the runs keeps: the columns of the table of each."""
         return [name for name in STREAMS if any(
-            journal.is_recorded(name, {**DEFAULTS, **values}) for values in self.alternatives)]
+            topics.is_recorded(name, {**DEFAULTS, **values}) for values in self.alternatives)]
 
 
 def read(path: Path) -> Specification:
@@ -187,7 +187,7 @@ def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
     what, kinds = f'sample: {name}', (*DISTRIBUTIONS, VALUES)
     if name != PARAMS:
         ours = parse_section({name: 0.0}, 'sample')         # refuses an unknown name
-        if not ours or str(name).endswith(('.enabled', 'record.streams', 'publish_clock')):
+        if not ours or str(name).endswith(('.enabled', 'record.streams')):
             raise ValueError(f'{what} must not be sampled: `streams`, or a set of `params`, says '
                              'which streams there are')
     if not isinstance(rule, Mapping) or len(rule) != 1 or not set(rule) <= set(kinds):

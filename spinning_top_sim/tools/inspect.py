@@ -122,7 +122,7 @@ def _as_json(found: Survey, comparison: Comparison | None) -> object:
         'motions': [{
             **_fields_of(motion, 'cause', 'begin_ns', 'end_ns', 'source'),
             'regime': motion.exact and motion.exact.name,
-            **_fields_of(motion.segment, 'l3', 'lz', 'energy'),
+            **_fields_of(motion.piece, 'l3', 'lz', 'energy'),
             'exact': motion.exact and asdict(motion.exact),
             'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
         'drifts': found.drifts,
@@ -130,8 +130,8 @@ def _as_json(found: Survey, comparison: Comparison | None) -> object:
     if run is not None:
         content['run'] = {'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
                           **_fields_of(run, 'epoch_ns', 'begun_ns'), **run.environment}
-        content['events'] = [{'event': event.name, **_fields_of(event, 'stamp_ns', 't_ns'),
-                              **event.details} for event in run.events]
+        content['events'] = [{'event': event.kind, 'stamp_ns': stamp_ns, 't_ns': event.t_ns,
+                              **event.details} for stamp_ns, event in run.events]
     if comparison is not None:
         content['verify'] = {'identical': comparison.identical, 'whole': found.whole,
                              **asdict(comparison),
@@ -179,7 +179,7 @@ def _as_text(found: Survey, comparison: Comparison | None) -> Iterator[str]:
 def _journal(run: RunDescription) -> str:
     if run.events_topic is None:
         return 'no journal: commands and resets are unknown'
-    counts = Counter(event.name for event in run.events)
+    counts = Counter(logged.event.kind for logged in run.events)
     return (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
             f'{counts["parameters"]} changes of parameters'
             + (f', {counts["state"]} states set' if counts['state'] else '')
@@ -200,7 +200,7 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
     exact, measured = motion.exact, motion.measured
     begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
                   for at_ns in (motion.begin_ns, motion.end_ns))
-    name = (exact.name if exact is not None else 'the pivot moves' if motion.segment.ride
+    name = (exact.name if exact is not None else 'the pivot moves' if not motion.piece.rests
             else 'beyond the closed form')
     title = f'motion {number} ({motion.cause}), {begin:.6g} to {end:.6g} s: {name}'
     rows = []
@@ -214,7 +214,7 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
         yield from (f'not measured: {reason}' for reason in measured.missing)
     else:
         yield 'not measured: no topic with enough attitudes (joint_states, pose, ground_truth/...)'
-    if motion.segment.ride:
+    if not motion.piece.rests:
         yield ('the pivot moves: no constants and no closed form of the whole motion to compare '
                'with; --verify compares each message')
 

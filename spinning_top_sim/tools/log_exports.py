@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.cdr import stamp_text
-from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import cli
-from spinning_top_sim.tools.recorded_run import RunDescription
+from spinning_top_sim.tools.recorded_run import RunDescription, channels_of
 
 RAW, BIAS, ODOMETRY = 'imu/data_raw', 'ground_truth/imu_bias', 'ground_truth/imu_odom'
 KALIBR_NEEDS = tuple(f'imu.{kind}_{name}' for kind in ('accelerometer', 'gyroscope')
@@ -128,8 +127,8 @@ def _kalibr(_: LogReader, run: RunDescription) -> Iterator[str]:
 def _blocks(reader: LogReader, run: RunDescription, topic: str,
             ) -> Iterator[tuple[NDArray[np.int64], tuple[NDArray[np.float64], ...]]]:
     """Yield stamps (n,) [ns] and fields of the messages of a stream, block by block."""
-    template = next(stream.template for stream in all_streams(run.values_in_effect)
-                    if stream.topic == topic)
+    template = next(channel.template for channel in channels_of(run.values_in_effect)
+                    if channel.topic == topic)
     for _, group in reader.groups([run.topics[topic]]):
         data = b''.join(message.data for message in group if len(message.data) == len(template))
         yield template.stamps_ns(data), template.decode(data)

@@ -33,11 +33,11 @@ def animate(_: str, motion: MotionReport, data: Attitudes, path: Path) -> None:
 def _columns(motion: MotionReport, data: Attitudes, seconds: float) -> SimpleNamespace:
     """Return the first samples, at least two, with the columns of `States` that are drawn."""
     data = data.first(max(2, int(np.searchsorted(data.time, seconds, 'right'))))
-    top = motion.segment.motion.top
+    top = motion.piece.top
     unknown = np.full(len(data.time), np.nan)       # such as the rates in a log of poses alone
     constants = data.constants(top)
     return SimpleNamespace(
-        t=data.time, top=top, start=motion.segment.start,
+        t=data.time, top=top, start=motion.piece.start,
         quaternion=np.stack(data.quaternion, axis=-1),
         rows_axis=(data.tip.real, data.tip.imag, data.height),
         theta_folded=np.arccos(np.clip(data.height, -1.0, 1.0)),

@@ -19,18 +19,19 @@ from typing import Any
 
 from spinning_top_sim.recording.provenance import run_metadata
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recorder import create_file
+from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.blocks import Block
+from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.simulation import Simulation
-from spinning_top_sim.streams.stream import Stream, period_ns
-from spinning_top_sim.streams.topics import resolve_topic
+from spinning_top_sim.streams.channel import Channel, period_ns
+from spinning_top_sim.streams.events import Event
+from spinning_top_sim.streams.play import Block, Simulation
+from spinning_top_sim.streams.topics import recorded, resolve_topic
 from spinning_top_sim.tools import cli, log_exports, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
-from spinning_top_sim.tools.table import RIDE_UNITS, UNITS, TrueStates, write_csv, write_parquet
+from spinning_top_sim.tools.table import RIDE_UNITS, UNITS, true_states, write_csv, write_parquet
 
 FORMATS = ('mcap', 'csv', 'parquet')
 
@@ -72,10 +73,10 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ValueError(f'--export: needs a log, and {output} is {file_format}')
     values = _parameters(arguments)
     simulation = Simulation(values, round(epoch_ns))
-    if simulation.top.objection:
-        cli.print_line(f'spinning-top simulate: warning: {simulation.top.objection}', sys.stderr)
-    log_exports.check(arguments.export, [stream.topic for stream in journal.recorded_streams(
-        simulation.streams, values)], values)
+    if objection := simulation.trajectory.top.objection:
+        cli.print_line(f'spinning-top simulate: warning: {objection}', sys.stderr)
+    log_exports.check(arguments.export, [
+        channel.topic for channel in recorded(simulation.channels, values)], values)
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
         if file_format == 'mcap':
@@ -97,14 +98,14 @@ def _run(arguments: argparse.Namespace) -> int:
 def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Sequence[Stop],
                  show: Callable[[float], object]) -> Mapping[str, str]:
     """Write a table; return the units of its columns."""
-    every_ns = period_ns(simulation.values['pose.rate'])
-    table = TrueStates(every_ns, UNITS) if simulation.pivot_path is None else TrueStates(
-        every_ns, RIDE_UNITS, lambda samples: (*samples.pivot.position, *samples.pivot.velocity))
+    pivot_moves = simulation.trajectory.pivot is not None
+    table = true_states(period_ns(simulation.values['pose.rate']), pivot_moves=pivot_moves)
+    units = RIDE_UNITS if pivot_moves else UNITS
     write = write_csv if file_format == 'csv' else write_parquet
     # A command changes the rows after its time.
     write(path, (rows for done in _play(simulation, [table], stops, show)
-                 if isinstance(done, Block) for _, _, rows in done.messages), table.units)
-    return table.units
+                 if isinstance(done, Block) for _, _, rows in done.messages), units)
+    return units
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -135,25 +136,25 @@ def _parse_stops(commands: Sequence[str], duration_ns: int) -> list[Stop]:
     return [*sorted(stops, key=lambda stop: stop[0]), (duration_ns, None)]
 
 
-def _play(simulation: Simulation, streams: Sequence[Stream], stops: Sequence[Stop],
-          show: Callable[[float], object]) -> Iterator[Block | tuple[float, float]]:
+def _play(simulation: Simulation, channels: Sequence[Channel], stops: Sequence[Stop],
+          show: Callable[[float], object]) -> Iterator[Block | Event]:
     """
-    Yield the blocks up to each stop, then L3 and Lz of its command, which has been applied.
+    Yield the blocks up to each stop, then its command, which has been applied.
 
     Raises IntegrationError where the state cannot take a command.
     """
     for stop_ns, momenta in stops:
-        for block in simulation.play(streams, stop_ns):
+        for block in simulation.play(channels, stop_ns):
             yield block
             show(simulation.now_ns / NANOSECONDS)
         if momenta is not None:
+            l3, lz = momenta
             try:
-                simulation.command(*momenta)
+                yield simulation.apply('command', l3=l3, lz=lz)
             except ValueError as error:
-                t, (l3, lz) = simulation.now_ns / NANOSECONDS, momenta
+                t = stop_ns / NANOSECONDS
                 raise IntegrationError(f'--command {t!r}:{l3!r}:{lz!r}: {error}; the file holds '
-                                       f'the run up to t = {t!r} s') from error
-            yield momenta
+                                       f'the run up to t = {t!r} s', reached_ns=stop_ns) from error
 
 
 def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
@@ -164,30 +165,31 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     After an error the log is closed and readable, and holds what was computed before.
     """
     values, epoch_ns = simulation.values, simulation.epoch_ns
-    streams = journal.recorded_streams(simulation.streams, values)
-    types = {stream.topic: stream.type_name for stream in streams} | journal.TOPICS
+    channels = recorded(simulation.channels, values)
+    types = {channel.topic: channel.type_name for channel in channels} | events.TOPICS
     topics = list(types)
     file = create_file(
         path, [RecordedTopic(resolve_topic(name, namespace), type_name)
                for name, type_name in types.items()],
         run_metadata(values, epoch_ns, -1, (), values), compression=values['record.compression'])
+
+    def add(event: Event) -> None:
+        for topic, data in event.entries():
+            file.add(*single(topics.index(topic), epoch_ns + event.t_ns, data))
+
     try:
-        file.append(topics.index(journal.EVENTS), epoch_ns, journal.event('start', 0, -1))
-        for done in _play(simulation, streams, stops, show):
+        add(Event('start', 0, -1))
+        for done in _play(simulation, channels, stops, show):
             if isinstance(done, Block):
-                file.append_rows([(streams.index(stream), epoch_ns + t_ns, rows)
-                                  for stream, t_ns, rows in done.messages])
+                for channel, t_ns, rows in done.messages:
+                    file.add(channels.index(channel), epoch_ns + t_ns, rows)
             else:
-                for topic, data in journal.command_entries(simulation.now_ns, *done):
-                    file.append(topics.index(topic), epoch_ns + simulation.now_ns, data)
+                add(done)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(f'{path} holds the run up to t = '
                                 f'{simulation.now_ns / NANOSECONDS:g} s') from interrupt
     finally:
-        try:
-            file.flush()
-        finally:
-            file.finish()
+        file.finish()
     return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
 
 

@@ -10,7 +10,6 @@ import itertools
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,11 +22,11 @@ from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.recording.damage import Damage
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import LogMessage, LogReader
-from spinning_top_sim.streams.blocks import Block
-from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
+from spinning_top_sim.solvers.handover import Piece
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, stamp_text
+from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.path import Segment
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams.play import Block
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured
 from spinning_top_sim.tools.recorded_run import LAST_LOG_TIME_NS, RunDescription
@@ -62,7 +61,7 @@ class Section:
     begin_ns: int                         # log times [ns]
     end_ns: int
     epoch_ns: int                         # stamp of t = 0 [ns]
-    streams: dict[str, Stream]            # with their rates, by topic of the log
+    channels: dict[str, Channel]          # with their rates, by topic of the log
 
 
 @dataclass
@@ -70,8 +69,7 @@ class MotionReport:
     """A motion of the top, from its cause to the next one."""
 
     cause: str                            # start, command, state, drive or reset
-    origin_ns: int                        # log time of the t = 0 of `segment` [ns]
-    segment: Segment                      # its constants and its exact solution
+    piece: Piece                          # its constants and its exact solution
     exact: Description | None             # None if the closed form cannot represent it
     source: str | None                    # topic that it is measured from
     imu: Imu
@@ -132,7 +130,7 @@ def survey(reader: LogReader) -> Survey:
     if sections:        # the last entry of the journal may be later than the last sample
         last = sections[-1]
         found.end_ns = last.end_ns = max(last.begin_ns, 0, *(
-            int(stamps_ns[topic].max(initial=0)) for topic in last.streams))
+            int(stamps_ns[topic].max(initial=0)) for topic in last.channels))
     for topic, report in found.topics.items():
         _count(report, stamps_ns[topic], sections if report.stream is not None else [], topic)
     for motion in found.motions:
@@ -144,37 +142,37 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
     """Compute the motions of a run; add notes about what cannot be followed."""
     motions = found.motions
     try:
-        for simulation, event in recorded_run.rerun(run, found.damage.end_ns):
-            if isinstance(event, Block):
+        for simulation, done in recorded_run.rerun(run, found.damage.end_ns):
+            if isinstance(done, Block):
                 continue
+            event = done.event
             if motions:
                 last = motions[-1].sections[-1]
                 last.end_ns = last.epoch_ns + event.sent_ns
             begin_ns = simulation.epoch_ns + simulation.now_ns
-            streams = {run.topics[stream.topic]: copy(stream) for stream in simulation.streams
-                       if stream.topic in run.topics}
+            channels = {run.topics[channel.topic]: channel for channel in simulation.channels
+                        if channel.topic in run.topics}
             # The velocities of the pivot belong to one motion.
-            if event.name != 'parameters' and not (
-                    event.name == 'drive' and motions and motions[-1].cause == 'drive'):
-                exact = simulation.describe() if len(motions) < MOST_EXACT else None
-                motions.append(MotionReport(
-                    event.name, simulation.epoch_ns + simulation.segment.start_ns,
-                    simulation.segment, exact, _source(run, streams, exact),
-                    Imu(simulation.values)))
+            if event.kind not in ('parameters', 'epoch') and not (
+                    event.kind == 'drive' and motions and motions[-1].cause == 'drive'):
+                piece = simulation.trajectory.after(max(simulation.now_ns, 0))
+                exact = piece.describe() if len(motions) < MOST_EXACT else None
+                motions.append(MotionReport(event.kind, piece, exact,
+                                            _source(run, channels, exact), simulation.imu))
             motions[-1].sections.append(
-                Section(begin_ns, begin_ns, simulation.epoch_ns, streams))
+                Section(begin_ns, begin_ns, simulation.epoch_ns, channels))
     except MALFORMED as error:
         found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
     if len(motions) > MOST_EXACT:
         found.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact one')
 
 
-def _source(run: RunDescription, streams: Mapping[str, Stream],
+def _source(run: RunDescription, channels: Mapping[str, Channel],
             exact: Description | None) -> str | None:
     """Return the topic that a motion is measured from, as docs/log_format.md says."""
     period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
     return max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
-               key=lambda name: min(period_ns / streams[name].period_ns, ENOUGH_SAMPLES))
+               key=lambda name: min(period_ns / channels[name].period_ns, ENOUGH_SAMPLES))
 
 
 def _read_messages(found: Survey, reader: LogReader) -> dict[str, Stamps]:
@@ -195,27 +193,28 @@ def _stamps(samples: Sequence[LogMessage]) -> Stamps:
 
 
 def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogMessage]) -> None:
-    stream, segment = motion.sections[0].streams[topic], motion.segment
-    fitting = [sample for sample in samples if len(sample.data) == len(stream.template)]
+    section, piece = motion.sections[0], motion.piece
+    channel = section.channels[topic]
+    fitting = [sample for sample in samples if len(sample.data) == len(channel.template)]
     stamps_ns = _stamps(fitting)
-    fields = stream.template.decode(b''.join(sample.data for sample in fitting))
-    data = analysis.attitudes_of(stream.topic, motion.imu, stamps_ns, fields)
+    fields = channel.template.decode(b''.join(sample.data for sample in fitting))
+    data = analysis.attitudes_of(channel.topic, motion.imu, stamps_ns, fields)
     if data is None:
         return
     if topic == motion.source:
         motion.samples.append((data.stamps_ns, data.rows))
-    if segment.ride:                # there are other constants in each of its pieces
+    if not piece.rests:             # there are other constants in each of its pieces
         return
-    values = data.constants(segment.motion.top)
-    if values is not None and stream.topic != 'imu/data':       # which is noisy
+    values = data.constants(piece.top)
+    if values is not None and channel.topic != 'imu/data':       # which is noisy
         drifts = found.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})
         for (name, largest), value in zip(drifts.items(), values, strict=True):
-            drift = relative_drift(value, getattr(segment, name))
+            drift = relative_drift(value, getattr(piece, name))
             drifts[name] = max(largest, _largest(drift))
-    if motion.exact is not None and (exact := segment.closed_form) is not None:
-        times_ns = np.clip(data.stamps_ns - motion.origin_ns, -exact.ns_limit, exact.ns_limit)
-        truth = exact.states(times_ns).rows_quaternion
-        error = _largest(angle_between(data.quaternion, truth))
+    # Log times of the run; those of a log that was changed may lie anywhere.
+    times_ns = np.clip(data.stamps_ns - section.epoch_ns, piece.start_ns, LAST_STAMP_NS)
+    if motion.exact is not None and (truth := piece.truth(times_ns)) is not None:
+        error = _largest(angle_between(data.quaternion, truth.rows_quaternion))
         found.errors[topic] = max(found.errors.get(topic, 0.0), error)
 
 
@@ -231,31 +230,22 @@ def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topi
         report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
     for section in sections:
         end = int(np.searchsorted(stamps_ns, section.end_ns, 'right'))
-        _count_section(report, section, section.streams[topic], stamps_ns[:end])
+        _count_section(report, section, section.channels[topic], stamps_ns[:end])
         stamps_ns = stamps_ns[end:]
 
 
-def _count_section(report: TopicReport, section: Section, stream: Stream,
+def _count_section(report: TopicReport, section: Section, channel: Channel,
                    stamps_ns: Stamps) -> None:
-    """Add the samples and the gaps of a section; its times count from t = 0."""
-    period_ns, late_ns = stream.period_ns, stream.late_ns
-    times_ns = stamps_ns - section.epoch_ns
-    begin_ns = max(section.begin_ns - section.epoch_ns, -1)
-    end_ns = section.end_ns - section.epoch_ns
-    due = stream.times(begin_ns, end_ns)
-    expected_gaps = [(begin + late_ns, end + late_ns) for begin, end in stream.silences_ns]
-    silent = sum(len(stream.times(max(begin_ns, begin - 1), min(end_ns, end - 1)))
-                 for begin, end in expected_gaps)
-    report.grid_rate = NANOSECONDS / period_ns
-    # A sample that is there twice does not replace a missing one.
-    present = np.unique(times_ns[(times_ns - late_ns) % period_ns == 0])
-    report.missing = (report.missing or 0) + len(due) - silent - len(present)
-    edges_ns = np.array([due.start - period_ns, *times_ns, due.start + len(due) * period_ns])
-    for place in np.flatnonzero(np.diff(edges_ns) > period_ns):
-        first_ns, last_ns = int(edges_ns[place]) + period_ns, int(edges_ns[place + 1]) - period_ns
-        if len(report.gaps_ns) < MOST_GAPS and not any(
-                begin <= first_ns and last_ns < end for begin, end in expected_gaps):
-            report.gaps_ns.append((section.epoch_ns + first_ns, section.epoch_ns + last_ns))
+    """Add the missing messages of a section: those that the run has sent and the log lacks."""
+    times = channel.times(max(section.begin_ns - section.epoch_ns, -1),
+                          section.end_ns - section.epoch_ns)
+    due_ns = section.epoch_ns + np.unique(channel.due(np.array(times, np.int64)))
+    report.grid_rate = NANOSECONDS / channel.period_ns
+    missing = ~np.isin(due_ns, stamps_ns)
+    report.missing = (report.missing or 0) + int(np.sum(missing))
+    edges = np.flatnonzero(np.diff(missing, prepend=False, append=False))
+    report.gaps_ns += [(int(due_ns[begin]), int(due_ns[end - 1])) for begin, end in zip(
+        edges[::2], edges[1::2], strict=True)][:max(MOST_GAPS - len(report.gaps_ns), 0)]
 
 
 def _measure(found: Survey, motion: MotionReport) -> None:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of true states, as CSV and Parquet; their numbers are read back to the last bit."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.stream import Encoded, Samples, Stream
+from spinning_top_sim.streams.cdr import NANOSECONDS, Field
+from spinning_top_sim.streams.channel import Channel, Rows, Samples, Stamps
 
 # Names and units of the columns of a table.
 UNITS = {
@@ -20,32 +20,36 @@ UNITS = {
 RIDE_UNITS = {**UNITS, 'x': 'm', 'y': 'm', 'z': 'm', 'vx': 'm/s', 'vy': 'm/s', 'vz': 'm/s'}
 
 
-class TrueStates(Stream):
-    """
-    The true states as rows of numbers: a stream whose messages are the rows of a table.
+class TableRows:
+    """Encodes fields of one column each as rows of numbers, (n, columns)."""
 
-    units : names and units of its columns: UNITS, and those that `added` returns for samples
-    """
+    def __init__(self, units: Mapping[str, str]) -> None:
+        self.units = units      # names and units of the columns
 
-    def __init__(self, period_ns: int, units: Mapping[str, str],
-                 added: Callable[[Samples], Sequence[NDArray[np.float64]]] = lambda _: (),
-                 ) -> None:
-        self.period_ns, self.units, self._added = period_ns, units, added
-
-    @property
-    def size(self) -> int:
+    def __len__(self) -> int:
         return 8 * len(self.units)
 
-    def encode(self, *samples: Samples) -> Encoded:
-        return (np.concatenate([one.t_ns for one in samples]),
-                np.concatenate([self._rows(one) for one in samples]))
+    def encode(self, stamps_ns: Stamps, fields: Sequence[Field]) -> Rows:
+        rows = np.empty((len(stamps_ns), len(self.units)))
+        for column, numbers in zip(rows.T, fields, strict=True):
+            column[:] = numbers
+        return rows
 
-    def _rows(self, samples: Samples) -> NDArray[np.float64]:
-        states = samples.states
-        return np.stack(np.broadcast_arrays(
-            samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
-            states.psi, states.psi_dot, *states.quaternion.T, *states.angular_velocity.T,
-            states.energy, states.l3, states.lz, *self._added(samples)), axis=-1)
+
+def true_states(period_ns: int, *, pivot_moves: bool) -> Channel:
+    """Return the channel whose messages are the rows of a table of true states."""
+    return Channel('table', '', '', period_ns,
+                   TableRows(RIDE_UNITS if pivot_moves else UNITS),
+                   lambda samples: _true(samples, pivot_moves))
+
+
+def _true(samples: Samples, pivot_moves: bool) -> Sequence[Field]:
+    states = samples.states
+    return (
+        samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
+        states.psi, states.psi_dot, *states.rows_quaternion, *states.rows_angular_velocity,
+        states.energy, states.l3, states.lz,
+        *((*states.pivot.position, *states.pivot.velocity) if pivot_moves else ()))
 
 
 def write_csv(path: Path, blocks: Iterable[NDArray[np.float64]],

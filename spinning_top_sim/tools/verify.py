@@ -3,7 +3,6 @@
 
 import math
 import operator
-import struct
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -12,14 +11,13 @@ from typing import NamedTuple
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import journal
-from spinning_top_sim.streams.blocks import Block
-from spinning_top_sim.streams.messages import FIELDS
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams import events
+from spinning_top_sim.streams.channel import Channel
+from spinning_top_sim.streams.play import Block
 from spinning_top_sim.tools.recorded_run import RunDescription, rerun
 
-# Streams and messages by stamp and topic: several commands may have the same.
-_Computed = defaultdict[tuple[int, str], deque[tuple[Stream | None, bytes]]]
+# Channels and messages by stamp and topic: several commands may have the same.
+_Computed = defaultdict[tuple[int, str], deque[tuple[Channel | None, bytes]]]
 
 
 class Difference(NamedTuple):
@@ -81,13 +79,13 @@ def compare(run: RunDescription, reader: LogReader, end_ns: int,
             comparison.unexpected += 1
             comparison.note(Difference(*key, 'message', 'there', 'no such message'))
             continue
-        stream, expected = computed[key].popleft()
+        channel, expected = computed[key].popleft()
         if not computed[key]:
             del computed[key]
         comparison.compared[message.topic] += 1
         if message.data != expected:
             comparison.different += 1
-            comparison.note(_difference(key, stream, message.data, expected))
+            comparison.note(_difference(key, channel, message.data, expected))
     for _ in progress:
         _miss(computed, comparison, math.inf)
     _miss(computed, comparison, math.inf)
@@ -98,15 +96,16 @@ def _compute(run: RunDescription, end_ns: int, computed: _Computed, comparison: 
              show: Callable[[int], None]) -> Iterator[float]:
     """Compute the run; yield the log times before which all is computed, at last infinity."""
     try:
-        for simulation, event in rerun(run, end_ns, samples=True):
-            if isinstance(event, Block):
-                for stream, times_ns, rows in event.messages:
-                    topic = run.topics[stream.topic]
+        for simulation, done in rerun(run, end_ns, samples=True):
+            if isinstance(done, Block):
+                for channel, times_ns, rows in done.messages:
+                    topic = run.topics[channel.topic]
                     for t_ns, row in zip(times_ns.tolist(), rows, strict=True):
-                        computed[simulation.epoch_ns + t_ns, topic].append((stream, row.tobytes()))
-            elif run.commands_topic is not None and event.name == 'command':
-                computed[event.stamp_ns, run.commands_topic].append(
-                    (None, journal.command(event.details['l3'], event.details['lz'])))
+                        computed[simulation.epoch_ns + t_ns, topic].append(
+                            (channel, row.tobytes()))
+            elif run.commands_topic is not None and done.event.kind == 'command':
+                computed[done.stamp_ns, run.commands_topic].append(
+                    (None, events.command(**done.event.details)))
             reached_ns = simulation.epoch_ns + simulation.now_ns
             show(reached_ns)
             # Not up to it: another command at this very time may follow.
@@ -123,20 +122,14 @@ def _miss(computed: _Computed, comparison: Comparison, before_ns: float) -> None
         comparison.note(Difference(*key, 'message', 'no such message', 'there'))
 
 
-def _difference(key: tuple[int, str], stream: Stream | None, logged: bytes,
+def _difference(key: tuple[int, str], channel: Channel | None, logged: bytes,
                 computed: bytes) -> Difference:
     sizes = len(logged), len(computed)
     if sizes[0] != sizes[1]:
         return Difference(*key, 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes))
     at = next(at for at in range(sizes[0]) if logged[at] != computed[at])
-    place = None if stream is None else stream.template.field_at(at)
-    if stream is None or place is None:
-        return Difference(*key, f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}', at)
-    number, element, start = place
-    if number < 0:
-        what, code, text = 'header.stamp', '<iI', '{}.{:09d}'
+    if channel is not None:
+        what, (one, two) = channel.template.shown_at(at, logged, computed)
     else:
-        what = f'{FIELDS[stream.type_name][number]}[{element}]'
-        code, text = '<d', '{!r}'
-    one, two = (text.format(*struct.unpack_from(code, data, start)) for data in (logged, computed))
+        what, one, two = f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}'
     return Difference(*key, what, one, two, at)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from spinning_top_sim.recording.errors import MALFORMED, LogError, reason_of
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.blocks import Block
 from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.play import Block
 from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
 from spinning_top_sim.view import plots, svg, text
@@ -69,8 +69,8 @@ def _read_log(path: Path, name: str) -> list[Track]:
 def _new_tracks(run: recorded_run.RunDescription, name: str) -> list[Track]:
     """Return tracks without samples, one for each top or mounting of the IMU in a run."""
     tracks = [Track(name, run.values_in_effect)]
-    for event in run.events:
-        if event.name == 'reset':
+    for _, event in run.events:
+        if event.kind == 'reset':
             before, values = tracks[-1].values, event.details['parameters']
             if any(values[key] != before[key] for key in values
                    if key.startswith('top.') or key == 'imu.rpy'):
@@ -123,15 +123,15 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
 
 
 def _follow_run(tracks: Sequence[Track], run: recorded_run.RunDescription, end_ns: int) -> None:
-    for simulation, event in recorded_run.rerun(run, end_ns):
-        if isinstance(event, Block) or event.name == 'parameters':
+    for simulation, done in recorded_run.rerun(run, end_ns):
+        if isinstance(done, Block) or done.event.kind in ('parameters', 'epoch'):
             continue
         begin_ns = simulation.epoch_ns + max(simulation.now_ns, 0)
         track = _track_at(tracks, begin_ns)
+        piece = simulation.trajectory.after(max(simulation.now_ns, 0))
         track.motions.append(DescribedMotion.of(
-            begin_ns, track.top, simulation.segment.start, simulation.describe(),
-            pivot_moves=simulation.segment.ride is not None))
-        if event.name == 'command':
+            begin_ns, track.top, piece.start, piece.describe(), pivot_moves=not piece.rests))
+        if done.event.kind == 'command':
             track.commands_ns.append(begin_ns)
 
 

@@ -14,8 +14,9 @@ from spinning_top_sim.physics.regimes import Description, natural_momentum
 from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.channel import period_ns
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.topics import INVARIANTS, all_streams
+from spinning_top_sim.streams.topics import INVARIANTS, all_channels
 from spinning_top_sim.tools.analysis import attitudes_of
 
 # The topics that tell the attitude, the best first; those that tell its rates, and the pivot.
@@ -131,9 +132,9 @@ class Track:
         self.begin_ns, self.epoch_ns, self.commands_ns = 0, 0, list[int]()
         self.note = ''
         self._constants: tuple[float, float, float] | None = None   # of the newest motion
-        self._imu = Imu(values)
-        self.templates = {stream.topic: stream.template for stream in all_streams(values)
-                          if stream.topic in WIDTHS}
+        self._imu = Imu(values, period_ns(values['imu.rate']))
+        self.templates = {channel.topic: channel.template for channel in all_channels(
+            values, self._imu) if channel.topic in WIDTHS}
 
     def decode(self, topic: str, messages: Sequence[bytes],
                stamps_ns: Sequence[int] | None = None) -> Series:
@@ -160,7 +161,7 @@ class Track:
         if topic == 'ground_truth/imu':
             # With imu.sampling = mean these are means, which are near enough for a picture.
             for columns, field in ((RATES, fields[1]), (FORCE, fields[2])):
-                _, in_body = self._imu.in_body(tuple(fields[0].T), tuple(field.T))
+                _, in_body = self._imu.mounting.to_body(tuple(fields[0].T), tuple(field.T))
                 rows[:, columns] = np.vstack(in_body).T
         if topic in PLACE_TOPICS:
             rows[:, PLACE] = np.nan_to_num(fields[0])

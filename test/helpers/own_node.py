@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from helpers.node_harness import numbers, options, wait_for
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.simulator import Simulator
+from spinning_top_sim.nodes.node import Simulator
 
 
 class InThisProcess:

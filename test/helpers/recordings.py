@@ -9,8 +9,9 @@ from mcap.reader import NonSeekingReader
 from mcap.records import Channel as ChannelRecord
 from rosbags.typesys import Stores, get_typestore
 
-from spinning_top_sim.recording.recorder import create_file
+from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, qos_profiles
+from spinning_top_sim.recording.writer import create_file
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -43,16 +44,15 @@ def write_rows(path, topics, rows, per_chunk=None, metadata=None):
     """Write a log of rows (number of a topic, stamp [ns], data), so many in a chunk."""
     file = create_file(path, topics, metadata or {}, compression='none')
     for number, row in enumerate(rows, start=1):
-        file.append(*row)
+        file.add(*single(*row))
         if per_chunk and number % per_chunk == 0:
             file.flush()
-    file.flush()
     file.finish()
     return path
 
 
 def write(recorder, topic_index, log_time_ns, data):
-    recorder.write_all([(topic_index, log_time_ns, data)])
+    recorder.write([single(topic_index, log_time_ns, data)])
 
 
 def some_messages(count: int) -> list[tuple[int, int, bytes]]:

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `spinning_top`: connects a `LiveSimulation` to topics, services and parameters."""
+"""
+The node `spinning_top`: connects a simulation to topics, services and parameters.
+
+Everything happens in the thread of the executor; a steady timer ticks.
+"""
 
 import functools
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -20,123 +24,126 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import ros_parameters
-from spinning_top_sim.nodes.endpoints import wait_for_all_acked
-from spinning_top_sim.nodes.node_status import NodeStatus
-from spinning_top_sim.nodes.pacing import DeadlineThread, FairLock
-from spinning_top_sim.nodes.publishers import StreamPublishers
-from spinning_top_sim.nodes.recording_session import RecordingSession
+from spinning_top_sim.nodes.clock import SimulatedClock
+from spinning_top_sim.nodes.endpoints import answers_later, wait_for_all_acked
+from spinning_top_sim.nodes.loop import Loop, LoopState
+from spinning_top_sim.nodes.publishers import ChannelPublishers
+from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.stamp_clock import StampClock
+from spinning_top_sim.nodes.status import NodeStatus
 from spinning_top_sim.nodes.terminal import Terminal
-from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop, next_epoch
-from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.parameter import Effect
 
 LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
+CHECK_S = 0.02                  # how often requests to open or close a log are looked at
 
 
 class Simulator(Node):
     """
-    The node.  Raises ValueError for a parameter that is not allowed.
+    The node.
 
-    One thread ticks, and the thread of the executor does everything else.  Both hold `lock` while
-    they use the simulation.
+    given : parameters of its command line, which those of ROS override
+
+    Raises ValueError for a parameter that is not allowed.
     """
 
-    def __init__(self, argv: Sequence[str] = ()) -> None:
+    def __init__(self, given: Mapping[str, Any]) -> None:
         super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()        # completes after `duration`
-        self.offers_actions = False             # their goals end with the motion
         self._terminal = Terminal()
-        values = ros_parameters.declare(self, argv)
+        values = ros_parameters.declare(self, given)
         simulation = self.simulation = LiveSimulation(values)
         # A reset starts with this spin.  An unset spin.lz stays unset: it follows initial.theta.
         self._start_spin = {name: values[name] for name in SPIN}
         # The parameters, with the spin as last commanded.
-        self.values = {**values, 'spin.lz': simulation.lz}
+        self.values = {**values, 'spin.lz': simulation.trajectory.lz}
         self.add_pre_set_parameters_callback(ros_parameters.with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._date = StampClock(self, parameters.is_enabled('clock', values))
-        self.lock = FairLock()
-        self._topics = StreamPublishers(self)
-        self._session = RecordingSession(simulation, self.lock, self._topics.topics_to_record)
-        self.loop = TickLoop(
-            simulation, values, self._session, warn=self._warn, error=self._tell_error,
-            update_subscribers=lambda: self._topics.update_subscribers(simulation.outputs),
-            source=self._date.now_ns if self._date.follows else time.monotonic_ns)
-        self._pacer = DeadlineThread(self._tick, self._idle, lambda: self.loop.grid, self.fail)
-        self._report = NodeStatus(simulation, self.loop, self._session)
-        self._status_timer: Timer | None = None
-        self._status_period = 0.0
+        self._topics = ChannelPublishers(self)
+        self._recording = Recording(simulation, self._topics.topics_to_record)
+        follows = self._date.follows
+        self.loop = Loop(
+            simulation, values, self._recording,
+            SimulatedClock(values['time_scale'], self._date.publishers if follows else None),
+            date=self._date.now_ns, source=self._date.now_ns if follows else time.monotonic_ns,
+            warn=self._warn, error=self._tell_error, update_subscribers=self._update_subscribers)
+        self._report = NodeStatus(simulation, self.loop, self._recording)
+        self._alarms: dict[str, Timer] = {}
         self._topics.check(simulation.outputs, values)
         self._open_topics(values)
         self._diagnostics = self._topics.create(DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         self.create_subscription(Twist, '~/cmd_vel', self._on_velocity, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
-                                ('step', Trigger, self._step), ('reset', Trigger, self._reset),
-                                ('record', SetBool, self._record)):
+                                ('step', Trigger, self._step), ('reset', Trigger, self._reset)):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
-        self._steady_timer(1.0, self._publish_diagnostics)
-        if simulation.top.objection:
-            self._log.warning(simulation.top.objection)
+        answers_later(self.create_service(SetBool, '~/record', self._record))
+        self._every('diagnostics', 1.0, self._publish_diagnostics)
+        for warning in ros_parameters.disobeyed_overrides(self):
+            self._log.warning(warning)
+        if objection := simulation.trajectory.top.objection:
+            self._log.warning(objection)
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
-        # Another thread releases the interpreter this soon when a tick is due; by default 5 ms.
+        # The recorder's thread releases the interpreter this soon when a tick is due.
         sys.setswitchinterval(1e-4)
-        self._begin_timer = self._steady_timer(0.02, self._begin)
+        self._every('check', CHECK_S, self._check_recording)
+        self._every('start', CHECK_S, self._begin)
         self._begin()
 
     def _begin(self) -> None:
         """Let time run if the clock that is followed has begun; a timer calls it until then."""
-        if self._date.now_ns() == 0 or not self._set_epoch():
+        if self._date.now_ns() == 0:
             return
-        self.destroy_timer(self._begin_timer)
-        self.loop.start()
-        if self.values['record.enabled']:
-            self._session.start(self.start_values)
-        self._pacer.start()
-        if self.values['record.enabled']:
-            try:
-                self._log.info(self._session.open())
-            except RecordingError as error:     # no client waits for an answer
-                self._session.error = str(error)
-                self._log.error(f'not recording: {error}')
-
-    def _set_epoch(self) -> bool:
-        """Set the stamp of t = 0, and wait for its date; return False if no stamp can have it."""
-        if self.values['max_error'] > 0.0:
-            _ = self.simulation.segment.closed_form  # its modules take a while to import
-        now_ns = self._date.first_ns()
         try:
-            self.simulation.epoch_ns = next_epoch(now_ns)
+            self.loop.start()
         except ValueError as error:
             if not self._date.follows:
                 raise
             self._log.warning(f'/clock: {error}', once=True)
-            return False
-        if not self._date.follows:
-            time.sleep((self.simulation.epoch_ns - now_ns) / NANOSECONDS)
-        return True
+            return
+        self._every('start', 0.0)
+        if self.values['record.enabled']:
+            self._recording.start(self.start_values, self._tell_of_recording)
+        self._align_ticks()
+
+    def _align_ticks(self) -> None:
+        """Let ticks come just after samples are due."""
+        def first() -> None:
+            self._every('tick', self.loop.tick_period_ns / NANOSECONDS, self._tick)
+            self._tick()
+
+        self._every('tick', self.loop.next_tick_s, first)
+
+    def _tell_of_recording(self, success: bool, text: str) -> None:
+        if success:
+            self._log.info(text)
+        else:                   # no client waits for an answer
+            self._log.error(f'not recording: {text}')
+
+    def _update_subscribers(self) -> None:
+        if self._topics.update_subscribers(self.simulation.outputs):
+            self.simulation.refresh()
 
     def stop(self) -> None:
         """End the motion and close the recording, whether the context is valid or not."""
-        self._pacer.stop()
         self._terminal.end()
-        path = self._session.path
-        summary = self._session.stop()
+        path = self._recording.path
+        summary = self._recording.close()
         if summary:
             self._terminal.tell(f'{summary}\nnext: spinning-top inspect {path}\n'
                                 f'      spinning-top view {path}')
 
     def finish(self) -> None:
         """End the process after the response that is being prepared."""
-        self._finish_timer = self._steady_timer(
-            LAST_ANSWERS_S, lambda: self.finished.done() or self.finished.set_result(None))
+        self._every('finish', LAST_ANSWERS_S,
+                    lambda: self.finished.done() or self.finished.set_result(None))
 
     def fail(self, error: Exception) -> None:
         """Stop the motion after an unexpected error, and close the log while it is whole."""
@@ -144,25 +151,14 @@ class Simulator(Node):
             return
         self._log.error(traceback.format_exc())
         reason = f'unexpected {type(error).__name__}: {error}'
-        with self.lock:
-            self.loop.fail(reason)
-        self._session.stop(reason)
+        self.loop.fail(reason)
+        self._recording.end(error=reason)
 
-    def _tick(self) -> bool:
-        with self.lock:
-            wants_idle = self.loop.tick()
-            if self.loop.state is not LoopState.RUNNING:
-                self._topics.flush(at_once=self.loop.state is LoopState.ENDED)
+    def _tick(self) -> None:
+        self.loop.tick()
         if self.loop.state is LoopState.ENDED and not self.finished.done():
             wait_for_all_acked(self._topics.by_topic.values(), 1.0)
-            if self.offers_actions:
-                time.sleep(LAST_ANSWERS_S)
             self.finished.set_result(None)
-        return wants_idle
-
-    def _idle(self) -> None:
-        with self.lock:
-            self.loop.idle()
 
     @property
     def start_values(self) -> dict[str, Any]:
@@ -186,8 +182,7 @@ class Simulator(Node):
         try:
             if any(angular):
                 raise ValueError(f'angular = {angular!r} rad/s: must be 0')
-            with self.lock:
-                self.loop.drive(linear)
+            self.loop.drive(linear)
         except ValueError as error:
             self.loop.rejected_commands += 1
             self._log.warning(f'~/cmd_vel: refused: {error}')
@@ -210,16 +205,16 @@ class Simulator(Node):
         values, start_spin = ros_parameters.changed(self.values, changes, self._start_spin)
         self._check_context(values)
         rest = sorted(changes.keys() - SPIN)
-        with self.lock:
-            if ros_parameters.is_command(changes):
-                self.check_started()
-                self.loop.command(values['spin.l3'], values['spin.lz'])
-            if rest:
-                changed = {name: values[name] for name in rest}
-                self._session.write_event('parameters', **changed)
-                self.simulation.apply(changed)
-                self._open_topics(values)
-                self.loop.set_pace(values)
+        if ros_parameters.is_command(changes):
+            self.check_started()
+            self.loop.command(values['spin.l3'], values['spin.lz'])
+        if rest:
+            self._recording.write(self.simulation.apply(
+                'parameters', **{name: values[name] for name in rest}))
+            self._open_topics(values)
+            self.loop.set_pace(values)
+            if 'tick' in self._alarms:
+                self._align_ticks()
         for effect in (Effect.RESET, Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
                      and values[name] != self.values[name]]
@@ -229,8 +224,8 @@ class Simulator(Node):
 
     def _check_context(self, values: Mapping[str, Any]) -> None:
         if self._date.follows and parameters.is_enabled('clock', values):
-            raise ValueError('clock.enabled, publish_clock: must be false while this node follows '
-                             'another /clock (use_sim_time)')
+            raise ValueError('clock.enabled = True: must be false while this node follows another '
+                             '/clock (use_sim_time)')
         self._topics.check(self.simulation.outputs, values)
         lowest = self.simulation.lowest_imu_rate
         if values['imu.rate'] < lowest:
@@ -240,13 +235,8 @@ class Simulator(Node):
     def _open_topics(self, values: Mapping[str, Any]) -> None:
         """Open the publishers and the status line that these parameters ask for."""
         self._topics.open(self.simulation.outputs, values)
-        period = values['status_period']
-        if period != self._status_period:
-            self._status_period = period
-            if self._status_timer is not None:
-                self.destroy_timer(self._status_timer)
-            self._status_timer = (
-                self._steady_timer(period, self._show_status) if period else None)
+        self.simulation.refresh()
+        self._every('status', values['status_period'], self._show_status)
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
         error, response.message = self.outcome(lambda: act(request))
@@ -268,24 +258,23 @@ class Simulator(Node):
             return error, f'{type(error).__name__}: {error}'
 
     def check_started(self) -> None:
-        """Raise RuntimeError if no ticks come: before the first /clock, or behind an error."""
-        if not self._pacer.is_alive():
-            raise RuntimeError(self.loop.failure or 'waiting for /clock (use_sim_time is set)')
+        """Raise RuntimeError before the first /clock that is followed."""
+        if self.loop.state is LoopState.WAITING:
+            raise RuntimeError('waiting for /clock (use_sim_time is set)')
 
     def _set_pause(self, request: SetBool.Request) -> str:
-        with self.lock:
-            if request.data:
-                self.loop.pause()
-            else:
-                self.loop.resume()
-            return f'{self.loop.state.value} {self.loop.time_text}'
+        if request.data:
+            self.loop.pause()
+        else:
+            self.loop.resume()
+            self._align_ticks()
+        return f'{self.loop.state.value} {self.loop.time_text}'
 
     def _step(self, _: Trigger.Request) -> str:
-        with self.lock:
-            self.check_started()
-            # A step is a whole number of nanoseconds, so that n steps are n times one step.
-            self.loop.step(self.values['step.count'] * round(self.values['step.dt'] * NANOSECONDS))
-            return self.loop.time_text
+        self.check_started()
+        # A step is a whole number of nanoseconds, so that n steps are n times one step.
+        self.loop.step(self.values['step.count'] * round(self.values['step.dt'] * NANOSECONDS))
+        return self.loop.time_text
 
     def _reset(self, _: Trigger.Request) -> str:
         self.start_again()
@@ -298,30 +287,40 @@ class Simulator(Node):
         Raises RuntimeError before the motion begins and after `duration`, and ValueError if no
         motion begins with the present parameters; nothing changes then.
         """
-        with self.lock:
-            self.check_started()
-            self.loop.reset(self.start_values, self._date.first_ns(), paused)
+        self.check_started()
+        self.loop.reset(self.start_values, paused)
+        self._align_ticks()
         self.show_spin()
 
     def show_spin(self) -> None:
         """Let the parameters show the present spin."""
-        self.values |= {'spin.l3': self.simulation.l3, 'spin.lz': self.simulation.lz}
+        motion = self.simulation.trajectory
+        self.values |= {'spin.l3': motion.l3, 'spin.lz': motion.lz}
         self.remove_on_set_parameters_callback(self._on_set_parameters)
         try:
             self.set_parameters([Parameter(name, value=self.values[name]) for name in SPIN])
         finally:
             self.add_on_set_parameters_callback(self._on_set_parameters)
 
-    def _record(self, request: SetBool.Request) -> str:
-        if not request.data:
-            summary = self._session.stop()
-            if summary and self._session.error:
-                raise RecordingError(summary)
-            return summary or 'not recording'
-        self.check_started()
-        self._check_recording()
-        self._session.start(self.start_values)
-        return self._session.open()
+    def _record(self, request: SetBool.Request, response: SetBool.Response) -> Future:
+        """Return the response, which is there when the log is open or closed."""
+        future: Future = Future()
+
+        def answer(success: bool, message: str) -> None:
+            response.success, response.message = success, message
+            future.set_result(response)
+
+        error, reason = self.outcome(lambda: self._start_or_end(request.data, answer))
+        if error is not None:
+            answer(False, reason)
+        return future
+
+    def _start_or_end(self, start: bool, answer: Callable[[bool, str], object]) -> None:
+        if start:
+            self.check_started()
+            self._recording.start(self.start_values, answer)
+        else:
+            self._recording.end(answer)
 
     @property
     def _log(self) -> Any:
@@ -335,33 +334,35 @@ class Simulator(Node):
     def _tell_error(self, text: str) -> None:
         self._log.error(text)
 
-    def _steady_timer(self, period: float, callback: Callable[[], object]) -> Timer:
-        """Create a timer that follows no /clock; unexpected errors stop the motion."""
+    def _every(self, name: str, period: float, callback: Callable[[], object] = lambda: None,
+               ) -> None:
+        """
+        Call back periodically [s], 0 = never, instead of what this timer did before.
+
+        The timer follows no /clock; unexpected errors stop the motion.
+        """
         def call() -> None:
             try:
                 callback()
             except Exception as error:
                 self.fail(error)
-        return self.create_timer(period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+        if name in self._alarms:
+            self.destroy_timer(self._alarms.pop(name))
+        if period:
+            self._alarms[name] = self.create_timer(
+                period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish_diagnostics(self) -> None:
         self._check_clock()
-        self._check_recording()
-        if self._session.warning:
-            self._log.warning(f'recording: {self._session.warning}', throttle_duration_sec=10.0)
+        if self._recording.warning:
+            self._log.warning(f'recording: {self._recording.warning}', throttle_duration_sec=10.0)
         if self._report.overloaded:
             self._log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
                 'clock slips; a recording stays complete, and /diagnostics counts', once=True)
-        if self.values['max_error'] > 0.0:
-            with self.lock:
-                segment = self.simulation.segment
-            _ = segment.closed_form     # it takes milliseconds: with the lock, ticks would wait
-        with self.lock:
-            message = self._report.diagnostics(
-                self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/'),
-                self.values['max_error'])
-        self._diagnostics.publish(message)
+        self._diagnostics.publish(self._report.diagnostics(
+            self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/')))
 
     def _check_clock(self) -> None:
         """Warn when the /clock that is followed stops; say when it goes on."""
@@ -372,11 +373,9 @@ class Simulator(Node):
                               '/clock goes on')
 
     def _check_recording(self) -> None:
-        reason = self._session.check()
+        reason = self._recording.check()
         if reason:
             self._log.error(f'recording stopped: {reason}; the simulation goes on')
 
     def _show_status(self) -> None:
-        with self.lock:
-            line = self._report.status_line()
-        self._terminal.show(line)
+        self._terminal.show(self._report.status_line())

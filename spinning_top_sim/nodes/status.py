@@ -9,43 +9,42 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Header
 
-from spinning_top_sim.nodes.recording_session import RecordingSession
-from spinning_top_sim.nodes.tick_loop import LoopState, TickLoop
+from spinning_top_sim.nodes.loop import Loop, LoopState
+from spinning_top_sim.nodes.recording import Recording
+from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 
-# Keys in /diagnostics that the page of `view` reads, with those of `recording_session`.
+# Keys in /diagnostics that the page of `view` reads, with those of `recording`.
 STATE, TIME, EPOCH = 'state', 'simulated time [s]', 'stamp of t = 0 [ns]'
-SPEED, DRIFT, ERROR = 'real-time factor', 'energy drift', 'orientation error [rad]'
+SPEED, DRIFT = 'real-time factor', 'energy drift'
 
 
 class NodeStatus:
-    """Describes a running simulation; the caller holds the simulation's lock."""
+    """Describes a running simulation."""
 
-    def __init__(self, simulation: LiveSimulation, loop: TickLoop,
-                 session: RecordingSession) -> None:
-        self._simulation, self._loop, self._session = simulation, loop, session
+    def __init__(self, simulation: LiveSimulation, loop: Loop, recording: Recording) -> None:
+        self._simulation, self._loop, self._recording = simulation, loop, recording
         self._speed = math.nan                  # simulated time over real time
-        self._described: object = None          # the segment that `_regime` names
+        self._described: object = None          # the piece of the motion that `_regime` names
         self._regime = ''
         self._read_at, self._read_ns = time.monotonic(), 0
         self.waits_for_clock = False            # whether /clock has not begun, or has stopped
 
-    def diagnostics(self, stamp: Time, name: str, max_error: float) -> DiagnosticArray:
-        """Return the message for /diagnostics; `max_error` = 0 leaves out the error."""
-        simulation, loop, session = self._simulation, self._loop, self._session
-        error = simulation.orientation_error if max_error else math.nan
+    def diagnostics(self, stamp: Time, name: str) -> DiagnosticArray:
+        """Return the message for /diagnostics."""
+        simulation, loop, recording = self._simulation, self._loop, self._recording
+        failed = self._total('failed')
         states = (      # whether it holds, its level, its message
             (True, DiagnosticStatus.OK, 'paused' if loop.paused else 'running'),
             (self.waits_for_clock, DiagnosticStatus.WARN, 'waiting for /clock'),
+            (failed, DiagnosticStatus.WARN, f'{failed} messages could not be published'),
             (self.overloaded, DiagnosticStatus.WARN, 'this machine cannot keep up'),
-            (error > max_error > 0.0, DiagnosticStatus.WARN,
-             f'orientation error {error:.3g} rad: more than max_error = {max_error:g} rad'),
-            (session.warning, DiagnosticStatus.WARN, f'recording: {session.warning}'),
-            (session.error, DiagnosticStatus.ERROR, f'recording: {session.error}'),
+            (recording.warning, DiagnosticStatus.WARN, f'recording: {recording.warning}'),
+            (recording.error, DiagnosticStatus.ERROR, f'recording: {recording.error}'),
             (loop.failure, DiagnosticStatus.ERROR, loop.failure))
         _, level, message = max(filter(itemgetter(0), states), key=itemgetter(1))
-        now_ns = loop.now_ns
+        now_ns, motion = loop.now_ns, simulation.trajectory
         numbers = {
             STATE: loop.state.name.lower(),
             TIME: f'{now_ns / NANOSECONDS:.6f}',
@@ -55,14 +54,14 @@ class NodeStatus:
             'skipped ticks': loop.skipped_ticks,
             'published messages': self._total('sent'),
             'skipped samples': self._total('skipped'),
+            'failed messages': failed,
             'clock slip [s]': f'{loop.slipped_ns / NANOSECONDS:.3f}',
-            DRIFT: f'{simulation.energy_drift:.3g}',
-            ERROR: f'{error:.3g}',
+            DRIFT: f'{self._energy_drift():.3g}',
             'commands': loop.commands,
             'rejected commands': loop.rejected_commands,
-            'integration steps': simulation.steps,
-            'evaluations': simulation.evaluations,
-            **session.numbers()}
+            'integration steps': motion.steps,
+            'evaluations': motion.evaluations,
+            **recording.numbers()}
         return DiagnosticArray(header=Header(stamp=stamp), status=[DiagnosticStatus(
             level=level, name=name, hardware_id='none', message=message,
             values=[KeyValue(key=key, value=str(value)) for key, value in numbers.items()])])
@@ -74,6 +73,11 @@ class NodeStatus:
 
     def _total(self, count: str) -> int:
         return sum(getattr(output, count) for output in self._simulation.outputs)
+
+    def _energy_drift(self) -> float:
+        """Return the relative drift since the motion began, absolute where its energy was 0."""
+        piece = self._simulation.trajectory.after(self._loop.now_ns)
+        return float(relative_drift(self._simulation.state().energy, piece.energy)[0])
 
     def _measure_speed(self, now_ns: int) -> float:
         """Return simulated time over real time since the previous call, or since a reset."""
@@ -87,9 +91,11 @@ class NodeStatus:
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
         simulation, loop = self._simulation, self._loop
-        if simulation.segment is not self._described:
-            self._described, motion = simulation.segment, simulation.describe()
-            self._regime = motion.name if motion else ''
+        motion = simulation.trajectory
+        piece = motion.after(loop.now_ns)
+        if piece is not self._described:
+            self._described, description = piece, piece.describe()
+            self._regime = description.name if description else ''
         theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
         flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
@@ -99,5 +105,5 @@ class NodeStatus:
             f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',
             f'x{self._speed:.2f}' if is_running else '',
             f'{sent} messages' if sent else 'no subscribers yet',
-            f'L3 {simulation.l3:.4g} Lz {simulation.lz:.4g}',
-            f'energy drift {simulation.energy_drift:+.0e}')))
+            f'L3 {motion.l3:.4g} Lz {motion.lz:.4g}',
+            f'energy drift {self._energy_drift():+.0e}')))

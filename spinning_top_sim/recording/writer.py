@@ -11,35 +11,52 @@ Layout: header, metadata of the run, schemas, channels | chunk, its message inde
 import contextlib
 import itertools
 import os
-import queue
+import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
+import zstandard
 from mcap import records
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
-from spinning_top_sim.recording import chunks
-from spinning_top_sim.recording.chunks import ChunkBuilder, record_bytes
-from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata_yaml
+from spinning_top_sim.installation import version
+from spinning_top_sim.recording.definitions import find_definition
+from spinning_top_sim.recording.errors import RecordingError, why_not_written
+from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
+from spinning_top_sim.recording.rosbag2 import (
+    BAG_METADATA,
+    RecordedTopic,
+    bag_metadata_yaml,
+    offered_qos_yaml,
+)
 
-_COMPRESSING = 2    # chunks of rows that are compressed at once
-_NOTHING: Future[None] = Future()
-_NOTHING.set_result(None)
+CHUNK_BYTES = 1 << 20   # uncompressed, about
+
+# The fastest level that compresses nearly as well as zstd's own default, 3.
+ZSTD_LEVEL = -1
+# The default window of the level is half a chunk; a whole one saves up to 20 %.
+ZSTD_WINDOW_LOG = 20
+
+INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
+
+# Message index entries of a chunk by channel id: (n, 2) log times and offsets in the chunk.
+IndexEntries = Mapping[int, NDArray[np.uint64]]
 
 
 class McapWriter:
     """
     A new MCAP file, which must not exist (FileExistsError), used by one thread at a time.
 
-    Messages come one by one into a chunk in memory (`append`, `append_all`), or as arrays that
-    make a chunk (`append_rows`).  A topic is an index here, its channel has the id index + 1, and
-    its messages are numbered; `copy_message` takes one with channel and number of another file.
-    `flush` writes the chunk in memory, `write_chunk` another one, `write` any other record.
+    `add` collects messages of a topic for a chunk, `flush` writes the chunk.  A topic is an index
+    here, its channel has the id index + 1, and its messages are numbered.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
@@ -49,19 +66,17 @@ class McapWriter:
 
     def __init__(self, path: Path, *, header: records.Header, compression: str) -> None:
         self._path = path
-        self._chunk = ChunkBuilder(compression)       # of messages that come one by one
-        # Chunks of rows: one is filled while the others are compressed.
-        self._spare_chunks: queue.SimpleQueue[ChunkBuilder] = queue.SimpleQueue()
-        for _ in range(_COMPRESSING + 1):
-            self._spare_chunks.put(ChunkBuilder(compression))
-        self._pool = ThreadPoolExecutor(_COMPRESSING, 'chunks')     # has no threads before rows
-        self._queued = _NOTHING                     # the last chunk of rows
+        self._compression = compression
+        self._zstd = zstandard.ZstdCompressor(
+            compression_params=zstandard.ZstdCompressionParameters.from_level(
+                ZSTD_LEVEL, window_log=ZSTD_WINDOW_LOG))
+        self._next_sequence: defaultdict[int, int] = defaultdict(int)    # by channel id
+        self._clear_chunk()
 
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
         self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
-        self._next_sequence: dict[int, int] = {}
         self._type_names: dict[int, str] = {}       # by schema id
         self._channels: dict[int, records.Channel] = {}
         # Records of the summary.  Serialized: thousands of objects would take memory.
@@ -75,10 +90,12 @@ class McapWriter:
 
     @property
     def size(self) -> int:
+        """Size of the file [bytes]."""
         return self._end[0]
 
     @property
     def messages(self) -> int:
+        """Number of messages in the file."""
         return sum(self.message_counts.values())
 
     @contextlib.contextmanager
@@ -115,75 +132,65 @@ class McapWriter:
         elif isinstance(record, records.Channel):
             self._channels[record.id] = record
             self._summary_records[Opcode.CHANNEL].append(raw)
-            self.message_counts[record.id] = self._next_sequence[record.id] = 0
+            self.message_counts[record.id] = 0
 
-    def append(self, topic_index: int, log_time_ns: int, data: bytes) -> None:
-        """Add the next message of a topic to the chunk in memory; write it when it is full."""
-        self.copy_message(*self._numbered(topic_index, 1), log_time_ns, log_time_ns, data)
+    def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
+            rows: NDArray[np.uint8]) -> None:
+        """
+        Add messages of a topic to the chunk in memory.
 
-    def _numbered(self, topic_index: int, count: int) -> tuple[int, int]:
-        """Return a topic's channel, and the sequence number of the first of `count` messages."""
-        channel_id = topic_index + 1
-        sequence = self._next_sequence[channel_id]
+        log_times_ns : log and publish times (n,), n >= 1, in any order
+        rows : serialized messages (n, size)
+        """
+        channel_id, (count, size) = topic_index + 1, rows.shape
+        messages = np.empty(count, _message_type(size))
+        messages['opcode'] = Opcode.MESSAGE
+        messages['length'] = messages.itemsize - 9
+        messages['channel'] = channel_id
+        messages['sequence'] = np.arange(count) + self._next_sequence[channel_id]
+        messages['log_time'] = messages['publish_time'] = log_times_ns
+        messages['data'] = rows
+        entries = np.empty((count, 2), np.uint64)
+        entries[:, 0] = log_times_ns
+        entries[:, 1] = np.arange(count) * messages.itemsize + self.pending
         self._next_sequence[channel_id] += count
-        return channel_id, sequence
-
-    def append_all(self, messages: Iterable[tuple[int, int, bytes]], size: int) -> None:
-        """Add messages as `append` does, in less time; they take `size` bytes at most."""
-        if self._chunk.size + size > chunks.CHUNK_BYTES:
-            self.flush()
-        by_topic: defaultdict[int, list[tuple[int, int, bytes]]] = defaultdict(list)
-        for message in messages:
-            by_topic[message[0]].append(message)
-        for topic_index, group in by_topic.items():
-            _, times_ns, data = zip(*group, strict=True)
-            if len(set(map(len, data))) > 1:
-                for message in group:
-                    self.append(*message)
-                continue
-            self._chunk.add_rows(
-                *self._numbered(topic_index, len(data)), np.array(times_ns, np.uint64),
-                np.frombuffer(b''.join(data), np.uint8).reshape(len(data), len(data[0])))
-
-    def copy_message(self, channel_id: int, sequence: int, log_time_ns: int, publish_time_ns: int,
-                     data: bytes | bytearray | memoryview) -> None:
-        """Add a message to the chunk in memory, with these numbers; write it when it is full."""
-        self._chunk.add(channel_id, sequence, log_time_ns, publish_time_ns, data)
-        if self._chunk.size >= chunks.CHUNK_BYTES:
-            self.flush()
-
-    def append_rows(self, blocks: Iterable[chunks.RowBlock]) -> None:
-        """
-        Add a chunk of messages that come as arrays, after the messages that came one by one.
-
-        The arrays are copied before this returns.  Two threads compress and write the chunks in
-        the order in which they came.  This waits while both are busy, and raises the OSError of
-        an earlier chunk.
-        """
-        if self._queued.done():
-            self._wait()
-        if self._chunk.size:
-            self._queue(self._chunk)
-            self._chunk = self._spare_chunks.get()
-        chunk = self._spare_chunks.get()
-        for topic_index, times_ns, rows in blocks:
-            chunk.add_rows(*self._numbered(topic_index, len(rows)), times_ns, rows)
-        if chunk.size:
-            self._queue(chunk)
-        else:                   # nothing was due
-            self._spare_chunks.put(chunk)
+        self._parts.append(messages)
+        self._entries[channel_id].append(entries)
+        self.pending += messages.nbytes
 
     def flush(self) -> None:
-        """Write the chunk in memory, if it holds anything, after those of `append_rows`."""
-        self._wait()
-        if self._chunk.size:
-            self.write_chunk(self._chunk.record(), self._chunk.entries)
-            self._chunk.clear()
+        """Write the chunk in memory, if it holds anything.  After an OSError it is lost."""
+        if not self.pending:
+            return
+        plain = b''.join(part.data for part in self._parts)
+        entries = {channel_id: np.concatenate(parts)
+                   for channel_id, parts in sorted(self._entries.items())}
+        self._clear_chunk()
+        self.write_chunk(self.chunk_of(plain, entries), entries)
 
-    def write_chunk(self, chunk: records.Chunk, entries: chunks.IndexEntries) -> None:
+    def _clear_chunk(self) -> None:
+        self.pending = 0                            # bytes of the chunk in memory
+        self._parts: list[NDArray[np.void]] = []
+        self._entries: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
+
+    def chunk_of(self, plain: bytes, entries: IndexEntries) -> records.Chunk:
+        """Return a chunk with these message records, compressed."""
+        data = plain
+        if self._compression == 'zstd':
+            data = self._zstd.compress(plain)
+        elif self._compression == 'lz4':
+            data = lz4.frame.compress(plain)
+        start_ns, end_ns = time_span(entries)
+        return records.Chunk(
+            compression='' if self._compression == 'none' else self._compression, data=data,
+            uncompressed_size=len(plain), uncompressed_crc=zlib.crc32(plain),
+            message_start_time=start_ns, message_end_time=end_ns)
+
+    def write_chunk(self, chunk: records.Chunk, entries: IndexEntries) -> None:
         """Write a chunk with the indexes of its messages.  Raises OSError."""
         raw = record_bytes(chunk)
-        indexes = chunks.message_indexes(entries)
+        indexes = {channel_id: _message_index(channel_id, numbers)
+                   for channel_id, numbers in entries.items()}
         offsets = list(itertools.accumulate(
             map(len, indexes.values()), initial=self.size + len(raw)))
         chunk_index = record_bytes(records.ChunkIndex(
@@ -196,12 +203,13 @@ class McapWriter:
         self._write([raw, *indexes.values()])
         self._summary_records[Opcode.CHUNK_INDEX].append(chunk_index)
         self.chunk_count += 1
-        if indexes:
+        if entries:
             self._times_ns += chunk.message_start_time, chunk.message_end_time
-            for channel_id in indexes:
-                self.message_counts[channel_id] += len(entries[channel_id]) // 2
+            for channel_id, numbers in entries.items():
+                self.message_counts[channel_id] += len(numbers)
 
     def sync(self) -> None:
+        """Bring what is in the file to the disk.  Raises OSError."""
         os.fsync(self._file.fileno())
 
     def check_disk(self, min_free_bytes: int) -> None:
@@ -216,9 +224,13 @@ class McapWriter:
                           f'{min_free_bytes}')
 
     def finish(self, *, bag: bool = True) -> None:
-        """Write the `rosbag2` record and the summary, bring all to the disk, close the file."""
+        """
+        Write the chunk in memory and the summary, bring all to the disk, close the file.
+
+        bag : write rosbag2's metadata record, too
+        """
         try:
-            self._pool.shutdown()
+            self.flush()
             if bag:
                 topics = [(channel, self._type_names.get(channel.schema_id, ''),
                            self.message_counts[channel.id])
@@ -234,26 +246,6 @@ class McapWriter:
             sync_directory(self._path.parent)
         finally:
             self._file.close()
-
-    def _queue(self, chunk: ChunkBuilder) -> None:
-        """Have a chunk compressed in a thread, and written after those queued before."""
-        self._queued = self._pool.submit(self._write_in_turn, chunk, self._queued)
-
-    def _wait(self) -> None:
-        """Wait for the chunks that are queued.  Raises the OSError of one, but only once."""
-        queued = self._queued
-        if queued.exception() is not None:
-            self._queued = _NOTHING
-        queued.result()
-
-    def _write_in_turn(self, chunk: ChunkBuilder, before: Future[None]) -> None:
-        try:
-            record = chunk.record()
-            before.result()
-            self.write_chunk(record, chunk.entries)
-        finally:
-            chunk.clear()
-            self._spare_chunks.put(chunk)
 
     def _summary(self) -> bytes:
         groups = self._summary_records
@@ -296,6 +288,73 @@ class McapWriter:
                 os.ftruncate(descriptor, self.size)
             raise
         self._end = offset, crc
+
+
+def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
+                compression: str, min_free_bytes: int = 0) -> McapWriter:
+    """
+    Create a log, which must not exist, and bring its head to the disk.
+
+    topics : all stand before the first chunk, so that a truncated file tells them in any case
+    metadata : the `spinning_top_sim` record at the head of the file
+    compression : 'zstd', 'lz4' or 'none'
+    min_free_bytes : a recording stops if the disk has less left than this, >= 0
+
+    Raises ValueError for a topic that is listed twice, RecordingError naming path or type.
+    """
+    names = [topic.name for topic in topics]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f'topic {name!r} is listed twice: once is allowed')
+    definitions = {     # text and type hash
+        name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
+    try:
+        header = records.Header(profile='ros2', library=OUR_LIBRARY + version())
+        file = McapWriter(path, header=header, compression=compression)
+        with file.discarded_on_failure():
+            file.check_disk(min_free_bytes)
+            file.write(records.Metadata(METADATA_NAME, dict(metadata)))
+            for number, (name, (text, _)) in enumerate(definitions.items(), start=1):
+                file.write(records.Schema(id=number, name=name, encoding='ros2msg',
+                                          data=text.encode()))
+            for number, topic in enumerate(topics, start=1):
+                file.write(records.Channel(
+                    id=number, topic=topic.name, message_encoding='cdr',
+                    schema_id=1 + list(definitions).index(topic.type_name),
+                    metadata={'offered_qos_profiles': offered_qos_yaml(topic),
+                              'topic_type_hash': definitions[topic.type_name][1]}))
+            file.sync()
+            sync_directory(path.parent)
+    except (OSError, ValueError) as error:
+        raise RecordingError(f'cannot record to {path}: {why_not_written(path, error)}') from error
+    return file
+
+
+def record_bytes(record: records.McapRecord) -> bytes:
+    """Return a record as it stands in a file."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def time_span(entries: IndexEntries) -> tuple[int, int]:
+    """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
+    times = [numbers[:, 0] for numbers in entries.values()]
+    return (min((int(column.min()) for column in times), default=0),
+            max((int(column.max()) for column in times), default=0))
+
+
+@lru_cache
+def _message_type(size: int) -> np.dtype[np.void]:
+    """Return the type of a message record with so many bytes of data."""
+    return np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
+                     ('log_time', '<u8'), ('publish_time', '<u8'), ('data', 'u1', (size,))])
+
+
+def _message_index(channel_id: int, entries: NDArray[np.uint64]) -> bytes:
+    """Return the record; mcap's class would make Python objects of all numbers."""
+    return INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size - 9 + entries.nbytes, channel_id,
+                           entries.nbytes) + entries.tobytes()
 
 
 def sync_directory(directory: Path) -> None:

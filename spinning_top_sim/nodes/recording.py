@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recordings of a running simulation: which log is open, and what goes into it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from spinning_top_sim.streams.channel import Channel
+from spinning_top_sim.streams.events import TOPICS, Event
+from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.streams.topics import recorded
+
+# Importing it takes long, so that is left to the start of a recording.
+if TYPE_CHECKING:
+    from spinning_top_sim.recording.recorder import Recorder
+
+RECORDER, RECORDED_FILE = 'recorder', 'recorded file'        # keys in /diagnostics
+
+Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
+Answer = Callable[[bool, str], object]      # takes success and a text
+
+
+@dataclass
+class _Request:
+    """A log that is being opened or closed, and who waits for that."""
+
+    recorder: Recorder
+    is_end: bool
+    answer: Answer
+
+
+class Recording:
+    """
+    Records a simulation into one log at a time; the recorder's own thread uses the disk.
+
+    topics : returns the topics of channels, and after them those of events
+    error : why the last recording stopped early or did not start
+    """
+
+    def __init__(self, simulation: LiveSimulation,
+                 topics: Callable[[Sequence[Channel]], list[Topic]]) -> None:
+        self.error: str | None = None
+        self._simulation, self._topics = simulation, topics
+        self._recorder: Recorder | None = None
+        self._requests: list[_Request] = []
+        self._events_index = 0              # index of the first topic of events in the log
+
+    def start(self, values: Mapping[str, Any], answer: Answer = lambda *_: None) -> None:
+        """Record from now on; `check` answers once the file is open."""
+        if self._recorder is not None:
+            answer(True, f'recording already to {self._recorder.path}')
+            return
+        from spinning_top_sim.recording.provenance import run_metadata  # noqa: PLC0415
+        from spinning_top_sim.recording.recorder import Recorder  # noqa: PLC0415
+        from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
+        simulation = self._simulation
+        channels = recorded(simulation.channels, values)
+        recorder = self._recorder = Recorder(
+            values['record.uri'], [RecordedTopic(*topic) for topic in self._topics(channels)],
+            run_metadata(simulation.values, simulation.epoch_ns, simulation.now_ns,
+                         [event.as_mapping() for event in simulation.history], values),
+            max_loss=values['record.max_loss'], compression=values['record.compression'],
+            min_free_bytes=values['record.min_free_bytes'])
+        self.error, self._events_index = None, len(channels)
+        simulation.log_to(recorder.write, channels)
+        self.write(Event('start', max(simulation.now_ns, 0), simulation.now_ns))
+        self._requests.append(_Request(recorder, False, answer))
+
+    def end(self, answer: Answer = lambda *_: None, error: str | None = None) -> None:
+        """Record no more; `check` answers once the file is closed."""
+        recorder, self._recorder = self._recorder, None
+        if recorder is None:
+            answer(True, 'not recording')
+            return
+        self._simulation.log_to(None)
+        recorder.end()
+        self.error = error
+        self._requests.append(_Request(recorder, True, answer))
+
+    def check(self) -> str | None:
+        """Answer the requests that are done; return why a recording has stopped by itself."""
+        waiting, self._requests = self._requests, []
+        for request in waiting:
+            recorder = request.recorder
+            if recorder.state == 'opening' or (request.is_end and recorder.state == 'recording'):
+                self._requests.append(request)
+            elif request.is_end:
+                request.answer(recorder.error is None, _summary(recorder))
+            elif recorder.error is not None:
+                request.answer(False, recorder.error)
+            else:
+                request.answer(True, f'recording to {recorder.path}')
+        reason = self._recorder.error if self._recorder else None
+        if reason:
+            self.end(error=reason)
+        return reason
+
+    def close(self) -> str | None:
+        """Wait until all logs are closed; return a text about the one that was open."""
+        recorder = self._recorder
+        self.end()
+        for request in self._requests:
+            request.recorder.close()
+        self.check()
+        return _summary(recorder) if recorder else None
+
+    def write(self, event: Event) -> None:
+        """Record an event, if a recording goes on."""
+        recorder, simulation = self._recorder, self._simulation
+        if recorder is not None:
+            from spinning_top_sim.recording.recorder import single  # noqa: PLC0415
+            recorder.write([single(
+                self._events_index + list(TOPICS).index(topic), simulation.epoch_ns + event.t_ns,
+                data) for topic, data in event.entries()])
+
+    def has_room(self) -> bool:
+        """Return whether the recorder takes more messages."""
+        return self._recorder is None or self._recorder.room
+
+    def wait_for_room(self) -> None:
+        """Wait until the recorder takes more messages, a tenth of a second at most."""
+        if self._recorder is not None:
+            self._recorder.wait_for_room(0.1)
+
+    @property
+    def warning(self) -> str | None:
+        """A text for the user while the disk is too slow for `record.max_loss`."""
+        return self._recorder.warning if self._recorder else None
+
+    @property
+    def path(self) -> Path | None:
+        """The log that is open."""
+        return self._recorder.path if self._recorder else None
+
+    def numbers(self) -> dict[str, object]:
+        """Return what /diagnostics say of the recorder, by their keys."""
+        recorder = self._recorder
+        if recorder is None:
+            return {RECORDER: 'failed' if self.error else 'off'}
+        counters = recorder.counters
+        return {RECORDER: recorder.state, RECORDED_FILE: recorder.path,
+                'recorded messages': counters.messages, 'recorded bytes': counters.bytes,
+                'queued messages': counters.queued,
+                'possible loss [s]': f'{recorder.possible_loss:.3f}'}
+
+
+def _summary(recorder: Recorder) -> str:
+    counters = recorder.counters
+    text = f'{counters.path}: {counters.messages} messages, {counters.bytes / 1e6:.1f} MB'
+    return f'{text}; stopped early: {counters.error}' if counters.error else text

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What changes a run: one type, in memory, in the topic ~/events and in the metadata of a log.
+
+With the parameters in a log's metadata, its events are enough to compute every message again.
+"""
+
+import json
+import operator
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+from spinning_top_sim.physics.top import State
+from spinning_top_sim.streams import messages, parameters
+from spinning_top_sim.streams.cdr import ENCAPSULATION
+
+COMMANDS, EVENTS = '~/commands', '~/events'
+# Topics and types, recorded behind the channels, in this order.
+TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/String'}
+# What an event of each kind has besides its times, and how that is read.
+MOTIONS = ('command', 'state', 'drive')     # events that begin another motion, on the same clock
+_DETAILS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
+    'start': {},
+    'command': {'l3': float, 'lz': float},
+    'state': {one.name: float for one in fields(State)},
+    'drive': {'x': float, 'y': float, 'z': float, 'stop_ns': operator.index},
+    'epoch': {'epoch_ns': operator.index},
+    'reset': {'epoch_ns': operator.index, 'parameters': parameters.checked}}
+
+
+@dataclass(frozen=True)
+class Event:
+    """
+    Something that changes a run.
+
+    kind : 'start' (of a recording), 'command' (L3 and Lz jump), 'state' (the top is put
+        somewhere), 'drive' (of the pivot), 'parameters' (that act at once), 'epoch' (stamps jump,
+        the motion does not) or 'reset'
+    t_ns : simulated time at which it acts [ns]
+    sent_ns : time up to which samples had been sent before, -1 for none [ns]; a reset puts t back
+        to 0, and this is a time of the motion that ended
+    details : depends on the kind, as docs/log_format.md says
+    """
+
+    kind: str
+    t_ns: int
+    sent_ns: int
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def begins_motion(self) -> bool:
+        return self.kind in MOTIONS
+
+    def repeats(self, last: 'Event') -> bool:
+        """Return whether this is a drive that puts off the end of another, and does no more."""
+        return (self.kind == last.kind == 'drive' and self.t_ns < last.details['stop_ns']
+                and all(self.details[axis] == last.details[axis] for axis in 'xyz'))
+
+    def as_mapping(self) -> dict[str, Any]:
+        return {'event': self.kind, 't_ns': self.t_ns, 'sent_ns': self.sent_ns, **self.details}
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> Self:
+        """Return the event that `as_mapping` describes.  Raises one of MALFORMED for any other."""
+        given = dict(mapping)
+        kind, t_ns, sent_ns = given.pop('event'), given.pop('t_ns'), given.pop('sent_ns')
+        if kind == 'parameters':
+            details = parameters.checked_changes(given)
+        elif kind in _DETAILS:
+            details = {name: read(given[name]) for name, read in _DETAILS[kind].items()}
+        else:
+            raise ValueError(f'event {kind!r} is unknown')
+        return cls(kind, operator.index(t_ns), operator.index(sent_ns), details)
+
+    def encoded(self) -> bytes:
+        """Return the event as it is logged: std_msgs/String of JSON."""
+        return messages.string(json.dumps(self.as_mapping(), default=list))
+
+    @classmethod
+    def decoded(cls, data: bytes) -> Self:
+        """Return a logged event.  Raises one of MALFORMED for any other message."""
+        mapping = json.loads(data[len(ENCAPSULATION) + 4:-1])      # 4 for the length of the text
+        if messages.string(json.dumps(mapping)) != data:
+            raise ValueError('the bytes of the entry are not as it was written')
+        return cls.from_mapping(mapping)
+
+    def entries(self) -> list[tuple[str, bytes]]:
+        """Return what is logged of the event: topics and messages."""
+        logged = [(EVENTS, self.encoded())]
+        if self.kind == 'command':
+            logged.append((COMMANDS, command(**self.details)))
+        return logged
+
+
+def command(l3: float, lz: float) -> bytes:
+    """Return an applied command as it is logged: std_msgs/Float64MultiArray [L3, Lz]."""
+    return messages.float64_multi_array(('l3', 'lz')).encode_one(0, (l3, lz))

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run: parameters, motion and events, and the one place where its messages are computed."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.streams import parameters, trajectory
+from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.channel import Channel, Rows, Samples, Stamps, period_ns
+from spinning_top_sim.streams.events import Event
+from spinning_top_sim.streams.imu import LONGEST_NS, Imu
+from spinning_top_sim.streams.topics import all_channels
+from spinning_top_sim.streams.trajectory import Trajectory
+
+BLOCK_BYTES = 4 << 20                       # of a block offline
+LONGEST_BLOCK_NS = 100 * NANOSECONDS        # for the sake of progress
+MOST_BLOCKS = 20_000                        # of a run; then they are longer
+
+
+class Block(NamedTuple):
+    """
+    The messages of some channels after the block before and up to `until_ns`.
+
+    messages : (channel, times (n,) [ns], rows (n, size)) of each channel that has any
+    """
+
+    until_ns: int
+    messages: Sequence[tuple[Channel, Stamps, Rows]]
+
+
+class Simulation:
+    """
+    One top in motion.  Times are integer nanoseconds since the start.
+
+    values : checked parameters of the run, as it started
+    trajectory : the motion
+    imu, channels : the sensor and all streams, with their present rates
+    now_ns : every sample up to here is sent, or yielded (-1: not even that of t = 0); may be set
+    history : the events since the start
+    epoch_ns : stamp of t = 0 [ns]
+
+    Raises ValueError where there is no motion from the start state.
+    """
+
+    def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
+        self.now_ns = -1
+        self._restart(values, epoch_ns)
+
+    def _restart(self, values: Mapping[str, Any], epoch_ns: int) -> None:
+        # Whatever may be refused comes first, before anything changes.
+        check_stamps(epoch_ns, values['duration'])
+        motion = Trajectory(
+            parameters.top_of(values), parameters.start_state(values),
+            parameters.pivot_path(values),
+            {name: values[f'solver.{name}'] for name in ('method', 'equations', 'rtol', 'atol')},
+            most_acceleration=values['pivot.max_acceleration'])
+        imu = Imu(values, period_ns(values['imu.rate']))
+        self.channels = all_channels(values, imu)
+        self.trajectory, self.imu, self.epoch_ns = motion, imu, epoch_ns
+        self.values, self._rates = dict(values), dict(values)
+        self.history: list[Event] = []
+        self.now_ns = -1
+        # The trace of the markers, intervals of the IMU and late fixes reach back across events.
+        self._keep_ns = max(round(values['markers.trace_length'] * NANOSECONDS), LONGEST_NS)
+
+    def apply(self, kind: str, **details: Any) -> Event:
+        """
+        Let something change the run now; return the event, with the time at which it acts.
+
+        kind, details : of an `Event`; a drive needs no `stop_ns`, which is then now +
+            `pivot.cmd_timeout`
+
+        Raises ValueError naming what is off; the run goes on unchanged.
+        """
+        sent_ns = self.now_ns
+        if kind == 'reset':
+            self._restart(details['parameters'], details['epoch_ns'])
+            return Event(kind, 0, sent_ns, details)
+        event = Event(kind, max(sent_ns, 0), sent_ns, details)
+        if event.begins_motion:
+            self.trajectory = self.trajectory.then(event)
+            self.now_ns = event.t_ns
+        elif kind == 'parameters':
+            self._set_rates(details)
+        elif kind == 'epoch':
+            check_stamps(details['epoch_ns'], 0.0)
+            self.epoch_ns = details['epoch_ns']
+        self._remember(event)
+        return event
+
+    def _remember(self, event: Event) -> None:
+        """Add an event to the history, or let a drive that is repeated last longer."""
+        last = self.history[-1] if self.history else None
+        if last and event.repeats(last):
+            self.history[-1] = replace(last, details=event.details)
+        else:
+            self.history.append(event)
+
+    def _set_rates(self, changes: Mapping[str, Any]) -> None:
+        """Take over new rates of channels after `now_ns`."""
+        self._rates |= {name: value for name, value in changes.items() if name.endswith('.rate')}
+        self.imu = self.imu.at_period(period_ns(self._rates['imu.rate']), max(self.now_ns, 0))
+        self.channels = all_channels(self._rates, self.imu)
+
+    def drive_details(self, velocity: Sequence[float]) -> dict[str, Any] | None:
+        """
+        Return the details of a drive to a velocity of the pivot in the world [m/s] from now on.
+
+        None if the pivot rests and is to rest.  Raises ValueError.
+        """
+        details = trajectory.drive_details(velocity, max(self.now_ns, 0),
+                                           self.values['pivot.cmd_timeout'])
+        is_rest = self.trajectory.pivot is None and not any(details[axis] for axis in 'xyz')
+        return None if is_rest else details
+
+    def state(self) -> States:
+        """Return the state (n = 1) in which the motion goes on after `now_ns`."""
+        now_ns = max(self.now_ns, 0)
+        return self.trajectory.after(now_ns).states(range(now_ns, now_ns + 1))
+
+    def block(self, channels: Sequence[Channel], after_ns: int, until_ns: int) -> Block:
+        """
+        Return the messages of channels that are due after one time and up to another.
+
+        Where the motion ends before, the block does too.  A message depends on the parameters,
+        the events and its own time alone, never on the block that it is computed in.
+
+        Raises IntegrationError if the motion does not go on at all.
+        """
+        last_ns = LAST_STAMP_NS - self.epoch_ns
+        if last_ns <= after_ns:
+            raise IntegrationError(f'the stamp {(self.epoch_ns + until_ns) / NANOSECONDS:.12g} s: '
+                                   f'must be < {2 ** 31} s, in January 2038', reached_ns=last_ns)
+        until_ns = self.reach(after_ns, min(until_ns, last_ns))
+        samples: dict[tuple[int, int], Samples] = {}
+        messages = []
+        for channel in channels:
+            if channel.grid not in samples:
+                samples[channel.grid] = Samples(
+                    self.trajectory, self.imu, channel.times(after_ns, until_ns), self.epoch_ns)
+            if samples[channel.grid].times:
+                t_ns, rows = channel.encode(samples[channel.grid])
+                if len(t_ns):           # a sensor may lose all samples of a block
+                    messages.append((channel, t_ns, rows))
+        return Block(until_ns, messages)
+
+    def reach(self, after_ns: int, until_ns: int) -> int:
+        """Return the last time up to `until_ns` that the motion has; as `block`, raise if none."""
+        try:
+            self.trajectory.evaluate(range(until_ns, until_ns + 1))
+        except IntegrationError as error:
+            if error.reached_ns <= after_ns:
+                raise
+            return error.reached_ns
+        return until_ns
+
+    def play(self, channels: Sequence[Channel], until_ns: int) -> Iterator[Block]:
+        """
+        Move on to `until_ns`; yield the messages of these channels on the way, block by block.
+
+        `now_ns` is the end of the block that is yielded.  Raises IntegrationError behind the last
+        block if the motion does not go on.
+        """
+        per_ns = sum(len(channel.encoder) / channel.period_ns for channel in channels)
+        span_ns = max(1, int(BLOCK_BYTES / max(per_ns, BLOCK_BYTES / LONGEST_BLOCK_NS)),
+                      (until_ns - self.now_ns) // MOST_BLOCKS)
+        while self.now_ns < until_ns:
+            block = self.block(channels, self.now_ns, min(until_ns, self.now_ns + span_ns))
+            self.now_ns = block.until_ns
+            yield block
+            self.forget()
+
+    def forget(self) -> None:
+        """Forget what no sample after `now_ns` needs."""
+        memory_ns = self.imu.memory_ns
+        self.trajectory.forget(self.now_ns - max(self._keep_ns, memory_ns),
+                               self.now_ns - memory_ns)
+
+
+def check_stamps(epoch_ns: int, duration: float) -> None:
+    """Raise ValueError if ROS has no stamp for t = 0 [ns] or for the end of a run [s]."""
+    for stamp_ns in (epoch_ns, epoch_ns + round(duration * NANOSECONDS)):
+        if not 0 <= stamp_ns <= LAST_STAMP_NS:
+            raise ValueError(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be >= 0 and '
+                             f'< {2 ** 31} s, in January 2038')

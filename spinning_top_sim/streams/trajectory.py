@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion of a run as a function of time: solutions, joined by events and by the pivot."""
+
+import math
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from copy import copy
+from functools import partial
+from operator import attrgetter
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.attitude import Vector
+from spinning_top_sim.physics.pivot import NEVER_NS, REST, Kinematics, PivotPath, kinematics
+from spinning_top_sim.physics.states import Point, States, joined
+from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
+from spinning_top_sim.solvers.handover import Piece
+from spinning_top_sim.solvers.vertical import Posture
+from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.streams.events import Event
+from spinning_top_sim.streams.parameters import FASTEST
+
+Times = range | NDArray[np.int64]
+
+
+class Trajectory:
+    """
+    The motion of a top from t = 0 on.  Times are integer nanoseconds, and ascend.
+
+    A sample at the instant of an event belongs to the motion before it.
+
+    top : in the gravity of the world
+    pivot : path of the pivot; None while it rests at the origin
+    l3, lz : as last commanded, Lz about the vertical of the world [kg m^2/s]
+    settings : of the solver, keywords of `Piece`
+
+    Raises ValueError where no motion begins.
+    """
+
+    def __init__(self, top: Top, start: State, pivot: PivotPath | None,
+                 settings: Mapping[str, Any], *, most_acceleration: float) -> None:
+        self.top, self.pivot, self.lz = top, pivot, start.lz
+        self._settings, self._most_acceleration = settings, most_acceleration
+        self._drive: Event | None = None            # the newest, while the pivot follows it
+        self._jumps: tuple[int, ...] = ()           # when the angular velocity jumps
+        self._forgotten = 0, 0                      # steps and evaluations of pieces that are gone
+        self._pieces = [self._begin(start, 0)]
+
+    def _begin(self, start: State | Posture, start_ns: int) -> Piece:
+        ride = self.pivot.lasting(start_ns) if self.pivot else REST
+        return Piece(self.top, start, start_ns, ride, **self._settings)
+
+    @property
+    def l3(self) -> float:
+        return self._pieces[-1].l3
+
+    @property
+    def steps(self) -> int:
+        """Integration steps taken so far."""
+        return self._forgotten[0] + sum(piece.steps for piece in self._pieces)
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the right-hand side so far."""
+        return self._forgotten[1] + sum(piece.evaluations for piece in self._pieces)
+
+    def evaluate(self, t_ns: Times) -> States:
+        """
+        Return the states at times (n,), in the world.
+
+        Raises IntegrationError if the motion does not go on to the last of them; `reached_ns` of
+        the error is the last time that can be had.
+        """
+        return joined([piece.states(times) for piece, times in self.pieces(t_ns)])
+
+    def pieces(self, t_ns: Times) -> list[tuple[Piece, Times]]:
+        """Return the pieces in which times lie, with the times in each; one piece without any."""
+        self._go_on(int(t_ns[-1]) if len(t_ns) else 0)
+        found, begin = [], 0
+        for piece, after in zip(self._pieces, [*self._pieces[1:], None], strict=True):
+            end = len(t_ns) if after is None else bisect_left(t_ns, after.start_ns + 1)
+            if end > begin:
+                found.append((piece, t_ns[begin:end]))
+                begin = end
+        return found or [(self._pieces[-1], t_ns)]
+
+    def _go_on(self, t_ns: int) -> None:
+        """Let pieces follow as far as a time, which lies in the last one."""
+        while (end_ns := self._pieces[-1].ride.end_ns) < t_ns:
+            try:
+                self._pieces.append(self._begin(self._pieces[-1].posture(end_ns), end_ns))
+            except ValueError as error:
+                raise IntegrationError(str(error), reached_ns=end_ns) from error
+
+    def after(self, t_ns: int) -> Piece:
+        """Return the piece in which the motion goes on after a time."""
+        self._go_on(t_ns + 1)
+        return self._pieces[bisect_left(
+            self._pieces, t_ns + 1, key=attrgetter('start_ns')) - 1]
+
+    def starts(self, begin_ns: int, end_ns: int) -> list[int]:
+        """Return the times in [begin, end) at which another piece begins."""
+        return [piece.start_ns for piece in self._pieces[1:]
+                if begin_ns <= piece.start_ns < end_ns]
+
+    def velocity_jump(self, t_ns: int, point: Point) -> Vector:
+        """Return by how much the velocity of a point of the body jumps at a time, (1,) each."""
+        if t_ns not in self._jumps:
+            return np.zeros(1), np.zeros(1), np.zeros(1)
+        moment = range(t_ns, t_ns + 1)
+        before, after = self.evaluate(moment), self.after(t_ns).states(moment)
+        (u1, u2, u3), (v1, v2, v3) = before.velocity(point), after.velocity(point)
+        return v1 - u1, v2 - u2, v3 - u3
+
+    def constants(self, name: str, t_ns: Times) -> NDArray[np.float64]:
+        """Return `energy`, `l3` or `lz` as it is at the start of the piece of each time, (n,)."""
+        found = self.pieces(t_ns)
+        return np.repeat([getattr(piece, name) for piece, _ in found],
+                         [len(times) for _, times in found])
+
+    def place(self, t_ns: Times) -> Kinematics:
+        """Return what the pivot does at times (n,), without its motion being solved."""
+        found = self.pieces(t_ns)
+        return kinematics([piece.ride for piece, _ in found],
+                          [len(times) for _, times in found], np.asarray(t_ns))
+
+    def orientation_error(self, states: States, t_ns: Times) -> NDArray[np.float64]:
+        """Return the angles (n,) [rad] of states to the exact ones; NaN: these are not known."""
+        angles, begin = np.zeros(len(t_ns)), 0
+        for piece, times in self.pieces(t_ns):
+            part = slice(begin, begin := begin + len(times))
+            if not piece.is_exact:
+                truth = piece.truth(times)
+                x, y, z, w = (column[part] for column in states.rows_quaternion)
+                angles[part] = math.nan if truth is None else attitude.angle_between(
+                    (x, y, z, w), truth.rows_quaternion)
+        return angles
+
+    def then(self, event: Event) -> Self:
+        """
+        Return the trajectory that is the same up to an event, and then follows it.
+
+        Raises ValueError naming what is off with the event.
+        """
+        after = copy(self)
+        now = self.after(event.t_ns)
+        after._pieces = self._pieces[:self._pieces.index(now) + 1]
+        after._follow(event, now)
+        return after
+
+    def _follow(self, event: Event, now: Piece) -> None:
+        t_ns, details = event.t_ns, event.details
+        state = now.states(range(t_ns, t_ns + 1))
+        if event.kind == 'drive':
+            repeats = self._drive is not None and event.repeats(self._drive)
+            self._drive = event
+            self.pivot = self._driven_path(stop_ns=details['stop_ns']) if repeats else (
+                self._path_of(event))
+            if repeats:         # the motion up to now is the same
+                self._pieces[-1] = now.with_ride(self.pivot.lasting(now.start_ns))
+                return
+            start: State | Posture = now.posture(t_ns)
+        elif event.kind == 'command':
+            start = commanded(state, **details)
+        else:
+            start = State(**details)
+        self._pieces.append(self._begin(start, t_ns))
+        if isinstance(start, State):
+            self.lz, self._jumps = start.lz, (*self._jumps, t_ns)
+
+    def _path_of(self, event: Event) -> PivotPath:
+        place = self.place(range(event.t_ns, event.t_ns + 1))
+        self._driven_path = partial(
+            PivotPath.to_velocity, [event.details[axis] for axis in 'xyz'],
+            position=place.position[:, 0].tolist(), velocity=place.velocity[:, 0].tolist(),
+            start_ns=event.t_ns, most_acceleration=self._most_acceleration)
+        return self._driven_path(stop_ns=event.details['stop_ns'])
+
+    def forget(self, before_ns: int, steps_before_ns: int) -> None:
+        """Forget the pieces before a time, and integration steps before another one."""
+        count = max(bisect_left(self._pieces, before_ns, key=attrgetter('start_ns')) - 1, 0)
+        gone, self._pieces = self._pieces[:count], self._pieces[count:]
+        self._jumps = tuple(t_ns for t_ns in self._jumps if t_ns >= self._pieces[0].start_ns)
+        self._forgotten = (self._forgotten[0] + sum(piece.steps for piece in gone),
+                           self._forgotten[1] + sum(piece.evaluations for piece in gone))
+        for piece in self._pieces:
+            piece.forget(steps_before_ns)
+
+
+def commanded(now: States, l3: float, lz: float) -> ContinuedState:
+    """
+    Return the state in which L3 and Lz have jumped to these values [kg m^2/s].
+
+    now : the state before (n = 1).  Raises ValueError naming what is off.
+    """
+    for name, value in (('l3', l3), ('lz', lz)):
+        if not math.isfinite(value):
+            raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
+    theta = float(now.theta[0])
+    pole = pole_momentum(abs(theta), l3)
+    if pole is not None and lz != pole:
+        raise ValueError(
+            f'lz = {lz!r} kg m^2/s with l3 = {l3!r}: the axis is at a pole (theta = {theta!r} '
+            f'rad), where lz must equal {pole!r}; command both together')
+    return ContinuedState(theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
+                          psi=float(now.psi[0]), l3=l3, lz=lz)
+
+
+def drive_details(velocity: Sequence[float], now_ns: int, timeout: float) -> dict[str, Any]:
+    """
+    Return the details of a drive: a velocity of the pivot in the world [m/s], and its end.
+
+    timeout : how long it lasts before the pivot brakes [s], 0 = for ever.  Raises ValueError.
+    """
+    x, y, z = target = [float(part) for part in velocity]
+    if not all(abs(part) <= FASTEST for part in target):
+        raise ValueError(f'linear = {target!r} m/s: each must be finite and within '
+                         f'{FASTEST:g} m/s')
+    stop_ns = now_ns + round(timeout * NANOSECONDS) if timeout else NEVER_NS
+    return {'x': x, 'y': y, 'z': z, 'stop_ns': stop_ns}
