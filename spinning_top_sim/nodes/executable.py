@@ -130,6 +130,17 @@ def split_ros_arguments(argv: Iterable[str]) -> tuple[list[str], list[str]]:
     return own, for_ros
 
 
+def node_name(for_ros: Sequence[str], name: str = 'spinning_top') -> str:
+    """Return the full name that arguments of ROS give to a node: the first rule holds."""
+    found: dict[str, str] = {}
+    for option, rule in pairwise(for_ros):
+        left, _, right = rule.partition(':=')
+        node, _, what = left.rpartition(':')
+        if option in ('-r', '--remap') and node in ('', name):
+            found.setdefault('__node' if what == '__name' else what, right)
+    return f'/{found.get("__ns", "").strip("/")}/{found.get("__node", name)}'.replace('//', '/')
+
+
 def _cannot_start(name: str, error: Exception) -> int:
     kind = type(error).__name__
     if isinstance(error, ImportError) and not find_spec('rclpy'):

@@ -24,7 +24,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
-from spinning_top_sim.nodes import playback
+from spinning_top_sim.nodes import playback, ros_parameters
 from spinning_top_sim.nodes.endpoints import message_class, wait_for_all_acked
 from spinning_top_sim.nodes.executable import short_reason
 from spinning_top_sim.nodes.terminal import Terminal
@@ -43,7 +43,9 @@ class Replayer(Node):
 
     def __init__(self, log: LogReader, options: argparse.Namespace) -> None:
         given = [] if options.rate is None else [Parameter('rate', value=options.rate)]
-        super().__init__('replay', parameter_overrides=given)
+        super().__init__('replay', parameter_overrides=given,
+                         automatically_declare_parameters_from_overrides=True)
+        overrides = ros_parameters.take_overrides(self)
         self.finished: Future = Future()    # completes with the exit code when all is played
         self._reader, self._options = log, options
         self._terminal = Terminal()
@@ -53,6 +55,8 @@ class Replayer(Node):
         if self._begin_ns > self._end_ns:
             raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
         self.outputs = self._open_publishers()      # by the number of the channel
+        for warning in ros_parameters.disobeyed_overrides(self, overrides):
+            self.get_logger().warning(warning)
         self._playback = playback.Playback()
         self._playback.pause(options.start_paused)
         self._round = 0
