@@ -140,3 +140,12 @@ def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):
             'spinning-top simulate: '
             f'{source}: there is no parameter spin.l33; did you mean spin.l3?\n')
     assert not output.exists()
+
+
+@pytest.mark.parametrize(('name', 'frame', 'says'), [
+    ('world_frame', '', 'a frame'), ('body_frame', '/base_link', 'without a slash at its begin'),
+    ('imu.frame_id', 'base_link', 'another frame than its parent'),
+    ('imu.frame_id', 'world', 'another frame than its parent')])
+def test_frames_that_make_no_tree_are_refused(name, frame, says):
+    with pytest.raises(ValueError, match=f'{name} = {frame!r}: must be .*{says}'):
+        parameters.checked({name: frame})

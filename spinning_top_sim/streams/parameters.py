@@ -255,6 +255,13 @@ def _check_together(values: Mapping[str, Any]) -> None:
             raise ValueError(
                 f'{name} = {list(value) if isinstance(value, tuple) else value!r}: {text}')
 
+    above: list[str] = []
+    for name in ('world_frame', 'body_frame', 'imu.frame_id'):
+        frame = values[name]
+        need(frame != '' and not frame.startswith('/'), name,
+             'must be the name of a frame, without a slash at its begin')
+        need(frame not in above, name, 'must be another frame than its parent')
+        above.append(frame)
     names = [row[0] for row in STREAM_DEFAULTS]
     for name in values['record.streams']:
         need(name in ('all', *names), 'record.streams',
