@@ -230,9 +230,11 @@ def checked(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return all parameters: these values, else defaults.  Raises ValueError for bad values."""
     result = {parameter.name: parameter.default for parameter in TABLE} | checked_changes(values)
     _check_together(result)
-    if result['gnss.enabled'] and find_spec('pymap3d') is None:
-        raise ValueError('gnss.enabled = True: needs pymap3d, which is not installed: '
-                         f'{remedy("gnss")}')
+    for name, value, library in (('gnss.enabled', True, 'pymap3d'),
+                                 ('solver.method', 'exact', 'gmpy2')):
+        if result[name] == value and find_spec(library) is None:
+            raise ValueError(f'{name} = {value}: needs {library}, which is not installed: '
+                             f'{remedy(library)}')
     for describe in (top_of, start_state, pivot_path):      # they refuse what cannot be
         describe(result)
     return result

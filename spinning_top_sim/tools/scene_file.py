@@ -15,6 +15,7 @@ import yaml
 from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools import cli
 
 NODE = '/spinning_top'      # the full name of the node where no other is asked for
 # Parameters that rclpy declares for every node.
@@ -50,11 +51,12 @@ class _Name(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  value: Any, option: str | None = None) -> None:
         if value == 'help':
-            for stem, path in parameter_files(self.dest).items():
-                # The first sentence of the comment at the head, behind the licence.
-                text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
-                                if line.startswith('# '))
-                print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
+            with cli.reader_may_end():
+                for stem, path in parameter_files(self.dest).items():
+                    # The first sentence of the comment at the head, behind the licence.
+                    text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
+                                    if line.startswith('# '))
+                    print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
             parser.exit()
         setattr(namespace, self.dest, value)
 
