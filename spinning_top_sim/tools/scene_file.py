@@ -220,7 +220,8 @@ def with_doubles(name: str, value: Any) -> Any:
     """
     parameter = parameters.BY_NAME.get(name)
     if isinstance(value, list | array.array):
-        return [with_doubles(name, item) for item in value]
+        items = [with_doubles(name, item) for item in value]
+        return items if len(set(map(type, items))) == 1 else value
     if parameter is not None and parameter.has_doubles and (
             type(value) is int or (isinstance(value, str) and _WITH_EXPONENT.fullmatch(value))):
         with contextlib.suppress(OverflowError):
