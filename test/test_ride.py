@@ -21,10 +21,9 @@ from hypothesis import strategies as st
 from spinning_top_sim import State, Top
 from spinning_top_sim.physics import attitude, pivot
 from spinning_top_sim.physics.pivot import Kinematics, PivotPath
-from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.multiprecision import BITS, precision
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.solvers.vertical import AcceleratedMotion, posture_of
+from spinning_top_sim.streams.trajectory import Trajectory
 
 BOUND = 5e-15
 S = 10 ** 9
@@ -33,30 +32,29 @@ CASES = {case['name']: case for case in json.loads(
 GENERAL = State(theta=0.5, theta_dot=0.3, phi=0.1, psi=0.2, l3=1.6, lz=1.3)
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
 NOWHERE = (0.0, 0.0, 0.0)
-RIDE = PivotPath([]).lasting(0)
 
 
 def kinematics(path, times_ns):
     """Return position, velocity and acceleration (n, 3) of a pivot at times [ns]."""
-    found = [pivot.kinematics(path.piece(int(t)), np.array([t])) for t in times_ns]
-    return Kinematics(*(np.hstack(rows).T for rows in zip(*found, strict=True)))
+    pieces = [path.piece(int(t)) for t in times_ns]
+    found = pivot.kinematics(pieces, len(pieces) * [1], np.array(times_ns))
+    return Kinematics(*(part.T for part in found))
 
 
-def sample(segment, t_ns, point):
+def sample(trajectory, t_ns, point):
     """Return attitude w x y z, omega and alpha in the body, and where a point is at a time."""
-    states, place = segment.states(range(t_ns, t_ns + 1)), segment.pivot(np.array([t_ns]))
-    arm = np.stack(attitude.rotated(states.rows_quaternion, point))
+    states = trajectory.after(t_ns).states(range(t_ns, t_ns + 1))
     return (np.roll(states.quaternion[0], 1), states.angular_velocity[0],
-            states.angular_acceleration[0], (place.position + arm)[:, 0])
+            states.angular_acceleration[0], np.ravel(states.position(point)))
 
 
-def errors(path, case):
+def errors(trajectory, case):
     """
     Return the worst error of a component of each quantity over max(1, its true size).
 
     Euler's equations give alpha as a difference of products of rates: it has the size of omega^2.
     """
-    found = [sample(path.after(t), t, case['point']) for t in case['times_ns']]
+    found = [sample(trajectory, t, case['point']) for t in case['times_ns']]
     worst = {}
     for name, rows in zip(('q', 'omega', 'alpha', 'position'), zip(*found, strict=True),
                           strict=True):
@@ -75,15 +73,14 @@ def errors(path, case):
 def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
     """Also after a thousand changes, and what is handed over last has all digits."""
     case = CASES[name]
-    run = Simulation(parameters.checked({'solver.method': 'exact'}))
-    run.top, run.now_ns = Top(**case['top']), 0
-    run._continue(State(**case['start']), PivotPath(
-        case['pieces'], position=case['position'], velocity=case['velocity']))
-    worst = errors(run.path, case)
+    path = PivotPath(case['pieces'], position=case['position'], velocity=case['velocity'])
+    run = Trajectory(Top(**case['top']), State(**case['start']), path, {'method': 'exact'},
+                     most_acceleration=2.0)
+    worst = errors(run, case)
     # In the longest one an error grows by some 1e10: the true motion is chaotic.
     assert max(worst.values()) <= BOUND, worst
     end, found = case['times_ns'][-1], []
-    alpha, beta, across, l3 = run.path.after(end).posture(end)
+    alpha, beta, across, l3 = run.after(end).posture(end)
     with precision(BITS):
         last = {key: [*map(mpfr, values)] for key, values in case['states'][-1].items()}
         parts = (alpha.real, -beta.imag, beta.real, alpha.imag, across.real, across.imag)
@@ -106,28 +103,29 @@ def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
     State(theta=0.0, theta_dot=1e-50, l3=0.5, lz=0.5),
     State(theta=1e-15, theta_dot=1e-15, psi=1.0, l3=0.5, lz=0.5)])
 def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
-    def begun(first, start_ns):
-        return Piece(TOP, first, start_ns, RIDE._replace(
-            acceleration=tuple(map(Fraction, acceleration)),
-            begins=np.array((*NOWHERE, *NOWHERE, *acceleration))), method='exact')
-    piece = begun(start, 0)
-    first, whole, back, now = piece.posture(0), piece.posture(S), piece, 0
+    exact = tuple(map(Fraction, acceleration))
+    posture = posture_of(TOP, start)
+    motion = AcceleratedMotion(TOP, posture, exact)
+    whole, back = motion.posture(S), posture
     for length in (1000, S // 3, S - S // 3 - 1000):
-        now += length
-        back = begun(back.posture(now), now)
+        back = AcceleratedMotion(TOP, back, exact).posture(length)
     with precision(BITS):
-        for one, other in zip(whole[:3], back.posture(S)[:3], strict=True):
+        for one, other in zip(whole[:3], back[:3], strict=True):
             assert abs(one - other) < max(1, abs(one)) * 1e-30
-    for t, (alpha, beta, across, _) in (0, first), (S, whole):
-        states = piece.states(range(t, t + 1))
-        q = states.quaternion[0]
+    for t, (alpha, beta, across, _) in (0, posture), (S, whole):
+        states = motion.states(range(t, t + 1))
+        q = np.ravel(attitude.product(motion.vertical.rotation, states.rows_quaternion))
         assert abs(q - [-beta.imag, beta.real, alpha.imag, alpha.real]).max() < 2e-15
         rates = np.array([across.real, across.imag], float)
         assert abs(states.angular_velocity[0, :2] - rates).max() < 5e-15 * max(1.0, *abs(rates))
-    assert back.l3 == start.l3 == piece.l3
-    force = np.array(acceleration) + np.array((0.0, 0.0, TOP.gravity))
-    felt = np.ravel(attitude.rotated(states.rows_quaternion, states.specific_force(NOWHERE)))
-    assert abs(felt - force).max() <= BOUND * max(1.0, np.linalg.norm(force))
+    assert back.l3 == start.l3 == motion.start.l3
+    assert 0.0 <= motion.start.theta <= math.pi / 2
+    # The vertical of the frame is the line of the effective gravity.
+    line = np.array(acceleration) + np.array((0.0, 0.0, TOP.gravity))
+    assert motion.top.gravity == pytest.approx(
+        math.copysign(np.linalg.norm(line), motion.top.gravity), rel=1e-15)
+    z = np.array(attitude.axis_in_world(motion.vertical.rotation)).ravel()
+    assert abs(motion.top.gravity * z - line).max() <= 1e-15 * max(1.0, np.linalg.norm(line))
 
 
 # The path of the pivot
