@@ -12,7 +12,7 @@ from helpers.simulations import play, stream
 from helpers.simulations import simulate as simulated
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.solvers.vertical import AcceleratedMotion
+from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools import inspect, simulate
 
 S = 10 ** 9
@@ -74,12 +74,12 @@ def test_a_velocity_of_zero_brakes_a_pivot_that_moves():
 
 def test_a_storm_of_velocities_costs_the_same_from_first_to_last(monkeypatch):
     """Also with a filter that remembers all of them."""
-    states, counts = AcceleratedMotion.states, [0]
+    states, counts = ExactSolution.states, [0]
 
     def counted(motion, times):
         counts[-1] += len(times)
         return states(motion, times)
-    monkeypatch.setattr(AcceleratedMotion, 'states', counted)
+    monkeypatch.setattr(ExactSolution, 'states', counted)
     simulation = simulated({'solver.method': 'exact', 'imu.bandwidth': 1.0})
     imu = [stream(simulation, 'imu/data_raw')]
     simulation.drive((0.0, 0.0, 0.1))

@@ -19,7 +19,6 @@ pytest.importorskip('rclpy')
 import rclpy
 import yaml
 from geometry_msgs.msg import PoseStamped
-from helpers.definitions import add_definitions
 from helpers.node_harness import SimNode, Topic, wait_for
 from helpers.own_node import InThisProcess, run_main
 from helpers.recordings import write
@@ -44,7 +43,6 @@ EPOCH_NS = 1_700_000_000_123_456_789
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 SECOND = 1_000_000_000
 STRING, TWIST, THING = 'std_msgs/msg/String', 'geometry_msgs/msg/Twist', 'nowhere_msgs/msg/Thing'
-add_definitions(TWIST)
 
 
 def string_cdr(number, padding=0):

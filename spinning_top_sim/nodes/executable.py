@@ -63,7 +63,7 @@ def run_node(name: str, argv: Sequence[str] | None,
         started = True
         # Python handles signals between waits; without a timeout, Jazzy's EventsExecutor hangs.
         while rclpy.ok() and not interrupts and not node.finished.done():
-            executor.spin_once(0.5)
+            executor.spin_until_future_complete(node.finished, 0.5)
         return (node.finished.result() or 0) if node.finished.done() else 0
     except Exception as error:
         # A call may raise anything when the context ends.

@@ -39,7 +39,7 @@ from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.parameter import Effect
 
 LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
-CHECK_S = 0.02                  # how often requests to open or close a log are looked at
+WAIT_S = 0.02                   # how often a /clock that has not begun is looked at
 
 
 class Simulator(Node):
@@ -94,8 +94,7 @@ class Simulator(Node):
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
         # The recorder's thread releases the interpreter this soon when a tick is due.
         sys.setswitchinterval(1e-4)
-        self._every('check', CHECK_S, self._check_recording)
-        self._every('start', CHECK_S, self._begin)
+        self._every('start', WAIT_S, self._begin)
         self._begin()
 
     def _begin(self) -> None:
@@ -157,6 +156,7 @@ class Simulator(Node):
 
     def _tick(self) -> None:
         self.loop.tick()
+        self._check_recording()
         if self.loop.state is LoopState.ENDED and not self.finished.done():
             wait_for_all_acked(self._topics.by_topic.values(), 1.0)
             self.finished.set_result(None)

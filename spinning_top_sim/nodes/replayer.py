@@ -226,7 +226,7 @@ class Replayer(Node):
 def open_log(path: Path, partial: bool) -> LogReader:
     """Open a log.  Raises LogError, and without `partial` ValueError for a damaged log."""
     log = LogReader(path)
-    damaged = not log.whole and (log.damage.truncated or log.damage.losses)
+    damaged = not log.whole and (log.damage.torn or log.damage.lost_bytes)
     if damaged and not partial:
         raise ValueError(f'{path} is damaged: `recover` makes a whole log of it, --partial plays '
                          'what is whole')

@@ -16,7 +16,7 @@ from typing import Any
 from spinning_top_sim.installation import remedy
 from spinning_top_sim.physics.pivot import SHORTEST_S, PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
-from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
+from spinning_top_sim.solvers.solve import EQUATIONS, METHODS
 from spinning_top_sim.streams.parameter import Effect, Parameter
 
 # Name, default rate [Hz], on by default, description.  Streams with None have the rate `imu.rate`.
