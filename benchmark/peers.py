@@ -24,7 +24,7 @@ from cases import FINEST_HZ, FINEST_NS, Case
 from spinning_top_sim import solve
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.solvers.solve import motion_of
 
 
 class FailedError(Exception):
@@ -105,7 +105,7 @@ class _Ours(Runner):
             self._options |= {'rtol': setting, 'atol': 0.1 * setting}
 
     def _states(self, ns):
-        propagator = propagate(self.case.top, self.case.start, **self._options)
+        propagator = motion_of(self.case.top, self.case.start, **self._options)
         states = propagator.states(ns)
         self.work = propagator.evaluations or None
         return states

@@ -71,7 +71,7 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
 | service | `~/reset` | std_srvs/Trigger | starts again with the start state, spin and seed; stamps stay monotonic |
 | service | `~/record` | std_srvs/SetBool | starts, stops a log; the response has its path and counts |
 | parameters | `spin.l3`, `spin.lz` | double | the same as a command, with a result; set both atomically |
-| services, action | `get_entity_state`, `simulate_steps`, … | simulation_interfaces | where that package is installed: [simulation_interfaces.md](simulation_interfaces.md) |
+| services | `get_entity_state`, `step_simulation`, … | simulation_interfaces | where that package is installed: [simulation_interfaces.md](simulation_interfaces.md) |
 
 The node refuses a command of wrong length, with NaN or infinity, or with Lz ≠ ±L3 while the axis is at a
 pole. It logs the reason and counts the command in `/diagnostics`. The motion continues unchanged.

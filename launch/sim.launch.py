@@ -79,17 +79,13 @@ def _nodes(context: LaunchContext) -> list:
         raise ValueError(f'set = {given["set"]!r}: use_sim_time is an argument of its own, '
                          'use_sim_time:=true')
     changes, values = _parameters(given, namespace, files, asked)
-
-    # Also as `-p`: these override an integer in a file, which hides a double of a later file.
+    options = [('--params', str(path)) for path in files] + [
+        ('-p', f'{name}:={json.dumps(values[name])}') for name in changes]
     actions = [Node(
         package='spinning_top_sim', executable='sim_node', namespace=namespace, output='screen',
         sigterm_timeout='15', on_exit=Shutdown(reason='it has ended'),
-        parameters=[*map(str, files), {
-            **{name: list(value) if isinstance(value, tuple) else value
-               for name, value in changes.items()},
-            **of_ros, 'use_sim_time': on['use_sim_time']}],
-        ros_arguments=[word for name in changes for word in (
-            '-p', f'{name}:={json.dumps(values[name])}')])]
+        arguments=[word for option in options for word in option],
+        parameters=[{**of_ros, 'use_sim_time': on['use_sim_time']}])]
     if on['tf']:
         actions += launch_helpers.state_publisher(
             SHARE, values, namespace, resolve_topic('joint_states', namespace),
@@ -105,7 +101,8 @@ def _nodes(context: LaunchContext) -> list:
 
 def _parameters(given: dict, namespace: str, files: list, asked: dict) -> tuple[dict, dict]:
     """Return what changes the parameters of the scene, and all parameters with these changes."""
-    scene, *second = map(read_scene, files)
+    node = resolve_topic('spinning_top', namespace)
+    scene, *second = (read_scene(path, node) for path in files)
     changes = {name: value for source in (*second, asked) for name, value in source.items()}
     values = parameters.checked({**scene, **changes})
     prefix = given['frame_prefix']

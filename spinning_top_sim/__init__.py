@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from spinning_top_sim.physics.top import State, Top
 
 if TYPE_CHECKING:
-    from spinning_top_sim.solvers.propagator import solve
+    from spinning_top_sim.solvers.solve import solve
 
 __all__ = ['State', 'Top', 'solve']
 
@@ -16,6 +16,6 @@ __all__ = ['State', 'Top', 'solve']
 def __getattr__(name: str) -> object:
     """Import `solve`, and numpy with it, when it is first asked for."""
     if name == 'solve':
-        from spinning_top_sim.solvers.propagator import solve  # noqa: PLC0415
+        from spinning_top_sim.solvers.solve import solve  # noqa: PLC0415
         return solve
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

@@ -37,6 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:        # not where it is ignored
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    from spinning_top_sim.tools.cli import print_any_text  # noqa: PLC0415
+    print_any_text()
     try:
         name = _parser().parse_args(argv[:1]).command
         if name != 'examine':       # where filters of the user run

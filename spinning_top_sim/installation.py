@@ -2,6 +2,7 @@
 """What is installed: the version, the shared files, and how to install what is missing."""
 
 import contextlib
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -9,6 +10,9 @@ from importlib import metadata
 from pathlib import Path
 
 NAME = 'spinning_top_sim'
+# Libraries whose distribution has another name, and those that Ubuntu has as python3-NAME.
+DISTRIBUTIONS = {'yaml': 'PyYAML'}
+FROM_APT = ('gmpy2', 'matplotlib', 'numpy', 'scipy', 'tqdm', 'yaml')
 
 
 def version(distribution: str = NAME) -> str:
@@ -57,6 +61,9 @@ def remedy(wanted: str) -> str:
 
     wanted : an extra of the package, or the name of one library that it requires
     """
+    if wanted in FROM_APT and 'ROS_DISTRO' in os.environ and sys.prefix == sys.base_prefix:
+        return f'sudo apt install python3-{wanted}'
+    wanted = DISTRIBUTIONS.get(wanted, wanted)
     lines = []
     with contextlib.suppress(metadata.PackageNotFoundError):
         for line in metadata.requires(NAME) or []:

@@ -24,10 +24,14 @@ from stress import tops
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.states import TIMES_TOGETHER
-from spinning_top_sim.solvers import propagator
-from spinning_top_sim.solvers.cubic import RootsTooCloseError, cubic_roots
+from spinning_top_sim.solvers import solve as solve_module
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.multiprecision import BITS, precision
+from spinning_top_sim.solvers.multiprecision import (
+    BITS,
+    RootsTooCloseError,
+    cubic_roots,
+    precision,
+)
 
 BOUND = 5e-15
 G = 9.81
@@ -236,7 +240,7 @@ def test_states_can_be_pickled(settings):
 def test_a_range_has_the_bits_of_its_times_in_any_pieces(name):
     """Of nanoseconds and of years, backwards, where the integers end, and beyond one block."""
     solution = ExactSolution(*REGIMES[name])
-    end = solution.ns_limit
+    end = 2 ** 63 - 1
     for times in (range(-3, 700), range(700, -3, -1), range(10 ** 9, 50_000 * 10 ** 9, 10 ** 9),
                   range(end - 2000, end, 3), range(-end, 3000 - end, 3),
                   range(0, 2 * TIMES_TOGETHER * 10 ** 6 + 1, 10 ** 6), range(-end, end, end // 7),
@@ -288,13 +292,10 @@ def test_times_end_where_the_fastest_phase_has_made_2_to_the_52_turns(name):
 
 def test_bad_times_in_nanoseconds_are_refused():
     solution = ExactSolution(*REGIMES['looping'])
-    for bad in (np.zeros(2), np.zeros((2, 2), np.int64)):
-        with pytest.raises(ValueError, match='nanoseconds'):
+    for bad in (np.zeros(2), np.zeros((2, 2), np.int64), np.zeros(2, np.uint64),
+                range(10 ** 400, 10 ** 400 + 1), range(-10 ** 30, 1, 10 ** 30)):
+        with pytest.raises(ValueError, match=r'times_ns .*int64'):
             solution.states(bad)
-    for far in (range(10 ** 400, 10 ** 400 + 1), range(-10 ** 30, 1, 10 ** 30),
-                np.array([0, 2 ** 63 - 1]), np.array([2 ** 63 + 10 ** 18], np.uint64)):
-        with pytest.raises(ValueError, match=r't = .* within|times_ns = .* int64'):
-            solution.states(far)
 
 
 def test_a_rate_of_next_to_nothing_is_right():
@@ -326,6 +327,6 @@ def test_after_a_hundred_days_each_nanosecond_counts():
 
 
 def test_the_example_of_solve_is_right_and_swapped_arguments_are_told():
-    assert doctest.testmod(propagator) == (0, 4)
+    assert doctest.testmod(solve_module) == (0, 4)
     with pytest.raises(TypeError, match=r'^solve\(State, Top, ...\): must be solve\(top'):
         solve(State(theta=0.5, l3=1.6, lz=1.3), top_of(next(iter(CASES.values()))), [0.0])

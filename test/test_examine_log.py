@@ -9,7 +9,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from helpers.definitions import add_definitions
 from helpers.recordings import write_rows
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
@@ -26,7 +25,6 @@ IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (
     'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped', 'geometry_msgs/msg/PoseStamped',
     'geometry_msgs/msg/PoseWithCovarianceStamped', 'nav_msgs/msg/Odometry')
 STRING = 'std_msgs/msg/String'
-add_definitions(POSE_COVARIANCE)
 
 
 def simulated(path, *options):

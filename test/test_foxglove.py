@@ -7,7 +7,7 @@ import re
 import pytest
 from helpers.reference import ROOT
 
-from spinning_top_sim.nodes.executable import message_class
+from spinning_top_sim.nodes.endpoints import message_class
 from spinning_top_sim.streams import parameters, topics
 
 LAYOUT = json.loads((ROOT / 'foxglove/spinning_top_sim.json').read_text())

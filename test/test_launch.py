@@ -12,15 +12,17 @@ import shutil
 import subprocess
 import sys
 import types
+from argparse import ArgumentParser
 from types import SimpleNamespace
 
 import pytest
 from helpers.reference import ROOT
 
 from spinning_top_sim import nodes
+from spinning_top_sim.nodes import sim_node
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools import simulate
-from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
+from spinning_top_sim.tools import scene_file, simulate
+from spinning_top_sim.tools.scene_file import read_scene
 
 pytest.importorskip('ament_index_python')
 pytest.importorskip('xacro')
@@ -100,12 +102,11 @@ def started(name, **given):
 
 
 def parameters_of(node):
-    """Return what a node's files and dictionaries set together."""
-    values = {}
-    for source in node.parameters:
-        values.update(read_scene(source) if isinstance(source, str) else source)
-    values.pop('use_sim_time')
-    return parameters.checked(values)
+    """Return what the options of a node set together."""
+    parser = ArgumentParser()
+    sim_node.add_arguments(parser)
+    return parameters.checked(scene_file.given(
+        parser.parse_args(node.arguments), f'/{node.namespace}/spinning_top'.replace('//', '/')))
 
 
 def links_of(node):
@@ -197,17 +198,12 @@ def log(tmp_path):
     return path
 
 
-def test_overrides_win_over_integers_in_files(installed, tmp_path):
-    """Between parameter files rcl takes an integer, wherever it stands, and drops a double."""
-    for name, value in (('scene', '2'), ('second', '2.5')):
-        (tmp_path / f'{name}.yaml').write_text(
-            f'/**:\n  ros__parameters:\n    spin.l3: {value}\n    top.mass: {value}\n')
-    run = started('sim', scene=str(tmp_path / 'scene.yaml'), set='spin.l3:=1.5 record.uri:="a b"',
-                  params_file=str(tmp_path / 'second.yaml'))
-    words = run.nodes['spinning_top_sim/sim_node'].ros_arguments
-    assert words[::2] == len(words[1::2]) * ['-p']
-    given = dict(map(parse_assignment, words[1::2]))
-    assert (given['spin.l3'], given['top.mass'], given['record.uri']) == (1.5, 2.5, 'a b')
+def test_a_file_for_a_node_of_another_namespace_is_refused(installed, tmp_path):
+    (tmp_path / 'left.yaml').write_text('/left/*:\n  ros__parameters:\n    top.mass: 5.0\n')
+    run = started('sim', scene=str(tmp_path / 'left.yaml'), namespace='left')
+    assert parameters_of(run.nodes['spinning_top_sim/sim_node'])['top.mass'] == 5.0
+    with pytest.raises(ValueError, match='no parameters for the node /right/spinning_top'):
+        started('sim', scene=str(tmp_path / 'left.yaml'), namespace='right')
 
 
 def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(installed, log):

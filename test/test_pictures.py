@@ -43,7 +43,7 @@ def test_animate_shows_samples_in_time():
     axes = animation._fig.axes[0]
     assert axes.texts[0].get_text() == 't = 1.00 s'         # the last one that was drawn
     # The mark of the disc is where the body is.
-    from spinning_top_sim.physics.pictures import DISC, DISC_HEIGHT, project
+    from spinning_top_sim.pictures import DISC, DISC_HEIGHT, project
     middle = Rotation.from_quat(motion.quaternion[-1]).apply([DISC, 0.0, DISC_HEIGHT])
     drawn = axes.patches[1].get_xy()
     assert np.min(np.linalg.norm(drawn - np.column_stack(project(middle[np.newaxis])[:2]),

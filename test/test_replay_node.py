@@ -10,28 +10,35 @@ import importlib
 import re
 import signal
 import time
+from itertools import pairwise
 
 import pytest
 
 pytest.importorskip('rclpy')
 
 import rclpy
+import yaml
+from geometry_msgs.msg import PoseStamped
 from helpers.definitions import add_definitions
-from helpers.node_harness import SimNode, wait_for
+from helpers.node_harness import SimNode, Topic, wait_for
 from helpers.own_node import InThisProcess, run_main
 from helpers.recordings import write
 from mcap.writer import Writer as McapWriter
+from nav_msgs.msg import Path as PathMessage
 from rclpy.parameter import Parameter
-from rclpy.qos import ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.time import Time
 from rosbags.typesys import Stores, get_typestore
-from std_srvs.srv import SetBool
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from spinning_top_sim.nodes import replay_node
-from spinning_top_sim.nodes.executable import message_class
-from spinning_top_sim.nodes.playback import ROUND_GAP_NS
+from spinning_top_sim.nodes.endpoints import message_class
 from spinning_top_sim.nodes.replayer import Replayer, open_log
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import McapRecorder
-from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
 
 EPOCH_NS = 1_700_000_000_123_456_789
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
@@ -89,7 +96,8 @@ class Sink:
     """Takes the messages of a publisher."""
 
     def __init__(self, publisher):
-        self.publisher, self.raw = publisher, []
+        self.topic_name, self.msg_type = publisher.topic_name, publisher.msg_type
+        self.raw = []
         self.publish = self.raw.append
 
     def get_subscription_count(self):
@@ -97,30 +105,28 @@ class Sink:
 
 
 class OwnReplay(InThisProcess):
-    """A replay without an executor; `raw` are the messages by topic, in the order of `topics`."""
+    """A replay in this process; `raw` are the messages by topic, in the order of `topics`."""
 
     def __init__(self, file, *options, topics=OURS, arguments=()):
         rclpy.init(args=['replay_node', '--ros-args', *arguments])
         given = replay_node._parser().parse_args([str(file), *options])
         self.node = Replayer(open_log(given.file, given.partial), given)
         sinks = {}
-        for channel, publisher in self.node._by_channel.items():
-            sink = sinks.setdefault(publisher.topic_name, Sink(publisher))
-            self.node._by_channel[channel] = sink
-        self.node._senders = set(sinks.values())
+        for channel, publisher in self.node.outputs.items():
+            self.node.outputs[channel] = sinks.setdefault(publisher.topic_name, Sink(publisher))
         self.sinks = [sinks[name] for name, _ in topics]
 
     @property
     def raw(self):
         return [list(sink.raw) for sink in self.sinks]
 
+    def spin_until(self, what, condition):
+        wait_for(what, lambda: rclpy.spin_once(self.node, timeout_sec=0.1) or condition())
+
     def wait(self):
         """Wait for the end; return the exit code."""
-        wait_for('the end', self.node.finished.done)
+        self.spin_until('the end', self.node.finished.done)
         return self.node.finished.result()
-
-    def pause(self, paused):
-        return self.node._on_pause(SetBool.Request(data=paused), SetBool.Response())
 
     def set_rate(self, rate):
         return self.node.set_parameters([Parameter('rate', value=rate)])[0]
@@ -185,7 +191,7 @@ def test_one_odd_channel_does_not_stop_the_others(tmp_path, capfd):
         for name in (STRING, TWIST, 'no type; at all', '/msg/X', THING):
             log.register_schema(name, 'ros2msg', b'')
         channels = [log.register_channel(name, 'cdr', 1, {
-            'offered_qos_profiles': offered_qos_yaml(RecordedTopic(name, STRING, profile))})
+            'offered_qos_profiles': yaml.dump([{**DEFAULT_QOS, **profile}])})
             for name, profile in qos.items()]
         channels += [log.register_channel(name, encoding, schema)
                      for name, (schema, encoding) in odd.items()]
@@ -237,13 +243,12 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, second_log,
 
 
 @pytest.mark.parametrize('step_ns', [2_000_000, 0])
-def test_loops_begin_again_a_gap_after_the_end(tmp_path, step_ns):
+def test_loops_begin_again(tmp_path, step_ns, capfd):
     path = tmp_path / 'run.mcap'
     wanted = write_log(path, 10, step_ns=step_ns)
     with OwnReplay(path, '--loop') as replay:
-        wait_for('three rounds', lambda: len(replay.raw[1]) >= 3 * len(wanted[1]))
-        assert int(replay.pause(True).message.split('round ')[1]) >= 3
-        assert replay.node._playback.now() >= EPOCH_NS + 2 * (9 * step_ns + ROUND_GAP_NS)
+        replay.spin_until('three rounds', lambda: len(replay.raw[1]) >= 3 * len(wanted[1]))
+        replay.spin_until('the status', lambda: 'of round ' in capfd.readouterr().out)
         for found, once in zip(replay.raw, wanted, strict=True):
             turns = -(-len(found) // len(once))
             assert_same([found], [(once * turns)[:len(found)]])
@@ -260,21 +265,28 @@ def test_the_rate_is_a_parameter(tmp_path):
         assert_same(replay.raw, wanted)
 
 
+# As where rclpy has no EventsExecutor.
+ON_ONE_THREAD = ('-c', "import sys; sys.modules['rclpy.experimental'] = None\n"
+                 'from spinning_top_sim.__main__ import main; sys.exit(main())')
+EXECUTORS = {'events': ('-m', 'spinning_top_sim'), 'single-threaded': ON_ONE_THREAD}
+
+
 class Replay(SimNode):
     """A replay_node in its own process group."""
 
-    def __init__(self, folder, file, *options, arguments=()):
+    def __init__(self, folder, file, *options, arguments=(), executor='events'):
         super().__init__(folder, namespace='/', arguments=arguments, program=(
-            '-m', 'spinning_top_sim', 'replay', str(file), *options))
+            *EXECUTORS[executor], 'replay', str(file), *options))
         self.name = f'{self.namespace}/replay'
 
 
-def test_a_log_is_played_over_dds_with_its_qos_or_another(peer, tmp_path, second_log):
+@pytest.mark.parametrize('executor', EXECUTORS)
+def test_a_log_is_played_over_dds_with_its_qos_or_another(peer, tmp_path, second_log, executor):
     """It waits for two subscribers and the resume; /clock tells the time of the log meanwhile."""
     path, wanted = second_log
     names = ('/chatter', '/elsewhere/vel', '/clock')
     with Replay(tmp_path, path, '--start-paused', '--clock', '200', '--rate', '2', '-d', '0.1',
-                '--wait-for-subscribers', '3', arguments=(
+                '--wait-for-subscribers', '3', executor=executor, arguments=(
                     '-r', '/robot/cmd_vel:=/elsewhere/vel', '-p', 'rate:=0.001', '-p',
                     'qos_overrides./chatter.publisher.depth:=30', '-p',
                     'qos_overrides./elsewhere/vel.publisher.depth:=30')) as node:
@@ -298,6 +310,121 @@ def test_a_log_is_played_over_dds_with_its_qos_or_another(peer, tmp_path, second
     assert numbers and numbers == sorted(set(numbers))
     times = [message.clock.sec * SECOND + message.clock.nanosec for message in clock.messages()]
     assert times[0] == EPOCH_NS and times == sorted(times) and times[-1] > EPOCH_NS + SECOND // 2
+
+
+def write_bag(path, messages, channels):
+    """Write a log: `messages` are channel, time and data; `channels` topic, type and profiles."""
+    with path.open('wb') as file:
+        log = McapWriter(file)
+        log.start('ros2')
+        numbers = [log.register_channel(
+            topic, 'cdr', log.register_schema(kind, 'ros2msg', b''),
+            {'offered_qos_profiles': yaml.dump([{**DEFAULT_QOS, **one} for one in profiles])})
+            for topic, kind, profiles in channels]
+        for channel, time_ns, data in messages:
+            log.add_message(numbers[channel], time_ns, data, time_ns)
+        log.finish()
+    return path
+
+
+LATCHED = {'durability': 1, 'depth': 1}
+
+
+@pytest.mark.parametrize('channels', [
+    [('/map', STRING, [LATCHED]), ('/map', STRING, [LATCHED])],
+    [('/map', STRING, [LATCHED, LATCHED])], [('/map', STRING, [{'reliability': 2}, LATCHED, {}])]])
+def test_who_comes_late_gets_what_all_latched_publishers_sent(peer, tmp_path, channels):
+    write_bag(tmp_path / 'run.mcap', [(0, EPOCH_NS, string_cdr(0)),
+              (len(channels) - 1, EPOCH_NS + 1, string_cdr(1)),
+              (len(channels), EPOCH_NS + 2, string_cdr(2)),
+              (len(channels), EPOCH_NS + 99 * SECOND, string_cdr(3))],
+              [*channels, ('/chatter', STRING, [LATCHED])])
+    late = QoSProfile(depth=9, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    with Replay(tmp_path, tmp_path / 'run.mcap') as node:
+        wait_for('messages', lambda: '| 3 messages' in node.out)
+        found = Topic(message_class(STRING))
+        subscription = peer.node.create_subscription(
+            found.kind, '/map', found.receive, late, raw=True)
+        found.wait(2)
+        assert node.end() == 0
+    peer.node.destroy_subscription(subscription)
+    assert sorted(found.raw) == [string_cdr(0), string_cdr(1)]
+    assert node.err.count('/map was recorded with several QoS profiles: it is played with '
+                          'reliable, transient_local, keep_last, depth') == (
+        len(channels[0][2]) == 3)
+
+
+def test_messages_of_a_time_before_the_first_clock_do_not_make_it_wait(tmp_path, capfd):
+    path = write_bag(tmp_path / 'run.mcap', [
+        (0, 0, string_cdr(0)), (0, 600 * SECOND, string_cdr(1)),
+        (0, 600 * SECOND + 1, string_cdr(2))], [('/ours/text', STRING, [])])
+    raw, _ = play_all(path, topics=OURS[:1])
+    assert_same(raw, [[string_cdr(n) for n in range(3)]])
+    assert '0 of them late' in capfd.readouterr().out
+
+
+def test_what_a_stalled_reader_does_not_take_is_counted(tmp_path, capfd):
+    write_log(tmp_path / 'run.mcap', 10)
+    with OwnReplay(tmp_path / 'run.mcap') as replay:
+        replay.sinks[0].publish = None      # a call of it raises an error
+        assert replay.wait() == 0
+    assert ('played 5 messages on 2 topics, 0 of them late; 5 not published: a reader that keeps '
+            'all has stalled') in capfd.readouterr().out
+
+
+def stamped_log(path):
+    """Record 21 joint states and paths in 0.2 s, whose last poses have no stamps."""
+    messages = []
+    for n in range(21):
+        stamp = Time(nanoseconds=EPOCH_NS + n * SECOND // 100).to_msg()
+        header = Header(stamp=stamp, frame_id='world')
+        for channel, message in enumerate((
+                JointState(header=header, name=['joint'], position=[1.0]),
+                PathMessage(header=header, poses=[PoseStamped(header=header), PoseStamped()]))):
+            messages.append((channel, EPOCH_NS + n * SECOND // 100, serialize_message(message)))
+    return write_bag(path, messages, [('/joint_states', 'sensor_msgs/msg/JointState', []),
+                                      ('/path', 'nav_msgs/msg/Path', [])])
+
+
+def test_without_a_clock_the_stamps_of_later_rounds_go_on(tmp_path):
+    with OwnReplay(stamped_log(tmp_path / 'run.mcap'), '--loop', topics=[
+            ('/joint_states', None), ('/path', None)]) as replay:
+        replay.spin_until('three rounds', lambda: len(replay.raw[1]) >= 60)
+        joints, paths = ([deserialize_message(data, sink.msg_type) for data in sink.raw]
+                              for sink in replay.sinks)
+        first = replay.raw[0][:21]
+    stamps = [Time.from_msg(message.header.stamp).nanoseconds for message in joints]
+    assert stamps[:21] == [EPOCH_NS + n * SECOND // 100 for n in range(21)]
+    assert {later - before for before, later in pairwise(stamps)} == {SECOND // 100}
+    assert [Time.from_msg(message.poses[0].header.stamp).nanoseconds
+            for message in paths][:60] == stamps[:60]
+    assert all(one.poses[1].header.stamp.sec == 0 for one in paths), '0 is no time'
+    with LogReader(tmp_path / 'run.mcap') as log:
+        assert first == [one.data for one in log.messages(['/joint_states'])]
+
+
+def test_with_a_clock_each_round_begins_with_the_clock_of_its_begin(peer, tmp_path):
+    """What robot_state_publisher takes: stamps that go back after the time went back."""
+    stamped_log(tmp_path / 'run.mcap')
+    with Replay(tmp_path, tmp_path / 'run.mcap', '--loop', '--clock', '500') as node:
+        heard = []
+        for kind, topic in (('rosgraph_msgs/msg/Clock', '/clock'),
+                            ('sensor_msgs/msg/JointState', '/joint_states')):
+            peer.node.create_subscription(message_class(kind), topic, heard.append, 5000)
+        wait_for('three rounds', lambda: len(heard) > 500)
+        assert node.end() == 0
+    now_ns, newest_ns, rounds = 0, 0, 0
+    for message in heard:
+        if hasattr(message, 'clock'):
+            before, now_ns = now_ns, Time.from_msg(message.clock).nanoseconds
+            if now_ns < before:
+                newest_ns, rounds = 0, rounds + 1
+            assert EPOCH_NS <= now_ns <= EPOCH_NS + SECOND // 5
+        else:
+            stamp_ns = Time.from_msg(message.header.stamp).nanoseconds
+            assert stamp_ns >= newest_ns + SECOND // 100
+            newest_ns = stamp_ns
+    assert rounds >= 2
 
 
 def test_a_signal_ends_it_while_it_waits_or_plays(peer, tmp_path):

@@ -4,7 +4,9 @@
 import contextlib
 
 import pytest
+import yaml
 
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 from spinning_top_sim.tools.simulate import main
 
@@ -16,8 +18,8 @@ REFUSED = ['[1, 2.0]', '[1e3, 2]', '[0.5, a]', '[true, "n"]', '', '[1', '{', '&a
 
 
 @contextlib.contextmanager
-def ros_node(path):
-    """Yield a node spinning_top that was started with a parameter file."""
+def ros_node(path, name='/spinning_top'):
+    """Yield a node of this full name that was started with a parameter file."""
     pytest.importorskip('rclpy')
     import helpers.node_harness  # noqa: F401 - DDS stays on this machine
     import rclpy
@@ -27,7 +29,8 @@ def ros_node(path):
     context = Context()
     rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
     try:
-        node = Node('spinning_top', context=context, start_parameter_services=False,
+        namespace, _, name = name.rpartition('/')
+        node = Node(name, context=context, namespace=namespace, start_parameter_services=False,
                     automatically_declare_parameters_from_overrides=True)
         yield node
         node.destroy_node()
@@ -45,9 +48,21 @@ def test_values_have_the_types_that_rcl_finds(tmp_path):
     path = scene(tmp_path / 'p.yaml', **{f'p{k}': text for k, text in enumerate(VALUES)})
     with ros_node(path) as node:
         theirs = [node.get_parameter(f'p{k}').value for k in range(len(VALUES))]
-    ours = [parse_assignment(f'spin.l3:={text}')[1] for text in VALUES]
+    ours = [parse_assignment(f'world_frame:={text}')[1] for text in VALUES]
     assert list(zip(VALUES, map(repr, ours), strict=True)) == list(
         zip(VALUES, map(repr, theirs), strict=True))
+
+
+def test_a_number_in_quotes_is_a_text_unless_yaml_would_take_it_for_one(tmp_path):
+    """YAML 1.1, of `ros2 param set`, knows no 1e-9; the rule is the same for all."""
+    for text, value in (("'1e-9'", 1e-9), ('1e-9', 1e-9), ("'3.5'", '3.5'), ('3', 3.0)):
+        assert parse_assignment(f'solver.rtol:={text}')[1] == value
+        assert read_scene(scene(tmp_path / 'p.yaml', **{'solver.rtol': text})) == {
+            'solver.rtol': value}
+    assert parse_assignment("imu.lever_arm:=['1e-2', '2E0', '.5e3']")[1] == [0.01, 2.0, 500.0]
+    assert parse_assignment("world_frame:='1e9'")[1] == '1e9'
+    with pytest.raises(ValueError, match=r"solver\.rtol = '3\.5': must be a number"):
+        parameters.checked(read_scene(scene(tmp_path / 'q.yaml', **{'solver.rtol': "'3.5'"})))
 
 
 @pytest.mark.parametrize('text', REFUSED)
@@ -57,6 +72,42 @@ def test_what_rcl_refuses_is_refused(tmp_path, capfd, text):
         pass
     with pytest.raises(ValueError, match=r'p\.yaml'):
         read_scene(path)
+
+
+SECTIONS = [
+    '/**', '/*', '**', '*', '/**/spinning_top', 'left/spinning_top', '/left/spinning_top',
+    '/left/*', '/left/**', '/*/spinning_top', '/**/left/**', '/**/*', '/*/*', '/a/**/spinning_top',
+    '/a/*/spinning_top', '/left/other', '/left/spinning', '/leftspinning_top',
+    ('/**', 'spinning_top'), ('left', 'spinning_top'), ('/left', '*'), ('a', 'b', 'spinning_top')]
+
+
+@pytest.mark.parametrize('node', ['/spinning_top', '/left/spinning_top', '/a/b/spinning_top',
+                                  '/left/other'])
+def test_a_section_applies_to_the_nodes_that_rcl_applies_it_to(tmp_path, node):
+    path = tmp_path / 'p.yaml'
+    for section in SECTIONS:
+        content = {'ros__parameters': {'world_frame': 'map'}}
+        for key in reversed([section] if isinstance(section, str) else section):
+            content = {key: content}
+        path.write_text(yaml.dump(content))
+        with ros_node(path, node) as ros:
+            theirs = ros.get_parameters_by_prefix('').get('world_frame')
+        if theirs is None:
+            with pytest.raises(ValueError, match=f'no parameters for the node {node}: '):
+                read_scene(path, node)
+        else:
+            assert read_scene(path, node) == {'world_frame': 'map'}, section
+
+
+def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(tmp_path):
+    path = tmp_path / 'p.yaml'
+    path.write_text('spinning_top:\n  ros__parameters:\n    top.mass: 5\n')
+    for node in ('/spinning_top', '/left/spinning_top', '/left/another_name'):
+        assert read_scene(path, node) == {'top.mass': 5.0}
+    path.write_text('/left/other: {ros__parameters: {a: 1}}\nb: {c: {ros__parameters: {}}}')
+    with pytest.raises(ValueError, match=r'for the node /a/spinning_top: .* nodes: /left/other, '
+                       '/b/c'):
+        read_scene(path, '/a/spinning_top')
 
 
 @pytest.mark.parametrize('sections', [
@@ -89,3 +140,12 @@ def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):
             'spinning-top simulate: '
             f'{source}: there is no parameter spin.l33; did you mean spin.l3?\n')
     assert not output.exists()
+
+
+@pytest.mark.parametrize(('name', 'frame', 'says'), [
+    ('world_frame', '', 'a frame'), ('body_frame', '/base_link', 'without a slash at its begin'),
+    ('imu.frame_id', 'base_link', 'another frame than its parent'),
+    ('imu.frame_id', 'world', 'another frame than its parent')])
+def test_frames_that_make_no_tree_are_refused(name, frame, says):
+    with pytest.raises(ValueError, match=f'{name} = {frame!r}: must be .*{says}'):
+        parameters.checked({name: frame})

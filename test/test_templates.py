@@ -27,7 +27,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu, JointState, MagneticField, NavSatFix  # noqa: E402
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String  # noqa: E402
 
-from spinning_top_sim.nodes.executable import message_class  # noqa: E402
+from spinning_top_sim.nodes.endpoints import message_class  # noqa: E402
 from spinning_top_sim.streams import messages  # noqa: E402
 
 STAMPS = (0, 1, SECOND - 1, SECOND, 1_700_000_000 * SECOND + 123_456_789, -1, -SECOND,

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.pivot import Kinematics
 from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
 Message = Any           # message packages have no types
@@ -29,13 +28,12 @@ class RefusedError(RuntimeError):
         self.code = code
 
 
-def fill_state(message: Message, states: States, pivot: Kinematics, stamp_ns: int,
-               frame: str) -> None:
-    """Write a state (n = 1) and what the pivot does into an EntityState, in the world frame."""
+def fill_state(message: Message, states: States, stamp_ns: int, frame: str) -> None:
+    """Write a state (n = 1) into an EntityState, in the world frame."""
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
     message.header.frame_id = frame
-    rotation = states.rows_quaternion
+    rotation, pivot = states.rows_quaternion, states.pivot
     for target, rows, names in (
             (message.pose.orientation, rotation, 'xyzw'),
             (message.twist.angular, attitude.rotated(rotation, states.rows_angular_velocity),
@@ -49,18 +47,17 @@ def fill_state(message: Message, states: States, pivot: Kinematics, stamp_ns: in
             setattr(target, name, float(column[0]))
 
 
-def requested_state(request: Message, response: Message, top: Top, frame: str, now: States,
-                    pivot: Kinematics) -> State:
+def requested_state(request: Message, response: Message, frame: str, now: States) -> State:
     """
     Return the state that a SetEntityState request asks for.
 
     response : has the codes of refusals
-    now : the present state (n = 1), which holds for what the request does not set
-    pivot : what the pivot does at present, which cannot be set
+    now : the present state (n = 1), which holds for what the request does not set, and for the
+        pivot
 
     Raises RefusedError or ValueError, which name the value and what is allowed.
     """
-    wanted, requested_frame = request.state, request.state.header.frame_id
+    pivot, wanted, requested_frame = now.pivot, request.state, request.state.header.frame_id
     # Older versions of the message have no flags, and set both.
     sets_pose, sets_twist = (getattr(request, name, True) for name in ('set_pose', 'set_twist'))
     if not (sets_pose or sets_twist):
@@ -91,7 +88,7 @@ def requested_state(request: Message, response: Message, top: Top, frame: str, n
                              f'{pivot_velocity.tolist()} (within {SMALLEST_SPEED:g})')
         if not np.all(np.isfinite(rates)):
             raise ValueError(f'twist.angular = {rates.tolist()} rad/s: must be finite')
-    return state_of(top, rotation, rates)
+    return state_of(now.top, rotation, rates)
 
 
 def _numbers(message: Message, names: Sequence[str]) -> NDArray[np.float64]:

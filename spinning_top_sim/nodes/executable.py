@@ -3,19 +3,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
-import importlib
 import os
 import re
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
 from itertools import pairwise
-from os import _exit  # a test takes `os.` and this for a private name of rclpy
-from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
 from spinning_top_sim.installation import needed, remedy
@@ -25,7 +20,6 @@ from spinning_top_sim.tools import cli
 if TYPE_CHECKING:
     from rclpy.executors import Executor
     from rclpy.node import Node
-    from rclpy.publisher import Publisher
     from rclpy.task import Future
 
 
@@ -52,7 +46,7 @@ def run_node(name: str, argv: Sequence[str] | None,
     argv = list(sys.argv[1:] if argv is None else argv)
     name = f'spinning-top {name}'
     # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
-    _handle(signal.SIGINT, lambda *_: _exit(130))
+    _handle(signal.SIGINT, lambda *_: os._exit(130))
     _open_standard_streams()
     try:
         with needed('it'):
@@ -69,7 +63,7 @@ def run_node(name: str, argv: Sequence[str] | None,
         started = True
         # Python handles signals between waits; without a timeout, Jazzy's EventsExecutor hangs.
         while rclpy.ok() and not interrupts and not node.finished.done():
-            executor.spin_once(0.5)
+            executor.spin_until_future_complete(node.finished, 0.5)
         return (node.finished.result() or 0) if node.finished.done() else 0
     except Exception as error:
         # A call may raise anything when the context ends.
@@ -136,6 +130,17 @@ def split_ros_arguments(argv: Iterable[str]) -> tuple[list[str], list[str]]:
     return own, for_ros
 
 
+def node_name(for_ros: Sequence[str], name: str = 'spinning_top') -> str:
+    """Return the full name that arguments of ROS give to a node: the first rule holds."""
+    found: dict[str, str] = {}
+    for option, rule in pairwise(for_ros):
+        left, _, right = rule.partition(':=')
+        node, _, what = left.rpartition(':')
+        if option in ('-r', '--remap') and node in ('', name):
+            found.setdefault('__node' if what == '__name' else what, right)
+    return f'/{found.get("__ns", "").strip("/")}/{found.get("__node", name)}'.replace('//', '/')
+
+
 def _cannot_start(name: str, error: Exception) -> int:
     kind = type(error).__name__
     if isinstance(error, ImportError) and not find_spec('rclpy'):
@@ -169,40 +174,3 @@ def _executor(node: RunnableNode) -> Executor:
     gc.freeze()             # a full collection then skips all objects of the start
     gc.collect()            # finds nothing, so that the next full collection comes soon
     return executor
-
-
-def message_class(type_name: str) -> type:
-    """Return a message class of an installed ROS package.  Raises LookupError for any other."""
-    # REP-144 and the ROS 2 interface names.
-    match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
-    if match:
-        package, name = match.groups()
-        prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
-        # Other Python packages must not be imported because a log names them.
-        if any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
-               for prefix in prefixes):
-            with contextlib.suppress(ImportError, AttributeError):
-                return getattr(importlib.import_module(f'{package}.msg'), name)
-    raise LookupError(f'{type_name} is not installed')
-
-
-def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float,
-                       stopped: Callable[[], bool] = lambda: False) -> None:
-    """Wait until all subscribers have acknowledged, `stopped` returns True, or time is over."""
-    from rclpy.duration import Duration  # noqa: PLC0415
-    end = time.monotonic() + seconds
-    for publisher in list(publishers):      # the node may close some meanwhile
-        while (publisher.get_subscription_count() and time.monotonic() < end and not stopped()
-                and not publisher.wait_for_all_acked(Duration(seconds=0.02))):
-            pass
-
-
-def answers_later(service):
-    send = service.send_response
-    from rclpy.task import Future
-    def send_when_done(response, header):
-        if isinstance(response, Future):
-            response.add_done_callback(lambda done: send(done.result(), header))
-        else:
-            send(response, header)
-    setattr(service, 'send_response', send_when_done)

@@ -129,7 +129,7 @@ class Loop:
             self._enter(LoopState.ENDED)
         elif self._simulation.now_ns >= target_ns:
             self._simulation.look_ahead(target_ns + self._ahead_ns,
-                                        0.5e-9 * self.tick_period_ns)
+                                        self.tick_period_ns / NANOSECONDS)
 
     def _advance(self) -> int:
         """Send what is due, or what one tick has time for; return the simulated time due [ns]."""

@@ -25,7 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import ros_parameters
 from spinning_top_sim.nodes.clock import SimulatedClock
-from spinning_top_sim.nodes.executable import answers_later, wait_for_all_acked
+from spinning_top_sim.nodes.endpoints import answers_later, wait_for_all_acked
 from spinning_top_sim.nodes.loop import Loop, LoopState
 from spinning_top_sim.nodes.publishers import ChannelPublishers
 from spinning_top_sim.nodes.recording import Recording
@@ -39,7 +39,7 @@ from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.parameter import Effect
 
 LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
-CHECK_S = 0.02                  # how often requests to open or close a log are looked at
+WAIT_S = 0.02                   # how often a /clock that has not begun is looked at
 
 
 class Simulator(Node):
@@ -55,13 +55,14 @@ class Simulator(Node):
         super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()        # completes after `duration`
         self._terminal = Terminal()
-        values = ros_parameters.declare(self, given)
+        overrides = ros_parameters.take_overrides(self)
+        values = ros_parameters.declare(self, given, overrides)
         simulation = self.simulation = LiveSimulation(values)
         # A reset starts with this spin.  An unset spin.lz stays unset: it follows initial.theta.
         self._start_spin = {name: values[name] for name in SPIN}
         # The parameters, with the spin as last commanded.
         self.values = {**values, 'spin.lz': simulation.trajectory.lz}
-        self.add_pre_set_parameters_callback(ros_parameters.with_doubles)
+        self.add_pre_set_parameters_callback(ros_parameters.all_with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._date = StampClock(self, parameters.is_enabled('clock', values))
         self._topics = ChannelPublishers(self)
@@ -84,7 +85,7 @@ class Simulator(Node):
             self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
         answers_later(self.create_service(SetBool, '~/record', self._record))
         self._every('diagnostics', 1.0, self._publish_diagnostics)
-        for warning in ros_parameters.disobeyed_overrides(self):
+        for warning in ros_parameters.disobeyed_overrides(self, overrides):
             self._log.warning(warning)
         if objection := simulation.trajectory.top.objection:
             self._log.warning(objection)
@@ -93,8 +94,7 @@ class Simulator(Node):
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
         # The recorder's thread releases the interpreter this soon when a tick is due.
         sys.setswitchinterval(1e-4)
-        self._every('check', CHECK_S, self._check_recording)
-        self._every('start', CHECK_S, self._begin)
+        self._every('start', WAIT_S, self._begin)
         self._begin()
 
     def _begin(self) -> None:
@@ -156,6 +156,7 @@ class Simulator(Node):
 
     def _tick(self) -> None:
         self.loop.tick()
+        self._check_recording()
         if self.loop.state is LoopState.ENDED and not self.finished.done():
             wait_for_all_acked(self._topics.by_topic.values(), 1.0)
             self.finished.set_result(None)

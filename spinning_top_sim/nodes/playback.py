@@ -2,107 +2,68 @@
 """Sends recorded messages at their times, without ROS."""
 
 import math
-import threading
 import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-
-from spinning_top_sim.nodes.pacing import FairLock, SimulatedClock
+from collections.abc import Callable, Iterator
 
 Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], its publish function, CDR
 
 SLOWEST, FASTEST = 1e-6, 1e9    # rates of a playback: recorded time over real time
 RATES = f'a number in [{SLOWEST:g}, {FASTEST:g}]'
-ROUND_GAP_NS = 10_000_000       # from the end of a round to the first message of the next
 LATE_NS = 10_000_000            # a message that is sent later than this is counted
-BATCH_BYTES, BATCH_MESSAGES, BATCHES = 256_000, 512, 16     # read ahead
-
-
-def read_ahead(messages: Iterator[Message]) -> Generator[Message]:
-    """Yield messages that a thread reads ahead; raise its error in their place."""
-    def batch() -> list[Message]:
-        found: list[Message] = []
-        size = 0
-        while size < BATCH_BYTES and len(found) < BATCH_MESSAGES:
-            if (message := next(messages, None)) is None:
-                break
-            found.append(message)
-            size += len(message[2])
-        return found
-
-    with ThreadPoolExecutor(1) as reader:
-        ahead = deque(reader.submit(batch) for _ in range(BATCHES))
-        try:
-            while found := ahead.popleft().result():
-                ahead.append(reader.submit(batch))
-                yield from found
-        finally:
-            reader.shutdown(wait=False, cancel_futures=True)
+BUDGET_NS = 20_000_000          # one call sends at most so long
 
 
 class Playback:
     """Sends messages at their times, late ones at once; has a rate and can be paused."""
 
-    def __init__(self, begin_ns: int, paused: bool = False) -> None:
-        self._clock = SimulatedClock(time.monotonic_ns, 1.0)
-        self._clock.set(begin_ns, running=False)
-        self._sent_until = begin_ns         # all messages before this time are sent
-        self._stopped = False
-        self._changed = threading.Event()   # wakes the thread that plays
-        self._lock = FairLock()             # held while sending, and for the clock
-        self.paused = paused
-        self.sent = self.late = 0
+    def __init__(self, steady: Callable[[], int] = time.monotonic_ns) -> None:
+        self.sent = self.late = self.failed = 0
+        self.rate, self.paused = 1.0, False
+        self._steady = steady
+        self._messages: Iterator[Message] = iter(())
+        self._next: Message | None = None
+        self._log_ns = self._from_ns = 0    # time of the log, and steady time of the same moment
 
-    def run(self, messages: Iterable[Message]) -> None:
-        """Play messages in the order of their times, to the end or until stopped."""
-        for at_ns, send, data in messages:
-            if not self.sent:           # reading the first message takes a while
-                with self._lock:
-                    self._clock.set(self._sent_until, not self.paused)
-            self._sent_until = at_ns
-            while (left_ns := self._send_if_due(at_ns, send, data)) > 0:
-                self._changed.wait(min(left_ns / 1e9, threading.TIMEOUT_MAX))
-                self._changed.clear()
-            if self._stopped:
-                return
-
-    def _send_if_due(self, at_ns: int, send: Callable[[bytes], object], data: bytes) -> float:
-        """Send a message if it is due; return the time left [ns], <= 0 if sent or stopped."""
-        with self._lock:
-            if self._stopped:
-                return 0.0
-            due_ns = self._clock.when(at_ns)
-            left_ns = math.inf if due_ns is None else due_ns - time.monotonic_ns()
-            if left_ns <= 0:
-                send(data)
-                self.sent += 1
-                self.late += left_ns < -LATE_NS
-            return left_ns
+    def begin(self, begin_ns: int, messages: Iterator[Message], wait_ns: int = 0) -> None:
+        """Play these messages, in the order of their times; `begin_ns` comes after a wait."""
+        self._messages, self._next = messages, next(messages, None)     # this takes a while
+        self._log_ns, self._from_ns = begin_ns, self._steady() + wait_ns
 
     def now(self) -> int:
-        """Return the time up to which all messages are sent [ns]."""
-        with self._lock:
-            return min(self._clock.now(), self._sent_until)
+        """Return the time of the log up to which all messages are sent [ns]."""
+        if self.paused:
+            return self._log_ns
+        passed = max(self._steady() - self._from_ns, 0) * self.rate
+        now_ns = self._log_ns + int(min(passed, 2.0 ** 63))
+        return min(now_ns, self._next[0]) if self._next else now_ns
+
+    def tick(self) -> float | None:
+        """Send what is due; return the time until more is due [ns], None if all is sent."""
+        stop_ns = self._steady() + BUDGET_NS
+        while self._next:
+            at_ns, send, data = self._next
+            now_ns = self._steady()
+            left_ns = (math.inf if self.paused else
+                       self._from_ns + (at_ns - self._log_ns) / self.rate - now_ns)
+            if left_ns > 0 or now_ns > stop_ns:
+                return max(left_ns, 0.0)
+            try:
+                send(data)
+                self.sent += 1
+            except Exception:       # as with a reader that keeps all and has stopped reading
+                self.failed += 1
+            self.late += left_ns < -LATE_NS
+            self._next = next(self._messages, None)
+        return None
 
     def pause(self, paused: bool) -> None:
-        """Pause, or go on without catching up.  No message is sent once this has paused."""
-        with self._lock:
-            self.paused = paused
-            self._go_on_from_sent(not paused)
-        self._changed.set()
+        """Pause, or go on without catching up."""
+        self._go_on_from_sent()
+        self.paused = paused
 
     def set_rate(self, rate: float) -> None:
-        with self._lock:
-            self._go_on_from_sent(self._clock.when(0) is not None)
-            self._clock.set_scale(rate)
-        self._changed.set()
+        self._go_on_from_sent()
+        self.rate = rate
 
-    def _go_on_from_sent(self, running: bool) -> None:
-        # The clock is ahead if sending is too slow.
-        self._clock.set(min(self._clock.now(), self._sent_until), running)
-
-    def stop(self) -> None:
-        with self._lock:
-            self._stopped = True
-        self._changed.set()
+    def _go_on_from_sent(self) -> None:
+        self._log_ns, self._from_ns = self.now(), max(self._steady(), self._from_ns)

@@ -9,7 +9,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from spinning_top_sim.nodes.executable import message_class
+from spinning_top_sim.nodes.endpoints import message_class
 from spinning_top_sim.nodes.recording import Topic
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.channel import Channel

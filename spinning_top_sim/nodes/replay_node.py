@@ -26,7 +26,13 @@ recorded QoS, which the parameters
 `qos_overrides.<topic>.publisher.{history,depth,reliability}` override. A topic
 that cannot be published is named and left out. Messages go out in the order of
 their log times and with their recorded bytes, old stamps included; what is late
-is sent at once.
+is sent at once. A message without log time (0, before the first /clock of what
+was recorded) goes out at the begin.
+
+With --clock, or a /clock in the log, time begins anew in each round of --loop,
+and so do nodes with use_sim_time, such as robot_state_publisher. Without it the
+time of other nodes goes on, and they would ignore old stamps: from the second
+round on, stamps are later by the rounds before.
 
 while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'
@@ -64,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('-r', '--rate', metavar='R',
         type=_number(SLOWEST, FASTEST, f'{RATES}; --start-paused begins with a pause'),
         help='recorded over real time (default: the parameter `rate`, 1)')
-    add('-l', '--loop', action='store_true', help='begin again at the end; --clock goes on')
+    add('-l', '--loop', action='store_true', help='begin again at the end')
     add('--start', type=not_negative, default=0.0, metavar='S',
         help='begin S seconds after the begin of the log')
     add('--topics', nargs='+', default=[], metavar='T',

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameter table as ROS parameters: descriptors, start values, and checked changes."""
 
-import array
-import contextlib
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
-from pathlib import Path
+import difflib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -15,33 +11,43 @@ from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameter import Effect, Parameter
-from spinning_top_sim.tools.scene_file import likely_name, parse_yaml
+from spinning_top_sim.tools.scene_file import likely_name, with_doubles
 
 SPIN = ('spin.l3', 'spin.lz')
 
 
-def declare(node: Node, defaults=()) -> dict[str, Any]:
+def take_overrides(node: Node) -> dict[str, Any]:
     """
-    Declare the table and return the start values.  Raises ValueError for a bad value.
+    Return the parameters that a node was started with, which can then be declared.
 
-    Unknown parameters are warned about.  The node must have been made with
-    `automatically_declare_parameters_from_overrides`, the public way to learn of them.
+    The node must have been made with `automatically_declare_parameters_from_overrides`, the public
+    way to learn of them.  Raises ValueError for a use_sim_time that is no bool.
     """
-    given = {}
-    for name in node.get_parameters_by_prefix(''):
-        value = node.get_parameter(name).value
-        if name == 'use_sim_time' and not isinstance(value, bool):
-            raise ValueError(f'{name} = {value!r}: must be true or false')
-        if name in {'use_sim_time', 'start_type_description_service'}:
-            continue        # rclpy declares these itself
+    found = {name: node.get_parameter(name).value for name in node.get_parameters_by_prefix('')}
+    if not isinstance(found['use_sim_time'], bool):
+        raise ValueError(f'use_sim_time = {found["use_sim_time"]!r}: must be true or false')
+    for name in ('use_sim_time', 'start_type_description_service'):     # of rclpy itself
+        found.pop(name, None)
+    for name in found:
+        node.undeclare_parameter(name)
+    return found
+
+
+def declare(node: Node, given: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Declare the table; return the start values.  Raises ValueError for a bad value.
+
+    given : parameters of the command line
+    overrides : those of ROS, which hold; unknown ones are warned about
+    """
+    values = dict(given)
+    for name, value in overrides.items():
         if name in parameters.BY_NAME:
-            given[name] = _as_doubles(parameters.BY_NAME[name], value)
+            values[name] = with_doubles(name, value)
         elif not name.startswith('qos_overrides.'):
             node.get_logger().warning(
                 f'there is no parameter {name}: ignored{likely_name(name)}')
-        # It is declared with its descriptor below, or by `create_publisher`.
-        node.undeclare_parameter(name)
-    values = parameters.checked(given)
+    values = parameters.checked(values)
     shown = {**values, 'spin.lz': parameters.start_state(values).lz}
     node.declare_parameters('', [
         (name, list(value) if isinstance(value, tuple) else value,
@@ -50,35 +56,14 @@ def declare(node: Node, defaults=()) -> dict[str, Any]:
     return values
 
 
-def _last_given(argv: Sequence[str], node_name: str) -> dict[str, object]:
-    """
-    Return the last value that the command line gives to each parameter of a node.
-
-    rcl keeps the last value of each type, and of these rclpy prefers an integer to a double.
-    """
-    last: dict[str, object] = {}
-    for flag, text in pairwise(argv):
-        tree: Any = {}
-        if flag == '--params-file':
-            tree = parse_yaml(Path(text).read_bytes(), text)
-        elif flag in {'-p', '--param'}:
-            rule, _, shown = text.partition(':=')
-            node, _, name = rule.rpartition(':')
-            tree = {node or '/**': {'ros__parameters': {name: parse_yaml(shown, text)}}}
-        for path, value in _leaves(tree):
-            nodes, _, name = path.partition('/ros__parameters/')
-            pattern = re.escape(nodes).replace(r'/\*\*', r'(/\w+)*').replace(r'\*', r'\w+')
-            if re.fullmatch(pattern, node_name):
-                last[name.replace('/', '.')] = value
-    return last
-
-
-def _leaves(tree: object, path: str = '') -> Iterator[tuple[str, object]]:
-    if isinstance(tree, Mapping):
-        for key, below in tree.items():
-            yield from _leaves(below, f'{path}/{str(key).strip("/")}')
-    else:
-        yield path, tree
+def disobeyed_overrides(node: Node, overrides: Iterable[str]) -> Iterator[str]:
+    """Yield a warning for each name of qos_overrides that no publisher of a node has used."""
+    used = list(node.get_parameters_by_prefix('qos_overrides'))
+    for name in overrides:
+        if name.startswith('qos_overrides.') and not node.has_parameter(name):
+            near = difflib.get_close_matches(name.removeprefix('qos_overrides.'), used, 1)
+            yield f'{name} is not obeyed: no publisher has this topic and policy' + (
+                f'; did you mean qos_overrides.{near[0]}?' if near else '')
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -99,20 +84,9 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     return result
 
 
-def with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
-    """Return parameters with doubles made from integers and, as 1e-9 is in YAML 1.1, strings."""
-    return [RosParameter(one.name, value=_as_doubles(parameters.BY_NAME[one.name], one.value))
-            if one.name in parameters.BY_NAME else one for one in given]
-
-
-def _as_doubles(parameter: Parameter, value: Any) -> Any:
-    if isinstance(value, list | array.array):
-        return [_as_doubles(parameter, item) for item in value]
-    first = (parameter.default or (0.0,))[0] if isinstance(parameter.default, tuple) else None
-    with contextlib.suppress(ValueError):
-        if type(value) in {int, str} and (parameter.is_double or isinstance(first, float)):
-            return float(value)
-    return value
+def all_with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:
+    """Return parameters whose values are as `with_doubles` returns them."""
+    return [RosParameter(one.name, value=with_doubles(one.name, one.value)) for one in given]
 
 
 def is_command(changes: Mapping[str, Any]) -> bool:
@@ -134,11 +108,7 @@ def changed(values: Mapping[str, Any], changes: Mapping[str, Any],
     else:
         start.update(spin)
     # A reset combines `start` with the other parameters, so they are checked together.  The
-    # present spin belongs to the present state, and `TickLoop.command` checks it.
+    # present spin belongs to the present state, and `Loop.command` checks it.
     checked = parameters.checked({**values, **changes, **start})
     return ({**checked, **{name: parameters.BY_NAME[name].check(present[name]) for name in SPIN}},
             {name: checked[name] for name in SPIN})
-
-
-def disobeyed_overrides(node):
-    return []

@@ -2,11 +2,17 @@
 """The command `spinning-top node`, the executable `sim_node`."""
 
 import argparse
+import json
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 
-from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
+from spinning_top_sim.nodes.executable import (
+    RunnableNode,
+    node_name,
+    run_node,
+    split_ros_arguments,
+)
 
 DESCRIPTION = """\
 Simulate the heavy symmetric top in real time as a ROS 2 node.
@@ -14,8 +20,8 @@ Simulate the heavy symmetric top in real time as a ROS 2 node.
   spinning-top node --scene looping --imu bmi088
   spinning-top node -p spin.l3:=2.0 --ros-args --params-file mine.yaml
 
-Of several values for a parameter, the last one on the command line holds; those
-of --scene and --imu come first.
+Of several values for a parameter that of -p holds, before those of --params,
+--imu and --scene; what follows --ros-args overrides all of them.
 
 exit code: 0 ended, also by a signal; 2 cannot start; 130 interrupted before
 """
@@ -27,9 +33,7 @@ Services:
   ~/set_pause, ~/record (std_srvs/SetBool); ~/step, ~/reset (std_srvs/Trigger)
   those of simulation_interfaces, where that package is installed
 Publishes, where enabled:
-  /diagnostics (diagnostic_msgs/DiagnosticArray), always
-  ground_truth/odom_throttle (nav_msgs/Odometry), with ground_truth/odom: at
-      most 30 messages a second of it"""
+  /diagnostics (diagnostic_msgs/DiagnosticArray), always"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,9 +44,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     from spinning_top_sim.tools import scene_file  # noqa: PLC0415 - YAML takes 10 ms
-    scene_file.add_arguments(parser)
-    parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
-                        help='one parameter; may be repeated')
+    scene_file.add_parameters(parser)
+    parser.add_argument('--namespace', metavar='NAME', help='of the node and its topics')
     parser.add_argument('--ros-args', metavar='...', nargs='*',
                         help='arguments of ROS 2, such as -p NAME:=VALUE and --params-file FILE')
 
@@ -62,21 +65,24 @@ def _interface() -> Iterator[str]:
 
 def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
     words, for_ros = split_ros_arguments(argv)
+    given: dict[str, object] = {}
     if words:
-        from spinning_top_sim.tools import cli  # noqa: PLC0415
-        from spinning_top_sim.tools.scene_file import chosen_files  # noqa: PLC0415
+        from spinning_top_sim.tools import cli, scene_file  # noqa: PLC0415
         parser = cli.Parser('node', DESCRIPTION, '\n'.join(_interface()))
         add_arguments(parser)
         arguments = parser.parse_args(words)
-        # They are read, because rcl accepts a file that has no parameters of the node.
-        given = [word for path in chosen_files(arguments)
-                 for word in ('--params-file', str(path))]
-        given += [word for parameter in arguments.param for word in ('-p', parameter)]
-        argv = ['--ros-args', *given, *for_ros]
+        if arguments.namespace:
+            for_ros += ['-r', f'__ns:=/{arguments.namespace.strip("/")}']
+        name = node_name(for_ros)
+        given = scene_file.given(arguments, name)
+        of_ros = scene_file.given(arguments, name, to_ros=True)
+        for_ros = [*(word for name, value in of_ros.items()
+                     for word in ('-p', f'{name}:={json.dumps(value)}')), *for_ros]
+        argv = ['--ros-args', *for_ros]
     from spinning_top_sim.nodes.node import Simulator  # noqa: PLC0415
 
     def make_node() -> RunnableNode:
-        node = Simulator({})
+        node = Simulator(given)
         if node.values['simulation_interfaces'] and find_spec('simulation_interfaces'):
             from spinning_top_sim.nodes import simulation_handlers  # noqa: PLC0415
             simulation_handlers.offer(node)

@@ -10,18 +10,14 @@ mean RESULT_OPERATION_FAILED.
 import importlib
 import re
 import types
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-import numpy as np
-from rclpy.action import ActionServer, CancelResponse
-
 from spinning_top_sim.nodes import entity
 from spinning_top_sim.nodes.entity import RefusedError
-from spinning_top_sim.nodes.simulator import Simulator
-from spinning_top_sim.nodes.tick_loop import LoopState
-from spinning_top_sim.physics.pivot import Kinematics
+from spinning_top_sim.nodes.loop import LoopState
+from spinning_top_sim.nodes.node import Simulator
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.streams import parameters
@@ -33,7 +29,6 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     'GetSimulationState': ('SIMULATION_STATE_GETTING',),
     'SetSimulationState': ('SIMULATION_STATE_SETTING', 'SIMULATION_STATE_PAUSE'),
     'StepSimulation': ('STEP_SIMULATION_SINGLE', 'STEP_SIMULATION_MULTIPLE'),
-    'SimulateSteps': ('STEP_SIMULATION_ACTION',),
     'ResetSimulation': ('SIMULATION_RESET', 'SIMULATION_RESET_STATE'),
     'GetEntities': (),
     'GetEntitiesStates': ('ENTITY_STATE_GETTING',),
@@ -49,50 +44,38 @@ def service_name(type_name: str) -> str:
 
 
 def offer(node: Simulator) -> None:
-    """Create the services that are installed, and the action server, in the node's namespace."""
-    messages, services, actions = (importlib.import_module(f'simulation_interfaces.{kind}')
-                                   for kind in ('msg', 'srv', 'action'))
-    handlers = SimulationHandlers(node, messages, actions)
+    """Create the services that are installed, in the node's namespace."""
+    messages, services = (importlib.import_module(f'simulation_interfaces.{kind}')
+                          for kind in ('msg', 'srv'))
+    handlers = SimulationHandlers(node, messages)
     for name in FEATURES:
         if hasattr(services, name):
             node.create_service(getattr(services, name), service_name(name),
                                 partial(handlers.serve, name))
-    node.offers_actions = True
-    # The node keeps the action server.
-    ActionServer(node, actions.SimulateSteps, 'simulate_steps', handlers.simulate_steps,
-                 cancel_callback=lambda _: CancelResponse.ACCEPT)
 
 
 class SimulationHandlers:
-    """The handlers of one node; `messages`, `actions`: modules of simulation_interfaces."""
+    """The handlers of one node; `messages`: the module simulation_interfaces.msg."""
 
-    def __init__(self, node: Simulator, messages: types.ModuleType,
-                 actions: types.ModuleType) -> None:
-        self._node, self._lock = node, node.lock
-        self._loop, self._simulation = node.loop, node.simulation
-        self._messages, self._actions = messages, actions
+    def __init__(self, node: Simulator, messages: types.ModuleType) -> None:
+        self._node, self._loop, self._simulation = node, node.loop, node.simulation
+        self._messages = messages
         self._results, self._states = messages.Result, messages.SimulationState
         self._name = node.get_name()            # of the entity
-        self._category = messages.EntityCategory.CATEGORY_ROBOT
         self._pause_at_start = -1               # `loop.interruptions` when PAUSED was set at t = 0
-        self._quits = self._is_stepping = False
+        self._quits = False
 
     def serve(self, name: str, request: object, response: object) -> object:
         """Handle a request for the service of this type; return the response."""
         result: Any = getattr(response, 'result', None)
         act = getattr(self, f'_{service_name(name)}')
-        code, text = self._outcome(lambda: act(request, response))
+        error, text = self._node.outcome(lambda: act(request, response))
         if result is not None:
+            result.result = self._results.RESULT_OK if error is None else getattr(
+                error, 'code', self._results.RESULT_OPERATION_FAILED)
             # A request in YAML can hold text that UTF-8 cannot; sending it would raise an error.
-            result.result = code
             result.error_message = text.encode(errors='backslashreplace').decode()
         return response
-
-    def _outcome(self, act: Callable[[], str | None]) -> tuple[int, str]:
-        error, text = self._node.outcome(act)
-        if error is None:
-            return self._results.RESULT_OK, text
-        return getattr(error, 'code', self._results.RESULT_OPERATION_FAILED), text
 
     def _get_simulator_features(self, _: Any, response: Any) -> None:
         known = self._messages.SimulatorFeatures
@@ -101,7 +84,7 @@ class SimulationHandlers:
             if hasattr(known, name)})
 
     def _state(self) -> int:
-        """Return the constant of SimulationState; the caller holds the lock."""
+        """Return the constant of SimulationState."""
         loop, states = self._loop, self._states
         if self._quits or loop.state is LoopState.ENDED:
             return states.STATE_QUITTING
@@ -115,9 +98,8 @@ class SimulationHandlers:
         return states.STATE_STOPPED if is_at_start else states.STATE_PAUSED
 
     def _get_simulation_state(self, _: Any, response: Any) -> str:
-        with self._lock:
-            response.state.state = self._state()
-            return self._loop.failure or ''
+        response.state.state = self._state()
+        return self._loop.failure or ''
 
     def _set_simulation_state(self, request: Any, response: Any) -> None:
         states, target = self._states, request.state.state
@@ -130,8 +112,7 @@ class SimulationHandlers:
             raise RefusedError(response.INCORRECT_TRANSITION, f'state = {target}: must be ' + (
                 ', '.join(f'{number} ({name})' for number, (name, _) in changes.items())))
         name, change = changes[target]
-        with self._lock:
-            present = self._state()
+        present = self._state()
         if target == present:
             raise RefusedError(response.ALREADY_IN_TARGET_STATE,
                                f'the simulation is {name} already')
@@ -144,104 +125,37 @@ class SimulationHandlers:
 
     def _play(self) -> None:
         self._node.check_started()
-        with self._lock:
-            self._loop.resume()
+        self._loop.resume()
 
     def _pause(self) -> None:
         self._node.check_started()
-        with self._lock:
-            if self._state() == self._states.STATE_STOPPED:
-                self._pause_at_start = self._loop.interruptions
-                return
+        if self._state() == self._states.STATE_STOPPED:
+            self._pause_at_start = self._loop.interruptions
+        else:
             self._loop.pause()
 
     def _quit(self) -> None:
-        with self._lock:
-            self._loop.pause()
-            self._quits = True
+        self._loop.pause()
+        self._quits = True
         self._node.finish()
 
     def _step_simulation(self, request: Any, _: Any) -> None:
-        self._check_steps(request.steps)
-        self._step(request.steps)
-
-    def _check_steps(self, steps: int) -> None:
+        loop, steps = self._loop, request.steps
         if steps < 1:
             raise ValueError(f'steps = {steps}: must be >= 1')
         self._node.check_started()
-        with self._lock:
-            if self._state() != self._states.STATE_PAUSED:
-                raise RuntimeError('the simulation is not paused: SetSimulationState must set '
-                                   'STATE_PAUSED first')
-        if self._is_stepping:
-            raise RuntimeError('SimulateSteps is stepping: wait for its end, or cancel it')
-
-    def _step(self, count: int) -> None:
-        loop = self._loop
-        step_ns = round(self._node.values['step.dt'] * NANOSECONDS)
-        with self._lock:
-            target_ns = loop.now_ns + count * step_ns
-            loop.step(count * step_ns)
-            if loop.now_ns < target_ns:
-                raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
-
-    async def simulate_steps(self, goal_handle: object) -> object:
-        """Execute a goal of the action; between two steps the executor has its turn."""
-        goal: Any = goal_handle
-        steps, done, ok = goal.request.steps, 0, self._results.RESULT_OK
-        code, text = self._outcome(lambda: self._check_steps(steps))
-        if code == ok:
-            done, code, text = await self._run_steps(goal, steps)
-        while not self._node.context.ok():      # a signal ends the process, nothing can be sent
-            await _turn()
-        if code != ok:
-            goal.abort()
-        elif done < steps:
-            goal.canceled()
-            code, text = (self._results.RESULT_OPERATION_FAILED,
-                          f'canceled after {done} of {steps} steps')
-        else:
-            goal.succeed()
-        result = self._actions.SimulateSteps.Result()
-        result.result.result, result.result.error_message = code, text
-        return result
-
-    async def _run_steps(self, goal: Any, steps: int) -> tuple[int, int, str]:
-        """Step until the end or an interruption; return the number of steps, code and text."""
-        feedback, context = self._actions.SimulateSteps.Feedback(), self._node.context
-        interruptions, ok = self._loop.interruptions, self._results.RESULT_OK
-        done, code, text = 0, ok, ''
-        self._is_stepping = True
-        try:
-            while code == ok and done < steps and not goal.is_cancel_requested and context.ok():
-                progress = f'after {done} of {steps} steps'
-                code, text = self._outcome(partial(self._next_step, interruptions, progress))
-                if code == ok:
-                    done += 1
-                    feedback.completed_steps, feedback.remaining_steps = done, steps - done
-                    try:
-                        goal.publish_feedback(feedback)
-                    except Exception:
-                        if context.ok():
-                            raise
-                await _turn()
-        finally:
-            self._is_stepping = False
-        return done, code, text
-
-    def _next_step(self, interruptions: int, progress: str) -> None:
-        """Step once, or raise RuntimeError if the motion was interrupted meanwhile."""
-        loop = self._loop
-        if self._quits or loop.interruptions != interruptions:
-            why = ('`duration` ends before the steps do' if loop.state is LoopState.ENDED else
-                   loop.failure or 'the simulation was reset, or its state set')
-            raise RuntimeError(f'interrupted {progress}: {why}')
-        self._step(1)
+        if self._state() != self._states.STATE_PAUSED:
+            raise RuntimeError('the simulation is not paused: SetSimulationState must set '
+                               'STATE_PAUSED first')
+        length_ns = steps * round(self._node.values['step.dt'] * NANOSECONDS)
+        target_ns = loop.now_ns + length_ns
+        loop.step(length_ns)
+        if loop.now_ns < target_ns:
+            raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
 
     def _check_runs(self) -> None:
         """Raise RefusedError before the motion begins, and when the process ends."""
-        with self._lock:
-            quits = self._state() == self._states.STATE_QUITTING
+        quits = self._state() == self._states.STATE_QUITTING
         error, reason = self._node.outcome(self._node.check_started)
         if quits or error:
             raise RefusedError(self._results.RESULT_INCORRECT_STATE,
@@ -263,8 +177,7 @@ class SimulationHandlers:
                 '(time and state): time goes back with the state only, and nothing is spawned')
 
     def _set_state(self, change: Callable[[States], State]) -> None:
-        with self._lock:
-            self._loop.set_state(change)
+        self._loop.set_state(change)
         self._node.show_spin()
 
     def _check_entity(self, name: str) -> None:
@@ -274,13 +187,9 @@ class SimulationHandlers:
 
     def _fill_state(self, message: Any) -> None:
         simulation = self._simulation
-        with self._lock:
-            entity.fill_state(message, simulation.state(), self._pivot(),
-                              simulation.epoch_ns + self._loop.now_ns,
-                              self._node.values['world_frame'])
-
-    def _pivot(self) -> Kinematics:
-        return self._simulation.segment.pivot(np.array([self._loop.now_ns]))
+        entity.fill_state(message, simulation.state(),
+                          simulation.epoch_ns + self._loop.now_ns,
+                          self._node.values['world_frame'])
 
     def _get_entities(self, request: Any, response: Any) -> None:
         filters = request.filters
@@ -302,22 +211,15 @@ class SimulationHandlers:
     def _set_entity_state(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
         self._check_runs()
-        top, frame = self._simulation.top, self._node.values['world_frame']
-        self._set_state(lambda now: entity.requested_state(
-            request, response, top, frame, now, self._pivot()))
+        frame = self._node.values['world_frame']
+        self._set_state(lambda now: entity.requested_state(request, response, frame, now))
 
     def _get_entity_info(self, request: Any, response: Any) -> None:
         self._check_entity(request.entity)
-        response.info.category.category = self._category
-        top = self._simulation.top
+        response.info.category.category = self._messages.EntityCategory.CATEGORY_ROBOT
+        top = self._simulation.trajectory.top
         response.info.description = (
             f'heavy symmetric top on a pivot: mass {top.mass:g} kg, centre of mass '
             f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
             f'{top.lambda3:g} kg m^2')
         response.info.tags = list(entity.TAGS)
-
-
-@types.coroutine
-def _turn() -> Generator[None, None, None]:
-    """Let the executor do other work; it resumes a task that yields nothing."""
-    yield

@@ -30,7 +30,7 @@ ROUNDING = 1e-12                # of velocities, relative
 
 
 class Kinematics(NamedTuple):
-    """What a pivot does at n times: (3, n) each, in the world [m], [m/s], [m/s^2]."""
+    """What a pivot does at n times: (3, n) or (3, 1), in the world [m], [m/s], [m/s^2]."""
 
     position: NDArray[np.float64]
     velocity: NDArray[np.float64]
@@ -55,19 +55,12 @@ class Piece(NamedTuple):
 REST = Piece(0, NEVER_NS, ZERO, np.zeros(9))
 
 
-def kinematics(pieces: Sequence[Piece], counts: Sequence[int],
-               times_ns: NDArray[np.int64]) -> Kinematics:
-    """Return what the pivot does at times (n,) [ns], in each piece at so many of them."""
-    starts_ns = np.repeat([piece.start_ns for piece in pieces], counts)
-    start, velocity, acceleration = np.repeat(
-        np.array([piece.begins for piece in pieces]).T, counts, axis=1).reshape(3, 3, -1)
-    t = (times_ns - starts_ns) * 1e-9
-    position = 0.5 * t * acceleration
-    position += velocity
-    position *= t
-    position += start
-    velocity += t * acceleration
-    return Kinematics(position, velocity, acceleration)
+def kinematics(piece: Piece, times_ns: NDArray[np.int64]) -> Kinematics:
+    """Return what the pivot does in a piece at times (n,) [ns]."""
+    start, velocity, acceleration = piece.begins.reshape(3, 3, 1)
+    t = (times_ns - piece.start_ns) * 1e-9
+    return Kinematics((0.5 * t * acceleration + velocity) * t + start,
+                      velocity + t * acceleration, np.repeat(acceleration, len(t), axis=1))
 
 
 class PivotPath:
@@ -76,17 +69,11 @@ class PivotPath:
 
     After the last piece the pivot keeps its velocity, or the first one follows.
 
-    Parameters
-    ----------
-    pieces : sequence of (duration [ns], acceleration (3,) [m/s^2])
-        A duration is > 0.
-    repeat : bool, default False
-        Whether they are repeated for ever.  Then they must leave the velocity as it was, but for
-        rounding, which the last acceleration takes; and last SHORTEST_S each on average.
-    position, velocity : (3,) sequence
-        At the start, in the world [m], [m/s].
-    start_ns : int, default 0
-        When the path starts [ns].
+    pieces : durations > 0 [ns], and accelerations (3,) [m/s^2]
+    repeat : whether they are repeated for ever.  Then they must leave the velocity as it was, but
+        for rounding, which the last acceleration takes; and last SHORTEST_S each on average
+    position, velocity : (3,) at the start, in the world [m], [m/s]
+    start_ns : when the path starts [ns]
 
     Raises ValueError for a path that cannot be repeated, and for a piece of 9e9 s or more.
     """
@@ -127,17 +114,12 @@ class PivotPath:
         """
         Return the path along straight lines that stops at each waypoint.
 
-        On each line the pivot accelerates, cruises and brakes; speed and acceleration are the
-        greatest, and slightly smaller where a duration is rounded up to nanoseconds.
+        On each line the pivot accelerates, cruises and brakes.
 
-        Parameters
-        ----------
-        waypoints : sequence of (3,)
-            Two or more [m].  Points that repeat their predecessor are passed over.
-        speed, acceleration : float
-            [m/s], [m/s^2], > 0.
-        repeat : bool, default False
-            Whether the path leads from the last waypoint to the first, and goes on for ever.
+        waypoints : two or more (3,) [m]; points that repeat their predecessor are passed over
+        speed, acceleration : the greatest, > 0 [m/s], [m/s^2]; slightly smaller where a duration
+            is rounded up to nanoseconds
+        repeat : whether the path leads from the last waypoint to the first, and goes on for ever
         """
         points = [_fractions(point) for point in waypoints]
         if len(set(points)) < 2:
@@ -157,16 +139,10 @@ class PivotPath:
         """
         Return the path that changes the velocity into `target` uniformly, keeps it, and stops.
 
-        Parameters
-        ----------
-        target : (3,) sequence
-            In the world [m/s].
-        most_acceleration : float
-            > 0 [m/s^2]; the acceleration is slightly smaller: whole nanoseconds.
-        position, velocity : (3,) sequence
-            At the start [m], [m/s].
-        stop_ns : int
-            When the pivot begins to brake, even if it has not reached the target [ns].
+        target : (3,) in the world [m/s]
+        most_acceleration : > 0 [m/s^2]; the acceleration is slightly smaller: whole nanoseconds
+        position, velocity : (3,) at the start [m], [m/s]
+        stop_ns : when the pivot begins to brake, even if it has not reached the target [ns]
         """
         goal, now = _fractions(target), _fractions(velocity)
         pieces = list(_ramp(now, goal, most_acceleration))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from operator import methodcaller
+from operator import attrgetter, methodcaller
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.installation import needed
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
-from spinning_top_sim.physics.pivot import Kinematics
+from spinning_top_sim.physics.pivot import Kinematics, Piece, kinematics
 from spinning_top_sim.physics.top import State, Top
 
 if TYPE_CHECKING:
@@ -44,8 +44,8 @@ class States:
     States of a top at n times.
 
     Who asks for the attitude does not pay for Euler angles.  A value depends on its own time only,
-    never on the other times.  A solver has a subclass with its name, `method`, and the columns
-    that raise NotImplementedError here; all others follow.
+    never on the other times.  A solver has a subclass with its name, `method`, and the columns t,
+    angles, theta_dot, rows_quaternion and transverse_velocity; all others follow.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class States:
     l3, lz : (n,) array
         Angular momentum along the axis and along the vertical [kg m^2/s].
     pivot : Kinematics
-        Position, velocity and acceleration of the pivot, rows that broadcast to (3, n).
+        Position, velocity and acceleration of the pivot in the world.
     norm_error : (n,) array
         ``|q| - 1``.
     rows_quaternion, rows_axis, rows_vertical, rows_angular_velocity : tuple of (n,) array
@@ -77,14 +77,11 @@ class States:
     """
 
     method: str
-
-    # Of the pivot in the world [m/s^2].
-    _acceleration = 0.0, 0.0, 0.0
+    _acceleration = 0.0, 0.0, 0.0       # of the pivot
 
     def __init__(self, top: Top, start: State, n: int) -> None:
         self.top, self.start, self._n = top, start, n
         self._l3: Column | float = start.l3
-        self._lz = start.lz
 
     def __len__(self) -> int:
         return self._n
@@ -116,6 +113,10 @@ class States:
         raise NotImplementedError
 
     @cached_property
+    def pivot(self) -> Kinematics:
+        return AT_REST
+
+    @cached_property
     def half_angle_squares(self) -> tuple[Column, Column]:
         """Squares of cosine and sine of theta/2."""
         x, y, z, w = self.rows_quaternion
@@ -127,7 +128,7 @@ class States:
 
     @cached_property
     def lz(self) -> Column:
-        return np.full(len(self), self._lz)
+        return np.full(len(self), self.start.lz)
 
     @property
     def phi(self) -> Column:
@@ -144,7 +145,7 @@ class States:
     @cached_property
     def phi_dot(self) -> Column:
         """Eq. (31) of "Analysis of Symmetric Spinning Top"."""
-        return attitude.precession_rate(self.top, self.start.l3, self._lz,
+        return attitude.precession_rate(self.top, self.start.l3, self.start.lz,
                                         *self.half_angle_squares)
 
     @cached_property
@@ -169,12 +170,10 @@ class States:
 
     @cached_property
     def rows_axis(self) -> tuple[Column, Column, Column]:
-        """Symmetry axis e3 in the world frame."""
         return attitude.axis_in_world(self.rows_quaternion)
 
     @cached_property
     def rows_vertical(self) -> tuple[Column, Column, Column]:
-        """Upward vertical in the body frame."""
         return attitude.vertical_in_body(self.rows_quaternion)
 
     @cached_property
@@ -184,14 +183,6 @@ class States:
     @cached_property
     def angular_velocity(self) -> NDArray[np.float64]:
         return np.stack(np.broadcast_arrays(*self.rows_angular_velocity), axis=-1)
-
-    @cached_property
-    def rows_angular_acceleration(self) -> Vector:
-        """By Euler's equations."""
-        top, (w1, w2, w3), (f1, f2, _) = self.top, self.rows_angular_velocity, self._support
-        gyroscopic = (top.lambda1 - top.lambda3) * w3
-        return ((gyroscopic * w2 + top.mass * f2 * top.com_distance) / top.lambda1,
-                -(gyroscopic * w1 + top.mass * f1 * top.com_distance) / top.lambda1, 0.0)
 
     @cached_property
     def _support(self) -> Vector:
@@ -204,16 +195,27 @@ class States:
         return upward * z1, upward * z2, upward * z3
 
     @cached_property
+    def rows_angular_acceleration(self) -> Vector:
+        """By Euler's equations, with the torque R e3 x (-M f) of the specific force f."""
+        top, (w1, w2, w3), (f1, f2, _) = self.top, self.rows_angular_velocity, self._support
+        gyroscopic = (top.lambda1 - top.lambda3) * w3
+        return ((gyroscopic * w2 + top.mass * f2 * top.com_distance) / top.lambda1,
+                -(gyroscopic * w1 + top.mass * f1 * top.com_distance) / top.lambda1, 0.0)
+
+    @cached_property
     def angular_acceleration(self) -> NDArray[np.float64]:
         return np.stack(np.broadcast_arrays(*self.rows_angular_acceleration), axis=-1)
 
     @cached_property
-    def pivot(self) -> Kinematics:
-        """What the pivot does: rows that broadcast to (3, n)."""
-        return AT_REST
+    def energy(self) -> Column:
+        top, (w1, w2) = self.top, self.transverse_velocity
+        # In this order only what is too large itself overflows, not the square of a rate.
+        kinetic: Column = 0.5 * (top.lambda1 * w1 * w1 + top.lambda1 * w2 * w2
+                                 + self._l3 / top.lambda3 * self._l3)
+        return kinetic + top.mass * self._support[2] * top.com_distance
 
     def position(self, point: Point) -> Vector:
-        """Return where a point of the body [m] is in the world [m], as components (n,)."""
+        """Return where a point of the body [m] is in the world, as components (n,) [m]."""
         (x, y, z), (a, b, c) = attitude.rotated(self.rows_quaternion, point), self.pivot.position
         return x + a, y + b, z + c
 
@@ -269,20 +271,9 @@ class States:
                 a3 * r1 - a1 * r3 + w2 * along - r2 * square + f2,
                 a1 * r2 - a2 * r1 + w3 * along - r3 * square + f3)
 
-    @cached_property
-    def energy(self) -> Column:
-        top, (w1, w2) = self.top, self.transverse_velocity
-        # In this order only what is too large itself overflows, not the square of a rate.
-        kinetic: Column = 0.5 * (top.lambda1 * w1 * w1 + top.lambda1 * w2 * w2
-                                 + self._l3 / top.lambda3 * self._l3)
-        return kinetic + top.mass * self._support[2] * top.com_distance
-
     def plot(self) -> Figure:
         """
         Draw the motion: the path of its axis, tilt, precession rate and energy drift.
-
-        The path is drawn on the sphere and from above.  The bounds of theta are circles there, and
-        dotted lines in the plot of the tilt.  The drift is relative to the first sample.
 
         Returns
         -------
@@ -297,7 +288,7 @@ class States:
             Without matplotlib.
         """
         with needed('a picture', 'plot'):
-            from spinning_top_sim.physics import pictures  # noqa: PLC0415 - matplotlib is slow
+            from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
         return pictures.plot(self)
 
     def animate(self, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
@@ -318,14 +309,76 @@ class States:
 
         Raises
         ------
-        ValueError
-            For fewer than two times, times that do not ascend, or numbers that are not > 0.
-        ImportError
-            Without matplotlib.
+        ValueError, ImportError
+            As `plot`; also for numbers that are not > 0.
         """
         with needed('a picture', 'plot'):
-            from spinning_top_sim.physics import pictures  # noqa: PLC0415 - matplotlib is slow
+            from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
         return pictures.animate(self, fps, speed)
+
+
+class WorldStates(States):
+    """
+    States about another vertical, seen from the world.
+
+    Attitude and Euler angles are those in the world: theta in [0, pi], phi and psi in
+    [-2 pi, 2 pi].  Energy, Lz and `start` are those in the frame of the pivot about the vertical
+    there; energy and Lz are constants of the motion.
+
+    top : in the gravity of the world
+    moved : states in the frame of the vertical
+    rotation : (4, 1) q(world <- frame) as x, y, z, w
+    ride : what the pivot does
+    times_ns : (n,) simulated times [ns], on which the pivot depends
+    """
+
+    t, l3, transverse_velocity = (cached_property(attrgetter(f'_moved.{name}')) for name in (
+        't', 'l3', 'transverse_velocity'))
+
+    def __init__(self, top: Top, moved: States, rotation: Quaternion, ride: Piece,
+                 times_ns: NDArray[np.int64]) -> None:
+        super().__init__(top, moved.start, len(moved))
+        self.method, self._moved, self._rotation = moved.method, moved, rotation
+        self._ride, self._times_ns = ride, times_ns
+        self._acceleration = tuple(ride.begins[6:].tolist())
+
+    @cached_property
+    def pivot(self) -> Kinematics:
+        return kinematics(self._ride, self._times_ns)
+
+    @cached_property
+    def rows_quaternion(self) -> Quaternion:
+        # Without -0.0, which a product with the identity leaves or not.
+        x, y, z, w = (part + 0.0 for part in attitude.product(
+            self._rotation, self._moved.rows_quaternion))
+        return x, y, z, w
+
+    @cached_property
+    def angles(self) -> tuple[Column, Column, Column]:
+        x, y, z, w = self.rows_quaternion
+        half_sum, half_difference = np.arctan2(z, w), np.arctan2(-x, y)
+        return half_sum + half_difference, self.theta_folded, half_sum - half_difference
+
+    @cached_property
+    def _axis_rates(self) -> tuple[Column, Column]:
+        """Theta' and phi', which is 0 where the axis is vertical, from the angular velocity."""
+        # alpha conj(beta) = sin(theta)/2 exp(i psi); at a pole the angle of what is left of it
+        x, y, z, w = self.rows_quaternion
+        cosine, sine = w * y - z * x, w * x + z * y
+        half = np.sqrt(cosine * cosine + sine * sine)
+        at_pole = half == 0.0
+        cosine, sine = np.where(at_pole, w + y, cosine), np.where(at_pole, z + x, sine)
+        scale, (w1, w2) = np.where(at_pole, 1.0, half), self.transverse_velocity
+        return ((w1 * sine + w2 * cosine) / scale,
+                np.where(at_pole, 0.0, 0.5 * (w2 * sine - w1 * cosine) / scale / scale))
+
+    @cached_property
+    def theta_dot(self) -> Column:
+        return self._axis_rates[0]
+
+    @cached_property
+    def phi_dot(self) -> Column:
+        return self._axis_rates[1]
 
 
 def joined(parts: Sequence[States]) -> States:

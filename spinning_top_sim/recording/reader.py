@@ -2,89 +2,102 @@
 """
 Reads MCAP logs of any writer, also truncated and damaged ones.
 
-Every message that can be decoded is read, and `damage` tells the rest.  Memory holds the chunks
-that overlap in time: one in a log that was written in order.
+The summary of a whole file leads to its messages; any other file is read from record to record.
 """
 
 import contextlib
-import functools
-import heapq
 import itertools
 import os
-import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+import zlib
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from io import BytesIO, FileIO
 from operator import attrgetter
 from pathlib import Path
+from typing import Any, NamedTuple
 
+from mcap import records
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Chunk, ChunkIndex, Header, Metadata, Schema
+from mcap.reader import NonSeekingReader
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording import parsing
-from spinning_top_sim.recording.damage import Damage
+from spinning_top_sim.recording import decoding, rosbag2
+from spinning_top_sim.recording.decoding import HEAD, CompleteReads, LogMessage, Messages
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.log_file import MAGIC_SIZE, LogFile, read_summary
-from spinning_top_sim.recording.parsing import HEAD, DamagedError, LogMessage, Messages
-from spinning_top_sim.recording.provenance import OUR_LIBRARY
-from spinning_top_sim.recording.rosbag2 import Qos, qos_profiles
-from spinning_top_sim.recording.scan import Index, Part, Scan
+from spinning_top_sim.recording.writer import record_bytes, time_span
 
+MAX_BYTES = 256 << 20       # of one record or one uncompressed chunk in memory
+MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are read together
-_FIRST_DATE = 10 ** 17      # [ns], in 1973
-_STREAM_BYTES = 1 << 12     # that an open chunk costs besides its content, about
+RUN_BYTES = 1 << 20         # of messages outside of chunks that are read together, about
+MAGIC_SIZE = len(MCAP0_MAGIC)
+FOOTER_SIZE = HEAD.size + 8 + 8 + 4
+FIRST_DATE = 10 ** 17       # [ns], in 1973
+UNPACK = {b'\x28\xb5\x2f\xfd': 'zstd -d {} -o {}', b'\x04\x22\x4d\x18': 'lz4 -d {} {}'}
+
+Found = tuple[records.McapRecord, int, int]     # a record, where it begins, and where it ends
 
 
 @dataclass(frozen=True)
 class LogTopic:
-    """
-    A channel of a log.
-
-    Parameters
-    ----------
-    name : str
-        Name of the topic.
-    type_name : str
-        Such as 'sensor_msgs/msg/Imu', empty without schema.
-    schema, schema_encoding : str
-        The definition with its dependencies, and its format, such as 'ros2msg'.
-    encoding : str
-        Encoding of the messages, such as 'cdr'.
-    qos : tuple of mapping
-        Offered profiles, each with the keys of `rosbag2.DEFAULT_QOS`.
-    metadata : mapping
-        Metadata of the channel.
-    channel_id : int
-        Number of the channel in the file.
-    """
+    """A channel of a log."""
 
     name: str
-    type_name: str
-    schema: str
-    schema_encoding: str
-    encoding: str
-    qos: tuple[Qos, ...]
+    type_name: str              # such as 'sensor_msgs/msg/Imu', empty without schema
+    schema: str                 # the definition with its dependencies
+    schema_encoding: str        # such as 'ros2msg'
+    encoding: str               # of the messages, such as 'cdr'
+    qos: tuple[rosbag2.Qos, ...]    # offered profiles, with the keys of `rosbag2.DEFAULT_QOS`
     metadata: Mapping[str, str]
     channel_id: int
 
 
-def _file_of(path: Path) -> Path:
-    """Return a file, or the one in a folder; raises LogError."""
-    if not path.is_dir():
-        return path
-    files = sorted(file.name for file in path.glob('*.mcap'))
-    if len(files) != 1:
-        raise LogError(f'cannot read {path}: a folder must hold one .mcap file; in it: '
-                       f'{", ".join(files) or "none"}')
-    return path / files[0]
+@dataclass
+class Damage:
+    """What is wrong with a log."""
+
+    torn: bool                  # it does not end as an MCAP file ends
+    lost_bytes: int = 0         # that cannot be read; indexes do not count
+    reasons: list[str] = field(default_factory=list)
+
+    def lose(self, offset: int, end: int, reason: str) -> None:
+        self.lost_bytes += end - offset
+        self.reasons.append(f'found: {end - offset} bytes at byte {offset}: {reason}')
+
+    def lines(self) -> list[str]:
+        """Return what is lost, and the first reasons."""
+        lost = [f'lost: {self.lost_bytes} bytes'] if self.lost_bytes else []
+        return lost + self.reasons[:MOST_REASONS]
+
+
+class Part(NamedTuple):
+    """A record, or adjacent messages outside of chunks, the last of which is `record`."""
+
+    record: records.McapRecord
+    messages: Messages
+    offset: int
+    end: int
+
+
+class Place(NamedTuple):
+    """A chunk, or adjacent messages outside of chunks, in the file."""
+
+    start_ns: int                   # the earliest log time
+    end_ns: int                     # the latest
+    offset: int
+    end: int
+    channel_ids: frozenset[int]
 
 
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
     An MCAP file, open for reading; a context manager.
 
-    A file with a usable summary opens at once.  Any other is scanned before its topics, metadata
-    or messages are returned, and so is every file for its `damage`.  Damage raises nothing.
+    A file with a summary opens at once, any other is read through.  What is damaged is left out.
 
     Parameters
     ----------
@@ -101,10 +114,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         Its size when it was opened [bytes]: what is written later is not read.
     profile, library : str
         What its header says: such as 'ros2', and the program that wrote it.
+    whole : bool
+        Whether the file was closed and its summary, if any, is right; see also `damage`.
+    metadata : dict
+        The metadata records by name; of several with one name, the last.
+    schemas, channels : dict
+        mcap's records by id.
     left_out : int
         Damaged chunks that `messages` has skipped so far.
-    file : LogFile
-        Its bytes and records, for recovery.
 
     Raises
     ------
@@ -112,73 +129,92 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         For what is no MCAP file, or cannot be read.
     """
 
-    def __init__(self, path: str | os.PathLike[str], max_bytes: int = parsing.MAX_BYTES) -> None:
-        self.path = _file_of(Path(path))
-        self.left_out = 0
-        self.file = LogFile(self.path, max_bytes)
-        self.size = self.file.size
-        self._scanned: Scan | None = None
+    def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
+        self.path, self._max_bytes, self.left_out = _file_of(Path(path)), max_bytes, 0
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._small_bytes = 0       # of schemas, channels and metadata
+        try:
+            if self.path.exists() and not self.path.is_file():     # opening a pipe would block
+                raise LogError(f'cannot read {self.path}: it is no regular file')
+            self._file = CompleteReads(FileIO(self.path))
+        except OSError as error:
+            raise LogError(f'cannot read {self.path}: {error.strerror}') from error
+        self.size = self._data_end = self._file.size
         try:
             header = self._read_header()
-            self._summary = read_summary(self.file)
+            self.profile, self.library = header.profile, header.library
+            self._torn, self._summary, self._problem = True, Summary(), ''
+            try:
+                self._read_summary()
+            except decoding.UNREADABLE as error:
+                self._problem = f'found: the summary is not used: {error}'
+                if self._torn:
+                    self._problem = 'found: the file does not end as an MCAP file ends'
+            self.whole = not self._problem
+            self.schemas, self.channels = self._summary.schemas, self._summary.channels
+            self._damage: Damage | None = None
+            self._places = self._find_places()
         except BaseException:
             self.close()
             raise
-        self.profile, self.library = header.profile, header.library
 
     def close(self) -> None:
         """Close the file; nothing can be read any more."""
-        self.file.close()
+        self._file.close()
 
     def __exit__(self, *exception: object) -> None:
         self.close()
 
     @property
-    def whole(self) -> bool:
-        """Whether the file was closed and its summary, if any, is right; see also `damage`."""
-        return self._summary.closed and not self._summary.problem
-
-    @property
     def topics(self) -> tuple[LogTopic, ...]:
         """The channels of the log, in the order of their ids."""
-        no_schema = Schema(id=0, data=b'', encoding='', name='')
-        schemas, channels = self._index.schemas, self._index.channels
+        none = records.Schema(id=0, data=b'', encoding='', name='')
         return tuple(LogTopic(
             name=channel.topic, type_name=schema.name,
             schema=schema.data.decode(errors='replace'), schema_encoding=schema.encoding,
-            encoding=channel.message_encoding, qos=qos_profiles(channel),
+            encoding=channel.message_encoding, qos=rosbag2.qos_profiles(channel),
             metadata=channel.metadata, channel_id=number)
-            for number, channel in sorted(channels.items())
-            for schema in [schemas.get(channel.schema_id, no_schema)])
+            for number, channel in sorted(self.channels.items())
+            for schema in [self.schemas.get(channel.schema_id, none)])
 
     @property
-    def metadata(self) -> dict[str, dict[str, str]]:
-        """The metadata records by name; of several with one name, the last."""
-        return self._index.metadata
+    def compression(self) -> rosbag2.Compression:
+        """How rosbag2 has compressed the messages, by its record or the bag's metadata.yaml."""
+        text = self.metadata.get(rosbag2.BAG_METADATA, {}).get('serialized_metadata', '')
+        beside = self.path.with_name('metadata.yaml')
+        if not text and beside.is_file():
+            text = beside.read_text(errors='replace')
+        return rosbag2.compression_of(text)
 
     @property
     def damage(self) -> Damage:
-        """What is wrong with the file; scans all of it at the first use."""
-        return self.scan().damage
+        """What is wrong with the file; reads all of it at the first use."""
+        if self._damage is None:
+            for _ in self.parts():
+                pass
+        assert self._damage is not None
+        return self._damage
 
-    @functools.cached_property
+    @cached_property
     def span(self) -> tuple[int, int]:
         """
         The earliest and the latest log time [ns]; both 0 without messages.
 
         Beside dates, a time of 0 does not count: it says that there was no clock yet.
         """
-        begin_ns = min((part.start_ns for part in self._message_parts), default=0)
-        end_ns = max((part.end_ns for part in self._message_parts), default=0)
-        if begin_ns == 0 and end_ns > _FIRST_DATE:
+        begin_ns = min((place.start_ns for place in self._places), default=0)
+        end_ns = max((place.end_ns for place in self._places), default=0)
+        if begin_ns == 0 and end_ns > FIRST_DATE:
             first = next(self.messages(start=1), None)
-            begin_ns = first.log_time if first and first.log_time > _FIRST_DATE else 0
+            begin_ns = first.log_time if first and first.log_time > FIRST_DATE else 0
         return begin_ns, end_ns
 
     def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
                  end: int | None = None) -> Iterator[LogMessage]:
         """
         Yield the messages in the order of their log times, equal ones in file order.
+
+        Those that rosbag2 has compressed one by one are decompressed.
 
         Parameters
         ----------
@@ -187,23 +223,45 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         start, end : int, optional
             Log times [ns]; `end` is exclusive.
 
-        Yields
+        Raises
         ------
-        LogMessage
-            A message that is read completely.
+        LogError
+            For a message that cannot be decompressed, and for chunks that overlap in time and do
+            not fit into memory.
         """
         names = None if topics is None else frozenset(topics)
-        wanted = {number: topic for number, topic in self._index.topics.items()
-                  if names is None or topic in names}
+        wanted = {number: channel.topic for number, channel in self.channels.items()
+                  if names is None or channel.topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
-        held: list[int] = []        # bytes of each part that is read and not yet passed
-        # A part is read when its time comes.
-        streams = [self._stream(part, wanted, held) for part in self._message_parts
-                   if part.end_ns >= times.start and part.start_ns < times.stop
-                   and not part.channel_ids.isdisjoint(wanted)]
-        for message in heapq.merge(*streams, key=attrgetter('log_time')):
-            if message.channel_id >= 0 and message.log_time in times:
-                yield message
+        mode, compression = self.compression
+        # What is read and not yet passed: log time, place and offset there
+        held: list[tuple[int, int, int, Messages]] = []
+        opened: list[tuple[int, int]] = []      # latest log time and size of chunks
+        for place in [*sorted(self._places), None]:
+            passed = len(held) if place is None else bisect_left(held, (place.start_ns,))
+            for time_ns, _, offset, messages in held[:passed]:
+                if time_ns in times:
+                    message = messages.message(wanted, offset)
+                    yield message if mode != 'MESSAGE' else self._decompressed(
+                        message, compression)
+            del held[:passed]
+            if (place is None or place.end_ns < times.start or place.start_ns >= times.stop
+                    or place.channel_ids.isdisjoint(wanted)):
+                continue
+            try:
+                messages = self._messages(place.offset, place.end)
+            except decoding.UNREADABLE:
+                self.left_out += 1
+                continue
+            opened = [one for one in opened if one[0] >= place.start_ns]
+            opened.append((place.end_ns, len(messages.plain)))
+            if sum(size for _, size in opened) > 2 * self._max_bytes:
+                raise LogError(f'cannot read {self.path}: chunks that overlap in time have more '
+                               f'than {2 * self._max_bytes} bytes')
+            for number in wanted.keys() & messages.entries.keys():
+                held += ((time_ns, place.offset, offset, messages)
+                         for time_ns, offset in messages.entries[number].tolist())
+            held.sort()
 
     def groups(self, topics: Iterable[str] | None = None,
                ) -> Iterator[tuple[str, list[LogMessage]]]:
@@ -213,75 +271,179 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
                 yield topic, list(group)
 
-    def scan(self, progress: Callable[[int], object] = lambda offset: None) -> Scan:
-        """Return what a scan of the whole file finds, done at the first use."""
-        if self._scanned is None:
-            self._scanned = Scan(self.file, self._summary, progress=progress,
-                                 ours=self.library.startswith(OUR_LIBRARY))
-        return self._scanned
-
-    def open_part(self, part: Part) -> Messages:
-        """Return the messages of a part.  Raises DamagedError."""
-        if part.opcode == Opcode.MESSAGE:
-            return parsing.find_messages(self.file.read(part.offset, part.end - part.offset))
-        chunk = self.file.record(part.offset, part.end)
-        if not isinstance(chunk, Chunk):
-            raise DamagedError('it is no chunk')
-        return parsing.open_chunk(chunk, self.file.max_bytes)
-
-    def _stream(self, part: Part, wanted: Mapping[int, str], held: list[int],
-                ) -> Iterator[LogMessage]:
-        """Yield a placeholder at the part's first time, so that parts open in turn, then all."""
-        yield LogMessage('', part.start_ns, 0, 0, b'', -1)
+    def _decompressed(self, message: LogMessage, compression: str) -> LogMessage:
         try:
-            messages = self.open_part(part)
-        except DamagedError:
-            self.left_out += 1
-            return
-        held_bytes = len(messages.plain) + _STREAM_BYTES
-        held.append(held_bytes)
-        most = 2 * self.file.max_bytes
-        if sum(held) > most:
-            raise LogError(f'cannot read {self.path}: the messages of several chunks overlap in '
-                           f'time, and these have more than {most} bytes')
-        yield from messages.in_order(wanted, by_time=True)
-        held.remove(held_bytes)
+            data = decoding.decompress(message.data, compression or 'unknown', self._max_bytes)
+        except McapError as error:
+            raise LogError(f'cannot read {self.path}: a message of {message.topic}: {error}'
+                           ) from None
+        return message._replace(data=data)
 
-    @functools.cached_property
-    def _index(self) -> Index:
-        """What the summary tells, if that is all and right, else what a scan finds."""
+    # ------------------------------------------------------------------------------ the records
+
+    def parts(self) -> Iterator[Part]:
+        """Yield what can be read, in file order; then `damage` tells what cannot."""
+        damage = Damage(self._torn, reasons=[self._problem] * (not self.whole))
+        self._small_bytes = 0
+        for is_run, found in itertools.groupby(
+                self._records(damage), lambda one: isinstance(one[0], records.Message)):
+            for record, offset, end in _runs(found) if is_run else found:
+                try:
+                    messages = (self._messages(offset, end)
+                                if is_run or isinstance(record, records.Chunk)
+                                else Messages(b'', {}, [record]))
+                    self._declare(messages)
+                    yield Part(record, messages, offset, end)
+                except decoding.UNREADABLE as error:
+                    damage.lose(offset, end, str(error))
+        self._damage = damage
+
+    def _records(self, damage: Damage) -> Iterator[Found]:
+        """Yield the records of the data section, but for indexes, up to one that has no end."""
+        offset, index_bytes = MAGIC_SIZE, 0
+        while offset < self._data_end:
+            opcode, end = self._head(offset)
+            if opcode == 0 or end > self._data_end:
+                # Nothing is lost by a truncated index of the last chunk.
+                if not self._torn or opcode not in (Opcode.MESSAGE_INDEX, Opcode.DATA_END) or (
+                        self.size - offset > index_bytes):
+                    damage.lose(offset, self._data_end, 'no whole record')
+                return
+            # Opcodes that are unknown belong to an application.
+            if opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE_INDEX:
+                try:
+                    record = decoding.parse(self._raw(offset, end))
+                except decoding.UNREADABLE as error:
+                    damage.lose(offset, end, str(error))
+                else:
+                    if isinstance(record, records.DataEnd):
+                        self._check_data(offset, record.data_section_crc, damage)
+                        return
+                    if isinstance(record, records.Chunk):
+                        index_bytes = record.uncompressed_size      # at most
+                    yield record, offset, end
+            offset = end
+        if not self._torn:
+            damage.reasons.append('found: the data section has no end')
+
+    def _head(self, offset: int) -> tuple[int, int]:
+        """Return opcode and end of the record there; a head that is not whole has no end."""
+        head = self._file.at(offset, min(offset + HEAD.size, self.size))
+        opcode, length = HEAD.unpack(head.ljust(HEAD.size, b'\xff'))
+        return opcode, offset + HEAD.size + length
+
+    def _raw(self, offset: int, end: int) -> bytes:
+        if end - offset > self._max_bytes:
+            raise McapError(f'more than {self._max_bytes} bytes are not read')
+        return self._file.at(offset, end)
+
+    def _check_data(self, end: int, expected: int, damage: Damage) -> None:
+        """Compare the checksum of the data section, if there is one."""
+        crc = 0
+        for begin in range(0, end if expected else 0, RUN_BYTES):
+            crc = zlib.crc32(self._file.at(begin, min(begin + RUN_BYTES, end)), crc)
+        if crc != expected:
+            damage.reasons.append('found: the checksum of the data section is wrong')
+
+    def is_declared(self, channel_id: int) -> bool:
+        """Return whether a channel and its schema, if it has one, are known."""
+        channel = self.channels.get(channel_id)
+        return channel is not None and channel.schema_id in {0, *self.schemas}
+
+    def _declare(self, messages: Messages) -> None:
+        """Note schemas, channels and metadata.  Raises McapError if messages lack a channel."""
+        for record in messages.declared:
+            known: Any
+            if isinstance(record, records.Metadata):
+                self.metadata[record.name] = record.metadata
+            elif isinstance(record, records.Schema | records.Channel):
+                known = self.schemas if isinstance(record, records.Schema) else self.channels
+                if known.setdefault(record.id, record) != record:
+                    raise McapError(f'it changes {type(record).__name__.lower()} {record.id}')
+            else:
+                continue
+            self._small_bytes += len(record_bytes(record))
+            if self._small_bytes > decoding.MAX_SMALL:
+                raise McapError(f'more than {decoding.MAX_SMALL} bytes of schemas, channels and '
+                                'metadata are not read')
+        if not all(map(self.is_declared, messages.entries)):
+            raise McapError('no whole record declares a channel of its messages')
+
+    def _messages(self, offset: int, end: int) -> Messages:
+        """Return the messages of a chunk, or of what stands outside of chunks; UNREADABLE."""
+        raw = self._raw(offset, end)
+        if raw[:1] == bytes([Opcode.MESSAGE]):
+            return decoding.find_messages(raw)
+        chunk = decoding.parse(raw)
+        if not isinstance(chunk, records.Chunk):
+            raise McapError('it is no chunk')
+        return decoding.open_chunk(chunk, self._max_bytes)
+
+    def _find_places(self) -> list[Place]:
         summary = self._summary
-        if not (summary.is_complete and all(map(self._leads_to_chunk, summary.chunks.values()))):
-            return self.scan().index
-        metadata = {}
-        for index in summary.metadata:
-            with contextlib.suppress(DamagedError):
-                record = self.file.record(index.offset, summary.data_limit)
-                if isinstance(record, Metadata):
-                    metadata[record.name] = record.metadata
-        parts = [Part(Opcode.CHUNK, offset, offset + chunk.chunk_length,
-                      frozenset(chunk.message_index_offsets), chunk.message_start_time,
-                      chunk.message_end_time) for offset, chunk in sorted(summary.chunks.items())]
-        return Index(parts, metadata, summary.schemas, summary.channels)
+        if not summary.chunk_indexes or not all(
+                one.message_index_offsets and all(map(self.is_declared, one.message_index_offsets))
+                for one in summary.chunk_indexes):
+            return [Place(*time_span(entries), part.offset, part.end, frozenset(entries))
+                    for part in self.parts() if (entries := part.messages.entries)]
+        with contextlib.suppress(*decoding.UNREADABLE):
+            for one in summary.metadata_indexes:
+                record = decoding.parse(self._raw(one.offset, one.offset + one.length))
+                self._declare(Messages(b'', {}, [record]))
+        return [Place(one.message_start_time, one.message_end_time, one.chunk_start_offset,
+                      one.chunk_start_offset + one.chunk_length,
+                      frozenset(one.message_index_offsets)) for one in summary.chunk_indexes]
 
-    @property
-    def _message_parts(self) -> list[Part]:
-        return [part for part in self._index.parts if part.channel_ids]
+    def _read_header(self) -> records.Header:
+        """Return the header.  Raises LogError for no MCAP file."""
+        magic, reason = self._file.read(min(MAGIC_SIZE, self.size)), 'it is no MCAP file'
+        if magic == MCAP0_MAGIC:
+            with contextlib.suppress(*decoding.UNREADABLE):
+                header = decoding.parse(self._raw(MAGIC_SIZE, self._head(MAGIC_SIZE)[1]))
+                if isinstance(header, records.Header):
+                    return header
+            reason = 'its header is damaged'
+        elif not magic:
+            reason = 'it is empty'
+        elif magic[:4] in UNPACK:
+            reason = 'it is compressed as a whole, unpack it by ' + UNPACK[magic[:4]].format(
+                self.path, self.path.with_suffix(''))
+        raise LogError(f'cannot read {self.path}: {reason}')
 
-    def _leads_to_chunk(self, index: ChunkIndex) -> bool:
-        head = struct.pack(
-            '<BQQQ', Opcode.CHUNK, (index.chunk_length - HEAD.size) % (1 << 64),
-            index.message_start_time, index.message_end_time)
-        return self.file.read(index.chunk_start_offset, len(head)) == head
+    def _read_summary(self) -> None:
+        """Read the summary, if there is one.  UNREADABLE if it is damaged or the file is torn."""
+        footer_at = self.size - MAGIC_SIZE - FOOTER_SIZE
+        footer = decoding.parse(self._file.at(footer_at, self.size - MAGIC_SIZE))
+        if self._file.read(MAGIC_SIZE) != MCAP0_MAGIC or not isinstance(footer, records.Footer):
+            raise McapError
+        self._torn, start = False, footer.summary_start or footer_at
+        section = self._file.at(start, self.size)
+        if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
+            raise McapError('its checksum is wrong')
+        self._data_end = start
+        if len(section) <= decoding.MAX_SMALL:      # else it is read from record to record
+            self._summary = NonSeekingReader(
+                CompleteReads(BytesIO(MCAP0_MAGIC + section))).get_summary() or Summary()
 
-    def _read_header(self) -> Header:
-        """Return the header; raises LogError if neither magic nor header is there."""
-        magic = self.file.read(0, MAGIC_SIZE)
-        with contextlib.suppress(DamagedError):
-            header = self.file.record(MAGIC_SIZE, self.size)
-            if isinstance(header, Header):
-                return header
-        if magic != MCAP0_MAGIC:
-            reason = 'it is no MCAP file' if magic else 'it is empty'
-            raise LogError(f'cannot read {self.path}: {reason}')
-        return Header(profile='ros2', library='')
+
+def _runs(messages: Iterator[Found]) -> Iterator[Found]:
+    """Join adjacent messages."""
+    begin = None
+    for record, offset, end in messages:
+        begin = offset if begin is None else begin
+        if end - begin >= RUN_BYTES:
+            yield record, begin, end
+            begin = None
+    if begin is not None:
+        yield record, begin, end
+
+
+def _file_of(path: Path) -> Path:
+    """Return a file, or the one in a folder; raises LogError."""
+    if not path.is_dir():
+        return path
+    files = sorted([*path.glob('*.mcap')] or path.glob('*.mcap.*'))
+    if len(files) != 1:
+        raise LogError(f'cannot read {path}: a folder must hold one .mcap file; in it: '
+                       f'{", ".join(file.name for file in files) or "none"}')
+    return files[0]

@@ -2,10 +2,9 @@
 """
 Recording while the simulation runs: bounded loss, bounded memory, and no waiting for a disk.
 
-The caller only appends to a queue.  The recorder's thread opens the file, makes chunks and writes
-them, at least every half `max_loss`, so that a SIGKILL takes no more, and closes the file.
-Another thread brings them to the disk meanwhile; `possible_loss` tells what a power loss would
-take.
+The caller only appends to a queue.  The recorder's thread opens the file, writes chunks at least
+every half `max_loss`, so that a SIGKILL takes no more, and closes the file.  Another thread, which
+may hang as a disk does, brings them to the disk; `possible_loss` tells what a power loss takes.
 """
 
 from __future__ import annotations
@@ -26,16 +25,14 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import RecordingError, text_of, why_not_written
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
 
-# What writes is imported by the recorder's thread: that takes 0.1 s.
-if TYPE_CHECKING:
-    from spinning_top_sim.recording.rosbag2 import RecordedTopic
+if TYPE_CHECKING:       # the recorder's thread imports it, which takes 0.1 s
     from spinning_top_sim.recording.writer import McapWriter
 
 QUEUE_BYTES = 32_000_000    # of a full queue; a burst that began with room may go on
-BATCH_BYTES = 1_000_000     # of messages that make a chunk of their own, about
-
-_ENTRY_BYTES = 300          # what queued rows cost besides their data, about
+CHUNK_BYTES = 1_000_000     # of messages that make a chunk, about
+ENTRY_BYTES = 300           # what queued rows cost besides their data, about
 
 # The next messages of a topic: its index, log times (n,) [ns], serialized messages (n, size).
 Rows = tuple[int, NDArray[np.int64], NDArray[np.uint8]]
@@ -54,42 +51,24 @@ class RecordingSummary:
 
     @property
     def messages(self) -> int:
-        """Number of messages in the file."""
         return sum(self.counts.values())
 
 
 class Recorder:
     """
-    A recording into a new file, from now on until `close`; returns at once.
+    A recording into a new file from now on until `close`.  Raises nothing for the disk's sake.
 
-    Messages may be handed over at once: they wait in memory while the file is being opened.
-    Trouble with the disk never reaches the caller: the recording stops, `state` becomes 'failed'
-    and `error` says why, naming the path.  What was written up to then stays readable.
+    Messages may be handed over at once; they wait in memory while the file is being opened.  After
+    trouble with the disk `state` is 'failed', `error` says why, naming the path, and what was
+    written stays readable.
 
-    Parameters
-    ----------
-    uri : str
-        The file, which must not exist; or a folder, in which a name with the date is taken.  A
-        folder is made if its name ends with '/'.  '': the working directory.
-    topics : sequence of RecordedTopic
-        A message refers to a topic by its index here.
-    metadata : mapping
-        The metadata record of the run; see `provenance.run_metadata`.
-    max_loss : float
-        Most wall time whose messages a SIGKILL or a power loss may take [s], > 0.
-    compression : str
-        'zstd', 'lz4' or 'none'.
-    min_free_bytes : int
-        The recording stops if the disk has less left than this.
-
-    Attributes
-    ----------
-    state : str
-        'opening', 'recording', 'closed' or 'failed'.
-    error : str or None
-        Why it failed.
-    path : Path or None
-        The file; None before it is open.
+    uri : the file, which must not exist; or a folder, in which a name with the date is taken, and
+        which is made if it ends with '/'; '' is the working directory
+    topics : a message refers to one by its index
+    metadata : of the run; see `provenance.run_metadata`
+    max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
+    compression : 'zstd', 'lz4' or 'none'
+    min_free_bytes : the recording stops if the disk has less left than this
     """
 
     def __init__(self, uri: str, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
@@ -97,24 +76,21 @@ class Recorder:
                  min_free_bytes: int = 100_000_000) -> None:
         self.state: Literal['opening', 'recording', 'closed', 'failed'] = 'opening'
         self.error: str | None = None
-        self.path: Path | None = None
+        self.path: Path | None = None       # known once the file is open
         self._uri, self._topics, self._metadata = uri, topics, metadata
-        self._max_loss = max_loss
-        self._compression = compression
+        self._max_loss, self._compression = max_loss, compression
         self._min_free_bytes = min_free_bytes
-
         self._file: McapWriter | None = None
         # Appending to a deque and taking from its other end need no lock between threads.
         self._queue: deque[tuple[Sequence[Rows], int]] = deque()     # rows, and their bytes
         self._bytes_in = self._bytes_out = 0    # of the queue, ever
-        self._offered = 0              # messages handed over, ever
+        self._offered = 0                       # messages handed over, ever
         self._accepting = True
         # (time, bytes): what had left the queue by that time is on the disk.
         self._on_disk = time.monotonic(), 0
         self._sync_error: Exception | None = None
         self._syncing: threading.Thread | None = None
-        self._wake = threading.Event()
-        self._taken = threading.Event()
+        self._wake, self._taken = threading.Event(), threading.Event()
         # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
         # exit handler runs before daemons are stopped and closes the file properly.
         atexit.register(self.close)
@@ -152,22 +128,18 @@ class Recorder:
         missing = self._offered - sum(counts.values())
         return RecordingSummary(
             path=self.path, bytes=file.size if file else 0, counts=counts,
-            queued=missing if running else 0, lost=0 if running else missing,
-            error=self.error)
+            queued=missing if running else 0, lost=0 if running else missing, error=self.error)
 
     def write(self, rows: Sequence[Rows]) -> None:
         """
-        Hand over messages, from one thread at a time; those of a topic keep their order.
+        Hand over messages, from one thread at a time; never waits.
 
-        rows : the topic's index, log times (n,) [ns] and serialized messages (n, size), n >= 1;
-            the arrays must not change afterwards
-
-        Never waits, never raises for the disk's sake.  After the recording stopped the messages
-        are only counted, as lost.
+        Those of a topic keep their order.  The arrays must not change afterwards.  After the
+        recording stopped the messages are only counted, as lost.
         """
         self._offered += sum(len(times_ns) for _, times_ns, _ in rows)
         if self._accepting:
-            size = sum(_ENTRY_BYTES + messages.nbytes for _, _, messages in rows)
+            size = sum(ENTRY_BYTES + messages.nbytes for _, _, messages in rows)
             self._queue.append((rows, size))
             self._bytes_in += size
             if self._bytes_in - self._bytes_out >= QUEUE_BYTES // 2 and not self._wake.is_set():
@@ -182,7 +154,7 @@ class Recorder:
         return self.room
 
     def end(self) -> None:
-        """Have the file closed; does not wait for it."""
+        """Have the file closed, without waiting for it."""
         self._accepting = False
         self._wake.set()
 
@@ -209,24 +181,20 @@ class Recorder:
             self._record(self._file)
             self.state = 'closed'
         except Exception as error:  # whatever it is, the simulation goes on without a log
-            self._fail(error)
-        finally:
-            atexit.unregister(self.close)
-
-    def _fail(self, error: Exception) -> None:
-        self._accepting = False
-        self.error = text_of(error) if self.path is None else (
-            f'recording to {self.path} stopped: {why_not_written(self.path, error)}')
-        self.state = 'failed'
-        self._queue.clear()
-        self._bytes_out = self._bytes_in
-        self._taken.set()
-        # Cutting off the truncated chunk may have freed enough space for the summary.
-        with contextlib.suppress(Exception):
-            if self._syncing is not None:
-                self._syncing.join()
-            if self._file is not None:
-                self._file.finish()
+            self._accepting = False
+            self.error = text_of(error) if self.path is None else (
+                f'recording to {self.path} stopped: {why_not_written(self.path, error)}')
+            self.state = 'failed'
+            self._queue.clear()
+            self._bytes_out = self._bytes_in
+            self._taken.set()
+            # Cutting off the truncated chunk may have freed enough space for the summary.
+            with contextlib.suppress(Exception):
+                if self._syncing is not None:
+                    self._syncing.join()
+                if self._file is not None:
+                    self._file.finish()
+        atexit.unregister(self.close)
 
     def _open(self) -> McapWriter:
         """Return the file that `uri` names; in a folder, under the first free name."""
@@ -237,23 +205,21 @@ class Recorder:
         if self._uri.endswith('/'):
             folder.mkdir(parents=True, exist_ok=True)
         named = self._uri and not path.is_dir()
-        stem = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S')
-        for number in itertools.count(1):
+        stem, number = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S'), 1
+        while True:
             if not named:
                 path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
             try:
                 file = create_file(path, self._topics, self._metadata,
                                    compression=self._compression,
                                    min_free_bytes=self._min_free_bytes)
-            except RecordingError as error:
-                # Another node may take a name at any time, so only opening shows whether it is
-                # free.
-                if named or not isinstance(error.__cause__, FileExistsError):
-                    raise
-            else:
                 self.path = path
                 return file
-        raise AssertionError
+            except RecordingError as error:
+                # Another node may take a name at any time: only opening shows whether it is free.
+                if named or not isinstance(error.__cause__, FileExistsError):
+                    raise
+            number += 1
 
     def _record(self, file: McapWriter) -> None:
         interval = self._max_loss / 2.0
@@ -285,7 +251,7 @@ class Recorder:
             batch += rows
             batch_bytes += size
             self._bytes_out += size
-            if batch_bytes >= BATCH_BYTES:
+            if batch_bytes >= CHUNK_BYTES:
                 _add(file, batch)
                 file.flush()
                 batch, batch_bytes = [], 0
@@ -294,7 +260,6 @@ class Recorder:
             self._taken.set()
 
     def _begin_sync(self, file: McapWriter, now: float) -> None:
-        """Bring what is in the file to the disk, in a thread that may hang as the disk does."""
         if self._syncing is not None and self._syncing.is_alive():
             return
         written = now, self._bytes_out
@@ -321,7 +286,7 @@ def single(topic_index: int, log_time_ns: int, data: bytes) -> Rows:
 
 
 def _add(file: McapWriter, batch: Sequence[Rows]) -> None:
-    """Add messages in as few arrays as there are topics, where those of a topic have one size."""
+    """Add messages, neighbours of one topic and size together."""
     by_topic: defaultdict[int, list[Rows]] = defaultdict(list)
     for rows in batch:
         by_topic[rows[0]].append(rows)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The texts that rosbag2 (jazzy) writes into a log: offered QoS, bag metadata.
+The texts that rosbag2 (jazzy) writes into a log: definitions, offered QoS, bag metadata.
 
 Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_storage.cpp.
 """
@@ -8,13 +8,17 @@ Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_stora
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import yaml
 
-if TYPE_CHECKING:
+from spinning_top_sim.recording.errors import RecordingError
+
+if TYPE_CHECKING:       # nodes need this module without mcap
     from mcap.records import Channel
 
 # A profile: the keys of DEFAULT_QOS, integer policies as in rmw, durations as {'sec', 'nsec'}.
@@ -52,6 +56,37 @@ class RecordedTopic(NamedTuple):
     name: str               # resolved, such as '/imu/data_raw'
     type_name: str          # 'package/msg/Type'
     qos: Qos = MappingProxyType({})     # offered; what is left out is as in DEFAULT_QOS
+
+
+class Compression(NamedTuple):
+    """How rosbag2 has compressed a bag beyond MCAP's chunks."""
+
+    mode: str       # '', 'MESSAGE' or 'FILE'
+    format: str     # '', or such as 'zstd'
+
+
+NOT_COMPRESSED = Compression('', '')
+
+
+@cache
+def _types() -> Any:
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - it takes 50 ms
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def find_definition(type_name: str) -> tuple[str, str]:
+    """
+    Return schema (`ros2msg`) and type hash (REP-2011) of a type of ROS 2 Jazzy.
+
+    They are the same where ROS is installed and where not.  Other than rosbag2's, the schema,
+    which is the definition followed by those it depends on, has no comments.
+    Raises RecordingError for another type.
+    """
+    if type_name not in _types().fielddefs:
+        raise RecordingError(f'there is no message type {type_name} in ROS 2 Jazzy')
+    text, _ = _types().generate_msgdef(type_name, ros_version=2)
+    return text, _types().hash_rihs01(type_name)
 
 
 def offered_qos_yaml(topic: RecordedTopic) -> str:
@@ -99,8 +134,16 @@ def _is_int64(value: object) -> TypeGuard[int]:
     return type(value) is int and -1 << 63 <= value < 1 << 63
 
 
-def bag_metadata_yaml(topics: Sequence[tuple[Channel, str, int]], *, file_name: str,
-                      start_ns: int, end_ns: int) -> str:
+def compression_of(text: str) -> Compression:
+    """Return what the text of a `rosbag2` record, or of a bag's metadata.yaml, says."""
+    mode, form = (re.search(rf'^\s*compression_{key}:[ \t]*["\']?([\w.-]*)', text, re.MULTILINE)
+                  for key in ('mode', 'format'))
+    found = Compression(mode[1].upper() if mode else '', form[1] if form else '')
+    return NOT_COMPRESSED if found.mode in ('', 'NONE') else found
+
+
+def bag_metadata_yaml(topics: Sequence[tuple[Channel, str, int]], file_name: str, start_ns: int,
+                      end_ns: int, compression: Compression) -> str:
     """Return the text of the `rosbag2` record; `topics` are channels, types and message counts."""
     # A file name may hold bytes that are no text: they must not spoil the closing of a log.
     file_name = file_name.encode(errors='replace').decode()
@@ -123,8 +166,8 @@ def bag_metadata_yaml(topics: Sequence[tuple[Channel, str, int]], *, file_name: 
                      for key, value in qos.items()} for qos in qos_profiles(channel)],
                 'type_description_hash': channel.metadata.get('topic_type_hash', '')},
              'message_count': messages} for channel, type_name, messages in topics],
-        'compression_format': '',
-        'compression_mode': '',
+        'compression_format': compression.format,
+        'compression_mode': compression.mode,
         'relative_file_paths': [file_name],
         'files': [{'path': file_name, 'starting_time': start, 'duration': duration,
                    'message_count': total}],

@@ -28,27 +28,17 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
-from spinning_top_sim.recording.definitions import find_definition
+from spinning_top_sim.recording import rosbag2
 from spinning_top_sim.recording.errors import RecordingError, why_not_written
 from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
-from spinning_top_sim.recording.rosbag2 import (
-    BAG_METADATA,
-    RecordedTopic,
-    bag_metadata_yaml,
-    offered_qos_yaml,
-)
 
-CHUNK_BYTES = 1 << 20   # uncompressed, about
-
-# The fastest level that compresses nearly as well as zstd's own default, 3.
-ZSTD_LEVEL = -1
-# The default window of the level is half a chunk; a whole one saves up to 20 %.
-ZSTD_WINDOW_LOG = 20
-
+# The fastest level that compresses nearly as well as zstd's own default, 3, with a window of a
+# whole chunk: its default, half of one, costs up to 20 %.
+ZSTD = zstandard.ZstdCompressionParameters.from_level(-1, window_log=20)
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
 
 # Message index entries of a chunk by channel id: (n, 2) log times and offsets in the chunk.
-IndexEntries = Mapping[int, NDArray[np.uint64]]
+Entries = Mapping[int, NDArray[np.uint64]]
 
 
 class McapWriter:
@@ -66,36 +56,30 @@ class McapWriter:
 
     def __init__(self, path: Path, *, header: records.Header, compression: str) -> None:
         self._path = path
-        self._compression = compression
-        self._zstd = zstandard.ZstdCompressor(
-            compression_params=zstandard.ZstdCompressionParameters.from_level(
-                ZSTD_LEVEL, window_log=ZSTD_WINDOW_LOG))
+        self._compression = '' if compression == 'none' else compression
+        self._zstd = zstandard.ZstdCompressor(compression_params=ZSTD)
+        self.pending = 0                            # bytes of the chunk in memory
+        self._parts: list[NDArray[np.void]] = []    # of it, and its entries
+        self._entries: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
         self._next_sequence: defaultdict[int, int] = defaultdict(int)    # by channel id
-        self._clear_chunk()
-
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
         self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
-        self._type_names: dict[int, str] = {}       # by schema id
+        self._type_names = {0: ''}                  # by schema id
         self._channels: dict[int, records.Channel] = {}
-        # Records of the summary.  Serialized: thousands of objects would take memory.
-        self._summary_records: dict[Opcode, list[bytes]] = {kind: [] for kind in (
-            Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
-            Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)}
-
+        # Records of the summary by opcode.  Serialized: thousands of objects would take memory.
+        self._summary: defaultdict[int, list[bytes]] = defaultdict(list)
         self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
         with self.discarded_on_failure():
             self._write([MCAP0_MAGIC, record_bytes(header)])
 
     @property
     def size(self) -> int:
-        """Size of the file [bytes]."""
         return self._end[0]
 
     @property
     def messages(self) -> int:
-        """Number of messages in the file."""
         return sum(self.message_counts.values())
 
     @contextlib.contextmanager
@@ -109,30 +93,30 @@ class McapWriter:
                 self._path.unlink()
             raise
 
-    def write(self, record: records.McapRecord, raw: bytes = b'') -> None:
-        """
-        Write a schema, a channel (after its schema), metadata or an attachment.
-
-        raw : the bytes of the record in another file
-        """
-        offset = self.size
-        raw = raw or record_bytes(record)
+    def write(self, record: records.McapRecord) -> None:
+        """Write metadata, an attachment, or a schema or channel that is not there already."""
+        if isinstance(record, records.Schema):
+            if record.id in self._type_names:
+                return
+            self._type_names[record.id] = record.name
+        elif isinstance(record, records.Channel):
+            if record.id in self._channels:
+                return
+            self._channels[record.id] = record
+            self.message_counts[record.id] = 0
+        offset, raw = self.size, record_bytes(record)
         self._write([raw])
         if isinstance(record, records.Metadata):
-            self._summary_records[Opcode.METADATA_INDEX].append(
-                record_bytes(records.MetadataIndex(offset, len(raw), record.name)))
+            record = records.MetadataIndex(offset, len(raw), record.name)
         elif isinstance(record, records.Attachment):
-            self._summary_records[Opcode.ATTACHMENT_INDEX].append(
-                record_bytes(records.AttachmentIndex(
-                    offset, len(raw), record.log_time, record.create_time, len(record.data),
-                    record.name, record.media_type)))
-        elif isinstance(record, records.Schema):
-            self._type_names[record.id] = record.name
-            self._summary_records[Opcode.SCHEMA].append(raw)
-        elif isinstance(record, records.Channel):
-            self._channels[record.id] = record
-            self._summary_records[Opcode.CHANNEL].append(raw)
-            self.message_counts[record.id] = 0
+            record = records.AttachmentIndex(
+                offset, len(raw), record.log_time, record.create_time, len(record.data),
+                record.name, record.media_type)
+        self._summarize(record)
+
+    def _summarize(self, record: records.McapRecord) -> None:
+        raw = record_bytes(record)
+        self._summary[raw[0]].append(raw)
 
     def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
             rows: NDArray[np.uint8]) -> None:
@@ -143,16 +127,15 @@ class McapWriter:
         rows : serialized messages (n, size)
         """
         channel_id, (count, size) = topic_index + 1, rows.shape
+        numbers = np.arange(count)
         messages = np.empty(count, _message_type(size))
-        messages['opcode'] = Opcode.MESSAGE
-        messages['length'] = messages.itemsize - 9
+        messages['opcode'], messages['length'] = Opcode.MESSAGE, messages.itemsize - 9
         messages['channel'] = channel_id
-        messages['sequence'] = np.arange(count) + self._next_sequence[channel_id]
+        messages['sequence'] = numbers + self._next_sequence[channel_id]
         messages['log_time'] = messages['publish_time'] = log_times_ns
         messages['data'] = rows
         entries = np.empty((count, 2), np.uint64)
-        entries[:, 0] = log_times_ns
-        entries[:, 1] = np.arange(count) * messages.itemsize + self.pending
+        entries[:, 0], entries[:, 1] = log_times_ns, numbers * messages.itemsize + self.pending
         self._next_sequence[channel_id] += count
         self._parts.append(messages)
         self._entries[channel_id].append(entries)
@@ -160,48 +143,41 @@ class McapWriter:
 
     def flush(self) -> None:
         """Write the chunk in memory, if it holds anything.  After an OSError it is lost."""
-        if not self.pending:
-            return
-        plain = b''.join(part.data for part in self._parts)
-        entries = {channel_id: np.concatenate(parts)
-                   for channel_id, parts in sorted(self._entries.items())}
-        self._clear_chunk()
-        self.write_chunk(self.chunk_of(plain, entries), entries)
+        if self.pending:
+            plain = b''.join(part.data for part in self._parts)
+            entries = {number: np.concatenate(parts) for number, parts in self._entries.items()}
+            self._parts.clear()
+            self._entries.clear()
+            self.pending = 0
+            self.write_messages(plain, entries)
 
-    def _clear_chunk(self) -> None:
-        self.pending = 0                            # bytes of the chunk in memory
-        self._parts: list[NDArray[np.void]] = []
-        self._entries: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
-
-    def chunk_of(self, plain: bytes, entries: IndexEntries) -> records.Chunk:
-        """Return a chunk with these message records, compressed."""
-        data = plain
-        if self._compression == 'zstd':
-            data = self._zstd.compress(plain)
-        elif self._compression == 'lz4':
-            data = lz4.frame.compress(plain)
+    def write_messages(self, plain: bytes, entries: Entries) -> None:
+        """Write a chunk of these message records.  Raises OSError."""
+        data = (self._zstd.compress(plain) if self._compression == 'zstd'
+                else lz4.frame.compress(plain) if self._compression else plain)
         start_ns, end_ns = time_span(entries)
-        return records.Chunk(
-            compression='' if self._compression == 'none' else self._compression, data=data,
-            uncompressed_size=len(plain), uncompressed_crc=zlib.crc32(plain),
-            message_start_time=start_ns, message_end_time=end_ns)
+        self.write_chunk(records.Chunk(
+            compression=self._compression, data=data, message_start_time=start_ns,
+            message_end_time=end_ns, uncompressed_crc=zlib.crc32(plain),
+            uncompressed_size=len(plain)), entries)
 
-    def write_chunk(self, chunk: records.Chunk, entries: IndexEntries) -> None:
+    def write_chunk(self, chunk: records.Chunk, entries: Entries) -> None:
         """Write a chunk with the indexes of its messages.  Raises OSError."""
         raw = record_bytes(chunk)
-        indexes = {channel_id: _message_index(channel_id, numbers)
-                   for channel_id, numbers in entries.items()}
-        offsets = list(itertools.accumulate(
-            map(len, indexes.values()), initial=self.size + len(raw)))
-        chunk_index = record_bytes(records.ChunkIndex(
+        # mcap's class would make Python objects of all entries.
+        indexes = [INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + numbers.nbytes, channel_id,
+                                   numbers.nbytes) + numbers.tobytes()
+                   for channel_id, numbers in sorted(entries.items())]
+        offsets = list(itertools.accumulate(map(len, indexes), initial=self.size + len(raw)))
+        index = records.ChunkIndex(
             chunk_start_offset=self.size, chunk_length=len(raw),
-            message_index_offsets=dict(zip(indexes, offsets, strict=False)),
+            message_index_offsets=dict(zip(sorted(entries), offsets, strict=False)),
             message_index_length=offsets[-1] - offsets[0],
             compression=chunk.compression, compressed_size=len(chunk.data),
             uncompressed_size=chunk.uncompressed_size,
-            message_start_time=chunk.message_start_time, message_end_time=chunk.message_end_time))
-        self._write([raw, *indexes.values()])
-        self._summary_records[Opcode.CHUNK_INDEX].append(chunk_index)
+            message_start_time=chunk.message_start_time, message_end_time=chunk.message_end_time)
+        self._write([raw, *indexes])
+        self._summarize(index)
         self.chunk_count += 1
         if entries:
             self._times_ns += chunk.message_start_time, chunk.message_end_time
@@ -209,7 +185,6 @@ class McapWriter:
                 self.message_counts[channel_id] += len(numbers)
 
     def sync(self) -> None:
-        """Bring what is in the file to the disk.  Raises OSError."""
         os.fsync(self._file.fileno())
 
     def check_disk(self, min_free_bytes: int) -> None:
@@ -223,49 +198,43 @@ class McapWriter:
             raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
                           f'{min_free_bytes}')
 
-    def finish(self, *, bag: bool = True) -> None:
+    def finish(self, bag: rosbag2.Compression | None = rosbag2.NOT_COMPRESSED) -> None:
         """
         Write the chunk in memory and the summary, bring all to the disk, close the file.
 
-        bag : write rosbag2's metadata record, too
+        bag : how the messages are compressed, for a `rosbag2` record; None: there is none
         """
         try:
             self.flush()
-            if bag:
-                topics = [(channel, self._type_names.get(channel.schema_id, ''),
-                           self.message_counts[channel.id])
-                          for channel in self._channels.values()]
-                self.write(records.Metadata(BAG_METADATA, {
-                    'serialized_metadata': bag_metadata_yaml(
-                        topics, file_name=self._path.name,
-                        start_ns=min(self._times_ns, default=0),
-                        end_ns=max(self._times_ns, default=0))}))
+            span = min(self._times_ns, default=0), max(self._times_ns, default=0)
+            if bag is not None:
+                topics = [(channel, self._type_names[channel.schema_id], count) for channel, count
+                          in zip(self._channels.values(), self.message_counts.values(),
+                                 strict=True)]
+                self.write(records.Metadata(rosbag2.BAG_METADATA, {
+                    'serialized_metadata': rosbag2.bag_metadata_yaml(
+                        topics, self._path.name, *span, bag)}))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
-            self._write([self._summary()])
+            self._write([self._summary_section(*span)])
             self.sync()
             sync_directory(self._path.parent)
         finally:
             self._file.close()
 
-    def _summary(self) -> bytes:
-        groups = self._summary_records
-        groups[Opcode.STATISTICS] = [record_bytes(records.Statistics(
-            message_count=self.messages,
-            schema_count=len(groups[Opcode.SCHEMA]), channel_count=len(groups[Opcode.CHANNEL]),
-            attachment_count=len(groups[Opcode.ATTACHMENT_INDEX]),
-            metadata_count=len(groups[Opcode.METADATA_INDEX]), chunk_count=self.chunk_count,
-            message_start_time=min(self._times_ns, default=0),
-            message_end_time=max(self._times_ns, default=0),
-            channel_message_counts=self.message_counts))]
-        summary = bytearray()
-        offsets = bytearray()
-        for opcode, members in groups.items():
-            group = b''.join(members)
+    def _summary_section(self, start_ns: int, end_ns: int) -> bytes:
+        counts = {f'{name}_count': len(self._summary[kind]) for name, kind in (
+            ('schema', Opcode.SCHEMA), ('channel', Opcode.CHANNEL), ('chunk', Opcode.CHUNK_INDEX),
+            ('attachment', Opcode.ATTACHMENT_INDEX), ('metadata', Opcode.METADATA_INDEX))}
+        self._summarize(records.Statistics(
+            message_count=self.messages, message_start_time=start_ns, message_end_time=end_ns,
+            channel_message_counts=self.message_counts, **counts))
+        summary, offsets = bytearray(), bytearray()
+        for opcode, group in sorted(self._summary.items()):
             if group:
+                start = self.size + len(summary)
+                summary += b''.join(group)
                 offsets += record_bytes(records.SummaryOffset(
-                    group_opcode=opcode, group_start=self.size + len(summary),
-                    group_length=len(group)))
-                summary += group
+                    opcode, start, self.size + len(summary) - start))
         footer = record_bytes(records.Footer(self.size, self.size + len(summary), 0))
         # The summary's checksum runs on into the footer, up to the checksum itself.
         summary += offsets + footer[:-4]
@@ -290,15 +259,13 @@ class McapWriter:
         self._end = offset, crc
 
 
-def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
-                compression: str, min_free_bytes: int = 0) -> McapWriter:
+def create_file(path: Path, topics: Sequence[rosbag2.RecordedTopic], metadata: Mapping[str, str],
+                *, compression: str, min_free_bytes: int = 0) -> McapWriter:
     """
     Create a log, which must not exist, and bring its head to the disk.
 
     topics : all stand before the first chunk, so that a truncated file tells them in any case
     metadata : the `spinning_top_sim` record at the head of the file
-    compression : 'zstd', 'lz4' or 'none'
-    min_free_bytes : a recording stops if the disk has less left than this, >= 0
 
     Raises ValueError for a topic that is listed twice, RecordingError naming path or type.
     """
@@ -306,8 +273,8 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f'topic {name!r} is listed twice: once is allowed')
-    definitions = {     # text and type hash
-        name: find_definition(name) for name in dict.fromkeys(topic.type_name for topic in topics)}
+    types = list(dict.fromkeys(topic.type_name for topic in topics))
+    definitions = {name: rosbag2.find_definition(name) for name in types}
     try:
         header = records.Header(profile='ros2', library=OUR_LIBRARY + version())
         file = McapWriter(path, header=header, compression=compression)
@@ -315,13 +282,12 @@ def create_file(path: Path, topics: Sequence[RecordedTopic], metadata: Mapping[s
             file.check_disk(min_free_bytes)
             file.write(records.Metadata(METADATA_NAME, dict(metadata)))
             for number, (name, (text, _)) in enumerate(definitions.items(), start=1):
-                file.write(records.Schema(id=number, name=name, encoding='ros2msg',
-                                          data=text.encode()))
+                file.write(records.Schema(number, text.encode(), 'ros2msg', name))
             for number, topic in enumerate(topics, start=1):
                 file.write(records.Channel(
                     id=number, topic=topic.name, message_encoding='cdr',
-                    schema_id=1 + list(definitions).index(topic.type_name),
-                    metadata={'offered_qos_profiles': offered_qos_yaml(topic),
+                    schema_id=1 + types.index(topic.type_name),
+                    metadata={'offered_qos_profiles': rosbag2.offered_qos_yaml(topic),
                               'topic_type_hash': definitions[topic.type_name][1]}))
             file.sync()
             sync_directory(path.parent)
@@ -337,11 +303,12 @@ def record_bytes(record: records.McapRecord) -> bytes:
     return builder.end()
 
 
-def time_span(entries: IndexEntries) -> tuple[int, int]:
+def time_span(entries: Entries) -> tuple[int, int]:
     """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
-    times = [numbers[:, 0] for numbers in entries.values()]
-    return (min((int(column.min()) for column in times), default=0),
-            max((int(column.max()) for column in times), default=0))
+    if not entries:
+        return 0, 0
+    times = np.concatenate([numbers[:, 0] for numbers in entries.values()])
+    return int(times.min()), int(times.max())
 
 
 @lru_cache
@@ -349,12 +316,6 @@ def _message_type(size: int) -> np.dtype[np.void]:
     """Return the type of a message record with so many bytes of data."""
     return np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
                      ('log_time', '<u8'), ('publish_time', '<u8'), ('data', 'u1', (size,))])
-
-
-def _message_index(channel_id: int, entries: NDArray[np.uint64]) -> bytes:
-    """Return the record; mcap's class would make Python objects of all numbers."""
-    return INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size - 9 + entries.nbytes, channel_id,
-                           entries.nbytes) + entries.tobytes()
 
 
 def sync_directory(directory: Path) -> None:

@@ -14,7 +14,6 @@ import math
 from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from fractions import Fraction
 from operator import attrgetter
 from typing import NamedTuple
@@ -26,8 +25,6 @@ from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.pivot import NANOSECONDS
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.times import Times
 
 # The unknowns of one state: complex numbers, of which floats are some.
 Unknowns = tuple[complex, ...]
@@ -58,17 +55,15 @@ FASTEST_RATE, LONGEST_STEP = 1e100, 1e100       # [rad/s], [s]
 SMALLEST_STEP_ULPS = 16
 # A time that so many steps of the present size do not reach is refused: minutes of work.
 MOST_STEPS = 1e7
-# Steps that `states_at_seconds` takes and reads together; more would only take memory.
-STEPS_TOGETHER = 256
-# Steps that `release` leaves whatever it is asked: some 50 MB.
-MOST_KEPT = 50_000
+# Steps that are taken and read together, and those that are kept at most: some 50 MB.
+STEPS_TOGETHER, MOST_KEPT = 256, 50_000
 
 
 class IntegrationError(RuntimeError):
     """
     The integration cannot go on; the message says where, why and what to do instead.
 
-    reached_ns : last simulated time of which a `Piece` still gives states [ns]
+    reached_ns : last time of which there are states [ns]
     """
 
     def __init__(self, text: str, *, reached_ns: int = 0) -> None:
@@ -132,10 +127,8 @@ class SteppedMotion(ABC):
     A motion from its start at t = 0, by steps of equations y' = f(y).
 
     top, start : what moves, and from where
-    ns_limit : the last time that it can give at all [ns]
-    reached_ns : the last time that `states` can give without further steps [ns]
     steps, evaluations : counts
-    closed_form : the same motion; None where doubles cannot hold it
+    reached_ns : the last time that needs no further steps [ns]
 
     A subclass has the equations: f, its derivative, the error that is tolerated, and the states.
     It sets what `derivative` needs before it calls `__init__`, which calls `derivative`.
@@ -145,7 +138,6 @@ class SteppedMotion(ABC):
     """
 
     derivative: Callable[..., Unknowns]   # f of the unknowns, which it takes one by one
-    ns_limit = 2 ** 63 - 1              # steps go on for ever
 
     def __init__(self, top: Top, start: State, y: Unknowns, tolerance: float,
                  fastest_rate: float) -> None:
@@ -203,51 +195,33 @@ class SteppedMotion(ABC):
         # derivative at the unprojected end serves the next step too.
         self._kept.append(Step(t, y, derivative, end, y_new, derivative_new))
 
-    @functools.cached_property
-    def closed_form(self) -> ExactSolution | None:
-        with suppress(ValueError):
-            return ExactSolution(self.top, self.start)
-        return None
-
     @property
     def reached_ns(self) -> int:
         end = self._kept[-1].t1
         ns = math.floor(end * NANOSECONDS)
         return ns if ns / NANOSECONDS <= end else ns - 1
 
-    def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        """
-        Take steps up to a time [ns]; return False if `max_steps` were too few.
+    def forget(self, before_ns: int) -> None:
+        """Forget the steps that only states before this time [ns] need."""
+        self._forget(self._number(before_ns / NANOSECONDS))
 
-        Raises IntegrationError if the equations cannot go on.
-        """
-        taken = 0
-        while self.reached_ns < ns:
-            if taken == max_steps:
-                return False
-            self._take_step()
-            taken += 1
-        return True
-
-    def release(self, before_ns: int) -> None:
-        """Forget the steps that only states before this time [ns] need, or more to save memory."""
-        count = bisect_left(self._kept, before_ns / NANOSECONDS, hi=len(self._kept) - 1,
-                            key=attrgetter('t1'))
-        self._forget(max(count, len(self._kept) - MOST_KEPT))
+    def _number(self, t: float) -> int:
+        """Return which of the steps that are kept a time [s] lies in, or comes after."""
+        return bisect_left(self._kept, t, hi=len(self._kept) - 1, key=attrgetter('t1'))
 
     def _forget(self, count: int) -> None:
         del self._kept[:count]
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """Return the states at ascending times (n,) [ns]; see `states_at_seconds`."""
-        return self.states_at_seconds(Times.from_ns(times_ns).seconds)
+        return self.states_at_seconds(np.asarray(times_ns, np.float64) / NANOSECONDS)
 
     def states_at_seconds(self, t: Column) -> States:
         """
         Return the states at ascending times t (n,) [s].
 
-        Missing steps are taken here, STEPS_TOGETHER at a time, and forgotten once the times in
-        them are computed: `solve` reads a motion of any length in bounded memory.
+        Missing steps are taken here.  The newest MOST_KEPT are kept: a motion of any length is
+        read in bounded memory.
         Raises IntegrationError if a time lies before the steps that are kept, if the steps cannot
         go on to the last time, or if it is too many of them away.
         """
@@ -256,21 +230,31 @@ class SteppedMotion(ABC):
                                    f'that is kept begins at {self._kept[0].t0!r} s')
         parts, begin = [], 0
         while begin < len(t):
-            while self._kept[-1].t1 < t[-1] and len(self._kept) < STEPS_TOGETHER:
-                self._take_step()
-            oldest, newest = self._kept[0], self._kept[-1]
-            length = (newest.t1 - oldest.t0) / len(self._kept)
-            if t[-1] - newest.t1 > MOST_STEPS * length:
-                raise IntegrationError(f't = {t[-1]:.9g} s is more than {MOST_STEPS:.0e} steps of '
-                                       f"{length:.3g} s away: use method = 'exact'")
-            end = int(np.searchsorted(t, newest.t1, 'right'))
+            end = int(np.searchsorted(t, self._kept[-1].t1, 'right'))
             if end > begin:
                 parts.append(self._unknowns(t[begin:end]))
                 begin = end
-            if begin < len(t):
-                self._forget(len(self._kept) - 1)
+                continue
+            self._forget(max(len(self._kept) - MOST_KEPT, 0))
+            self._take_steps(float(t[-1]))
         unknowns = np.concatenate(parts, axis=1) if parts else self._unknowns(t[:0])
         return self._states_of(t.copy(), unknowns)
+
+    def _take_steps(self, until: float) -> None:
+        """Take STEPS_TOGETHER steps towards a time [s], or those that are missing."""
+        try:
+            begin, taken = self._kept[-1].t1, 0
+            while taken < STEPS_TOGETHER and self._kept[-1].t1 < until:
+                self._take_step()
+                taken += 1
+            newest = self._kept[-1].t1
+            if until - newest > MOST_STEPS * (newest - begin) / taken:
+                raise IntegrationError(f't = {until:.9g} s is more than {MOST_STEPS:.0e} steps of '
+                                       f"{(newest - begin) / taken:.3g} s away: use method = "
+                                       "'exact'")
+        except IntegrationError as error:
+            error.reached_ns = self.reached_ns
+            raise
 
     def _unknowns(self, t: Column) -> UnknownRows:
         """Return the unknowns (k, n) at times [s] within the steps that are kept."""
@@ -278,8 +262,7 @@ class SteppedMotion(ABC):
 
     def _interpolated(self, t: Column) -> tuple[NDArray[np.int64], UnknownRows]:
         """Return in which of the steps that are kept times [s] lie, and the unknowns there."""
-        steps = np.array([step.t1 for step in self._kept]).searchsorted(t)
-        first, last = (int(steps[0]), int(steps[-1])) if len(t) else (0, 0)
+        first, last = (self._number(t[0]), self._number(t[-1])) if len(t) else (0, 0)
         begin, y0, first0, end, y1, first1 = map(
             components, zip(*self._kept[first:last + 1], strict=True))
         h = end - begin
@@ -292,7 +275,7 @@ class SteppedMotion(ABC):
             10.0 * rise - 6.0 * p - 4.0 * q - 3.0 * u + v,
             -15.0 * rise + 8.0 * p + 7.0 * q + 3.0 * u - 2.0 * v,
             6.0 * rise - 3.0 * p - 3.0 * q - u + v))
-        numbers = steps - first
+        numbers = end.searchsorted(t)
         s = (t - begin[numbers]) / np.where(h > 0.0, h, 1.0)[numbers]
         c0, c1, c2, c3, c4, c5 = coefficients.take(numbers, axis=2)
-        return steps, ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
+        return first + numbers, ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0

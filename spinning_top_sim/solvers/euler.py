@@ -17,6 +17,8 @@ from spinning_top_sim.solvers.dormand_prince import (
     Unknowns,
 )
 
+# lambda3/lambda1 at which the rounding of psi' + phi' cos(theta) costs eq. (29) a millionth.
+LARGEST_RATIO = 1e-6 * 2.0 ** 53
 # |sin(theta)| at which the rounding of cos(theta), 1.1e-16, costs phi' a millionth of L3/lambda1.
 SMALLEST_SINE = math.sqrt(2.0 ** -53 / 1e-6)
 ADVICE = "use the regular equations (equations = 'transport') or method = 'exact'"
@@ -29,10 +31,14 @@ class EulerMotion(SteppedMotion):
     They are singular where the axis is vertical, and near there wrong without a sign of it:
     cos(theta) rounds towards 1, Lz - L3 cos(theta) loses its digits, or a step leaps over the
     pole, and phi and psi drift off while every error estimate is small.  So these equations stop
-    with an error there.
+    with an error there, and do not begin with a disc whose lambda3/lambda1 loses digits.
     """
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+        if top.lambda3 > LARGEST_RATIO * top.lambda1:
+            raise ValueError(
+                f'lambda3 = {top.lambda3!r} kg m^2: must be at most {LARGEST_RATIO:.2g} lambda1 '
+                f"for the euler equations: eq. (29) loses psi' + phi' cos(theta); {ADVICE}")
         self.top, self._l3, self._lz = top, start.l3, start.lz
         self._rtol, self._atol = rtol, atol
         super().__init__(

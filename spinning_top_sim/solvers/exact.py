@@ -2,104 +2,40 @@
 """
 The exact motion of the heavy symmetric top, at the same cost and accuracy for every time.
 
-`theta_setup` finds the theta functions of a motion once, `theta_values` evaluates them in doubles.
+`constants` finds the theta functions of a motion once, `evaluate` evaluates them in doubles.
 """
 
 from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Self
 
 import numpy as np
-from gmpy2 import const_pi, mpfr
+from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sinh, sqrt
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Column, Number, Quaternion
-from spinning_top_sim.physics.regimes import Description, axis_rests, precession_extremes, regime
+from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.pivot import NANOSECONDS, Fractions
+from spinning_top_sim.physics.regimes import (
+    Description,
+    axis_rests,
+    precession_extremes,
+    precession_momentum,
+    regime,
+)
 from spinning_top_sim.physics.states import TIMES_TOGETHER, States
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.multiprecision import as_mpfr, precision
-from spinning_top_sim.solvers.theta_setup import ThetaMotion, set_up
-from spinning_top_sim.solvers.theta_values import (
-    LARGEST_NUMBER,
-    ConstantArrays,
-    MotionConstants,
-    ThetaValues,
-    in_range,
-)
-from spinning_top_sim.solvers.times import LARGEST_NS, Times
+from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set_up
+from spinning_top_sim.solvers.evaluate import ThetaArrays, ThetaValues, Times
+from spinning_top_sim.solvers.multiprecision import SIN_ODD, as_mpfr, phase, precision
+from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
 
 
-class ClosedForm:
-    """
-    A motion in theta functions, from its start at t = 0.
-
-    top, start : what moves, and from where
-    time_limit, ns_limit : the farthest time either way [s], [ns]
-    bottom_rate, top_rate : (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
-    constants : of the motion, in doubles
-
-    Raises ValueError if doubles cannot hold the constants.
-    """
-
-    steps = evaluations = 0
-    reached_ns = LARGEST_NS
-    start: State
-
-    def __init__(self, top: Top, motion: ThetaMotion, l3: mpfr, lz: mpfr) -> None:
-        self.top = top
-        with precision():
-            alpha, beta, two_lambda1 = motion.alpha, motion.beta, 2 * as_mpfr(top.lambda1)
-            bottom_rate, top_rate = (lz + l3) / two_lambda1, (lz - l3) / two_lambda1
-            in_range('the fastest rate', max(map(abs, (
-                motion.quarter_rate, alpha.rate, beta.rate, bottom_rate, top_rate,
-                l3 / as_mpfr(top.lambda3)))))
-            self.bottom_rate, self.top_rate = float(bottom_rate), float(top_rate)
-            self.constants = MotionConstants(motion)
-            fastest = max(abs(motion.quarter_rate), abs(alpha.rate) / (2 * const_pi()),
-                          abs(beta.rate) / (2 * const_pi()), 1e-300)
-            limit = min(MOST_TURNS / fastest, LARGEST_NUMBER)
-            self.time_limit, self.ns_limit = float(limit), min(int(limit * 10 ** 9), LARGEST_NS)
-
-    @cached_property
-    def arrays(self) -> ConstantArrays:
-        return ConstantArrays([self.constants])
-
-    @property
-    def closed_form(self) -> Self:
-        return self
-
-    def reach(self, ns: int, max_steps: int | None = None) -> bool:
-        return True                     # there are no steps to take
-
-    def release(self, before_ns: int) -> None:
-        pass                            # nor to forget
-
-    def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """Return the states at integer nanoseconds (n,), in any order and of any sign."""
-        return self._states(Times.from_ns(times_ns), self.ns_limit, 'ns')
-
-    def states_at_seconds(self, t: Column) -> States:
-        """Return the states at t (n,) [s], in any order and of any sign."""
-        return self._states(Times.from_seconds(t), self.time_limit, 's')
-
-    def _states(self, times: Times, limit: float, unit: str) -> States:
-        if not times.latest <= float(limit):    # rounded as the times are; catches NaN too
-            raise ValueError(
-                f't = {times.latest!r} {unit}: must be finite and within {limit:.6g} {unit}, '
-                'where a phase of this motion reaches 2^52 turns or int64 ends')
-        return self._states_at(times)
-
-    def _states_at(self, times: Times) -> States:
-        raise NotImplementedError
-
-
-class ExactSolution(ClosedForm):
+class ExactSolution:
     """
     The motion of `top` that is in the state `start` at t = 0, in closed form.
 
@@ -124,8 +60,8 @@ class ExactSolution(ClosedForm):
         Bounds of theta folded into [0, pi] [rad].
     m, m1 : float
         Parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix.
-    time_limit, ns_limit : float, int
-        The farthest time either way [s], [ns].
+    time_limit : float
+        The farthest time either way [s]: there a phase has made 2^52 turns.
 
     Raises
     ------
@@ -133,19 +69,26 @@ class ExactSolution(ClosedForm):
         For motions whose constants doubles cannot hold, and from every evaluation for bad times.
     """
 
-    def __init__(self, top: Top, start: State) -> None:
-        self.turns = round(start.theta / math.tau)
-        theta = start.theta - self.turns * math.tau
-        # A state continued through a pole is solved from the same attitude with theta in [0, pi].
-        self.sign, half_turn = (-1.0, math.pi) if theta < 0.0 else (1.0, 0.0)
-        self.start = State(
-            theta=min(abs(theta), math.pi), theta_dot=self.sign * start.theta_dot,
-            phi=start.phi + half_turn, psi=start.psi - half_turn,
-            l3=start.l3, lz=start.lz)
-        phi, psi = self.start.phi, self.start.psi
+    steps = evaluations = 0
+
+    def __init__(self, top: Top, start: State | PreciseState,
+                 gravity: mpfr | None = None) -> None:
+        # A motion about another vertical has its start and its `gravity` in multiprecision.
+        self.top, self.turns, self.sign, half_turn = top, 0, 1.0, 0.0
+        if isinstance(start, PreciseState):
+            self.start, self._precise_start = start.rounded(), start
+        else:
+            # A state continued through a pole is solved from the same attitude in [0, pi].
+            self.turns = round(start.theta / math.tau)
+            theta = start.theta - self.turns * math.tau
+            if theta < 0.0:
+                self.sign, half_turn = -1.0, math.pi
+            self.start = start = State(
+                theta=min(abs(theta), math.pi), theta_dot=self.sign * start.theta_dot,
+                phi=start.phi + half_turn, psi=start.psi - half_turn, l3=start.l3, lz=start.lz)
         with precision():
-            motion = set_up(top, as_mpfr(top.gravity), self.start)
-            super().__init__(top, motion, as_mpfr(start.l3), as_mpfr(start.lz))
+            self._motion = motion = set_up(
+                top, as_mpfr(top.gravity) if gravity is None else gravity, start)
             alpha, beta, self.m, self.m1 = (
                 motion.alpha, motion.beta, float(motion.m), float(motion.m1))
             # 2 K/w, two quarter periods
@@ -154,30 +97,39 @@ class ExactSolution(ClosedForm):
             self.mean_spin_rate = float(alpha.rate - beta.rate)
             # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
             self.phi_phase = float(
-                phi - alpha.start_argument - beta.start_argument) - half_turn
+                self.start.phi - alpha.start_argument - beta.start_argument) - half_turn
             self.psi_phase = float(
-                psi - alpha.start_argument + beta.start_argument) + half_turn
+                self.start.psi - alpha.start_argument + beta.start_argument) + half_turn
+            self.time_limit = MOST_TURNS / float(max(
+                abs(motion.quarter_rate), abs(alpha.rate) / (2 * const_pi()),
+                abs(beta.rate) / (2 * const_pi()), 1e-290))
+            self.arrays = ThetaArrays(motion)
         self._check_start()
 
     def _check_start(self) -> None:
-        """Refuse constants so far apart that doubles lose the start among them."""
+        """Refuse constants so large, or so far apart, that doubles lose the start among them."""
         start, first = self.start, self.at_start
-        alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
+        (alpha, beta), theta_dot, across = (np.ravel(x).tolist() for x in (
+            first.moduli, first.theta_dot, first.across))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
-        across = axis_rate(self.bottom_rate, self.top_rate, cosine, sine)
         for name, error, size in (
                 ('theta', beta * cosine - alpha * sine, alpha * sine),
-                ('theta_dot', theta_dot - start.theta_dot,
-                 min(math.hypot(start.theta_dot, across), max(1.0, abs(start.theta_dot))))):
+                ('theta_dot', theta_dot[0] - start.theta_dot,
+                 min(math.hypot(start.theta_dot, across[0]), max(1.0, abs(start.theta_dot))))):
             if not abs(error) <= 1e-14 * abs(size):
                 raise ValueError(f'{name} = {getattr(start, name)!r} cannot be held in doubles: '
                                  f'the constants of {self.top} and {start} are too far apart in '
                                  'size')
 
     @cached_property
+    def _precise_start(self) -> PreciseState:
+        return precise(self.start)
+
+    @cached_property
     def at_start(self) -> ThetaValues:
-        return ThetaValues(self.arrays, Times.from_ns(range(1)))
+        with np.errstate(all='ignore'):
+            return ThetaValues(self.arrays, Times.from_ns(range(1)))
 
     @property
     def theta_min(self) -> float:
@@ -201,34 +153,91 @@ class ExactSolution(ClosedForm):
             separatrix_distance=self.m1,
             gyroscopic_ratio=start.l3 * start.l3 / weight if weight else math.inf)
 
+    def states(self, times_ns: NDArray[np.int64] | range) -> States:
+        """Return the states at integer nanoseconds (n,), in any order and of any sign."""
+        return self._states_at(Times.from_ns(times_ns))
+
+    def states_at_seconds(self, t: Column) -> States:
+        """Return the states at t (n,) [s], in any order and of any sign."""
+        return self._states_at(Times(1, t.copy()))
+
     def _states_at(self, times: Times) -> States:
+        latest = float(np.abs(times.high).max(initial=0.0)) / times.per_second
+        if not latest <= self.time_limit:       # catches NaN too
+            raise ValueError(
+                f't = {latest!r} s: must be finite and within {self.time_limit:.6g} s, where a '
+                'phase of this motion reaches 2^52 turns')
         return _ExactStates(self, times)
 
+    def posture(self, t_ns: int, vertical: Vertical | None = None) -> Posture:
+        """
+        Return attitude and angular velocity at a time [ns], in multiprecision.
 
-def axis_rate(bottom_rate: float, top_rate: float, cosine: Number, sine: Number) -> Number:
-    """
-    Return phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) in half angles [rad/s].
+        They are right to 38 digits, times what the motion makes of such an error.
 
-    Nothing cancels, and at a pole that can be reached the singular term is absent.
+        vertical : that of the motion, if it is not the world's
+        """
+        with precision():
+            start = self._precise_start
+            found = start.posture(self.top)
+            if t_ns:                # perhaps at a pole, where the axis does not tell its rates
+                alpha, beta, u_dot = _at(self._motion, mpfr(t_ns) / NANOSECONDS)
+                # omega_1 + i omega_2 = -((Lz - L3 u)/lambda1 + i u')/(2 alpha conj(beta)); where
+                # the axis rests at a pole it is 0.
+                product, transverse = 2 * alpha * beta.conjugate(), mpc(0)
+                if abs(product):        # a zero mpc is true
+                    momentum = precession_momentum(start.l3, start.lz, abs(beta) ** 2,
+                                                   abs(alpha) ** 2)
+                    transverse = -(momentum / as_mpfr(self.top.lambda1) + 1j * u_dot) / product
+                found = Posture(alpha, beta, transverse, found.l3)
+            if self.turns % 2:
+                found = found._replace(alpha=-found.alpha, beta=-found.beta)
+            return vertical.to_world(found) if vertical else found
 
-    bottom_rate, top_rate : of `ClosedForm`
-    """
-    rate = 0.0 * cosine
-    if bottom_rate:
-        rate = rate + bottom_rate * (sine / cosine)
-    if top_rate:
-        rate = rate + top_rate * (cosine / sine)
-    return rate
+
+def exact_about(top: Top, start: State | Posture,
+                acceleration: Fractions) -> tuple[ExactSolution, Vertical]:
+    """Return the motion while the pivot accelerates so [m/s^2], and the vertical it is about."""
+    with precision():
+        posture = start if isinstance(start, Posture) else precise(start).posture(top)
+        vertical = Vertical.of(top, posture, acceleration, mpfr)
+        state = vertical.state_of(vertical.to_frame(posture), mpfr)
+    return ExactSolution(vertical.top, state, vertical.gravity), vertical
 
 
-class ThetaStates(States):
-    """States by the theta functions of a motion."""
+def _at(motion: ThetaMotion, t: mpfr) -> tuple[mpc, mpc, mpfr]:
+    """Return alpha, beta and cos(theta)' of a motion at t [s], in multiprecision."""
+    quarters = motion.start_whole + motion.start_offset + motion.quarter_rate * t
+    whole = int(rint(quarters))
+    y = const_pi() / 2 * ((motion.start_whole - whole) + motion.quarter_rate * t
+                          + motion.start_offset)
+    sine = sinh(motion.stretch * y) if motion.stretch else sin_cos(y)[0]
+    xi = -sine * sine if motion.stretch else sine * sine
+    point = sine, sqrt(1 - xi), xi
+
+    def value(factor: Factor) -> mpc:
+        """Return alpha D or beta D."""
+        real, imag = (factor.scales[whole % 2] * part.at(*point)
+                      for part in factor.parts[whole % 2])
+        if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
+            real = -real                # it passes a pole
+        turn = factor.rate * t + 2 * const_pi() * factor.phase_turns + factor.drift * y
+        return (real + 1j * imag) * phase(turn)
+
+    alpha, beta = value(motion.alpha), value(motion.beta)
+    size = sqrt(abs(alpha) ** 2 + abs(beta) ** 2)
+    slope = motion.u_dot_series.at(2 * sine * point[1], 1 - 2 * xi, 4 * xi * (1 - xi))
+    return alpha / size, beta / size, motion.u_dot[whole % 2] * slope / size ** 4
+
+
+class _ExactStates(States):
+    """The states of an exact solution, on the branch of its start."""
 
     method = 'exact'
 
-    def __init__(self, top: Top, start: State, arrays: ConstantArrays, times: Times) -> None:
-        super().__init__(top, start, len(times))
-        self._arrays, self._times = arrays, times
+    def __init__(self, solution: ExactSolution, times: Times) -> None:
+        super().__init__(solution.top, solution.start, len(times.high))
+        self._solution, self._times = solution, times
 
     @cached_property
     def t(self) -> Column:
@@ -236,57 +245,21 @@ class ThetaStates(States):
 
     @cached_property
     def _block(self) -> ThetaValues:
-        return ThetaValues(self._arrays, self._times)
+        if len(self) == 1 and not self._times.high[0]:
+            return self._solution.at_start
+        return ThetaValues(self._solution.arrays, self._times)
 
     def _rows(self, name: str) -> NDArray[np.float64]:
         """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
         blocks = (self._block,) if len(self) <= TIMES_TOGETHER else (
-            ThetaValues(self._arrays, self._times[first:first + TIMES_TOGETHER])
-            for first in range(0, len(self), TIMES_TOGETHER))
+            ThetaValues(self._solution.arrays, self._times.part(slice(k, k + TIMES_TOGETHER)))
+            for k in range(0, len(self), TIMES_TOGETHER))
         rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
         return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
         x, y, z, w = self._rows('quaternion')
-        return x, y, z, w
-
-    @cached_property
-    def half_angle_squares(self) -> tuple[Column, Column]:
-        cosine, sine = self._rows('half_theta')
-        return cosine * cosine, sine * sine
-
-    @cached_property
-    def _axis_rates(self) -> NDArray[np.float64]:
-        """Theta' of the motion with theta in [0, pi] at the start, cos(psi) and sin(psi)."""
-        return self._rows('rates')
-
-    def _across(self) -> Column:
-        """Return phi' sin(theta) [rad/s]."""
-        raise NotImplementedError
-
-    @cached_property
-    def transverse_velocity(self) -> tuple[Column, Column]:
-        theta_dot, cos_psi, sin_psi = self._axis_rates
-        return attitude.transverse(theta_dot, self._across(), cos_psi, sin_psi)
-
-
-class _ExactStates(ThetaStates):
-    """The states of an exact solution, on the branch of its start."""
-
-    def __init__(self, solution: ExactSolution, times: Times) -> None:
-        super().__init__(solution.top, solution.start, solution.arrays, times)
-        self._solution = solution
-
-    @cached_property
-    def _block(self) -> ThetaValues:
-        if len(self) == 1 and not self._times.latest:
-            return self._solution.at_start
-        return ThetaValues(self._arrays, self._times)
-
-    @cached_property
-    def rows_quaternion(self) -> Quaternion:
-        x, y, z, w = super().rows_quaternion
         return (-x, -y, -z, -w) if self._solution.turns % 2 else (x, y, z, w)
 
     @cached_property
@@ -298,12 +271,14 @@ class _ExactStates(ThetaStates):
                 spin + (psi + solution.psi_phase))
 
     @cached_property
+    def _rates(self) -> NDArray[np.float64]:
+        return self._rows('rates')
+
+    @cached_property
     def theta_dot(self) -> Column:
-        theta_dot: Column = self._solution.sign * self._axis_rates[0]
+        theta_dot: Column = self._solution.sign * self._rates[0]
         return theta_dot
 
-    def _across(self) -> Column:
-        # `AcceleratedStates` chooses between two formulas.  Here there is only the first, until a
-        # MINOR version: a choice would change the last bits of earlier logs.
-        cosine, sine = self._rows('half_theta')
-        return axis_rate(self._solution.bottom_rate, self._solution.top_rate, cosine, sine)
+    @cached_property
+    def transverse_velocity(self) -> tuple[Column, Column]:
+        return attitude.transverse(*self._rates)

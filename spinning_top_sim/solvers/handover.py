@@ -4,27 +4,32 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
+from copy import copy
 from functools import cached_property
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import integrals, pivot
-from spinning_top_sim.physics.pivot import NANOSECONDS, REST
+from spinning_top_sim.physics.pivot import REST
 from spinning_top_sim.physics.regimes import Description
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.states import States, WorldStates
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.physics.world_states import WorldStates
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.exact import ClosedForm, ExactSolution
-from spinning_top_sim.solvers.propagator import Motion, propagate, propagate_accelerated
-from spinning_top_sim.solvers.vertical import AcceleratedMotion, Posture, posture_at, posture_of
+from spinning_top_sim.solvers.dormand_prince import IntegrationError, SteppedMotion
+from spinning_top_sim.solvers.solve import motion_of
+from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical, posture_at
 
-# The last stamp of ROS is 2^31 s; a double holds the phases of a motion up to 2^52 half turns.
+if TYPE_CHECKING:
+    from spinning_top_sim.solvers.exact import ExactSolution
+
+# Stamps of ROS end at 2^31 s; doubles hold the phases of a motion up to 2^52 half turns.
 FASTEST_RATE = math.pi * 2.0 ** 52 / 2.0 ** 31          # [rad/s]
 
 Times = NDArray[np.int64] | range
+# A motion, and the vertical that it is about, if that is not the world's.
+Solution = tuple['ExactSolution | SteppedMotion', Vertical | None]
 
 
 class Piece:
@@ -43,7 +48,7 @@ class Piece:
     start_ns : int
         When the piece begins [ns].
     ride : pivot.Piece
-        What the pivot does; REST where it rests at the origin.
+        What the pivot does; REST where it has always rested at the origin.
     method, equations, rtol, atol
         As of `solve`.
 
@@ -66,20 +71,10 @@ class Piece:
                  *, method: str = 'rk45', equations: str = 'transport', rtol: float = 1e-11,
                  atol: float = 1e-12) -> None:
         self.top, self.start_ns, self.ride, self._start = top, start_ns, ride, start
-        self._rests = ride is REST and isinstance(start, State)
-        settings: dict[str, Any] = {'method': method, 'equations': equations, 'rtol': rtol,
-                                    'atol': atol}
-        whence = start if isinstance(start, State) else f't = {start_ns / NANOSECONDS!r} s on'
         try:
             with np.errstate(over='ignore', invalid='ignore'):
-                if self._rests:
-                    assert isinstance(start, State)
-                    self._motion: Motion = propagate(top, start, **settings)
-                    self._rotation = None
-                else:
-                    self._motion, vertical = propagate_accelerated(
-                        top, start, ride.acceleration, **settings)
-                    self._rotation = vertical.rotation
+                self._solution = self._begun(method, equations=equations, rtol=rtol, atol=atol)
+                self._motion, self._vertical = self._solution
                 self.l3, self.lz = self._motion.start.l3, self._motion.start.lz
                 self.energy = float(self._motion.states(range(1)).energy[0])
                 self.fastest_rate = integrals.fastest_rate(
@@ -88,7 +83,24 @@ class Piece:
                 raise ValueError(f'it turns at up to {self.fastest_rate:.3g} rad/s: must be at '
                                  f'most {FASTEST_RATE:.2g}')
         except (ArithmeticError, IntegrationError, ValueError) as error:
+            whence = start if isinstance(start, State) else f't = {start_ns * 1e-9!r} s on'
             raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
+
+    def _begun(self, method: str, **settings: Any) -> Solution:
+        top, start = self.top, self._start
+        if self.ride is REST and isinstance(start, State):
+            return motion_of(top, start, method=method, **settings), None
+        if method == 'exact':
+            from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
+
+            return exact_about(top, start, self.ride.acceleration)
+        posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
+                   else start.in_doubles())
+        vertical = Vertical.of(top, posture, self.ride.acceleration, float)
+        posture = vertical.to_frame(posture)
+        state = vertical.state_of(posture, float).rounded()
+        return motion_of(vertical.top, state, method=method, posture=posture,
+                         **settings), vertical
 
     @property
     def start(self) -> State:
@@ -98,17 +110,16 @@ class Piece:
     @property
     def rests(self) -> bool:
         """Whether the pivot has always rested."""
-        return self._rotation is None
-
-    def describe(self) -> Description | None:
-        """Return the motion in numbers; None if it has no closed form or the pivot moves."""
-        return (self._exact.describe() if self.rests and isinstance(self._exact, ExactSolution)
-                else None)
+        return self._vertical is None
 
     @property
     def is_exact(self) -> bool:
         """Whether the states are those of `truth`."""
-        return self._motion.closed_form is self._motion
+        return not isinstance(self._motion, SteppedMotion)
+
+    def describe(self) -> Description | None:
+        """Return the motion in numbers; None if it has no closed form or the pivot moves."""
+        return self._exact[0].describe() if self.rests and self._exact else None
 
     @property
     def steps(self) -> int:
@@ -122,59 +133,53 @@ class Piece:
         """
         Return the states in the world, the pivot included, at ascending times from the start on.
 
-        The steps that are missing are taken here, and kept until `forget`.
+        The steps that are missing are taken here, and the newest are kept until `forget`.
 
         Raises
         ------
         IntegrationError
             Where the equations cannot go on; its `reached_ns` says up to when they do [ns].
         """
-        since_ns = self._since_start(t_ns)
-        if len(since_ns):
-            try:
-                self._motion.reach(int(since_ns[-1]))
-            except IntegrationError as error:
-                error.reached_ns = self.start_ns + self._motion.reached_ns
-                raise
-        return self._in_world(self._motion.states(since_ns), t_ns)
+        try:
+            return self._in_world(self._solution, t_ns)
+        except IntegrationError as error:
+            error.reached_ns += self.start_ns
+            raise
 
     def truth(self, t_ns: Times) -> States | None:
         """Return the exact states of the same piece; None where doubles cannot hold them."""
-        if self._exact is None:
-            return None
-        return self._in_world(self._exact.states(self._since_start(t_ns)), t_ns)
+        return None if self._exact is None else self._in_world(self._exact, t_ns)
 
     @cached_property
-    def _exact(self) -> ClosedForm | None:
-        return self._motion.closed_form
+    def _exact(self) -> Solution | None:
+        if not isinstance(self._motion, SteppedMotion):
+            return self._solution
+        with suppress(ImportError, ValueError):
+            return self._begun('exact')
+        return None
 
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time, for what follows."""
-        if isinstance(self._motion, AcceleratedMotion):
-            return self._motion.posture(t_ns - self.start_ns)
-        if t_ns == self.start_ns and isinstance(self._start, State):
-            return posture_of(self.top, self._start)
-        if isinstance(self._motion, ExactSolution) and isinstance(self._start, State):
-            return AcceleratedMotion(self.top, posture_of(self.top, self._start),
-                                     REST.acceleration).posture(t_ns - self.start_ns)
-        return posture_at(self.states(range(t_ns, t_ns + 1)))
+        if isinstance(self._motion, SteppedMotion):
+            return posture_at(self.states(range(t_ns, t_ns + 1)))
+        return self._motion.posture(t_ns - self.start_ns, self._vertical)
 
     def forget(self, before_ns: int) -> None:
         """Forget the steps that only earlier times need."""
-        self._motion.release(before_ns - self.start_ns)
+        if isinstance(self._motion, SteppedMotion):
+            self._motion.forget(before_ns - self.start_ns)
 
     def with_ride(self, ride: pivot.Piece) -> Self:
         """Return this motion where the pivot has the same acceleration till another end."""
-        changed = object.__new__(type(self))
-        changed.__dict__.update(self.__dict__, ride=ride)
+        changed = copy(self)
+        changed.ride = ride
         return changed
 
-    def _since_start(self, t_ns: Times) -> Times:
-        if isinstance(t_ns, np.ndarray):
-            return t_ns - self.start_ns
-        return range(t_ns.start - self.start_ns, t_ns.stop - self.start_ns, t_ns.step)
-
-    def _in_world(self, states: States, t_ns: Times) -> States:
-        if self._rotation is None:
+    def _in_world(self, solution: Solution, t_ns: Times) -> States:
+        motion, vertical = solution
+        states = motion.states(
+            t_ns - self.start_ns if isinstance(t_ns, np.ndarray) else range(
+                t_ns.start - self.start_ns, t_ns.stop - self.start_ns, t_ns.step))
+        if vertical is None:
             return states
-        return WorldStates(self.top, states, self._rotation, self.ride, np.asarray(t_ns))
+        return WorldStates(self.top, states, vertical.rotation, self.ride, np.asarray(t_ns))

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The regular equations of motion, stepped by rk45, and their states."""
 
-import cmath
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -19,6 +18,7 @@ from spinning_top_sim.solvers.dormand_prince import (
     Unknowns,
     components,
 )
+from spinning_top_sim.solvers.vertical import Posture, PreciseState
 
 # The energy corrects the nutation rate only where its square is at least this share of the
 # largest |m|^2: at a turning point the energy does not tell the rate.
@@ -72,7 +72,8 @@ class TransportMotion(SteppedMotion):
     momenta : Lz + L3, Lz - L3 and 0: their signs are the senses in which the phases turn
     """
 
-    def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:
+    def __init__(self, top: Top, start: State, rtol: float, atol: float,
+                 posture: Posture | None = None) -> None:
         lambda1, l3, lz, torque = top.lambda1, start.l3, start.lz, top.gravity_torque
         self.top, self._l3, self._lz = top, l3, lz
         carried = 0.5 * l3                                              # c
@@ -82,7 +83,7 @@ class TransportMotion(SteppedMotion):
         self._turn_beta = 0.5j * (lz + carried) / lambda1
         self._fall = complex(-torque / lambda1)
         # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
-        alpha, beta, m = self._vector(start)
+        alpha, beta, m = _vector(top, posture or PreciseState.of(start).posture(top))
         self._energy = 2.0 * lambda1 * abs(m) ** 2 + torque * (abs(alpha) ** 2 - abs(beta) ** 2)
         # |m| never exceeds this: the scale of its error, as 1 is that of alpha and beta.  Close to
         # hanging the sum is what its rounding leaves.
@@ -90,7 +91,8 @@ class TransportMotion(SteppedMotion):
         self._scale = math.sqrt(0.5 * above_lowest / lambda1) or 1.0
         self._tolerance = rtol + atol
         self._large_enough = NUTATION_SHARE * self._scale ** 2
-        self.momenta = lz + l3, lz - l3, 0.0
+        # A posture that is handed over does not tell whether it passes a pole exactly.
+        self.momenta = (1.0, 1.0, 0.0) if posture else (lz + l3, lz - l3, 0.0)
         half = 0.5 * start.theta
         # Of the moduli, where theta is continued out of [0, pi].
         self._signs = math.copysign(1.0, math.cos(half)), math.copysign(1.0, math.sin(half))
@@ -101,20 +103,6 @@ class TransportMotion(SteppedMotion):
         super().__init__(
             top, start, self.accepted((), (alpha, beta, m)), self._tolerance,
             self._scale + (abs(l3) + abs(lz)) / lambda1 + math.sqrt(abs(torque) / lambda1))
-
-    def _vector(self, start: State) -> Unknowns:
-        """Return alpha, beta and m of a state; L_x + i L_y by eq. (6), turned by exp(i phi)."""
-        lambda1 = self.top.lambda1
-        cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
-        phi_dot = attitude.precession_rate(self.top, self._l3, self._lz, cosine * cosine,
-                                           sine * sine)
-        momentum = cmath.rect(1.0, start.phi) * complex(
-            2.0 * sine * cosine * (self._l3 - lambda1 * phi_dot
-                                   * (cosine * cosine - sine * sine)),
-            lambda1 * start.theta_dot)
-        return (cosine * cmath.rect(1.0, 0.5 * start.phi + 0.5 * start.psi),
-                sine * cmath.rect(1.0, 0.5 * start.phi - 0.5 * start.psi),
-                0.5j * momentum / lambda1)
 
     def derivative(self, alpha: complex, beta: complex, m: complex) -> Unknowns:
         return (self._turn_alpha * alpha + m * beta.conjugate(),
@@ -227,6 +215,15 @@ class TransportMotion(SteppedMotion):
         return _TransportStates(self, t, unknowns)
 
 
+def _vector(top: Top, posture: Posture) -> Unknowns:
+    """Return alpha, beta and m of a posture."""
+    alpha, beta, transverse, l3 = posture
+    # Of L in the body: lambda1 (omega_1 + i omega_2), L3.  e3 is (2 alpha beta, ...).
+    momentum = (alpha * alpha * transverse - beta * beta * transverse.conjugate()
+                + 2.0 * alpha * beta * (l3 / top.lambda1))
+    return alpha, beta, 0.5j * momentum
+
+
 def half_axis(a: Any, a_imag: Any, b: Any, b_imag: Any) -> tuple[Any, Any]:
     """Return alpha beta = (e3_x + i e3_y)/2, of length sin(theta)/2."""
     return a * b - a_imag * b_imag, a * b_imag + a_imag * b
@@ -261,31 +258,11 @@ class _TransportStates(States):
     @cached_property
     def _projected(self) -> Components:
         """The unknowns on the invariants, in the body's own frame."""
-        motion, y, pole_share = self._motion, self._stepped, POLE_SHARE
-        if not all(motion.momenta[:2]):     # the meridian of the axis is known
-            y, pole_share = self._on_lines(y, motion.uniform_rates[0] * self.t), 0.0
-        a, b, c, d, m_real, m_imag = motion.project(y, pole_share)
-        spin = 0.5 * motion.spin_rate * self.t
+        a, b, c, d, m_real, m_imag = self._motion.project(self._stepped, POLE_SHARE)
+        spin = 0.5 * self._motion.spin_rate * self.t
         cosine, sine = np.cos(spin), np.sin(spin)
         return (a * cosine - b * sine, b * cosine + a * sine,
                 c * cosine + d * sine, d * cosine - c * sine, m_real, m_imag)
-
-    def _on_lines(self, y: Components, uniform: Column) -> Components:
-        """Return y with alpha or beta moved onto the line through zero, and m turned with them."""
-        moved = list(y[:4])
-        moduli, phases = self._motion.polar(y, uniform)
-        for k, part in enumerate((uniform, -uniform)):
-            if not self._motion.momenta[k]:
-                moved[2 * k] = moduli[k] * np.cos(phases[k] + part)
-                moved[2 * k + 1] = moduli[k] * np.sin(phases[k] + part)
-        x, z = half_axis(*y[:4])
-        u, v = half_axis(*moved)
-        # Next to the pole m is known better than the axis.
-        away = x * x + z * z > POLE_SHARE
-        scale = np.where(away, np.hypot(x, z) * np.hypot(u, v), 1.0)
-        cosine = np.where(away, (x * u + z * v) / scale, 1.0)
-        sine = np.where(away, (x * v - z * u) / scale, 0.0)
-        return *moved, y[4] * cosine - y[5] * sine, y[4] * sine + y[5] * cosine
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
@@ -318,11 +295,12 @@ class _TransportStates(States):
 
     @cached_property
     def transverse_velocity(self) -> tuple[Column, Column]:
-        first, second, _ = attitude.rotated_back(self.rows_quaternion, (*self._momentum, self._lz))
+        momentum = *self._momentum, self.start.lz
+        first, second, _ = attitude.rotated_back(self.rows_quaternion, momentum)
         return first / self.top.lambda1, second / self.top.lambda1
 
     @cached_property
     def l3(self) -> Column:
         x, y, z = self.rows_axis
         lx, ly = self._momentum
-        return lx * x + ly * y + self._lz * z
+        return lx * x + ly * y + self.start.lz * z

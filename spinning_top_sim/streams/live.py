@@ -54,6 +54,7 @@ class Output:
     skipped: int = 0
     failed: int = 0
     # What waits to be sent: times [ns], messages as rows and as bytes, and how many are sent.
+    _t_ns: Stamps = field(default_factory=lambda: np.empty(0, np.int64))
     _times: list[int] = field(default_factory=list)
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
     _data: bytes = b''
@@ -71,24 +72,25 @@ class Output:
     def add(self, t_ns: Stamps, rows: Rows) -> None:
         """Put messages behind those that wait."""
         if self._cursor < len(self._times):
+            t_ns = np.concatenate((self._t_ns[self._cursor:], t_ns))
             rows = np.concatenate((self._rows[self._cursor:], rows))
-        self._times = self._times[self._cursor:] + t_ns.tolist()
-        self._rows, self._data, self._cursor = rows, rows.tobytes(), 0
+        self._t_ns, self._times, self._rows = t_ns, t_ns.tolist(), rows
+        self._data, self._cursor = rows.tobytes(), 0
 
     def take(self, until_ns: int, epoch_ns: int, publish_from_ns: int,
-             ) -> tuple[list[tuple[int, bytes]], list[LogRows]]:
+             ) -> tuple[list[tuple[int, bytes]], LogRows | None]:
         """Return what waits up to a time: to publish, with the times [ns]; and for the log."""
         begin = self._cursor
         end = self._cursor = bisect_right(self._times, until_ns, begin)
         if begin == end:
-            return [], []
-        logged = [] if self.log_index is None else [
-            (self.log_index, epoch_ns + np.array(self._times[begin:end]), self._rows[begin:end])]
+            return [], None
+        logged = None if self.log_index is None else (
+            self.log_index, epoch_ns + self._t_ns[begin:end], self._rows[begin:end])
         if self.publish is None:
             return [], logged
         first = bisect_right(self._times, publish_from_ns - 1, begin, end)
         self.skipped += first - begin
-        size = self._rows.shape[1]
+        size = len(self.channel.encoder)
         return [(self._times[k], self._data[k * size:(k + 1) * size])
                 for k in range(first, end)], logged
 
@@ -176,22 +178,32 @@ class LiveSimulation(Simulation):
 
         Raises IntegrationError if the motion does not go on; what comes before is sent.
         """
-        while self.now_ns < due_ns:
-            failure = None
-            try:
-                self._go_ahead(due_ns, PIECE_SECONDS)
-            except IntegrationError as error:
-                failure = error
-            until_ns = min(due_ns, self._reached_ns, *(
-                group.until_ns(publish_from_ns) for group in self._groups))
-            for group in self._groups:
-                self._compute(group, until_ns, publish_from_ns)
-            self._send(until_ns, publish_from_ns)
-            if failure is not None and self.now_ns >= self._reached_ns:
-                raise failure
-            if self.now_ns < due_ns and give_way():
+        failure = None
+        while self.now_ns < due_ns and failure is None:
+            if self._ready_ns < due_ns:
+                try:
+                    self._prepare(due_ns, publish_from_ns)
+                except IntegrationError as error:
+                    failure = error
+            self._send(min(due_ns, self._ready_ns), publish_from_ns)
+            if self.now_ns < due_ns and failure is None and give_way():
                 return False
+        if failure is not None:
+            raise failure
         return True
+
+    @property
+    def _ready_ns(self) -> int:
+        """Time up to which all messages are sent or wait [ns]."""
+        return min((group.computed_ns for group in self._groups), default=self._reached_ns)
+
+    def _prepare(self, due_ns: int, publish_from_ns: int) -> None:
+        """Compute what is due, or a part of it."""
+        self._go_ahead(due_ns, PIECE_SECONDS)
+        until_ns = min(self._reached_ns, *(
+            group.until_ns(publish_from_ns) for group in self._groups), due_ns)
+        for group in self._groups:
+            self._compute(group, until_ns, publish_from_ns)
 
     def look_ahead(self, until_ns: int, seconds: float) -> None:
         """
@@ -208,8 +220,10 @@ class LiveSimulation(Simulation):
             self._go_ahead(goal_ns, 0.5 * seconds)
             self._compute(behind, min(goal_ns, self._reached_ns), 0)
         taken = time.monotonic() - begin
-        self._span_ns = max(1, min(LONGEST_SPAN_NS, self._span_ns * 2) if taken < 0.5 * seconds
-                            else int(self._span_ns * 0.7))
+        if taken < 0.5 * seconds:
+            self._span_ns = min(2 * self._span_ns, LONGEST_SPAN_NS)
+        elif taken > 0.8 * seconds:
+            self._span_ns = max(self._span_ns // 2, 1)
 
     def _go_ahead(self, until_ns: int, seconds: float) -> None:
         """Let the solver go on up to a time, or for about so long."""
@@ -248,12 +262,15 @@ class LiveSimulation(Simulation):
         due: list[tuple[int, int, bytes]] = []
         for number, output in self._used:
             messages, rows = output.take(until_ns, self.epoch_ns, publish_from_ns)
-            logged += rows
-            due += [(t_ns, number, data) for t_ns, data in messages]
+            if rows is not None:
+                logged.append(rows)
+            for t_ns, data in messages:
+                due.append((t_ns, number, data))
         if logged:
             self._write(logged)
         self.now_ns = until_ns
-        for _, number, data in sorted(due, key=itemgetter(0, 1)):
+        due.sort(key=itemgetter(0, 1))
+        for _, number, data in due:
             self.outputs[number].send(data)
 
 

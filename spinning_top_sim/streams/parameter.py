@@ -49,6 +49,12 @@ class Parameter:
         """Whether the value is a double; an integer is converted."""
         return self.default is None or isinstance(self.default, float)
 
+    @property
+    def has_doubles(self) -> bool:
+        """Whether the value is a double or a list of doubles."""
+        return self.is_double or (
+            isinstance(self.default, tuple) and isinstance(self.default[0], float))
+
     def describe(self, range_too: bool = True) -> str:
         return '; '.join(filter(None, (
             self.text + (f' [{self.unit}]' if self.unit else ''),

@@ -16,7 +16,7 @@ from typing import Any
 from spinning_top_sim.installation import remedy
 from spinning_top_sim.physics.pivot import SHORTEST_S, PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
-from spinning_top_sim.solvers.propagator import EQUATIONS, METHODS
+from spinning_top_sim.solvers.solve import EQUATIONS, METHODS
 from spinning_top_sim.streams.parameter import Effect, Parameter
 
 # Name, default rate [Hz], on by default, description.  Streams with None have the rate `imu.rate`.
@@ -230,9 +230,11 @@ def checked(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return all parameters: these values, else defaults.  Raises ValueError for bad values."""
     result = {parameter.name: parameter.default for parameter in TABLE} | checked_changes(values)
     _check_together(result)
-    if result['gnss.enabled'] and find_spec('pymap3d') is None:
-        raise ValueError('gnss.enabled = True: needs pymap3d, which is not installed: '
-                         f'{remedy("gnss")}')
+    for name, value, library in (('gnss.enabled', True, 'pymap3d'),
+                                 ('solver.method', 'exact', 'gmpy2')):
+        if result[name] == value and find_spec(library) is None:
+            raise ValueError(f'{name} = {value}: needs {library}, which is not installed: '
+                             f'{remedy(library)}')
     for describe in (top_of, start_state, pivot_path):      # they refuse what cannot be
         describe(result)
     return result
@@ -255,6 +257,13 @@ def _check_together(values: Mapping[str, Any]) -> None:
             raise ValueError(
                 f'{name} = {list(value) if isinstance(value, tuple) else value!r}: {text}')
 
+    above: list[str] = []
+    for name in ('world_frame', 'body_frame', 'imu.frame_id'):
+        frame = values[name]
+        need(frame != '' and not frame.startswith('/'), name,
+             'must be the name of a frame, without a slash at its begin')
+        need(frame not in above, name, 'must be another frame than its parent')
+        above.append(frame)
     names = [row[0] for row in STREAM_DEFAULTS]
     for name in values['record.streams']:
         need(name in ('all', *names), 'record.streams',

@@ -3,6 +3,7 @@
 
 import argparse
 import contextlib
+import io
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -41,14 +42,11 @@ def run(name: str, help_text: str | None,
     parser = Parser(name, help_text)
     add_arguments(parser)
     arguments = parser.parse_args(argv)
+    code = OK
     try:
-        code = command(arguments)
-        print(end='', flush=True)
+        with reader_may_end():
+            code = command(arguments)
         return code
-    except BrokenPipeError:
-        # The reader of the output, such as a pager, has ended.  Python flushes the output again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
     except (ValueError, RuntimeError, ArithmeticError, OSError, ImportError) as error:
         print_line(f'{parser.prog}: {text_of(error)}', sys.stderr)
         return WRONG_USAGE if isinstance(error, ValueError) else FAILED
@@ -56,6 +54,23 @@ def run(name: str, help_text: str | None,
         what = f'; {interrupt}' if interrupt.args else ''
         print_line(f'{parser.prog}: interrupted{what}', sys.stderr)
         return INTERRUPTED
+
+
+@contextlib.contextmanager
+def reader_may_end() -> Iterator[None]:
+    """Ignore that the reader of the output, such as a pager, ends before it."""
+    try:
+        yield
+        print(end='', flush=True)
+    except BrokenPipeError:         # Python flushes the output again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def print_any_text() -> None:
+    """Let the standard streams escape what their encoding lacks, instead of raising an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')
 
 
 def check_output(*paths: Path | None) -> None:

@@ -23,7 +23,6 @@ from functools import partial
 from pathlib import Path
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.recording.damage import count
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
@@ -67,7 +66,7 @@ def _run(arguments: argparse.Namespace) -> int:
         exported: list[str] = []
         if found.run is not None:
             if arguments.verify:
-                begin_ns, end_ns = found.damage.start_ns, found.end_ns
+                begin_ns, end_ns = found.span[0], found.end_ns
                 with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
                                   quiet=arguments.json) as show:
                     comparison = compare(found.run, reader, end_ns, lambda stamp_ns: show(
@@ -84,8 +83,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if found.run is None and getattr(arguments, option):
             raise LogError(f'--{option}: {found.foreign_reason}')
     _draw(arguments, found)
-    passed = found.whole and not found.damage.defects and (
-        comparison is None or comparison.identical)
+    passed = not found.damage.reasons and (comparison is None or comparison.identical)
     return cli.OK if passed else cli.FAILED
 
 
@@ -109,13 +107,11 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
 
 def _as_json(found: Survey, comparison: Comparison | None) -> object:
     """Return the findings for JSON; docs/log_format.md has the keys."""
-    damage, run = found.damage, found.run
+    damage, run, (begin_ns, end_ns) = found.damage, found.run, found.span
     content: dict[str, object] = {
-        'file': str(found.path), 'whole': found.whole,
-        'damage': {'torn': damage.truncated, 'report': damage.lines(), **_fields_of(
-            damage, 'lost_bytes', 'lost_chunks', 'missing_messages', 'missing_exactly')},
-        'begin_ns': damage.start_ns, 'end_ns': damage.end_ns,
-        'duration': (damage.end_ns - damage.start_ns) / NANOSECONDS,
+        'file': str(found.path), 'whole': not damage.reasons,
+        'damage': {'torn': damage.torn, 'lost_bytes': damage.lost_bytes, 'report': damage.lines()},
+        'begin_ns': begin_ns, 'end_ns': end_ns, 'duration': (end_ns - begin_ns) / NANOSECONDS,
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
         'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
         'notes': found.notes, 'run': None, 'events': [], 'verify': None,
@@ -133,7 +129,7 @@ def _as_json(found: Survey, comparison: Comparison | None) -> object:
         content['events'] = [{'event': event.kind, 'stamp_ns': stamp_ns, 't_ns': event.t_ns,
                               **event.details} for stamp_ns, event in run.events]
     if comparison is not None:
-        content['verify'] = {'identical': comparison.identical, 'whole': found.whole,
+        content['verify'] = {'identical': comparison.identical, 'whole': not damage.reasons,
                              **asdict(comparison),
                              'first': comparison.first and comparison.first._asdict()}
     # Numbers that JSON does not have become null.
@@ -146,10 +142,9 @@ def _fields_of(source: object, *names: str) -> dict[str, object]:
 
 def _as_text(found: Survey, comparison: Comparison | None) -> Iterator[str]:
     """Yield the findings as lines of text."""
-    damage, run = found.damage, found.run
-    state = ('whole' if found.whole and not damage.defects else
-             'truncated' if damage.truncated else 'damaged')
-    yield f'{found.path}: {state}, {(damage.end_ns - damage.start_ns) / NANOSECONDS:.6g} s'
+    damage, run, (begin_ns, end_ns) = found.damage, found.run, found.span
+    state = 'truncated' if damage.torn else 'damaged' if damage.reasons else 'whole'
+    yield f'{found.path}: {state}, {(end_ns - begin_ns) / NANOSECONDS:.6g} s'
     yield from damage.lines()
     if run is None:
         yield found.foreign_reason
@@ -164,7 +159,7 @@ def _as_text(found: Survey, comparison: Comparison | None) -> Iterator[str]:
     yield _journal(run)
     yield from found.notes
     for number, motion in enumerate(found.motions, start=1):
-        yield from _motion(number, motion, damage.start_ns)
+        yield from _motion(number, motion, begin_ns)
     if found.errors or found.drifts:
         yield from cli.table_lines(
             'largest relative drifts in a motion, orientation error against the exact solution '
@@ -210,7 +205,7 @@ def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
         rows.append((text, _number(expected, 12), _number(seen, 12), _difference(expected, seen)))
     yield from cli.table_lines(title, ('', 'exact', 'measured', 'difference'), rows)
     if measured is not None:
-        yield f'measured from {motion.source}: {count(measured.nutations, "whole nutation")}'
+        yield f'measured from {motion.source}: {measured.nutations} whole nutations'
         yield from (f'not measured: {reason}' for reason in measured.missing)
     else:
         yield 'not measured: no topic with enough attitudes (joint_states, pose, ground_truth/...)'
@@ -228,7 +223,7 @@ def _about_comparison(comparison: Comparison) -> Iterator[str]:
     if comparison.identical:
         yield f'verify: identical, all {compared} messages byte for byte'
     elif not (comparison.different or comparison.unexpected or comparison.stopped):
-        yield (f'verify: incomplete, {count(comparison.missing, "message")} missing; '
+        yield (f'verify: incomplete, {comparison.missing} messages missing; '
                f'the other {compared} are identical byte for byte')
     else:
         yield (f'verify: DIFFERENT: {comparison.different} of {compared} messages differ, '

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 from matplotlib.animation import PillowWriter
 
-from spinning_top_sim.physics import pictures
+from spinning_top_sim import pictures
 from spinning_top_sim.tools.analysis import Attitudes
 from spinning_top_sim.tools.survey import MotionReport
 

@@ -2,6 +2,7 @@
 """
 Write everything that is whole in a truncated or damaged MCAP log into a new
 log that every reader takes: chunks as they are, index and summary made anew.
+Damaged chunks are left out; where a record has no end, the rest of the file is.
 The old file is only read.
 
 exit codes:
@@ -17,7 +18,6 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from spinning_top_sim.recording.damage import count
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recovery import recover
 from spinning_top_sim.tools import cli
@@ -40,14 +40,13 @@ def _run(arguments: argparse.Namespace) -> int:
         log = reader.path
         output: Path = arguments.output or log.parent / f'{log.stem}_recovered.mcap'
         recovered = recover(reader, output, show)
-    damage = reader.damage
+        damage = reader.damage
     for line in damage.lines():
         cli.print_line(line)
-    kept = 'kept all' if damage.lossless else 'kept'
-    cli.print_line(f'{kept}: {count(recovered.messages, "message")} in '
-                   f'{count(recovered.chunk_count, "chunk")}, {count(recovered.size, "byte")} in '
-                   f'{output}')
-    return cli.OK if damage.lossless else SOME_LOST
+    kept = 'kept' if damage.lost_bytes else 'kept all'
+    cli.print_line(f'{kept}: {recovered.messages} messages in {recovered.chunk_count} chunks, '
+                   f'{recovered.size} bytes in {output}')
+    return SOME_LOST if damage.lost_bytes else cli.OK
 
 
 main = partial(cli.run, 'recover', __doc__, add_arguments, _run)

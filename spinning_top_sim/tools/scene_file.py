@@ -2,6 +2,8 @@
 """Reads ROS 2 parameter files and assignments (NAME:=VALUE) without ROS."""
 
 import argparse
+import array
+import contextlib
 import difflib
 import re
 from collections.abc import Iterator, Mapping
@@ -13,11 +15,13 @@ import yaml
 from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.tools import cli
 
-# Sections of a file that apply to the node spinning_top.
-NODES = ('/**', '/*', 'spinning_top', '/spinning_top', '/**/spinning_top')
+NODE = '/spinning_top'      # the full name of the node where no other is asked for
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+
+_WITH_EXPONENT = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+')
 
 
 class _Loader(yaml.SafeLoader):
@@ -47,11 +51,12 @@ class _Name(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  value: Any, option: str | None = None) -> None:
         if value == 'help':
-            for stem, path in parameter_files(self.dest).items():
-                # The first sentence of the comment at the head, behind the licence.
-                text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
-                                if line.startswith('# '))
-                print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
+            with cli.reader_may_end():
+                for stem, path in parameter_files(self.dest).items():
+                    # The first sentence of the comment at the head, behind the licence.
+                    text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
+                                    if line.startswith('# '))
+                    print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
             parser.exit()
         setattr(namespace, self.dest, value)
 
@@ -74,21 +79,28 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
                         help='one parameter; may be repeated')
 
 
-def given(arguments: argparse.Namespace) -> dict[str, object]:
-    """Return the parameters that these options give, not checked.  Raises as `read_scene`."""
+def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = False,
+          ) -> dict[str, object]:
+    """
+    Return the parameters that these options give to a node, not checked; the last value holds.
+
+    node : its full name
+    to_ros : those that rclpy declares for every node, such as use_sim_time, instead of the others
+
+    Raises as `read_scene`.
+    """
     values: dict[str, object] = {}
-    for content in (*chosen_files(arguments).values(), *map(read_scene, arguments.params)):
-        values.update(content)
-    values.update((name, value) for name, value in map(parse_assignment, arguments.param)
-                  if not is_of_ros(name))
-    return values
+    for path in chosen_files(arguments):
+        values |= _read(path, node)
+    values |= map(parse_assignment, arguments.param)
+    return {name: value for name, value in values.items() if is_of_ros(name) == to_ros}
 
 
-def chosen_files(arguments: argparse.Namespace) -> dict[Path, dict[str, object]]:
-    """Return the files of --scene and --imu with what is in them.  Raises ValueError, OSError."""
-    paths = [file_of(kind, name) for kind in ('scene', 'imu')
-             if (name := getattr(arguments, kind, None)) is not None]
-    return {path: read_scene(path) for path in paths}
+def chosen_files(arguments: argparse.Namespace) -> list[Path]:
+    """Return the files of --scene, --imu and --params.  Raises ValueError for no known name."""
+    return [*(file_of(kind, name) for kind in ('scene', 'imu')
+              if (name := getattr(arguments, kind, None)) is not None),
+            *map(Path, arguments.params)]
 
 
 def file_of(kind: str, name: str) -> Path:
@@ -100,27 +112,54 @@ def file_of(kind: str, name: str) -> Path:
     return files.get(name, Path(name))
 
 
-def read_scene(path: str | Path) -> dict[str, object]:
+def read_scene(path: str | Path, node: str = NODE) -> dict[str, object]:
     """
-    Return the parameters of the node spinning_top in a ROS 2 parameter file, not checked.
+    Return the parameters of a node in a ROS 2 parameter file, not checked.
+
+    Sections are matched as by rcl: `/**`, `/left/*`, `left: spinning_top:`.  A section
+    `spinning_top` or with the last part of the node's name applies in any namespace.
+
+    node : its full name
 
     Raises OSError, or ValueError, which names the file.
     """
+    return {name: value for name, value in _read(path, node).items() if not is_of_ros(name)}
+
+
+def _read(path: str | Path, node: str) -> dict[str, object]:
     source = str(path)
-    content = parse_yaml(Path(path).read_bytes(), source)
-    sections = [node['ros__parameters'] for name, node in content.items()
-                if name in NODES and isinstance(node, Mapping) and isinstance(
-                    node.get('ros__parameters'), Mapping)] if isinstance(content, Mapping) else []
-    if not sections:
-        raise ValueError(f'{source} has no parameters for the node spinning_top: it must have '
-                         "'/**:' or 'spinning_top:', and 'ros__parameters:' in it")
-    return {name: value for section in sections
-            for name, value in parse_section(section, source).items()}
+    sections = list(_sections(parse_yaml(Path(path).read_bytes(), source)))
+    fitting = [section for name, section in sections if _fits(name, node)]
+    if not fitting:
+        there = ', '.join(name for name, _ in sections) or 'none'
+        raise ValueError(f'{source} has no parameters for the node {node}: it must have '
+                         "'/**:' or 'spinning_top:', and 'ros__parameters:' in it; its nodes: "
+                         f'{there}')
+    return {name: value for section in fitting
+            for name, value in _known(dict(_flatten(section)), source).items()}
+
+
+def _sections(content: object, name: str = '') -> Iterator[tuple[str, Mapping[object, object]]]:
+    """Yield the names of nodes, which may have wildcards, and their parameters."""
+    for key, below in content.items() if isinstance(content, Mapping) else ():
+        if isinstance(below, Mapping):
+            if key == 'ros__parameters':
+                yield name, below
+            else:
+                yield from _sections(below, f'{name}/{key}'.replace('//', '/'))
+
+
+def _fits(section: str, node: str) -> bool:
+    """Return whether a section of a file applies to a node (rcl_yaml_param_parser)."""
+    pattern = re.escape(section).replace(r'/\*\*', r'(/\w+)*').replace(r'\*', r'\w+')
+    return (re.fullmatch(pattern, node) is not None
+            or section in (NODE, f'/{node.rpartition("/")[2]}'))
 
 
 def parse_section(section: Mapping[object, object], source: str) -> dict[str, object]:
     """Return the parameters in a mapping, not checked.  Raises ValueError, as `read_scene`."""
-    return _known(dict(_flatten(section)), source)
+    return {name: value for name, value in _known(dict(_flatten(section)), source).items()
+            if not is_of_ros(name)}
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
@@ -128,9 +167,7 @@ def parse_assignment(text: str) -> tuple[str, object]:
     name, separator, yaml_text = text.partition(':=')
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
-    value = parse_yaml(yaml_text, text)
-    _known({name: value}, text)
-    return name, value
+    return name, _known({name: parse_yaml(yaml_text, text)}, text)[name]
 
 
 def parse_yaml(text: str | bytes, source: str) -> object:
@@ -161,9 +198,10 @@ def likely_name(name: str) -> str:
 
 
 def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
-    """Return the values without those of ROS.  Raises ValueError for unknown parameters."""
-    ours = {name: value for name, value in values.items() if not is_of_ros(name)}
-    for name, value in ours.items():
+    """Return the values, with doubles.  Raises ValueError for unknown parameters."""
+    for name, value in values.items():
+        if is_of_ros(name):
+            continue
         if name not in parameters.BY_NAME:
             raise ValueError(f'{source}: there is no parameter {name}{likely_name(name)}')
         if value is None:
@@ -171,4 +209,21 @@ def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
         if isinstance(value, list) and len(set(map(type, value))) > 1:
             raise ValueError(f'{source}: {name} = {shown(value)}: the items of a list must have '
                              'one type, such as [0.0, 1.5]')
-    return ours
+    return {name: with_doubles(name, value) for name, value in values.items()}
+
+
+def with_doubles(name: str, value: Any) -> Any:
+    """
+    Return the value of a parameter with doubles for integers where it has doubles.
+
+    A text such as '1e-9' is a double, too: YAML 1.1, as in `ros2 param set`, takes it for a text.
+    """
+    parameter = parameters.BY_NAME.get(name)
+    if isinstance(value, list | array.array):
+        items = [with_doubles(name, item) for item in value]
+        return items if len(set(map(type, items))) == 1 else value
+    if parameter is not None and parameter.has_doubles and (
+            type(value) is int or (isinstance(value, str) and _WITH_EXPONENT.fullmatch(value))):
+        with contextlib.suppress(OverflowError):
+            return float(value)
+    return value

@@ -110,7 +110,7 @@ def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Se
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the checked parameters of the command line.  Raises ValueError or OSError."""
-    given = scene_file.given(arguments)
+    given = scene_file.given(arguments, resolve_topic('spinning_top', arguments.namespace))
     given.update((name, value) for name, value in vars(arguments).items()
                  if name in ('seed', 'duration') and value is not None)
     values = parameters.checked(given)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.recording.damage import Damage
+from spinning_top_sim.recording.decoding import LogMessage
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
-from spinning_top_sim.recording.reader import LogMessage, LogReader
+from spinning_top_sim.recording.reader import Damage, LogReader
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, stamp_text
 from spinning_top_sim.streams.channel import Channel
@@ -93,7 +93,7 @@ class Survey:
 
     path: Path                            # of the log
     damage: Damage
-    whole: bool                           # the log was closed, and nothing is lost
+    span: tuple[int, int]                 # log times of the first and the last message [ns]
     end_ns: int                           # log time up to which samples were recorded [ns]
     topics: dict[str, TopicReport]
     run: RunDescription | None = None     # None for a log that this package did not record
@@ -111,10 +111,8 @@ class Survey:
 @np.errstate(all='ignore')                  # a log may hold any numbers
 def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
-    damage = reader.damage
-    found = Survey(reader.path, damage, reader.whole and not damage.truncated and damage.lossless,
-                   damage.end_ns, {topic.name: TopicReport(topic.type_name)
-                                   for topic in reader.topics})
+    found = Survey(reader.path, reader.damage, reader.span, reader.span[1], {
+        topic.name: TopicReport(topic.type_name) for topic in reader.topics})
     try:
         run = found.run = recorded_run.read_run_description(reader)
     except recorded_run.ForeignLogError as error:
@@ -142,7 +140,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
     """Compute the motions of a run; add notes about what cannot be followed."""
     motions = found.motions
     try:
-        for simulation, done in recorded_run.rerun(run, found.damage.end_ns):
+        for simulation, done in recorded_run.rerun(run, found.span[1]):
             if isinstance(done, Block):
                 continue
             event = done.event

@@ -10,13 +10,18 @@ import signal
 import subprocess
 import sys
 import webbrowser
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
+from spinning_top_sim.nodes.executable import (
+    RunnableNode,
+    node_name,
+    run_node,
+    split_ros_arguments,
+)
 from spinning_top_sim.tools import cli, scene_file
 
 if TYPE_CHECKING:
@@ -52,12 +57,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _node(files: Iterable[Path], for_ros: Sequence[str]) -> Iterator[None]:
-    """Run a node with these parameter files while the page is shown."""
+def _node(options: Sequence[str], for_ros: Sequence[str]) -> Iterator[None]:
+    """Run a node with these options while the page is shown."""
     node = subprocess.Popen([
-        sys.executable, '-m', 'spinning_top_sim', 'node', '--ros-args',
-        *(word for path in files for word in ('--params-file', str(path))),
-        *for_ros, '-p', 'status_period:=0.0'])
+        sys.executable, '-m', 'spinning_top_sim', 'node', *options,
+        '--ros-args', *for_ros, '-p', 'status_period:=0.0'])
     try:
         yield
     finally:
@@ -72,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add = parser.add_argument
     add('log', nargs='*', type=Path, help='one or two MCAP files; without: a running node')
-    scene_file.add_arguments(parser)
+    scene_file.add_parameters(parser)
     add('--port', type=int, help='of the page (default: the first free one from 8080 on)')
     add('--host', default=LOOPBACK,
         help=f'address to serve at (default: {LOOPBACK}, which only this machine reaches)')
@@ -85,9 +89,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _show_logs(arguments: argparse.Namespace) -> int:
     if len(arguments.log) > 2:
         raise ValueError(f'{len(arguments.log)} logs: must be one or two')
-    for option in ('scene', 'imu'):
-        if (name := getattr(arguments, option)) is not None:
-            raise ValueError(f'--{option} {name}: must be without a log, which has its own')
+    for option in ('scene', 'imu', 'params', 'param'):
+        if value := getattr(arguments, option):
+            raise ValueError(f'--{option} {value}: must be without a log, which has its own')
     if arguments.html is not None:
         cli.check_output(arguments.html)
     with needed('the page', 'view'):
@@ -135,12 +139,15 @@ def _prepare(stack: contextlib.ExitStack, arguments: argparse.Namespace, for_ros
     """Return what opens the page; a node of a scene or IMU runs until `stack` is closed."""
     if arguments.html is not None:
         raise ValueError(f'--html {arguments.html}: must have a log')
-    files = list(scene_file.chosen_files(arguments))
+    scene_file.given(arguments, node_name(for_ros))     # raises for what the node would refuse
+    options = [word for option, values in (
+        ('--params', scene_file.chosen_files(arguments)), ('-p', arguments.param))
+        for value in values for word in (option, str(value))]
     from spinning_top_sim.view.live import LiveView  # noqa: PLC0415
 
     def make_node() -> RunnableNode:
         view = LiveView(_open_page(arguments, 'spinning_top'))
-        if files:
-            stack.enter_context(_node(files, for_ros))
+        if options:
+            stack.enter_context(_node(options, for_ros))
         return view
     return argv, make_node

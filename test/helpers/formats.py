@@ -10,7 +10,7 @@ from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, Schem
 from mcap.writer import MCAP0_MAGIC
 
 from helpers.logs import ALL_KEPT, run
-from spinning_top_sim.recording.chunks import record_bytes
+from spinning_top_sim.recording.writer import record_bytes
 
 HEADER = record_bytes(Header(profile='', library='a stranger'))
 SCHEMA = record_bytes(Schema(id=1, name='thing', encoding='jsonschema', data=b'{}'))

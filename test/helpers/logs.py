@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import yaml  # type: ignore[import-untyped]
+import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
@@ -18,18 +19,16 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from helpers.definitions import add_definitions
 from helpers.recordings import METADATA
-from spinning_top_sim.recording import chunks
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recorder import create_file
+from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
+from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.tools.recover import main
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 POINT = 'geometry_msgs/msg/Point'
 NUMBER = 'std_msgs/msg/Float64'
-add_definitions(POINT, NUMBER)
 TOPICS = (
     RecordedTopic('/top/point', POINT),
     RecordedTopic('/top/number', NUMBER, {'depth': 3, 'reliability': 2}),
@@ -47,25 +46,36 @@ def cdr(number: int) -> tuple[int, bytes]:
     return 1, bytes(JAZZY.serialize_cdr(JAZZY.types[NUMBER](float(number)), NUMBER))
 
 
-def write_log(path, chunks=CHUNKS, compression='zstd', messages_per_chunk=MESSAGES_PER_CHUNK):
+def write_log(path, compression='zstd'):
     """Write a log by our writer, chunk borders where they are wanted; return its messages."""
     file = create_file(path, TOPICS, METADATA, compression=compression)
     messages = []
-    for number in range(chunks * messages_per_chunk):
+    for number in range(CHUNKS * MESSAGES_PER_CHUNK):
         index, data = cdr(number)
         stamp = EPOCH_NS + number * 1_234_567
-        file.append(index, stamp, data)
+        file.add(*single(index, stamp, data))
         messages.append((TOPICS[index].name, stamp, data))
-        if (number + 1) % messages_per_chunk == 0:
+        if (number + 1) % MESSAGES_PER_CHUNK == 0:
             file.flush()
     file.finish()
     return messages
+
+
+def small_log(path) -> SimpleNamespace:
+    """Write a small log of ours; return bytes, messages, and (opcode, start, end) of records."""
+    messages = write_log(path)
+    content = path.read_bytes()
+    records = records_of(content)
+    chunks = [record for record in records if record[0] == Opcode.CHUNK]
+    assert len(chunks) == CHUNKS
+    return SimpleNamespace(content=content, messages=messages, records=records, chunks=chunks)
 
 
 def write_anew(path, content):
     """Write a file, not over the one before: that would wait for the disk."""
     path.unlink(missing_ok=True)
     path.write_bytes(content)
+    return path
 
 
 def flipped(content: bytes, position: int, bit: int = 0) -> bytes:
@@ -120,27 +130,12 @@ def seen_by_rosbags(path) -> list[tuple[str, int, bytes]]:
     return read
 
 
-def places(log, each=8):
-    """Some bytes of every record: most of its head, and seeded ones of the rest; and the magic."""
-    choice = random.Random(5)
-    yield from range(len(MCAP0_MAGIC))
-    for _, start, end in log.records:
-        head = range(start, min(start + each, end))
-        yield from head
-        yield from choice.sample(range(head.stop, end), min(each, end - head.stop))
-    yield from range(len(log.content) - len(MCAP0_MAGIC), len(log.content))
-
-
-def torn(log, content=None):
-    """Return a log up to the end of its last chunk; nothing in it repeats what stands before."""
-    return (content or log.content)[:log.chunks[-1][2]]
-
-
 STRANGERS = {
     'plain': {},
     'unchunked': {'use_chunking': False},
     'lz4': {'compression': CompressionType.LZ4},
     'no index': {'index_types': IndexType.NONE},
+    'no message index': {'index_types': IndexType.ALL & ~IndexType.MESSAGE},
     'nothing repeated': {'repeat_channels': False, 'repeat_schemas': False},
     'nothing but messages': {
         'use_chunking': False, 'use_statistics': False, 'use_summary_offsets': False,
@@ -172,14 +167,31 @@ def write_stranger(path, options, profile='', count=300):
     return messages
 
 
-def small_log(path) -> SimpleNamespace:
-    """Write a small log of ours; return bytes, messages, and (opcode, start, end) of records."""
-    messages = write_log(path)
-    content = path.read_bytes()
-    records = records_of(content)
-    chunks = [record for record in records if record[0] == Opcode.CHUNK]
-    assert len(chunks) == CHUNKS
-    return SimpleNamespace(content=content, messages=messages, records=records, chunks=chunks)
+def write_bag(folder, mode='', form='', compress=zstandard.compress, split=1, *,
+              record=True):
+    """Write what matters of a bag as rosbag2 does, with ten strings; return these."""
+    folder.mkdir()
+    messages = [b'\0\1\0\0\x06\0\0\0text%d\0' % number for number in range(10)]
+    about = f"compression_format: {form}\ncompression_mode: '{mode}'\n"
+    for part in range(split):
+        path = folder / f'{folder.name}_{part}.mcap'
+        with path.open('wb') as file:
+            writer = Writer(file)
+            writer.start('ros2', 'libmcap')
+            channel = writer.register_channel('/said', 'cdr', writer.register_schema(
+                'std_msgs/msg/String', 'ros2msg', b'string data\n'))
+            for number, data in enumerate(messages):
+                writer.add_message(channel, number, compress(data) if mode == 'MESSAGE' else data,
+                                   number)
+            if record:
+                writer.add_metadata('rosbag2', {'serialized_metadata': about})
+            writer.finish()
+        if mode == 'FILE':
+            path.with_name(f'{path.name}.{form}').write_bytes(compress(path.read_bytes()))
+            path.unlink()
+    (folder / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  ' + about.replace(
+        '\n', '\n  '))
+    return messages
 
 
 def without_sync(monkeypatch) -> None:
@@ -194,5 +206,4 @@ def without_sync(monkeypatch) -> None:
 
     monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
     monkeypatch.setattr(yaml, 'dump', dump_once)
-    monkeypatch.setattr(chunks, 'CHUNK_BYTES', 1 << 14)         # of memory that is taken
     monkeypatch.setattr(yaml, 'safe_load', functools.cache(yaml.safe_load))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sim_node in this process without an executor: a test calls what the executor would call."""
+"""A sim_node in this process: a test calls what the executor would call, or lets it spin."""
 
 import contextlib
 import gc
@@ -14,8 +14,8 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from helpers.node_harness import numbers, options, wait_for
+from spinning_top_sim.nodes.node import Simulator
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.simulator import Simulator
 
 
 class InThisProcess:
@@ -43,7 +43,7 @@ class OwnNode(InThisProcess):
                  'record.min_free_bytes': 0, **dotted(values)}
         argv = ['--ros-args', *options(given), *arguments]
         rclpy.init(args=argv)
-        self.node = Simulator(argv)
+        self.node = Simulator({})
         self.loop, self.simulation = self.node.loop, self.node.simulation
         self.heard, self._diagnosed = {}, []
         self.node._diagnostics = SimpleNamespace(publish=self._diagnosed.append)
@@ -52,14 +52,14 @@ class OwnNode(InThisProcess):
         """Let these streams, and no others, have a subscriber."""
         self.heard |= {topic: [] for topic in topics}
         self.node._topics.update_subscribers = lambda outputs: [
-            setattr(one, 'publish', self.heard[one.stream.topic].append)
-            for one in outputs if one.stream.topic in self.heard]
+            setattr(one, 'publish', self.heard[one.channel.topic].append)
+            for one in outputs if one.channel.topic in self.heard and one.publish is None]
         return self
 
     def begin_again(self, values):
         """Let the node be as after a start with these values, and paused."""
         node = self.node
-        node._session.stop()
+        node._recording.close()
         before, node.values = node.values, dict(values)
         node._start_spin = {name: values[name] for name in SPIN}
         node._open_topics(values)
@@ -88,8 +88,15 @@ class OwnNode(InThisProcess):
         return self._serve(Trigger, name)
 
     def _serve(self, kind, name, **request):
-        return self.node._serve(getattr(self.node, f'_{name}'), kind.Request(**request),
-                                kind.Response())
+        act, response = getattr(self.node, f'_{name}'), kind.Response()
+        if name != 'record':
+            return self.node._serve(act, kind.Request(**request), response)
+        future = act(kind.Request(**request), response)
+        self.spin_until('an answer', future.done)
+        return future.result()
+
+    def spin_until(self, what, condition):
+        wait_for(what, lambda: condition() or rclpy.spin_once(self.node, timeout_sec=0.1))
 
     def step(self, count):
         """Step a paused motion, by 10 ms each; the samples are sent afterwards."""
@@ -104,7 +111,7 @@ class OwnNode(InThisProcess):
         return status.level[0], status.message, numbers(status)
 
     def wait_until(self, t_ns):
-        wait_for(f't = {t_ns} ns', lambda: self.simulation.now_ns >= t_ns)
+        self.spin_until(f't = {t_ns} ns', lambda: self.simulation.now_ns >= t_ns)
 
 
 def dotted(values):

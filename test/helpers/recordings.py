@@ -2,6 +2,7 @@
 """Messages for the tests of the recorder, and what readers find of them."""
 
 import struct
+import time
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -49,6 +50,15 @@ def write_rows(path, topics, rows, per_chunk=None, metadata=None):
             file.flush()
     file.finish()
     return path
+
+
+def opened(recorder):
+    """Wait until a recorder has opened its file, or failed."""
+    deadline = time.monotonic() + 20.0
+    while recorder.state == 'opening':
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    return recorder
 
 
 def write(recorder, topic_index, log_time_ns, data):

@@ -3,7 +3,6 @@
 
 import importlib
 import importlib.util
-from functools import partial
 
 import pytest
 
@@ -16,28 +15,24 @@ KINDS = ('stand-in', 'installed') if INSTALLED else ('stand-in',)
 
 
 def types_of(kind):
-    """Return simulation_interfaces.msg, .srv and .action."""
+    """Return simulation_interfaces.msg and .srv."""
     if kind == 'stand-in':
         return standard_types.modules()
     return [importlib.import_module(f'simulation_interfaces.{part}')
-            for part in ('msg', 'srv', 'action')]
+            for part in ('msg', 'srv')]
 
 
 class StandardNode(OwnNode):
-    """
-    The node; `call` calls a handler as the executor calls it, `steps` is an action's coroutine.
-
-    The node starts paused.
-    """
+    """The node, which starts paused; `call` calls a handler as the executor calls it."""
 
     def __init__(self, folder, kind='stand-in', **values):
         super().__init__(folder, start_paused=True, **values)
-        self.messages, self.services, self.actions = types_of(kind)
+        self.messages, self.services = types_of(kind)
         self._first_values = dict(self.node.start_values)
         self._forget()
 
     def _forget(self):
-        self.handlers = SimulationHandlers(self.node, self.messages, self.actions)
+        self.handlers = SimulationHandlers(self.node, self.messages)
 
     def renew(self):
         """Go back to the state after the start."""
@@ -78,36 +73,8 @@ class StandardNode(OwnNode):
         assert self.set_state('PAUSED') == self.messages.Result.RESULT_OK
         return self
 
-    def steps(self, count):
-        """Return a goal of SimulateSteps, and the coroutine that executes it."""
-        goal = Goal(self.actions.SimulateSteps.Goal(steps=count))
-        return goal, self.handlers.simulate_steps(goal)
-
 
 @pytest.fixture(scope='module', params=KINDS, name='node')
 def standard_node(request, tmp_path_factory):
     with StandardNode(tmp_path_factory.mktemp('node'), request.param) as node:
         yield node
-
-
-class Goal:
-    """A goal handle of an action server: what has become of it, and the feedback."""
-
-    def __init__(self, request):
-        self.request, self.feedback, self.end = request, [], None
-        self.is_cancel_requested = False
-        self.succeed, self.abort, self.canceled = (
-            partial(setattr, self, 'end', end) for end in ('succeeded', 'aborted', 'canceled'))
-
-    def publish_feedback(self, feedback):
-        self.feedback.append((feedback.completed_steps, feedback.remaining_steps))
-
-
-def finished(coroutine, turns=10_000):
-    """Execute a coroutine as an executor does; return what it returns."""
-    for _ in range(turns):
-        try:
-            coroutine.send(None)
-        except StopIteration as end:
-            return end.value
-    raise AssertionError(f'not finished after {turns} turns')

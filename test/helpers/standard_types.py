@@ -95,15 +95,12 @@ SERVICES = {
                                'set_acceleration': bool}, codes={'INVALID_POSE': 101}),
     'GetEntityInfo': service(NAMED, {'info': EntityInfo}),
 }
-ACTIONS = {'SimulateSteps': SimpleNamespace(
-    Goal=message('Goal', {'steps': int}), Result=message('Result', {'result': Result}),
-    Feedback=message('Feedback', {'completed_steps': int, 'remaining_steps': int}))}
 
 
 def modules():
-    """Return simulation_interfaces.msg, .srv and .action."""
-    found = [ModuleType(f'simulation_interfaces.{kind}') for kind in ('msg', 'srv', 'action')]
+    """Return simulation_interfaces.msg and .srv."""
+    found = [ModuleType(f'simulation_interfaces.{kind}') for kind in ('msg', 'srv')]
     for module, content in zip(found, (
-            {one.__name__: one for one in MESSAGES}, SERVICES, ACTIONS), strict=True):
+            {one.__name__: one for one in MESSAGES}, SERVICES), strict=True):
         vars(module).update(content)
     return found

@@ -21,7 +21,7 @@ from helpers.taylor import LONG
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.solvers.propagator import propagate
+from spinning_top_sim.solvers.solve import motion_of
 from spinning_top_sim.solvers.transport import NUTATION_SHARE
 
 EPS = 2.0 ** -53
@@ -253,7 +253,7 @@ def check_steps(found, case, solution, motion, times):
     sum of all steps is within twice their count times the tolerance times the largest growth from
     any of them to the end, of which some are tried; the growth is 1 or more.
     """
-    integration = propagate(case.top, case.start, method='rk45', rtol=RTOL, atol=0.1 * RTOL)
+    integration = motion_of(case.top, case.start, method='rk45', rtol=RTOL, atol=0.1 * RTOL)
     stepped = integration.states_at_seconds(times)
     finite = all(np.all(np.isfinite(getattr(stepped, name))) for name in COLUMNS)
     found.check(case, 'rk45: finite', 0.0 if finite else math.inf, 1.0)

@@ -55,23 +55,33 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from gmpy2 import asinh, const_pi, mpc, mpfr, sin_cos, sqrt
+from gmpy2 import asinh, const_pi, mpfr, sin_cos, sqrt
 from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.cubic import Roots, RootsTooCloseError, cubic_roots
-from spinning_top_sim.solvers.elliptic import GaussMean
-from spinning_top_sim.solvers.multiprecision import BITS, ONE, ZERO, as_mpfr, atan2, precision
-from spinning_top_sim.solvers.theta_series import (
+from spinning_top_sim.solvers.multiprecision import (
+    BITS,
     COS_EVEN,
     MOST_TERMS,
     NOTHING,
+    ONE,
     SIN_ODD,
+    ZERO,
+    GaussMean,
     Parts,
+    Roots,
+    RootsTooCloseError,
     Series,
     ThetaForm,
+    argument,
+    as_mpfr,
+    atan2,
+    cubic_roots,
+    phase,
+    precision,
 )
+from spinning_top_sim.solvers.vertical import PreciseState
 
 BITS_TO_TRY = BITS, 2 * BITS, 4 * BITS, 8 * BITS
 with precision():
@@ -88,8 +98,8 @@ class Factor(NamedTuple):
     parts : R and s J at even and at odd N, less their common factors.  If it changes its sign at
         a pole, R is a sine series at one of them, and has the factor (-1)^floor(N/2).
     scales : these factors
-    sense : s
-    start_argument : of (R + i s J) exp(i kappa y), less that of the start's `direction` [rad]
+    pole_rate : (Lz +- L3)/(2 lambda1) [rad/s]; its sign is s
+    start_argument : of (R + i s J) exp(i kappa y) at t = 0 [rad]
     """
 
     rate: mpfr
@@ -97,7 +107,7 @@ class Factor(NamedTuple):
     drift: mpfr
     parts: tuple[Parts, Parts]
     scales: tuple[mpfr, mpfr]
-    sense: int
+    pole_rate: mpfr
     start_argument: mpfr
 
 
@@ -110,7 +120,7 @@ class ThetaMotion(NamedTuple):
     start_whole, start_offset : N and 2y/pi at t = 0, start_offset accurate relative to itself
     size : coefficients of each polynomial that doubles need
     u_dot, u_dot_series : c at even and at odd N, and theta1, of u' = c theta1(2y)/D^4
-    precession0, precession_swing : p and q at even and at odd N, of
+    precession, swing : p and q at even and at odd N, of
         (Lz - L3 u)/lambda1 = p + q theta1(y)^2/D^2
     """
 
@@ -122,29 +132,19 @@ class ThetaMotion(NamedTuple):
     start_offset: mpfr = ZERO
     u_dot: tuple[mpfr, mpfr] = (ZERO, ZERO)
     u_dot_series: Series = NOTHING
-    precession0: tuple[mpfr, mpfr] = (ZERO, ZERO)
-    precession_swing: tuple[mpfr, mpfr] = (ZERO, ZERO)
+    precession: tuple[mpfr, mpfr] = (ZERO, ZERO)
+    swing: tuple[mpfr, mpfr] = (ZERO, ZERO)
     m: mpfr = ZERO
     m1: mpfr = ONE
     size: int = MOST_TERMS
 
 
-class PreciseState(NamedTuple):
-    """
-    A state in multiprecision; theta is in [0, pi/2].
-
-    sin_half, cos_half, theta_dot : of theta/2; [rad/s]
-    alpha, beta : complex numbers of any modulus with the arguments (phi + psi)/2, (phi - psi)/2
-    l3, lz : [kg m^2/s]
-    """
-
-    sin_half: mpfr
-    cos_half: mpfr
-    theta_dot: mpfr
-    alpha: mpc
-    beta: mpc
-    l3: mpfr
-    lz: mpfr
+def precise(state: State) -> PreciseState:
+    """Return a state in multiprecision."""
+    half_phi, half_psi = (phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
+    sine, cosine = sin_cos(mpfr(state.theta) / 2)
+    return PreciseState(sine, cosine, mpfr(state.theta_dot), half_phi * half_psi,
+                        half_phi * half_psi.conjugate(), mpfr(state.l3), mpfr(state.lz))
 
 
 def set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
@@ -176,14 +176,13 @@ class _Side(NamedTuple):
 
     momentum, spin : its argument has the rate (spin + momentum/(lambda1 x))/2; x is 1 + u for
         alpha and 1 - u for beta
-    turns, direction : its argument is so many turns and that of a complex number together
+    argument : its argument [rad]
     modulus, slope : its modulus, and twice the derivative of that
     """
 
     momentum: mpfr
     spin: mpfr
-    turns: mpfr
-    direction: mpc
+    argument: mpfr
     modulus: mpfr
     slope: mpfr
 
@@ -191,17 +190,11 @@ class _Side(NamedTuple):
 def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
     torque = as_mpfr(top.mass) * gravity * as_mpfr(top.com_distance)
     lambda1, lambda3 = as_mpfr(top.lambda1), as_mpfr(top.lambda3)
-    alpha_turns, beta_turns, alpha, beta = ZERO, ZERO, mpc(1), mpc(1)
-    if isinstance(start, PreciseState):
-        sin_half, cos_half, theta_dot, alpha, beta, l3, lz = start
-    else:
-        theta, theta_dot, l3, lz = map(mpfr, (start.theta, start.theta_dot, start.l3, start.lz))
-        phi, psi = _half_turns(start.phi), _half_turns(start.psi)
-        alpha_turns, beta_turns = phi + psi, phi - psi
-        sin_half, cos_half = sin_cos(theta / 2)
+    sin_half, cos_half, theta_dot, alpha, beta, l3, lz = (
+        start if isinstance(start, PreciseState) else precise(start))
     spin = l3 * (1 / lambda3 - 1 / lambda1)
-    sides = (_Side(lz + l3, spin, alpha_turns, alpha, cos_half, -sin_half * theta_dot),
-             _Side(lz - l3, -spin, beta_turns, beta, sin_half, cos_half * theta_dot))
+    sides = (_Side(lz + l3, spin, argument(alpha), cos_half, -sin_half * theta_dot),
+             _Side(lz - l3, -spin, argument(beta), sin_half, cos_half * theta_dot))
     f0, f1, f2, f3 = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     if not f0 and not f1:
         return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
@@ -212,21 +205,14 @@ def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion
         (f0, mirror * f1, f2, mirror * f3 or NO_GRAVITY * abs(f2)), falling=mirror * theta_dot > 0)
 
 
-def _half_turns(radians: float) -> mpfr:
-    """Return half an angle of any size in turns, less whole turns: in [-1/2, 1/2]."""
-    sine, cosine = sin_cos(mpfr(radians) / 2)
-    return atan2(sine, cosine) / (2 * const_pi())
-
-
 def _resting(side: _Side, lambda1: mpfr) -> Factor:
     """Return alpha = cos(theta/2) exp i(r t + c), or beta likewise, with constant theta."""
     rate = side.spin / 2
     if side.momentum:
         rate += side.momentum / (4 * lambda1 * side.modulus ** 2)
     parts = Series(COS_EVEN, (ONE,)), NOTHING
-    argument = -atan2(side.direction.imag, side.direction.real)
-    return Factor(rate, side.turns - argument / (2 * const_pi()), ZERO, (parts, parts),
-                  (side.modulus, side.modulus), 0, argument)
+    return Factor(rate, side.argument / (2 * const_pi()), ZERO, (parts, parts),
+                  (side.modulus, side.modulus), side.momentum / (2 * lambda1), ZERO)
 
 
 def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
@@ -265,9 +251,9 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
         alpha, beta, stretch=stretch, quarter_rate=2 * y_rate / const_pi(),
         start_whole=start_whole, start_offset=y0 * 2 / const_pi(),
         u_dot=(swing_rate * even, swing_rate * odd), u_dot_series=form.theta1,
-        precession0=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
-        precession_swing=(-swing * form.middle4 ** 2,
-                          swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
+        precession=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
+        swing=(-swing * form.middle4 ** 2,
+               swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
         m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31, size=form.size)
 
 
@@ -368,7 +354,6 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: mpfr, x_rate: 
     scale *= (form.middle4 if pole.is_beta else form.middle3) / second[0].leading
     parts, scales = (((second, first), (scale, scale * form.odd_over_even)) if pole.is_beta
                      else ((first, second), (scale, scale)))
-    c, s = side.direction.real, side.direction.imag
-    argument = drift * y + atan2(imag * c - real * s, real * c + imag * s)
-    return Factor(rate, side.turns - argument / (2 * const_pi()), drift, parts, scales,
-                  sense, argument)
+    start_argument = drift * y + atan2(imag, real)
+    return Factor(rate, (side.argument - start_argument) / (2 * const_pi()), drift, parts, scales,
+                  side.momentum / (2 * lambda1), start_argument)

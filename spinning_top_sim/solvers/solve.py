@@ -3,61 +3,63 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.solvers.dormand_prince import SteppedMotion
 from spinning_top_sim.solvers.euler import EulerMotion
-from spinning_top_sim.solvers.exact import ClosedForm, ExactSolution
-from spinning_top_sim.solvers.theta_values import LARGEST_NUMBER
 from spinning_top_sim.solvers.transport import TransportMotion
-from spinning_top_sim.solvers.vertical import (
-    AcceleratedMotion,
-    Posture,
-    Vertical,
-    about_vertical,
-    posture_of,
-    rounded,
-)
+from spinning_top_sim.solvers.vertical import Posture
+
+if TYPE_CHECKING:
+    from spinning_top_sim.solvers.exact import ExactSolution
 
 METHODS = ('rk45', 'exact')
 EQUATIONS = ('transport', 'euler')
-# A motion from its start at t = 0; `SteppedMotion` says what the members do.
-Motion = ClosedForm | SteppedMotion
+# Doubles do not hold the products of larger numbers.
+LARGEST_NUMBER = 1e290
 
 
-def propagate(top: Top, start: State, *, method: str, equations: str = 'transport',
-              rtol: float = 1e-11, atol: float = 1e-12) -> Motion:
+def motion_of(top: Top, start: State, *, method: str, equations: str = 'transport',
+              rtol: Any = 1e-11, atol: Any = None,
+              posture: Posture | None = None) -> ExactSolution | SteppedMotion:
     """
     Return the motion that begins at `start`; `solve` explains the settings.
 
-    Motions without torque or nutation take no steps: 'rk45' hands them to the closed form too.
-    The transport equations scale their unknowns to 1 and tolerate atol + rtol; the Euler equations
-    tolerate atol + rtol |angle|.
+    Motions without torque or nutation take no steps: 'rk45' leaves them to the closed form, where
+    that can hold them and gmpy2 is installed.  The transport equations scale their unknowns to 1
+    and tolerate atol + rtol; the Euler equations tolerate atol + rtol |angle|.
+
+    posture : of `start` in the same frame, in doubles that know more of it
 
     Raises ValueError for a bad setting, or a motion that doubles cannot hold, and IntegrationError
     if the Euler equations cannot start.
     """
-    if method not in METHODS:
-        raise ValueError(f'method = {method!r}: must be one of {", ".join(METHODS)}')
-    if equations not in EQUATIONS:
-        raise ValueError(f'equations = {equations!r}: must be one of {", ".join(EQUATIONS)}')
-    if not 1e-14 <= rtol <= 1e-2:
-        raise ValueError(f'rtol = {rtol!r}: must be in [1e-14, 1e-2]')
-    if not 0.0 <= atol <= 1e-2:
-        raise ValueError(f'atol = {atol!r}: must be in [0, 1e-2]')
-    if method == 'exact':
-        return ExactSolution(top, start)
+    atol = 0.1 * rtol if atol is None and isinstance(rtol, float) else atol
+    for name, value, allowed in (('method', method, METHODS), ('equations', equations, EQUATIONS)):
+        if value not in allowed:
+            raise ValueError(f'{name} = {value!r}: must be one of {", ".join(allowed)}')
+    for name, value, least in (('rtol', rtol, 1e-14), ('atol', atol, 0.0)):
+        if not (isinstance(value, int | float) and least <= value <= 1e-2):
+            raise ValueError(f'{name} = {shown(value)}: must be in [{least:g}, 1e-2]')
+    if method == 'exact' or (equations == 'transport' and (
+            top.gravity_torque == 0.0 or axis_rests(top, start))):
+        with suppress(*(() if method == 'exact' else (ImportError, ValueError))):
+            from spinning_top_sim.solvers.exact import ExactSolution  # noqa: PLC0415 - gmpy2
+
+            return ExactSolution(top, start)
     try:
         with np.errstate(over='raise', divide='raise', invalid='raise'):
-            motion = _stepped(top, start, equations, rtol, atol)
+            motion: SteppedMotion = (
+                EulerMotion(top, start, rtol, atol) if equations == 'euler'
+                else TransportMotion(top, start, rtol, atol, posture))
             first = motion.states(range(1))
             held = all(abs(float(column[0])) <= LARGEST_NUMBER for column in (
                 first.energy, first.phi_dot, first.psi_dot, *first.angular_acceleration.T))
@@ -67,31 +69,6 @@ def propagate(top: Top, start: State, *, method: str, equations: str = 'transpor
         raise ValueError(f'{top} from {start}: the constants are too far apart in size for '
                          'doubles to hold the motion')
     return motion
-
-
-def propagate_accelerated(top: Top, start: State | Posture, acceleration: Fractions, *,
-                          method: str, **settings: Any) -> tuple[Motion, Vertical]:
-    """
-    Return the motion while the pivot accelerates uniformly, and the vertical that it is about.
-
-    acceleration : of the pivot in the world [m/s^2]
-    method, settings : as of `propagate`
-    """
-    posture = posture_of(top, start) if isinstance(start, State) else start
-    if method == 'exact':
-        motion = AcceleratedMotion(top, posture, acceleration)
-        return motion, motion.vertical
-    vertical, precise_start = about_vertical(top, posture, acceleration)
-    return propagate(vertical.top, rounded(precise_start), method=method, **settings), vertical
-
-
-def _stepped(top: Top, start: State, equations: str, rtol: float, atol: float) -> Motion:
-    if equations == 'euler':
-        return EulerMotion(top, start, rtol, atol)
-    if top.gravity_torque == 0.0 or axis_rests(top, start):
-        with suppress(ValueError):      # beyond its range, steps go on
-            return ExactSolution(top, start)
-    return TransportMotion(top, start, rtol, atol)
 
 
 def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: float = 1e-11,
@@ -145,17 +122,17 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
         raise TypeError(f'solve({type(top).__name__}, {type(start).__name__}, ...): must be '
                         'solve(top, start, t) with a Top and a State')
     try:
-        times = np.asarray(t).astype(np.float64, casting='same_kind')
+        times = np.asarray(np.ma.filled(t, math.nan)).astype(np.float64, casting='same_kind')
     except (TypeError, ValueError) as error:
         raise ValueError(f't = {shown(t)}: must be (n,) numbers, in s') from error
     if times.ndim != 1:
         raise ValueError(f't has shape {times.shape}: must be (n,)')
     for at in np.flatnonzero(~np.isfinite(times)):
         raise ValueError(f't[{at}] = {times[at]} s: must be finite')
-    motion = propagate(top, start, method=method, equations=equations, rtol=rtol,
-                       atol=0.1 * rtol if atol is None else atol)
-    before = np.concatenate(([0.0], times[:-1]))
-    for at in np.flatnonzero(times < before) if method != 'exact' else ():
-        raise ValueError(f't[{at}] = {times[at]} s after {before[at]} s: must not decrease with '
-                         f'method = {method!r}')
+    if method != 'exact':
+        before = np.concatenate(([0.0], times[:-1]))
+        for at in np.flatnonzero(times < before):
+            raise ValueError(f't[{at}] = {times[at]} s after {before[at]} s: must not decrease '
+                             f'with method = {method!r}')
+    motion = motion_of(top, start, method=method, equations=equations, rtol=rtol, atol=atol)
     return motion.states_at_seconds(times)

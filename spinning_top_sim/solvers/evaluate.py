@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The exact motion at many times, in doubles; `constants` explains the symbols.
+
+Three phases are products of a rate and the time, whose error does not grow with time: that of the
+nutation in quarter periods, and those of the rotations exp i(r t + c) of alpha and beta in half
+turns.  Each is reduced to the nearest integer.  What is left is an angle of at most pi/4 or pi/2
+and keeps its relative precision: a top races past a pole that it misses by little.
+
+All arithmetic is elementwise, so that a value does not depend on the other values in its block.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from operator import sub
+from typing import NamedTuple
+
+import numpy as np
+from gmpy2 import const_pi, mpfr, rint
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.attitude import Column, Number
+from spinning_top_sim.physics.pivot import NANOSECONDS
+from spinning_top_sim.solvers.constants import ThetaMotion
+from spinning_top_sim.solvers.multiprecision import SIN_ODD, double_double, precision
+
+Matrix = NDArray[np.float64]
+QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
+SIGNS = np.array((1.0, -1.0))   # of an even and of an odd number of half turns
+HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the three phases' units
+# Smaller amplitudes leave no room for their squares in doubles, larger numbers none for halves.
+LEAST_AMPLITUDE, LARGEST_NUMBER = 1e-145, 1e290
+# 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).
+SPLITTER = 134217729.0
+# Once glibc has freed a block of this size, it keeps freed memory for large arrays instead of
+# clearing the pages again [mallopt(3)]: 20 000 attitudes take 0.9 ms, and would take 2.3 ms.
+np.empty(2 ** 22, np.uint8)
+
+
+class Times(NamedTuple):
+    """
+    Times since the start of a motion, as sums of two doubles.
+
+    per_second : 1 for times in s, 10^9 in ns
+    high, low : (n,) nearest doubles, and what they leave out, which may be one 0
+    """
+
+    per_second: int
+    high: Column
+    low: Column | float = 0.0
+
+    @classmethod
+    def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
+        """Return the times of integer nanoseconds (n,).  Raises ValueError."""
+        if isinstance(ns, range):
+            if not all(abs(x) < 2 ** 63 for x in (ns.start, ns.stop, ns.step)):
+                raise ValueError(f'times_ns = {ns!r}: must be within int64')
+            # `numpy.arange` takes its length from doubles.
+            count = ns.start + ns.step * np.arange(len(ns), dtype=np.int64)
+        else:
+            count = np.asarray(ns)
+            if count.ndim != 1 or count.dtype.kind != 'i':
+                raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must '
+                                 'be (n,) nanoseconds, int64')
+        high = count.astype(np.float64)
+        if np.abs(high).max(initial=0.0) < 2.0 ** 53:
+            return cls(NANOSECONDS, high)
+        upper = (count >> 20).astype(np.float64) * 2.0 ** 20
+        lower = (count & (2 ** 20 - 1)).astype(np.float64)
+        high = upper + lower
+        return cls(NANOSECONDS, high, lower - (high - upper))
+
+    @property
+    def seconds(self) -> Column:
+        return self.high / self.per_second + self.low / self.per_second
+
+    def part(self, rows: slice) -> Times:
+        return self._replace(high=self.high[rows], low=self.low if isinstance(self.low, float)
+                             else self.low[rows])
+
+
+def halves(x: Number) -> tuple[Number, Number]:
+    """Split doubles into two of 26 bits each; products of such halves are exact."""
+    big = SPLITTER * x
+    high = big - (big - x)
+    return high, x - high
+
+
+class ThetaArrays:
+    """
+    The constants of a motion in doubles; columns are (k, 1).
+
+    Raises ValueError if doubles cannot hold an amplitude or a rate.
+
+    start_wholes, start_offsets, start_rests : of the three phases at t = 0: their sum
+    drifts : kappa/2 of alpha and beta
+    stretch : K/K' times a quarter turn, 0 in the real form
+    prefactors : at even and at odd N, of the rows R of alpha and beta, s J of alpha and beta
+    coefficients : of the polynomials of these rows in xi, highest power first, (k, 4, 2)
+    on_line : the numbers, 0 for alpha and 1 for beta, of those that have s = 0
+    zeros : by the same number, of those that pass their pole exactly: whether R = 0 at y = 0 is
+        at even N (0) or at odd N (1)
+    u_dot, u_dot_coefficients : of u'
+    bottom_rate, top_rate : (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
+    precession, swing : p and q at even and at odd N, of (Lz - L3 u)/lambda1
+    """
+
+    def __init__(self, motion: ThetaMotion) -> None:
+        factors = motion.alpha, motion.beta
+        self.bottom_rate, self.top_rate = (float(x.pole_rate) for x in factors)
+        self._rates = [motion.quarter_rate, *(x.rate / const_pi() for x in factors)]
+        turns = [2 * x.phase_turns for x in factors]
+        wholes = [motion.start_whole, *map(int, map(rint, turns))]
+        self.start_wholes = np.array(wholes, np.float64)[:, np.newaxis]
+        self.start_offsets, self.start_rests = _columns(
+            [motion.start_offset, *map(sub, turns, wholes[1:])])
+        self.drifts = np.array([[0.5 * float(factor.drift)] for factor in factors])
+        self.stretch = QUARTER * float(motion.stretch) if motion.stretch else 0.0
+        rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
+        self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
+        self.coefficients = _highest_first(
+            [float(scale * x) for x in one.polynomial(motion.size)]
+            for row, factor in zip(rows, 2 * factors, strict=True)
+            for one, scale in zip(row, factor.scales, strict=True)).reshape(-1, 4, 2)
+        for name, factor in (('alpha', motion.alpha), ('beta', motion.beta)):
+            size = min(abs(scale) * max(map(abs, real.weights)) for (real, _), scale in zip(
+                factor.parts, factor.scales, strict=True))
+            if 0 < size < LEAST_AMPLITUDE:
+                raise ValueError(
+                    f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
+                    f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
+        self.on_line = [k for k, factor in enumerate(factors) if not factor.pole_rate]
+        self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
+                      if SIN_ODD in pair}
+        self.u_dot = np.array([*map(float, motion.u_dot)])
+        self.u_dot_coefficients = _highest_first(
+            [[*map(float, motion.u_dot_series.polynomial(motion.size))]])
+        self.precession, self.swing = np.array(
+            [[*map(float, motion.precession)], [*map(float, motion.swing)]])
+        self._scaled: dict[int, list[Matrix]] = {}
+
+    def turned(self, times: Times) -> tuple[Matrix, Matrix]:
+        """
+        Return what the three phases have grown by, rate * t, (3, n).
+
+        As nearest doubles and what they leave out: no error grows.
+        """
+        unit = times.per_second
+        if unit not in self._scaled:
+            with precision():
+                rate, rate_low = _columns([x / unit for x in self._rates])
+            self._scaled[unit] = [rate, *halves(rate), rate_low]
+        rate, r1, r2, rate_low = self._scaled[unit]
+        t1, t2 = halves(times.high)
+        high = rate * times.high
+        # Exact up to the last product of halves (Dekker).
+        rest = r1 * t1
+        rest -= high
+        rest += r1 * t2
+        rest += r2 * t1
+        rest += r2 * t2
+        small = rate_low * times.high
+        if not isinstance(times.low, float):
+            small += rate * times.low
+        rest += small
+        return high, rest
+
+    @cached_property
+    def _middles(self) -> Matrix:
+        """The rows where y = 0, at N = 0 and N = 1, (4, 2)."""
+        return np.where(np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
+
+    @cached_property
+    def bounds(self) -> tuple[float, float]:
+        """The least and the greatest theta in [0, pi] [rad]."""
+        alpha, beta, alpha_imag, beta_imag = self._middles
+        low, high = sorted((2.0 * np.arctan2(np.hypot(beta, beta_imag),
+                                             np.hypot(alpha, alpha_imag))).tolist())
+        return low, high
+
+    @cached_property
+    def rests(self) -> bool:
+        """Whether theta is constant."""
+        return not self.u_dot.any()
+
+    @cached_property
+    def precesses_slowly(self) -> bool:
+        """
+        Whether p + q theta1^2/D^2 has smaller terms than the half angles have; see `across`.
+
+        Their largest values decide.  A fast top hardly precesses, and the half angles cancel.
+        """
+        if self.rests or self.on_line:
+            return False
+        low, high = (0.5 * theta for theta in self.bounds)
+        least = min(math.sin(2.0 * low), math.sin(2.0 * high))
+        return 2.0 * float(np.abs(self.precession).max()) < least * (
+            abs(self.bottom_rate) * math.tan(high) + abs(self.top_rate) / math.tan(low))
+
+    @cached_property
+    def planar_rotation(self) -> tuple[float, float] | None:
+        """(i, j) if both poles are passed: theta/2 is within a quarter turn of pi/2 (i + j N)."""
+        if len(self.zeros) < 2:
+            return None
+        alpha, beta, *_ = self._middles
+        first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
+        slope = (second - first + 2.0) % 4.0 - 2.0
+        start_whole = float(self.start_wholes[0, 0])
+        start = (first + slope * start_whole + 1.0) % 4.0 - 1.0
+        return start - slope * start_whole, slope
+
+
+class ThetaValues:
+    """The motion at n times, in columns that are computed when they are first asked for."""
+
+    def __init__(self, arrays: ThetaArrays, times: Times) -> None:
+        self._arrays = arrays
+        self._turned, self._turned_rest = arrays.turned(times)
+        self._whole, part = _reduced(self._turned, self._turned_rest, arrays)
+        self._offset = part[0].copy()
+        part[1:] += arrays.drifts * self._offset
+        # Cosine and sine by the tangent of half the angle, which is at most 1.
+        part *= HALF_ANGLES
+        tangent = np.tan(part, out=part)
+        square = tangent * tangent
+        self._cos = 1.0 - square
+        square += 1.0
+        self._cos /= square
+        tangent += tangent
+        self._sin = np.divide(tangent, square, out=tangent)
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        """Compute R and s J of alpha and beta, (2, n) each."""
+        arrays, quarters = self._arrays, self._whole[0]
+        sin = np.sinh(arrays.stretch * self._offset) if arrays.stretch else self._sin[0]
+        xi = -sin * sin if arrays.stretch else sin * sin
+        cos = np.sqrt(1.0 - xi)
+        self._parity, self._xi = quarters & 1, xi
+        odd = self._parity.astype(bool)
+        rows = _horner(arrays.coefficients.take(self._parity, axis=2), xi)
+        for k in arrays.zeros:          # the sign is (-1)^floor(N/2)
+            rows[k] *= 1 - (quarters & 2)
+        self._without_zero = {k: rows[k].copy() for k in arrays.zeros}
+        bases = 1.0, cos, sin, sin * cos
+        for k, (one, other) in enumerate(arrays.prefactors):
+            rows[k] *= bases[one] if one == other else np.where(odd, bases[other], bases[one])
+        self._real, self._imag = rows[:2], rows[2:]
+        self._sin_cos, self._cos_y, self._sin_y = bases[3], cos, sin
+
+    @cached_property
+    def moduli(self) -> Matrix:
+        """|alpha| D and |beta| D, (2, n); signed, not absolute, where s = 0."""
+        # The squares may be too small for a double.
+        moduli: Matrix = np.hypot(self._real, self._imag)
+        for k in self._arrays.on_line:
+            moduli[k] = self._real[k]
+        return moduli
+
+    @cached_property
+    def _rotations(self) -> tuple[Matrix, Matrix]:
+        """Cosines and sines of r t + c + kappa y of alpha and beta, (2, n)."""
+        sign = SIGNS.take(self._whole[1:] & 1)
+        return sign * self._cos[1:], sign * self._sin[1:]
+
+    @cached_property
+    def _alpha_beta(self) -> tuple[Matrix, Matrix]:
+        """Real and imaginary parts of alpha D and beta D, (2, n)."""
+        (cos, sin), real, imag = self._rotations, self._real, self._imag
+        return real * cos - imag * sin, real * sin + imag * cos
+
+    @cached_property
+    def quaternion(self) -> Matrix:
+        """Q(world <- body) as x, y, z, w, (4, n)."""
+        real, imag = self._alpha_beta
+        squares = self._real * self._real + self._imag * self._imag
+        scale = 1.0 / np.sqrt(squares[0] + squares[1])
+        found = np.empty((4, len(scale)))
+        np.multiply(real[::-1], scale, out=found[1::2])
+        np.multiply(imag[::-1], scale, out=found[::2])
+        np.negative(found[0], out=found[0])
+        return found
+
+    @cached_property
+    def angles(self) -> Matrix:
+        """
+        phi, theta and psi, continued through the poles [rad], (5, n).
+
+        phi and psi are given in two parts each, as what grows with time and the rest, less their
+        values at t = 0.
+        """
+        (_, alpha, beta), (_, alpha_rest, beta_rest) = self._turned, self._turned_rest
+        arguments = np.arctan2(self._imag, self._real)
+        arguments += (math.pi * self._arrays.drifts) * self._offset
+        arguments[self._arrays.on_line] = 0.0
+        half = np.arctan2(self.moduli[1], self.moduli[0])
+        if self._arrays.planar_rotation:
+            i, j = self._arrays.planar_rotation
+            half += math.tau * np.rint((QUARTER * (i + j * self._whole[0]) - half) / math.tau)
+        return np.stack((
+            math.pi * ((alpha + beta) + (alpha_rest + beta_rest)), arguments[0] + arguments[1],
+            2.0 * half,
+            math.pi * ((alpha - beta) + (alpha_rest - beta_rest)), arguments[0] - arguments[1]))
+
+    @cached_property
+    def theta_dot(self) -> Column:
+        # theta' = -u'/sin(theta), and u' is a theta series of 2y.
+        arrays, xi, (alpha, beta) = self._arrays, self._xi, self.moduli
+        if arrays.rests:                # perhaps at a pole
+            return np.zeros(len(xi))
+        size, prefactor, without = alpha * alpha + beta * beta, self._sin_cos, [alpha, beta]
+        for k, parity in arrays.zeros.items():    # there sin y is divided out
+            here = self._parity == parity
+            prefactor = np.where(here, self._cos_y, prefactor)
+            without[k] = np.where(here, self._without_zero[k], without[k])
+        series = prefactor * _horner(arrays.u_dot_coefficients, 4.0 * xi * (1.0 - xi))
+        # In this order nothing overflows on the separatrix, where all grow like cosh x.
+        theta_dot: Column = -arrays.u_dot.take(self._parity) * (series / size) / (
+            without[0] * without[1])
+        return theta_dot
+
+    @cached_property
+    def across(self) -> Column:
+        """
+        Phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) [rad/s].
+
+        Nothing cancels near a pole in half angles, and at one that can be reached the singular
+        term is absent.
+        """
+        arrays, (alpha, beta) = self._arrays, self.moduli
+        if arrays.precesses_slowly:
+            series = self._sin_y * _horner(arrays.u_dot_coefficients, self._xi)
+            momentum = (arrays.precession.take(self._parity) * (alpha * alpha + beta * beta)
+                        + arrays.swing.take(self._parity) * (series * series))
+            slow: Column = 0.5 * momentum / (alpha * beta)
+            return slow
+        rate = np.zeros(len(alpha))
+        if arrays.bottom_rate:
+            rate += arrays.bottom_rate * (beta / alpha)
+        if arrays.top_rate:
+            rate += arrays.top_rate * (alpha / beta)
+        return rate
+
+    @cached_property
+    def rates(self) -> Matrix:
+        """The rate of theta, phi' sin(theta) [rad/s], cosine and sine of psi, (4, n)."""
+        # psi is the argument of alpha less that of beta.
+        real, imag = self._alpha_beta
+        moduli = self.moduli.copy()
+        moduli[self._arrays.on_line] = 1.0  # it may be 0, and its sign is in theta
+        cos, sin = real / moduli, imag / moduli
+        for k in self._arrays.on_line:
+            cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
+        return np.stack((self.theta_dot, self.across, cos[0] * cos[1] + sin[0] * sin[1],
+                         sin[0] * cos[1] - cos[0] * sin[1]))
+
+
+def _reduced(turned: Matrix, turned_rest: Matrix,
+             arrays: ThetaArrays) -> tuple[NDArray[np.int64], Matrix]:
+    """
+    Return the nearest integers of three phases, and what is left of them, (3, n) each.
+
+    turned, turned_rest : what they have grown by, as two doubles each
+
+    whole + part = turned + turned_rest + the phases at t = 0
+    """
+    whole = np.rint(turned)
+    part = turned - whole
+    shift = part + arrays.start_offsets
+    shift += turned_rest
+    np.rint(shift, out=shift)
+    # No difference rounds where the result is small: its terms are within a factor of two of each
+    # other then (Sterbenz).
+    half = 0.5 * shift
+    part -= half
+    half -= arrays.start_offsets
+    part -= half
+    part += turned_rest + arrays.start_rests
+    wholes = whole.astype(np.int64)
+    shift += arrays.start_wholes
+    wholes += shift.astype(np.int64)
+    return wholes, part
+
+
+def _columns(numbers: Sequence[mpfr]) -> Matrix:
+    """Return nearest doubles and what they leave out, (2, k, 1)."""
+    return np.array([*map(double_double, numbers)]).T[:, :, np.newaxis]
+
+
+def _highest_first(polynomials: Iterable[list[float]]) -> Matrix:
+    """Return coefficients with the highest of at least 2 powers first, (k, n)."""
+    polynomials = [*polynomials]
+    size = max(2, *map(len, polynomials))
+    return np.array([(size - len(one)) * [0.0] + one[::-1] for one in polynomials]).T
+
+
+def _horner(coefficients: Matrix, xi: Column) -> Matrix:
+    """Return the polynomials (..., n) at xi from their coefficients (k, ..., n or 1), k > 1."""
+    value: Matrix = coefficients[0] * xi + coefficients[1]
+    for coefficient in coefficients[2:]:
+        value *= xi
+        value += coefficient
+    return value
