@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 from spinning_top_sim import State, Top
 from spinning_top_sim.physics import attitude, pivot
 from spinning_top_sim.physics.pivot import Kinematics, PivotPath
+from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.multiprecision import BITS, precision
-from spinning_top_sim.solvers.vertical import AcceleratedMotion, posture_of
 from spinning_top_sim.streams.trajectory import Trajectory
 
 BOUND = 5e-15
@@ -32,13 +32,13 @@ CASES = {case['name']: case for case in json.loads(
 GENERAL = State(theta=0.5, theta_dot=0.3, phi=0.1, psi=0.2, l3=1.6, lz=1.3)
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
 NOWHERE = (0.0, 0.0, 0.0)
+RIDE = PivotPath([]).lasting(0)
 
 
 def kinematics(path, times_ns):
     """Return position, velocity and acceleration (n, 3) of a pivot at times [ns]."""
-    pieces = [path.piece(int(t)) for t in times_ns]
-    found = pivot.kinematics(pieces, len(pieces) * [1], np.array(times_ns))
-    return Kinematics(*(part.T for part in found))
+    found = [pivot.kinematics(path.piece(int(t)), np.array([t])) for t in times_ns]
+    return Kinematics(*(np.hstack(rows).T for rows in zip(*found, strict=True)))
 
 
 def sample(trajectory, t_ns, point):
@@ -103,29 +103,28 @@ def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
     State(theta=0.0, theta_dot=1e-50, l3=0.5, lz=0.5),
     State(theta=1e-15, theta_dot=1e-15, psi=1.0, l3=0.5, lz=0.5)])
 def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
-    exact = tuple(map(Fraction, acceleration))
-    posture = posture_of(TOP, start)
-    motion = AcceleratedMotion(TOP, posture, exact)
-    whole, back = motion.posture(S), posture
+    def begun(first, start_ns):
+        return Piece(TOP, first, start_ns, RIDE._replace(
+            acceleration=tuple(map(Fraction, acceleration)),
+            begins=np.array((*NOWHERE, *NOWHERE, *acceleration))), method='exact')
+    piece = begun(start, 0)
+    first, whole, back, now = piece.posture(0), piece.posture(S), piece, 0
     for length in (1000, S // 3, S - S // 3 - 1000):
-        back = AcceleratedMotion(TOP, back, exact).posture(length)
+        now += length
+        back = begun(back.posture(now), now)
     with precision(BITS):
-        for one, other in zip(whole[:3], back[:3], strict=True):
+        for one, other in zip(whole[:3], back.posture(S)[:3], strict=True):
             assert abs(one - other) < max(1, abs(one)) * 1e-30
-    for t, (alpha, beta, across, _) in (0, posture), (S, whole):
-        states = motion.states(range(t, t + 1))
-        q = np.ravel(attitude.product(motion.vertical.rotation, states.rows_quaternion))
+    for t, (alpha, beta, across, _) in (0, first), (S, whole):
+        states = piece.states(range(t, t + 1))
+        q = states.quaternion[0]
         assert abs(q - [-beta.imag, beta.real, alpha.imag, alpha.real]).max() < 2e-15
         rates = np.array([across.real, across.imag], float)
         assert abs(states.angular_velocity[0, :2] - rates).max() < 5e-15 * max(1.0, *abs(rates))
-    assert back.l3 == start.l3 == motion.start.l3
-    assert 0.0 <= motion.start.theta <= math.pi / 2
-    # The vertical of the frame is the line of the effective gravity.
-    line = np.array(acceleration) + np.array((0.0, 0.0, TOP.gravity))
-    assert motion.top.gravity == pytest.approx(
-        math.copysign(np.linalg.norm(line), motion.top.gravity), rel=1e-15)
-    z = np.array(attitude.axis_in_world(motion.vertical.rotation)).ravel()
-    assert abs(motion.top.gravity * z - line).max() <= 1e-15 * max(1.0, np.linalg.norm(line))
+    assert back.l3 == start.l3 == piece.l3
+    force = np.array(acceleration) + np.array((0.0, 0.0, TOP.gravity))
+    felt = np.ravel(attitude.rotated(states.rows_quaternion, states.specific_force(NOWHERE)))
+    assert abs(felt - force).max() <= BOUND * max(1.0, np.linalg.norm(force))
 
 
 # The path of the pivot

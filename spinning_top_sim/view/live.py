@@ -151,7 +151,9 @@ class LiveView(Node):
             topic, data = self._inbox.popleft()
             arrived[topic].append(data)
         for topic, messages in arrived.items():
-            samples = self._track.decode(topic, messages)
+            # Those without a stamp belong to the newest sample.
+            samples = self._track.decode(topic, messages, None if topic != '~/invariants' else (
+                len(messages) * [self._track.span[1]]))
             known_ns = self._track.samples[topic].stamps_ns
             if len(known_ns) and (samples.stamps_ns[-1:] < known_ns[-1] - RESTART_NS).any():
                 self._track.drop_before(known_ns[-1] + 1)        # the sim_node was started again
