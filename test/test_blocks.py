@@ -1,158 +1,161 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A value does not depend on which other values are computed with it.
+A message depends on parameters, events and its own time, never on what is computed with it.
 
-Samples are computed in blocks, whose sizes follow from ticks, commands, rates and listeners.  The
-same parameters and commands must give the same bytes for every division into blocks.
+The whole run as few large blocks is compared with the same run offline in pieces, and live.
 """
 
+import dataclasses
 import random
 
 import pytest
-from helpers.readings import command, rate
+from helpers.examples import examples
 from helpers.reference import scene_parameters
-from helpers.simulations import MILLISECOND, play, record, simulate
+from helpers.simulations import EPOCH_NS, MILLISECOND, drive, entries, play, record, simulate
+from hypothesis import given
+from hypothesis import strategies as st
 
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.messages import FIELDS
-from spinning_top_sim.streams.topics import all_streams
+from spinning_top_sim.physics.top import State
 
 COMMON = {
     'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 2e-4,
-    'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 2e-2,
-    'imu.accelerometer_random_walk': 3e-3, 'imu.accelerometer_turn_on_bias': 0.05,
-    'markers.trace_length': 0.3, 'markers.trace_points': 12,
-    'pose.rate': 333.0, 'imu.rate': 500.0, 'imu_data.rate': 77.7, 'ground_truth_imu.rate': 500.0}
-MOUNTED = {'imu.lever_arm': (0.1, -0.2, 0.3), 'imu.rpy': (0.1, 0.2, 0.3),
-           'imu.accelerometer_range': 40.0, 'imu.gyroscope_resolution': 1e-3,
-           'imu.gyroscope_M': (1.1, 0.01, 0.0, 0.02, 0.9, 0.03, 0.0, 0.04, 1.0),
-           'imu.accelerometer_M': (0.9, 0.0, 0.01, 0.0, 1.1, 0.0, 0.02, 0.0, 1.0),
-           'imu.gyroscope_A': (1e-3, 0.0, 2e-3, 0.0, 3e-3, 0.0, 0.0, 0.0, 1e-3),
-           'imu.gyroscope_bias_stddev': 0.1, 'imu.gyroscope_bias_correlation_time': 0.3,
-           'imu.accelerometer_bias_instability': 0.02, 'imu.orientation_stddev': (0.1, 0.2, 0.05),
-           'imu.stamp_offset': 0.01, 'imu.stamp_jitter': 1e-3, 'imu.clock_drift': -80.0,
-           'imu.drop_rate': 0.1, 'imu.duplicate_rate': 0.1, 'mag.noise_density': 1e-7,
-           'mag.random_walk': 1e-7, 'mag.hard_iron': (1e-5, 0.0, -2e-5), 'mag.resolution': 1.5e-7,
-           'mag.soft_iron': (1.1, 0.0, 0.1, 0.0, 0.9, 0.0, 0.1, 0.0, 1.0), 'mag.rate': 125.0,
-           'imu.sampling': 'mean', 'gnss.latency': 0.03, 'gnss.outages': (0.1, 0.2),
-           'gnss.position_noise': (1.0, 2.0), 'gnss.velocity_noise': (0.1, 0.2),
-           'gnss.rate': 300.0}
-FILTERED = {'imu.sampling': 'instant', 'imu.bandwidth': 40.0, 'imu.bandwidth_order': 2,
-            'imu.vibration.force': (1.0, 2.0, 3.0),
-            'imu.vibration.rate_psd': (10.0, 1e-3, 100.0, 1e-4),
-            'mag.disturbance.world': (0.1, 0.3, 1e-5, 0.0, 0.0)}
-SCENES = {
-    'cusps': {},
-    'a sensor elsewhere': {**scene_parameters('looping'), **MOUNTED},
-    # The acceleration changes at samples and between them.
-    'a filtered sensor': {
-        'pivot.path': (0.1, 2.0, 0.0, 0.0, 0.0123, 0.0, 0.0, -9.80665, 0.1, -2.0, 0.0, 0.0),
-        **MOUNTED, **FILTERED},
-    'many changes': {
-        'pivot.path': (0.012, 2.0, 0.0, 0.0, 0.017, 0.0, 3.0, -9.80665, 0.011, -2.0, 0.0, -25.0,
-                       0.023, 9.0, 0.0, -20.0, 0.02, 0.0, 0.0, 0.0, 0.015, -9.0, 0.0, 55.0),
-        **MOUNTED},
-    'through a pole': {'initial.theta': 0.5, 'spin.l3': 0.2, 'spin.lz': 0.2},
-    'planar rotation': scene_parameters('planar_pendulum'),
-}
-CASES = (('planar rotation', 'exact'), ('a filtered sensor', 'rk45'), ('many changes', 'exact'),
-         ('cusps', 'euler'), ('a sensor elsewhere', 'rk45'), ('through a pole', 'rk45'))
-DURATION_NS = 500_000_000
-# Commands, changes of rates, a velocity of the pivot and a state, and when they come [ns].
-EVENTS = ((125_000_000, command(1.1, 1.1)),
-          (225_000_001, lambda simulation: simulation.apply({'pose.rate': 250.0})),
-          (225_000_001, rate(320.0)),
-          (300_000_000, lambda simulation: simulation.drive((0.5, 0.0, 0.0))),
-          (350_000_003, command(0.9, 0.85)), (350_000_003, command(1.2, 1.2)),
-          (450_000_000, lambda simulation: simulation.set_state(
-              parameters.start_state(parameters.checked({'initial.theta': 1.0})))))
+    'imu.accelerometer_turn_on_bias': 0.05, 'markers.trace_length': 0.1, 'pose.rate': 333.0,
+    'markers.trace_points': 12, 'imu.rate': 500.0, 'imu_data.rate': 77.7, 'gnss.rate': 300.0,
+    'ground_truth_imu.rate': 500.0, 'invariants.rate': 60.0}
+MOUNTED = {
+    **COMMON, 'imu.lever_arm': (0.1, -0.2, 0.3), 'imu.rpy': (0.1, 0.2, 0.3),
+    'imu.accelerometer_range': 40.0, 'imu.gyroscope_resolution': 1e-3,
+    'imu.gyroscope_M': (1.1, 0.01, 0.0, 0.02, 0.9, 0.03, 0.0, 0.04, 1.0),
+    'imu.gyroscope_A': (1e-3, 0.0, 2e-3, 0.0, 3e-3, 0.0, 0.0, 0.0, 1e-3),
+    'imu.gyroscope_bias_stddev': 0.1, 'imu.gyroscope_bias_correlation_time': 0.3,
+    'imu.accelerometer_bias_instability': 0.02, 'imu.orientation_stddev': (0.1, 0.2, 0.05),
+    'imu.stamp_offset': 0.01, 'imu.stamp_jitter': 1e-3, 'imu.clock_drift': -80.0,
+    'imu.drop_rate': 0.1, 'imu.duplicate_rate': 0.1, 'mag.noise_density': 1e-7,
+    'mag.random_walk': 1e-7, 'mag.resolution': 1.5e-7, 'mag.rate': 125.0, 'gnss.latency': 0.03,
+    'mag.disturbance.world': (0.1, 0.2, 1e-5, 0.0, 0.0), 'gnss.outages': (0.05, 0.1),
+    'gnss.position_noise': (1.0, 2.0), 'gnss.velocity_noise': (0.1, 0.2), 'imu.sampling': 'mean'}
+FILTERED = {
+    **MOUNTED, 'imu.sampling': 'instant', 'imu.bandwidth': 150.0, 'imu.bandwidth_order': 2,
+    'imu.vibration.force': (1.0, 2.0, 3.0), 'imu.vibration.rate_psd': (10.0, 1e-3, 90.0, 1e-4)}
+# Accelerations change at samples and between them; two of them are free fall.
+PATH = (0.012, 2.0, 0.0, 0.0, 0.017, 0.0, 3.0, -9.80665, 0.011, -2.0, 0.0, -25.0,
+        0.0231, 9.0, 0.0, -20.0, 0.02, 0.0, 0.0, 0.0, 0.015, -9.0, 0.0, 55.0)
+RUNS = {
+    'cusps, the equations of the paper': {**COMMON, 'solver.equations': 'euler'},
+    'a sensor elsewhere, rk45': {**scene_parameters('looping'), **MOUNTED,
+                                 'solver.method': 'rk45'},
+    'a filtered sensor, rk45': {**FILTERED, 'pivot.path': PATH},
+    'many changes, exact': {**MOUNTED, 'pivot.path': PATH, 'solver.method': 'exact'},
+    'a filtered sensor, exact': {**FILTERED, 'solver.method': 'exact'},
+    'through a pole': {**COMMON, 'initial.theta': 0.5, 'spin.l3': 0.2, 'spin.lz': 0.2},
+    'planar rotation': {**scene_parameters('planar_pendulum'), **COMMON,
+                        'solver.method': 'exact'}}
+STATE = dataclasses.asdict(State(theta=1.0, theta_dot=0.3, l3=1.5, lz=1.1))
+# What may happen in a run; refused ones change nothing.
+ACTS = {
+    'command': lambda one: one.apply('command', l3=1.2 * one.trajectory.l3 + 0.1, lz=1.1),
+    'state': lambda one: one.apply('state', **STATE),
+    'drive': lambda one: drive(one, 0.5, 0.0, 0.1),
+    'repeat': lambda one: drive(one, 0.5, 0.0, 0.1),
+    'rates': lambda one: one.apply('parameters', **{'imu.rate': 320.0, 'pose.rate': 250.0}),
+    'slow': lambda one: one.apply('parameters', **{'imu.rate': 40.0}),
+    'epoch': lambda one: one.apply('epoch', epoch_ns=one.epoch_ns + 12_345),
+    'reset': lambda one: one.apply('reset', epoch_ns=EPOCH_NS + 10 ** 10,
+                                   parameters={**one.values, 'initial.theta': 0.7})}
+# Times between them: none, on samples, next to samples, anywhere.
+PAUSES = st.sampled_from((0, 1, 2 * MILLISECOND, 12 * MILLISECOND)) | st.integers(
+    0, 40).map(lambda k: 2 * MILLISECOND * k - 1).filter(lambda t: t > 0) | st.integers(
+        0, 60 * MILLISECOND)
+EVENTS = st.lists(st.tuples(PAUSES, st.sampled_from([*ACTS])), max_size=6)
 
 
-def start(scene, method):
-    solver = {'solver.equations': 'euler'} if method == 'euler' else {'solver.method': method}
-    return simulate({**COMMON, **SCENES[scene], **solver})
-
-
-def go(simulation, advance, splits):
-    """Run to the end with `advance`, divided at the events and at `splits` [ns]."""
-    stops = [*EVENTS, *((t_ns, lambda simulation: None) for t_ns in (*splits, DURATION_NS))]
-    for t_ns, act in sorted(stops, key=lambda stop: stop[0]):
-        if t_ns > simulation.now_ns:
-            advance(t_ns)
-        act(simulation)
-    assert len(simulation.history) == 6
-
-
-def offline(scene, method, splits=()):
-    """Return the messages of each topic, {topic: [(t [ns], data)]}, of a run offline."""
-    simulation, taken = start(scene, method), []
-    go(simulation, lambda t_ns: taken.extend(play(simulation, t_ns)), splits)
+def go(simulation, events, advance):
+    """Run through the events; `advance` goes on to a time [ns] and returns what it yields."""
+    taken = []
+    for pause_ns, name in (*events, (30 * MILLISECOND, '')):
+        until_ns = max(simulation.now_ns, 0) + pause_ns
+        if until_ns > simulation.now_ns:
+            taken += advance(simulation, until_ns) or ()
+        if name:
+            try:
+                ACTS[name](simulation)
+            except ValueError:      # of a top at a pole
+                assert name == 'command'
     return by_topic(taken)
-
-
-def restless(scene, method, splits, seed):
-    """
-    Return the same of a run as of a busy node, and what it publishes, [(topic, data)].
-
-    Ticks give way, blocks of any size are computed ahead, listeners come and go.
-    """
-    simulation, dice, published = start(scene, method), random.Random(seed), []
-    taken = record(simulation)
-
-    def advance(t_ns):
-        while not simulation.advance(t_ns, give_way=lambda: dice.random() < 0.3):
-            pass
-        for _ in range(dice.randrange(3)):
-            simulation.prepare(t_ns + dice.choice((1, 16, 200)) * MILLISECOND,
-                               dice.choice((None, 0, 100_000)))
-        for output in simulation.outputs:
-            if dice.random() < 0.05:
-                output.publish = None if output.publish else (
-                    lambda data, topic=output.stream.topic: published.append((topic, data)))
-    go(simulation, advance, splits)
-    return by_topic(taken), published
 
 
 def by_topic(taken):
     messages = {}
-    for topic, t_ns, data in taken:
-        messages.setdefault(topic, []).append((t_ns, data))
+    for topic, stamp_ns, data in taken:
+        messages.setdefault(topic, []).append((stamp_ns, data))
     return messages
 
 
-def random_splits(seed, count):
-    """Return so many times, anywhere, on samples, and one nanosecond beside them."""
-    dice = random.Random(seed)
-    splits = []
-    for _ in range(count):
-        sample = dice.randrange(DURATION_NS // 2_000_000) * 2_000_000
-        splits.append(dice.choice((dice.randrange(DURATION_NS), sample, sample + 1, sample - 1)))
-    return sorted({split for split in splits if split > 0})
+def at_once(simulation, until_ns):
+    """Nothing is forgotten, either."""
+    block = simulation.block(simulation.channels, simulation.now_ns, until_ns)
+    assert block.until_ns == until_ns
+    simulation.now_ns = until_ns
+    return entries(simulation, block)
 
 
-def first_difference(found, expected):
-    """Return topic and time [ns] of the first message that differs; None if none does."""
+def in_pieces(dice):
+    def advance(simulation, until_ns):
+        taken = []
+        while simulation.now_ns < until_ns:
+            taken += play(simulation, min(until_ns, simulation.now_ns + dice.choice(
+                (1, MILLISECOND, dice.randrange(1, 10 * MILLISECOND)))
+                if dice.random() < 0.1 else until_ns))
+        return taken
+    return advance
+
+
+def live(dice, published):
+    """Calls give way, look ahead for any time; subscribers come and go."""
+    def advance(simulation, until_ns):
+        while not simulation.send(dice.choice((until_ns, (until_ns + simulation.now_ns) // 2)),
+                                  give_way=lambda: dice.random() < 0.3
+                                  ) or simulation.now_ns < until_ns:
+            simulation.look_ahead(until_ns + dice.choice((0, 1, 16, 200)) * MILLISECOND,
+                                  dice.choice((0.0, 1e-4, 1e-2)))
+            for output in simulation.outputs:
+                if dice.random() < 0.05:
+                    output.publish = None if output.publish else (
+                        lambda data, topic=output.channel.topic: published.append((topic, data)))
+            if dice.random() < 0.5:
+                simulation.refresh()
+    return advance
+
+
+def assert_same(found, expected):
     assert {topic: len(messages) for topic, messages in found.items()} == {
         topic: len(messages) for topic, messages in expected.items()}
-    return next(((topic, two[0]) for topic in expected for one, two in zip(
-        found[topic], expected[topic], strict=True) if one != two), None)
+    for topic, messages in expected.items():
+        for one, two in zip(found[topic], messages, strict=True):
+            assert one == two, (topic, two[0])
 
 
-def test_each_field_of_each_stream_has_a_name():
-    """For the columns of ensembles, and for what `inspect --verify` says."""
-    for stream in all_streams(parameters.checked({})):
-        assert len(FIELDS[stream.type_name]) == len(stream.template.counts), stream.topic
+@pytest.mark.parametrize('name', RUNS)
+@examples(10)
+@given(EVENTS, st.integers(0, 999))
+def test_any_division_of_a_run_gives_the_same_bytes(name, events, seed):
+    dice = random.Random(seed)      # how often it is thrown depends on the clock
+    whole = go(simulate(RUNS[name]), events, at_once)
+    assert_same(go(simulate(RUNS[name]), events, in_pieces(dice)), whole)
+    simulation, published = simulate(RUNS[name]), []
+    taken = record(simulation)
+    go(simulation, events, live(dice, published))
+    assert_same(by_topic(taken), whole)
+    assert {*published} <= {(topic, data) for topic in whole for _, data in whole[topic]}
 
 
-@pytest.mark.parametrize(('scene', 'method'), CASES)
-def test_any_division_of_a_run_gives_the_same_bytes(scene, method):
-    """Offline in large blocks and divided anywhere, and live; what is published is recorded."""
-    whole = offline(scene, method)
-    assert len(whole['pose']) > 125 and len(whole['imu/data_raw']) > 175
-    assert len(whole) == len(all_streams(parameters.checked({})))
-    assert min(map(len, whole.values())) > 5
-    assert first_difference(offline(scene, method, random_splits(3, 5)), whole) is None
-    recorded, published = restless(scene, method, random_splits(2, 20), seed=2)
-    assert first_difference(recorded, whole) is None
+@pytest.mark.parametrize('name', RUNS)
+def test_a_run_with_every_event_has_every_topic_and_is_the_same_live(name):
+    events = [(25 * MILLISECOND, act) for act in ACTS]
+    whole, published = go(simulate(RUNS[name]), events, at_once), []
+    assert len(whole) == len(simulate().channels) and min(map(len, whole.values())) > 5
+    simulation = simulate(RUNS[name])
+    taken = record(simulation)
+    go(simulation, events, live(random.Random(2), published))
+    assert_same(by_topic(taken), whole)
     assert len(published) > 12
-    assert set(published) <= {(topic, data) for topic in recorded for _, data in recorded[topic]}

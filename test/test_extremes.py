@@ -144,7 +144,7 @@ def test_what_turns_too_fast_is_refused_at_the_start_and_by_simulate(
 
 def test_a_run_offline_whose_stamps_would_end_is_refused_before():
     simulation = simulate()
-    simulation.epoch_ns = LAST_STAMP_NS - SECOND + 1
+    simulation.apply('epoch', epoch_ns=LAST_STAMP_NS - SECOND + 1)
     with pytest.raises(IntegrationError, match='2038'):
         play(simulation, 2 * SECOND)
     assert simulation.now_ns == SECOND - 1

@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 from helpers.inspected import rewritten
-from helpers.readings import run
-from helpers.simulations import SECOND
+from helpers.simulations import SECOND, run
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.tools import inspect
@@ -40,7 +39,7 @@ def noisy():
 
 def test_the_truth_is_the_path_of_the_pivot_on_the_ellipsoid():
     simulation, found = run({**SHUTTLE, 'gnss.latency': 0.3}, 60 * SECOND, TRUE_FIX, TRUE_VELOCITY)
-    t_ns, stamps_ns, fixes = found[TRUE_FIX]
+    t_ns, stamps_ns, _, fixes, *_ = found[TRUE_FIX]
     assert np.array_equal(stamps_ns - simulation.epoch_ns, t_ns)
     assert np.array_equal(t_ns, np.arange(601) * PERIOD_NS)
     position, velocity = enu(fixes), found[TRUE_VELOCITY][2]
@@ -58,12 +57,12 @@ def test_the_truth_is_the_path_of_the_pivot_on_the_ellipsoid():
 
 
 def test_noise_is_white_with_the_standard_deviations(noisy):
-    for topic, exact, convert, levels in (
-            (FIX, TRUE_FIX, enu, (1.5, 1.5, 3.0)),
-            (VELOCITY, TRUE_VELOCITY, np.asarray, (0.05, 0.05, 0.1))):
-        _, stamps_ns, measured = noisy[topic]
+    for topic, exact, field, convert, levels in (
+            (FIX, TRUE_FIX, 3, enu, (1.5, 1.5, 3.0)),
+            (VELOCITY, TRUE_VELOCITY, 2, np.asarray, (0.05, 0.05, 0.1))):
+        stamps_ns, measured, truth = noisy[topic][1], noisy[topic][field], noisy[exact][field]
         is_valid = np.isfinite(measured).all(axis=1)
-        _, known_ns, truth = noisy[exact]
+        known_ns = noisy[exact][1]
         errors = (convert(measured[is_valid])
                   - convert(truth[np.isin(known_ns, stamps_ns[is_valid])]))
         count = len(errors)
@@ -76,7 +75,7 @@ def test_noise_is_white_with_the_standard_deviations(noisy):
 
 
 def test_delay_and_outages_are_exact(noisy):
-    t_ns, stamps_ns, fixes = noisy[FIX]
+    t_ns, stamps_ns, status, fixes, covariance, kind = noisy[FIX]
     late_ns = t_ns - (stamps_ns - noisy[TRUE_FIX][1][0])
     assert (late_ns.min(), late_ns.max()) == (120_000_000, 120_000_000)
     valid_ns = t_ns - 120_000_000
@@ -84,17 +83,23 @@ def test_delay_and_outages_are_exact(noisy):
     is_out = ((valid_ns >= 100 * SECOND) & (valid_ns < 120 * SECOND)) | (
         valid_ns == 200_100_000_000)
     assert np.array_equal(np.isnan(fixes), np.repeat(is_out[:, np.newaxis], 3, axis=1))
+    # sensor_msgs: no fix and an unknown covariance, else a fix with the diagonal known.
+    assert np.array_equal(status[:, 0], np.where(is_out, -1, 0))
+    assert np.array_equal(kind[:, 0], np.where(is_out, 0, 2))
+    known = np.diag((1.5 ** 2, 1.5 ** 2, 3.0 ** 2)).ravel()
+    assert np.array_equal(covariance, np.where(is_out[:, np.newaxis], 0.0, known))
     velocity_ns = noisy[VELOCITY][0] - 120_000_000
     assert np.array_equal(velocity_ns, valid_ns[~is_out])
 
 
 def test_a_late_fix_is_where_the_pivot_was_before_it_was_driven():
-    _, found = run({'gnss.enabled': True, 'gnss.latency': 0.5, 'gnss.rate': 50.0}, 3 * SECOND,
-                   *TOPICS, events=[(SECOND, lambda simulation: simulation.drive((1.0, 0, 0)))])
+    _, found = run(
+        {'gnss.enabled': True, 'gnss.latency': 0.5, 'gnss.rate': 50.0}, 3 * SECOND, *TOPICS,
+        events=[(SECOND, 'drive', {'x': 1.0, 'y': 0.0, 'z': 0.0, 'stop_ns': 3 * SECOND // 2})])
     for topic, exact in ((FIX, TRUE_FIX), (VELOCITY, TRUE_VELOCITY)):
         count = len(found[topic][1])
-        assert np.array_equal(found[topic][1], found[exact][1][:count])
-        assert np.array_equal(found[topic][2], found[exact][2][:count])
+        for one, true in zip(found[topic][1:], found[exact][1:], strict=True):
+            assert np.array_equal(one, true[:count])
     assert found[VELOCITY][2].max() > 0.5
 
 

@@ -5,8 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.readings import run
-from helpers.simulations import SECOND
+from helpers.simulations import SECOND, run
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.magnetometer import Magnetometer
@@ -55,7 +54,7 @@ NOISY = {**STANDING, 'mag.noise_density': 1e-7, 'mag.resolution': 1.5e-7}
 
 def test_noise_has_the_covariance_that_is_published_at_each_rate():
     _, found = run(NOISY, 200 * SECOND, 'imu/mag', 'ground_truth/mag', events=[
-        (100 * SECOND, lambda simulation: simulation.apply({'mag.rate': 50.0}))])
+        (100 * SECOND, 'parameters', {'mag.rate': 50.0})])
     (_, _, field, covariances), (_, _, exact, (known, *_)) = found.values()
     for rows, rate in ((slice(10_001), 100.0), (slice(10_001, None), 50.0)):
         errors, covariance = (field - exact)[rows], covariances[rows]

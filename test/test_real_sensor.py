@@ -5,8 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.readings import command, run
-from helpers.simulations import MILLISECOND, SECOND
+from helpers.simulations import MILLISECOND, SECOND, run
 
 # A free top whose attitude turns: its rates and forces are sines of two frequencies at most.
 TURNS = 20.0
@@ -23,7 +22,7 @@ def test_gain_and_delay_are_those_of_the_analog_filter(order, corner):
 
     values = {**FREE, 'imu.bandwidth': corner, 'imu.bandwidth_order': order}
     _, found = run(values, 2 * SECOND, 'imu/data_raw', 'ground_truth/imu')
-    (_, _, _, rates, _, *_), (_, _, _, exact, *_) = found.values()
+    (*_, rates, _), (*_, exact, _) = found.values()
     read, true = (np.ravel([1.0, 1j] @ part[1000:2000, :2].T) for part in (rates, exact))
     turning = true * np.conj(np.roll(true, 1))
     frequency = np.angle(turning[1:]).mean() * 1000.0
@@ -35,20 +34,27 @@ def test_gain_and_delay_are_those_of_the_analog_filter(order, corner):
     assert rates[:, 2] == pytest.approx(exact[:, 2], rel=1e-11)
 
 
-def test_a_command_gives_the_step_response_of_the_filter():
-    """The rate about the axis is a step."""
+@pytest.mark.parametrize('order', [1, 2])
+def test_jumps_give_the_step_response_of_the_filter(order):
+    """Of the rate about the axis by a command, of the force where the acceleration changes."""
     from scipy import signal
 
-    values = {**STANDING, 'spin.l3': 1.0, 'spin.lz': 1.0, 'imu.rate': 1000.0}
-    for order in (1, 2):
-        _, found = run({**values, 'imu.bandwidth': 10.0, 'imu.bandwidth_order': order}, SECOND,
-                       'imu/data_raw', events=[(300 * MILLISECOND + 123, command(2.0, 2.0))])
-        times_ns, _, _, rates, *_ = found['imu/data_raw']
-        late = np.maximum(times_ns * 1e-9 - 0.300000123, 0.0)
-        b, a = signal.butter(order, math.tau * 10.0, analog=True)
-        residues, poles, _ = signal.residue(b, (*a, 0.0))
-        expected = 1.0 + np.real(np.exp(np.outer(late, poles)) @ residues)
-        assert rates[:, 2] * 0.15 == pytest.approx(expected, abs=1e-8)
+    path = {'pivot.path': (0.1, 0.0, 0.0, 2.0, 0.1500001, 0.0, 0.0, -9.80665)}
+    values = {**STANDING, **path, 'spin.l3': 1.0, 'spin.lz': 1.0, 'imu.rate': 1000.0,
+              'imu.bandwidth': 10.0, 'imu.bandwidth_order': order}
+    _, found = run(values, SECOND, 'imu/data_raw', events=[
+        (300 * MILLISECOND + 123, 'command', {'l3': 2.0, 'lz': 2.0})])
+    times_ns, _, rates, force = found['imu/data_raw']
+    b, a = signal.butter(order, math.tau * 10.0, analog=True)
+    residues, poles, _ = signal.residue(b, (*a, 0.0))
+
+    def step(at_ns):
+        late = np.maximum((times_ns - at_ns) * 1e-9, 0.0)
+        return np.real(np.exp(np.outer(late, poles)) @ residues)
+
+    assert rates[:, 2] * 0.15 == pytest.approx(1.0 + step(300_000_123), abs=1e-8)
+    assert force[:, 2] - 9.80665 == pytest.approx(
+        2.0 - 11.80665 * step(100 * MILLISECOND) + 9.80665 * step(250_000_100), abs=1e-7)
 
 
 PROFILE = (20.0, 0.1, 80.0, 0.4, 350.0, 0.4, 800.0, 0.07)
@@ -66,7 +72,7 @@ def test_noise_has_the_power_of_the_profile_and_the_filter_acts_on_it():
             np.trapz(density * gain, frequencies))
         _, found = run({**values, 'imu.bandwidth': corner, 'imu.bandwidth_order': 2},
                        6 * SECOND, 'imu/data_raw')
-        _, _, _, rates, force, *_ = found['imu/data_raw']
+        *_, rates, force = found['imu/data_raw']
         assert not rates.any()
         at, spectra = signal.welch(force, 2000.0, nperseg=1024, axis=0)
         assert spectra.sum(axis=0) * at[1] == pytest.approx(3 * [power], rel=0.01)
@@ -86,8 +92,7 @@ def test_a_sine_has_its_amplitude_phase_and_gain():
     for more, factor in (({}, 1.0), ({'imu.bandwidth': 60.0}, gain),
                          ({'imu.sampling': 'mean'}, np.sinc(0.3) * np.exp(-0.3j * math.pi))):
         _, found = run({**values, **more}, SECOND, 'imu/data_raw', 'ground_truth/imu', 'imu/dq')
-        times_ns, _, _, rates, force, *_ = (part[1:] if part is not None else None
-                                            for part in found['imu/data_raw'])
+        times_ns, _, rates, force = (part[1:] for part in found['imu/data_raw'])
         sine = np.imag(factor * np.exp(1j * math.tau * 60.0 * times_ns * 1e-9))
         assert force[:, :2] == pytest.approx(np.outer(sine, (1.0, 2.0)), abs=1e-9)
         assert force[:, 2] == pytest.approx(9.80665, rel=1e-11)

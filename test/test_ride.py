@@ -23,8 +23,7 @@ from spinning_top_sim.physics import attitude, pivot
 from spinning_top_sim.physics.pivot import Kinematics, PivotPath
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.multiprecision import BITS, precision
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.trajectory import Trajectory
 
 BOUND = 5e-15
 S = 10 ** 9
@@ -42,21 +41,20 @@ def kinematics(path, times_ns):
     return Kinematics(*(np.hstack(rows).T for rows in zip(*found, strict=True)))
 
 
-def sample(segment, t_ns, point):
+def sample(trajectory, t_ns, point):
     """Return attitude w x y z, omega and alpha in the body, and where a point is at a time."""
-    states, place = segment.states(range(t_ns, t_ns + 1)), segment.pivot(np.array([t_ns]))
-    arm = np.stack(attitude.rotated(states.rows_quaternion, point))
+    states = trajectory.after(t_ns).states(range(t_ns, t_ns + 1))
     return (np.roll(states.quaternion[0], 1), states.angular_velocity[0],
-            states.angular_acceleration[0], (place.position + arm)[:, 0])
+            states.angular_acceleration[0], np.ravel(states.position(point)))
 
 
-def errors(path, case):
+def errors(trajectory, case):
     """
     Return the worst error of a component of each quantity over max(1, its true size).
 
     Euler's equations give alpha as a difference of products of rates: it has the size of omega^2.
     """
-    found = [sample(path.after(t), t, case['point']) for t in case['times_ns']]
+    found = [sample(trajectory, t, case['point']) for t in case['times_ns']]
     worst = {}
     for name, rows in zip(('q', 'omega', 'alpha', 'position'), zip(*found, strict=True),
                           strict=True):
@@ -75,15 +73,14 @@ def errors(path, case):
 def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
     """Also after a thousand changes, and what is handed over last has all digits."""
     case = CASES[name]
-    run = Simulation(parameters.checked({'solver.method': 'exact'}))
-    run.top, run.now_ns = Top(**case['top']), 0
-    run._continue(State(**case['start']), PivotPath(
-        case['pieces'], position=case['position'], velocity=case['velocity']))
-    worst = errors(run.path, case)
+    path = PivotPath(case['pieces'], position=case['position'], velocity=case['velocity'])
+    run = Trajectory(Top(**case['top']), State(**case['start']), path, {'method': 'exact'},
+                     most_acceleration=2.0)
+    worst = errors(run, case)
     # In the longest one an error grows by some 1e10: the true motion is chaotic.
     assert max(worst.values()) <= BOUND, worst
     end, found = case['times_ns'][-1], []
-    alpha, beta, across, l3 = run.path.after(end).posture(end)
+    alpha, beta, across, l3 = run.after(end).posture(end)
     with precision(BITS):
         last = {key: [*map(mpfr, values)] for key, values in case['states'][-1].items()}
         parts = (alpha.real, -beta.imag, beta.real, alpha.imag, across.real, across.imag)

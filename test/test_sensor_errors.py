@@ -12,8 +12,7 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from helpers.readings import rate, read, run
-from helpers.simulations import MILLISECOND, SECOND
+from helpers.simulations import MILLISECOND, SECOND, read, run
 from scipy.special import chdtri
 from stress import sensor as statistics
 
@@ -141,9 +140,9 @@ def test_a_jump_of_three_years_draws_few_numbers(monkeypatch):
 def test_a_change_of_the_rate_leaves_the_bias_on_its_path():
     values = {**ALL_BIASES, 'solver.method': 'exact', 'imu.rate': 200.0}
     _, found = run(values, 2 * SECOND, 'ground_truth/imu_bias', events=[
-        (number * SECOND // 2 + 7, rate(hertz))
+        (number * SECOND // 2 + 7, 'parameters', {'imu.rate': hertz})
         for number, hertz in enumerate((1000.0, 90.0, 400.0), 1)])
-    times_ns, _, _, rates, force = found['ground_truth/imu_bias']
+    times_ns, _, rates, force = found['ground_truth/imu_bias']
     _, steady = read(values, range(0, 2 * SECOND + 1, MILLISECOND))
     assert len(times_ns) > 700
     assert np.array_equal(np.hstack((rates, force)), steady[times_ns // MILLISECOND])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from spinning_top_sim.streams.stream import Stream
+from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.tools import cli, inspect
 from spinning_top_sim.tools.simulate import main
 
@@ -163,7 +163,7 @@ def test_nothing_is_overwritten(tmp_path, capsys):
 
 def test_an_interrupted_run_is_a_shorter_log_of_all_streams_up_to_one_time(
         tmp_path, capsys, monkeypatch):
-    path, encode, calls = tmp_path / 'run.mcap', Stream.encode, []
+    path, encode, calls = tmp_path / 'run.mcap', Channel.encode, []
 
     def interrupted(self, *arguments):
         calls.append(self)
@@ -171,7 +171,7 @@ def test_an_interrupted_run_is_a_shorter_log_of_all_streams_up_to_one_time(
             raise KeyboardInterrupt
         return encode(self, *arguments)
 
-    monkeypatch.setattr(Stream, 'encode', interrupted)
+    monkeypatch.setattr(Channel, 'encode', interrupted)
     assert main(['-o', str(path), '--duration', '40', '--quiet']) == 130
     assert re.fullmatch(f'spinning-top simulate: interrupted; {path} holds the run up to t = '
                         r'\d+\.?\d* s\n', capsys.readouterr().err)

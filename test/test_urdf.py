@@ -6,17 +6,15 @@ import runpy
 import numpy as np
 import pytest
 from helpers.reference import ROOT, scene_parameters
-from helpers.simulations import record, stream
+from helpers.simulations import SECOND, run
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.streams.imu import Mounting
 from spinning_top_sim.streams.topics import JOINTS
 from spinning_top_sim.tools import urdf
 
 pytest.importorskip('xacro')
-SECOND = 1_000_000_000
 MOUNTED = {'imu.lever_arm': (0.1, -0.05, 0.3), 'imu.rpy': (0.3, -0.2, 1.1)}
 ILLEGAL = {'no mass': {'top.mass': 0.0}, 'too flat': {'top.lambda3': 1.0},
            'too far out': {'top.com_distance': 1.0}, 'at the edge': {'top.lambda3': 0.1561}}
@@ -41,18 +39,13 @@ def matrix(q):
 def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
     values = {**scene_parameters(scene), **MOUNTED}
     model = robot(tmp_path, values)
-    simulation = LiveSimulation(parameters.checked(values))
-    pose, joints = (stream(simulation, topic) for topic in ('pose', 'joint_states'))
-    taken = record(simulation, pose.topic, joints.topic)
-    simulation.advance(SECOND)
-    poses, positions = ([one.template.decode(data)[place][0] for topic, _, data in taken
-                         if topic == one.topic] for one, place in ((pose, 1), (joints, 0)))
+    simulation, found = run(values, SECOND, 'pose', 'joint_states')
+    poses, positions = found['pose'][3], found['joint_states'][2]
     assert len(poses) == len(positions) == 101
     assert model.actuated_joint_names == list(JOINTS)
     arm = np.array(MOUNTED['imu.lever_arm'])
-    mounting = Imu(simulation.values)
-    state = simulation.state()
-    imu = matrix(np.concatenate(mounting.orientation(state)))
+    mounting = Mounting.of(simulation.values)
+    imu = matrix(np.concatenate(mounting.orientation(simulation.state())))
     # Unwrapped angles of thousands of radians cannot be told to 1e-12.
     limit = max(1e-12, 2.0 * np.spacing(np.abs(positions).max()))
     worst = 0.0
@@ -67,7 +60,7 @@ def test_the_joint_states_put_base_link_where_the_pose_is(tmp_path, scene):
 
 
 @pytest.mark.parametrize(('values', 'named'), [
-    ({'world_frame': 'base_link'}, 'world_frame'),
+    ({'world_frame': 'base_link'}, 'body_frame'),
     ({'body_frame': 'nutation_link'}, 'body_frame')])
 def test_frames_that_no_tree_has_are_refused(values, named):
     with pytest.raises(ValueError, match=f'{named}.*must be'):

@@ -178,18 +178,12 @@ class LiveSimulation(Simulation):
 
         Raises IntegrationError if the motion does not go on; what comes before is sent.
         """
-        failure = None
-        while self.now_ns < due_ns and failure is None:
+        while self.now_ns < due_ns:
             if self._ready_ns < due_ns:
-                try:
-                    self._prepare(due_ns, publish_from_ns)
-                except IntegrationError as error:
-                    failure = error
+                self._prepare(due_ns, publish_from_ns)
             self._send(min(due_ns, self._ready_ns), publish_from_ns)
-            if self.now_ns < due_ns and failure is None and give_way():
+            if self.now_ns < due_ns and give_way():
                 return False
-        if failure is not None:
-            raise failure
         return True
 
     @property
@@ -198,8 +192,12 @@ class LiveSimulation(Simulation):
         return min((group.computed_ns for group in self._groups), default=self._reached_ns)
 
     def _prepare(self, due_ns: int, publish_from_ns: int) -> None:
-        """Compute what is due, or a part of it."""
-        self._go_ahead(due_ns, PIECE_SECONDS)
+        """Compute what is due, or a part of it; raise where all is sent that the motion has."""
+        try:
+            self._go_ahead(due_ns, PIECE_SECONDS)
+        except IntegrationError:
+            if self.now_ns >= self._reached_ns:
+                raise
         until_ns = min(self._reached_ns, *(
             group.until_ns(publish_from_ns) for group in self._groups), due_ns)
         for group in self._groups:
@@ -223,7 +221,7 @@ class LiveSimulation(Simulation):
         if taken < 0.5 * seconds:
             self._span_ns = min(2 * self._span_ns, LONGEST_SPAN_NS)
         elif taken > 0.8 * seconds:
-            self._span_ns = max(self._span_ns // 2, 1)
+            self._span_ns = max(self._span_ns // 2, FIRST_SPAN_NS)
 
     def _go_ahead(self, until_ns: int, seconds: float) -> None:
         """Let the solver go on up to a time, or for about so long."""

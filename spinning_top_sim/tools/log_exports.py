@@ -93,7 +93,7 @@ def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
     if not biases:
         raise ValueError(f'--export euroc: the log has no sample of {BIAS}')
     bias_ns = np.concatenate([stamps_ns for stamps_ns, _ in biases])
-    bias = np.concatenate([np.hstack(fields[1:]) for _, fields in biases])
+    bias = np.concatenate([np.hstack(fields) for _, fields in biases])
     yield EUROC_HEAD
     for stamps_ns, (position, orientation, velocity, _) in _blocks(reader, run, ODOMETRY):
         world = attitude.rotated(tuple(orientation.T), tuple(velocity.T))
@@ -103,12 +103,12 @@ def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
                         np.column_stack(world), bias[newest])
 
 
-def _csv(topic: str, head: str, first: int, reader: LogReader,
+def _csv(topic: str, head: str, chosen: slice, reader: LogReader,
          run: RunDescription) -> Iterator[str]:
-    """Yield the lines of a table of a topic, from that field of its messages on."""
+    """Yield the lines of a table of a topic, with these fields of its messages."""
     yield head
     for stamps_ns, fields in _blocks(reader, run, topic):
-        yield from _rows(',', stamps_ns, *fields[first:])
+        yield from _rows(',', stamps_ns, *fields[chosen])
 
 
 def _rows(separator: str, stamps: Iterable[object],
@@ -137,6 +137,6 @@ def _blocks(reader: LogReader, run: RunDescription, topic: str,
 # Of each kind: the topics that it needs, and the generator of its text.
 KINDS: dict[str, tuple[Sequence[str], Callable[..., Iterator[str]]]] = {
     'tum': ((ODOMETRY,), _tum), 'euroc': ((ODOMETRY, BIAS), _euroc),
-    'euroc_imu': ((RAW,), partial(_csv, RAW, EUROC_IMU_HEAD, 1)), 'kalibr': ((RAW,), _kalibr),
-    'gnss_fix': ((FIX,), partial(_csv, FIX, FIX_HEAD, 0)),
-    'gnss_velocity': ((VELOCITY,), partial(_csv, VELOCITY, VELOCITY_HEAD, 0))}
+    'euroc_imu': ((RAW,), partial(_csv, RAW, EUROC_IMU_HEAD, slice(2))), 'kalibr': ((RAW,), _kalibr),
+    'gnss_fix': ((FIX,), partial(_csv, FIX, FIX_HEAD, slice(1, 2))),
+    'gnss_velocity': ((VELOCITY,), partial(_csv, VELOCITY, VELOCITY_HEAD, slice(1)))}

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulations for tests, what they send, and what that costs."""
 
+import numpy as np
+
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.inertial_sensor import Sensor
 from spinning_top_sim.streams.live import LiveSimulation
 
 SECOND = 1_000_000_000
 MILLISECOND = 1_000_000
 EPOCH_NS = 1_700_000_000 * SECOND
+STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 def simulate(values=None, **more):
@@ -15,69 +19,99 @@ def simulate(values=None, **more):
     return LiveSimulation(parameters.checked({**(values or {}), **dotted}), EPOCH_NS)
 
 
-def stream(simulation, topic):
-    return next(stream for stream in simulation.streams if stream.topic == topic)
+def channel(simulation, topic):
+    return next(one for one in simulation.channels if one.topic == topic)
 
 
 def output(simulation, topic):
-    return next(one for one in simulation.outputs if one.stream.topic == topic)
+    return next(one for one in simulation.outputs if one.channel.topic == topic)
 
 
 def record(simulation, *topics):
-    """Record these streams, all where none is named, from now on: [(topic, t_ns, bytes)]."""
-    taken, epoch_ns = [], simulation.epoch_ns
-    recorded = [one for one in simulation.streams if not topics or one.topic in topics]
-
-    def write(entries):
-        taken.extend((recorded[number].topic, stamp_ns - epoch_ns, message)
-                     for number, stamp_ns, message in entries)
-
-    simulation.log_to(write, recorded)
+    """Record these topics, all where none is named, from now on: [(topic, stamp_ns, bytes)]."""
+    taken = []
+    recorded = [one for one in simulation.channels if not topics or one.topic in topics]
+    simulation.log_to(lambda entries: taken.extend(
+        (recorded[number].topic, stamp_ns, row.tobytes()) for number, stamps_ns, rows in entries
+        for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True)), recorded)
     return taken
 
 
-def play(simulation, until_ns, *topics):
-    """Return what the same run sends offline, in the order of blocks: [(topic, t_ns, bytes)]."""
-    streams = [one for one in simulation.streams if not topics or one.topic in topics]
-    return [(one.topic, t_ns, row.tobytes()) for block in simulation.play(streams, until_ns)
-            for one, times_ns, rows in block.messages
-            for t_ns, row in zip(times_ns.tolist(), rows, strict=True)]
-
-
 def publish(simulation, *topics):
-    """Subscribe to these streams: [(topic, bytes)]."""
+    """Subscribe to these topics: [(topic, bytes)]."""
     taken = []
     for topic in topics:
         output(simulation, topic).publish = (
             lambda message, topic=topic: taken.append((topic, message)))
+    simulation.refresh()
     return taken
 
 
+def play(simulation, until_ns, *topics):
+    """Return what is sent offline, in the order of blocks: [(topic, stamp_ns, bytes)]."""
+    channels = [one for one in simulation.channels if not topics or one.topic in topics]
+    return [entry for block in simulation.play(channels, until_ns)
+            for entry in entries(simulation, block)]
+
+
+def entries(simulation, block):
+    return [(one.topic, simulation.epoch_ns + t_ns, row.tobytes())
+            for one, times_ns, rows in block.messages
+            for t_ns, row in zip(times_ns.tolist(), rows, strict=True)]
+
+
 def times(taken, topic):
-    """Return the times of the recorded samples of a stream [ns]."""
-    return [t_ns for name, t_ns, _ in taken if name == topic]
+    """Return the times of the messages of a topic [ns]."""
+    return [stamp_ns - EPOCH_NS for name, stamp_ns, _ in taken if name == topic]
 
 
-class Counting:
-    """Counts the items that a method of one object is asked for, and its calls."""
+def run(values, until_ns, *topics, events=()):
+    """
+    Simulate; return the simulation and {topic: (times (n,) [ns], stamps (n,) [ns], *fields)}.
 
-    def __init__(self, owner, name, number=lambda *args: 1):
-        original = getattr(owner, name)
-        self.count = self.calls = 0
-
-        def counted(*args):
-            self.calls += 1
-            self.count += number(*args)
-            return original(*args)
-        setattr(owner, name, counted)
-
-
-def states_of(simulation):
-    """Count the states that the present motion is asked for."""
-    return Counting(simulation.segment.motion, 'states', len)
+    events : time [ns], kind and details
+    """
+    simulation, taken = simulate(values), []
+    for t_ns, kind, details in events:
+        taken += play(simulation, t_ns, *topics)
+        simulation.apply(kind, **details)
+    taken += play(simulation, until_ns, *topics)
+    return simulation, {topic: fields(simulation, taken, topic) for topic in topics}
 
 
-def messages_of(simulation):
-    """Count the samples that are encoded of each topic."""
-    return {one.topic: Counting(one, 'encode', lambda samples: len(samples.times))
-            for one in simulation.streams}
+def fields(simulation, taken, topic):
+    one = channel(simulation, topic)
+    data = b''.join(data for name, _, data in taken if name == topic)
+    has_stamp = one.type_name != 'std_msgs/msg/Float64MultiArray'
+    return (np.array(times(taken, topic)), one.template.stamps_ns(data) if has_stamp else None,
+            *map(np.array, one.template.decode(data)))
+
+
+def drive(simulation, *velocity):
+    """Let the pivot go to a velocity [m/s]; return the event."""
+    return simulation.apply('drive', **simulation.drive_details(velocity))
+
+
+def read(sensor, times_ns, exact=STILL):
+    """
+    Return what an IMU reads at these times [ns], and its bias, (n, 6) each.
+
+    sensor : or the parameters of one that takes its samples at these times
+    """
+    if not isinstance(sensor, Sensor):
+        sensor = Sensor(parameters.checked(sensor), times_ns.step)
+    return tuple(np.column_stack([np.broadcast_to(axis, len(times_ns)) for kind in found
+                                  for axis in kind])
+                 for found in (sensor.read(exact, times_ns), sensor.bias(times_ns)))
+
+
+def calls_of(monkeypatch, owner, name, number=lambda *arguments: 1):
+    """Count the calls of a public method: a list of what `number` makes of their arguments."""
+    called, original = [], getattr(owner, name)
+
+    def counted(*arguments, **options):
+        called.append(number(*arguments))
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(owner, name, counted)
+    return called

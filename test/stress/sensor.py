@@ -9,9 +9,8 @@ some 1e5 seeds.  The estimators share nothing with the code under test.
 import math
 
 import numpy as np
-from helpers.readings import read, run
 from helpers.reference import scene_parameters
-from helpers.simulations import MILLISECOND, SECOND, stream
+from helpers.simulations import MILLISECOND, SECOND, channel, read, run
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
@@ -42,8 +41,8 @@ def check(seed, folder):
 # Two commands, so that the spin is not one constant that a bias could be mistaken for.
 EXCITED = {**scene_parameters('wavy'), 'solver.method': 'exact', 'imu.rpy': (0.4, -0.9, 1.3),
            'imu.lever_arm': (0.3, -0.2, 0.4)}
-COMMANDS = ((3 * SECOND, lambda one: one.command(1.0, 0.8)),
-            (6 * SECOND, lambda one: one.command(2.4, 1.9)))
+COMMANDS = ((3 * SECOND, 'command', {'l3': 1.0, 'lz': 0.8}),
+            (6 * SECOND, 'command', {'l3': 2.4, 'lz': 1.9}))
 
 
 def calibration(seed):
@@ -137,14 +136,15 @@ def nees(seed, duration_ns):
     turned = (Rotation.from_quat(exact[2]).inv() * Rotation.from_quat(found['imu/data'][2]))
     squares = [turned.as_rotvec() ** 2 / covariances(simulation, 'imu/data')[:3]]
     for topic, fields in found.items():
-        errors = np.hstack(fields[3:]) - np.hstack(exact[3:])
+        errors = np.hstack(fields[-2:]) - np.hstack(exact[-2:])
         squares.append(errors ** 2 / covariances(simulation, topic)[3:])
     return squares
 
 
 def covariances(simulation, topic):
     """Return the variances in a sensor_msgs/Imu: of orientation, rates and force, (9,)."""
-    message = stream(simulation, topic).template.encode_one(0, *np.split(np.zeros(10), (4, 7)))
+    template = channel(simulation, topic).template
+    message = template.encode_one(0, *(np.zeros(one.numbers) for one in template.fields))
     # Quaternion, rates and force come before nine numbers each.
     numbers = np.frombuffer(message, '<f8', 37, len(message) - 296)
     return np.concatenate([numbers[begin:begin + 9:4] for begin in (4, 16, 28)])
