@@ -40,7 +40,6 @@ EPOCH_NS = 1_700_000_000_123_456_789
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 SECOND = 1_000_000_000
 STRING, TWIST, THING = 'std_msgs/msg/String', 'geometry_msgs/msg/Twist', 'nowhere_msgs/msg/Thing'
-add_definitions(TWIST)
 
 
 def string_cdr(number, padding=0):
