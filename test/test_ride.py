@@ -17,6 +17,8 @@ import pytest
 from gmpy2 import mpfr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top
 from spinning_top_sim.physics import attitude, pivot
@@ -107,9 +109,7 @@ def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
     State(theta=1e-15, theta_dot=1e-15, psi=1.0, l3=0.5, lz=0.5)])
 def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
     def begun(first, start_ns):
-        return Piece(TOP, first, start_ns, RIDE._replace(
-            acceleration=tuple(map(Fraction, acceleration)),
-            begins=np.array((*NOWHERE, *NOWHERE, *acceleration))), method='exact')
+        return Piece(TOP, first, start_ns, ride(acceleration), method='exact')
     piece = begun(start, 0)
     first, whole, back, now = piece.posture(0), piece.posture(S), piece, 0
     for length in (1000, S // 3, S - S // 3 - 1000):
@@ -128,6 +128,57 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
     force = np.array(acceleration) + np.array((0.0, 0.0, TOP.gravity))
     felt = np.ravel(attitude.rotated(states.rows_quaternion, states.specific_force(NOWHERE)))
     assert abs(felt - force).max() <= BOUND * max(1.0, np.linalg.norm(force))
+
+
+def ride(acceleration):
+    """Return a piece of a path of the pivot that begins at rest in the origin and never ends."""
+    return RIDE._replace(acceleration=tuple(map(Fraction, acceleration)),
+                         begins=np.array((*NOWHERE, *NOWHERE, *acceleration)))
+
+
+def integrated(start, acceleration, times):
+    """
+    Return attitudes (n, 4), x y z w, by Newton and Euler in the world frame.
+
+    q' = (1/2) omega q and L' = R e3 x M (g - a), with omega = L/lambda1 + (L3/lambda3 -
+    L3/lambda1) e3: no frame of a vertical, no Euler angle but at the start.
+    """
+    first = Rotation.from_euler('ZYZ', (start.phi, start.theta, start.psi))
+    sine = math.sin(start.theta)
+    around = (start.lz - start.l3 * math.cos(start.theta)) / (TOP.lambda1 * sine)
+    across = (-around + 1j * start.theta_dot) * np.exp(-1j * start.psi)
+    momentum = first.apply((TOP.lambda1 * across.real, TOP.lambda1 * across.imag, start.l3))
+    pull = TOP.mass * (np.array((0.0, 0.0, -TOP.gravity)) - acceleration) * TOP.com_distance
+
+    def derivative(_, state):
+        (x, y, z, w), momentum = state[:4], state[4:]
+        axis = np.array((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)))
+        omega = momentum / TOP.lambda1 + (
+            start.l3 / TOP.lambda3 - start.l3 / TOP.lambda1) * axis
+        a, b, c = 0.5 * omega
+        return [a * w + b * z - c * y, b * w + c * x - a * z, c * w + a * y - b * x,
+                -a * x - b * y - c * z, *np.cross(axis, pull)]
+    found = solve_ivp(derivative, (0.0, times[-1]), (*first.as_quat(), *momentum), 'DOP853',
+                      times, rtol=3e-14, atol=4e-15)
+    return found.y[:4].T
+
+
+@pytest.mark.parametrize('tilt', [1e-9, 1e-8, 3e-8, 1e-6, 1e-3, 1.0])
+def test_a_vertical_that_turns_by_little_is_not_the_one_of_the_world(tilt):
+    acceleration = (TOP.gravity * math.tan(tilt), 0.0, 0.0)
+    expected = integrated(GENERAL, acceleration, np.linspace(0.0, 0.5, 6))
+    for method, bound in (('exact', 1e-13), ('rk45', 1e-9)):
+        piece = Piece(TOP, GENERAL, 0, ride(acceleration), method=method)
+        found = piece.states(range(0, S // 2 + 1, S // 10)).quaternion
+        assert abs(found - expected).max() <= bound
+        assert (piece.states(range(S // 10, S // 10 + 1)).quaternion[0] == found[1]).all()
+
+
+def test_next_to_the_line_of_effective_gravity_an_axis_stays_what_it_is():
+    """Within 1e-30 rad it is taken for the line, as the documentation says."""
+    for theta, falls in ((1e-29, True), (1e-31, False)):
+        piece = Piece(TOP, State(theta=theta, l3=0.0, lz=0.0), 0, ride(NOWHERE), method='exact')
+        assert (piece.states(range(20 * S, 20 * S + 1)).theta_folded[0] > 0.0) == falls
 
 
 # The path of the pivot

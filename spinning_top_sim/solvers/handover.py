@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import integrals, pivot
-from spinning_top_sim.physics.pivot import REST
 from spinning_top_sim.physics.states import States, WorldStates
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import IntegrationError, SteppedMotion
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 
 # Stamps of ROS end at 2^31 s; doubles hold the phases of a motion up to 2^52 half turns.
 FASTEST_RATE = math.pi * 2.0 ** 52 / 2.0 ** 31          # [rad/s]
-
 Times = NDArray[np.int64] | range
 # A motion, and the vertical that it is about, if that is not the world's.
 Solution = tuple['ExactSolution | SteppedMotion', Vertical | None]
@@ -66,9 +64,9 @@ class Piece:
         Naming what is off, where no motion begins.
     """
 
-    def __init__(self, top: Top, start: State | Posture, start_ns: int, ride: pivot.Piece = REST,
-                 *, method: str = 'rk45', equations: str = 'transport', rtol: float = 1e-11,
-                 atol: float = 1e-12) -> None:
+    def __init__(self, top: Top, start: State | Posture, start_ns: int,
+                 ride: pivot.Piece = pivot.REST, *, method: str = 'rk45',
+                 equations: str = 'transport', rtol: float = 1e-11, atol: float = 1e-12) -> None:
         self.top, self.start_ns, self.ride, self._start = top, start_ns, ride, start
         try:
             with np.errstate(over='ignore', invalid='ignore'):
@@ -87,7 +85,7 @@ class Piece:
 
     def _begun(self, method: str, **settings: Any) -> Solution:
         top, start = self.top, self._start
-        if self.ride is REST and isinstance(start, State):
+        if self.ride is pivot.REST and isinstance(start, State):
             return motion_of(top, start, method=method, **settings), None
         if method == 'exact':
             from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
@@ -114,11 +112,8 @@ class Piece:
         Return the states in the world, the pivot included, at ascending times from the start on.
 
         The steps that are missing are taken here, and the newest are kept until `forget`.
-
-        Raises
-        ------
-        IntegrationError
-            Where the equations cannot go on; its `reached_ns` says up to when they do [ns].
+        Raises IntegrationError where the equations cannot go on; its `reached_ns` says up to when
+        there are states.
         """
         try:
             return self._in_world(self._solution, t_ns)
