@@ -305,8 +305,12 @@ def test_a_rate_of_next_to_nothing_is_right():
 
 
 def test_constants_that_lose_the_start_are_refused():
-    with pytest.raises(ValueError, match='too far apart'):
-        solve(replace(TOP, lambda1=1e-100), start(1.9e-143, 0.4, l3=1.6, lz=1.1), [0.0])
+    """By all digits, and by half of them."""
+    for top, state in ((replace(TOP, lambda1=1e-100), start(1.9e-143, 0.4, l3=1.6, lz=1.1)),
+                       (replace(UNIT, com_distance=1.2229766755947465e-36, mass=2.0),
+                        start(1.8816372025848537e-133, 0.4, l3=1.6, lz=7.077894324236906e47))):
+        with pytest.raises(ValueError, match='too far apart'):
+            solve(top, state, [0.0])
 
 
 def test_the_precision_of_the_caller_does_not_matter():

@@ -90,9 +90,8 @@ class TransportMotion(SteppedMotion):
         self._scale = math.sqrt(0.5 * above_lowest / lambda1) or 1.0
         self._tolerance = rtol + atol
         self._large_enough = NUTATION_SHARE * self._scale ** 2
-        # Their signs are the senses in which the phases and theta turn.  A posture that is handed
-        # over does not tell whether it passes a pole exactly.
-        self.momenta = (1.0, 1.0, 0.0) if posture else (lz + l3, lz - l3, 0.0)
+        # Their signs are the senses in which the phases and theta turn.
+        self.momenta = lz + l3, lz - l3, 0.0
         half = 0.5 * start.theta
         # Of the moduli, where theta is continued out of [0, pi].
         self._signs = math.copysign(1.0, math.cos(half)), math.copysign(1.0, math.sin(half))
