@@ -181,7 +181,7 @@ def _nodes(angle: float) -> int:
     return max(4, math.ceil(math.log(HALF_THE_DIGITS) / math.log(0.5 * angle)))
 
 
-@lru_cache(64)
+@lru_cache(64)          # 200 increments take 0.53 ms, and would take 0.80 ms
 def _rule(length_ns: int, count: int) -> tuple[tuple[int, float], ...]:
     """Return rounded Gauss nodes [ns] and weights [s], by rational numbers: the same anywhere."""
     gauss, _ = np.polynomial.legendre.leggauss(count)
