@@ -29,7 +29,7 @@ from spinning_top_sim.nodes import replay_node
 from spinning_top_sim.nodes.executable import message_class
 from spinning_top_sim.nodes.playback import ROUND_GAP_NS
 from spinning_top_sim.nodes.replayer import Replayer, open_log
-from spinning_top_sim.recording.recorder import McapRecorder
+from spinning_top_sim.recording.recorder import Recorder
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, offered_qos_yaml
 
 EPOCH_NS = 1_700_000_000_123_456_789
@@ -58,8 +58,8 @@ def write_log(path, count, step_ns=2_000_000, padding=0, topics=OURS, **options)
     messages = [(n % 2, EPOCH_NS + n * step_ns,
                  twist_cdr(n) if n % 2 else string_cdr(n, padding)) for n in range(count)]
     (text, _), (twist, _) = topics
-    with contextlib.closing(McapRecorder(
-            path, [RecordedTopic(text, STRING),
+    with contextlib.closing(Recorder(
+            str(path), [RecordedTopic(text, STRING),
                    RecordedTopic(twist, TWIST, {'depth': 7, 'reliability': 2})],
             {}, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:

@@ -61,7 +61,7 @@ class McapWriter:
         self.pending = 0                            # bytes of the chunk in memory
         self._parts: list[NDArray[np.void]] = []    # of it, and its entries
         self._entries: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
-        self._next_sequence: defaultdict[int, int] = defaultdict(int)    # by channel id
+        self._next_sequence: dict[int, int] = {}    # by channel id
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
         self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
@@ -103,7 +103,7 @@ class McapWriter:
             if record.id in self._channels:
                 return
             self._channels[record.id] = record
-            self.message_counts[record.id] = 0
+            self.message_counts[record.id] = self._next_sequence[record.id] = 0
         offset, raw = self.size, record_bytes(record)
         self._write([raw])
         if isinstance(record, records.Metadata):
@@ -131,7 +131,7 @@ class McapWriter:
         messages = np.empty(count, _message_type(size))
         messages['opcode'], messages['length'] = Opcode.MESSAGE, messages.itemsize - 9
         messages['channel'] = channel_id
-        messages['sequence'] = numbers + self._next_sequence[channel_id]
+        messages['sequence'] = numbers + self._next_sequence[channel_id]    # modulo 2^32
         messages['log_time'] = messages['publish_time'] = log_times_ns
         messages['data'] = rows
         entries = np.empty((count, 2), np.uint64)
@@ -142,14 +142,24 @@ class McapWriter:
         self.pending += messages.nbytes
 
     def flush(self) -> None:
-        """Write the chunk in memory, if it holds anything.  After an OSError it is lost."""
+        """
+        Write the chunk in memory, if it holds anything.
+
+        An OSError loses it, so that the file can be finished; an interrupt does not.
+        """
         if self.pending:
-            plain = b''.join(part.data for part in self._parts)
-            entries = {number: np.concatenate(parts) for number, parts in self._entries.items()}
-            self._parts.clear()
-            self._entries.clear()
-            self.pending = 0
-            self.write_messages(plain, entries)
+            try:
+                self.write_messages(b''.join(part.data for part in self._parts), {
+                    number: np.concatenate(parts) for number, parts in self._entries.items()})
+            except OSError:
+                self._clear()
+                raise
+            self._clear()
+
+    def _clear(self) -> None:
+        self._parts.clear()
+        self._entries.clear()
+        self.pending = 0
 
     def write_messages(self, plain: bytes, entries: Entries) -> None:
         """Write a chunk of these message records.  Raises OSError."""
