@@ -178,7 +178,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
             if isinstance(done, Block):
                 for stream, t_ns, rows in done.messages:
                     file.add(streams.index(stream), epoch_ns + t_ns, rows)
-                file.flush()
+                file.flush(beside=True)
             else:
                 for topic, data in journal.command_entries(simulation.now_ns, *done):
                     file.add(*single(topics.index(topic), epoch_ns + simulation.now_ns, data))
