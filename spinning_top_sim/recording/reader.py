@@ -95,7 +95,7 @@ class Place(NamedTuple):
 
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
-    An MCAP file, open for reading; a context manager.
+    An MCAP file, open for reading; a context manager.  Raises LogError if it is none.
 
     A file with a summary opens at once, any other is read through.  What is damaged is left out.
 
@@ -108,10 +108,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     Attributes
     ----------
-    path : Path
-        The file; of a folder, the one in it.
-    size : int
-        Its size when it was opened [bytes]: what is written later is not read.
+    path, size : Path, int
+        The file, of a folder the one in it, and its size when it was opened [bytes].
     profile, library : str
         What its header says: such as 'ros2', and the program that wrote it.
     whole : bool
@@ -122,11 +120,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         mcap's records by id.
     left_out : int
         Damaged chunks that `messages` has skipped so far.
-
-    Raises
-    ------
-    LogError
-        For what is no MCAP file, or cannot be read.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
@@ -147,9 +140,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             try:
                 self._read_summary()
             except decoding.UNREADABLE as error:
-                self._problem = f'found: the summary is not used: {error}'
-                if self._torn:
-                    self._problem = 'found: the file does not end as an MCAP file ends'
+                self._problem = f'found: no summary: {error or "the file is truncated"}'
             self.whole = not self._problem
             self.schemas, self.channels = self._summary.schemas, self._summary.channels
             self._damage: Damage | None = None
@@ -396,16 +387,13 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def _read_header(self) -> records.Header:
         """Return the header.  Raises LogError for no MCAP file."""
-        magic, reason = self._file.read(min(MAGIC_SIZE, self.size)), 'it is no MCAP file'
-        if magic == MCAP0_MAGIC:
-            with contextlib.suppress(*decoding.UNREADABLE):
-                header = decoding.parse(self._raw(MAGIC_SIZE, self._head(MAGIC_SIZE)[1]))
-                if isinstance(header, records.Header):
-                    return header
-            reason = 'its header is damaged'
-        elif not magic:
-            reason = 'it is empty'
-        elif magic[:4] in UNPACK:
+        magic = self._file.read(min(MAGIC_SIZE, self.size))
+        with contextlib.suppress(*decoding.UNREADABLE):
+            header = decoding.parse(self._raw(MAGIC_SIZE, self._head(MAGIC_SIZE)[1]))
+            if magic == MCAP0_MAGIC and isinstance(header, records.Header):
+                return header
+        reason = 'it is no MCAP file' if magic else 'it is empty'
+        if magic[:4] in UNPACK:
             reason = 'it is compressed as a whole, unpack it by ' + UNPACK[magic[:4]].format(
                 self.path, self.path.with_suffix(''))
         raise LogError(f'cannot read {self.path}: {reason}')
@@ -415,7 +403,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         footer_at = self.size - MAGIC_SIZE - FOOTER_SIZE
         footer = decoding.parse(self._file.at(footer_at, self.size - MAGIC_SIZE))
         if self._file.read(MAGIC_SIZE) != MCAP0_MAGIC or not isinstance(footer, records.Footer):
-            raise McapError
+            raise McapError('the file does not end as an MCAP file ends')
         self._torn, start = False, footer.summary_start or footer_at
         section = self._file.at(start, self.size)
         if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):

@@ -8,18 +8,16 @@ Layout: header, metadata of the run, schemas, channels | chunk, its message inde
 `rosbag2` metadata, data end | summary, footer.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os
 import struct
+import threading
 import zlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
@@ -34,9 +32,6 @@ from spinning_top_sim.installation import version
 from spinning_top_sim.recording import rosbag2
 from spinning_top_sim.recording.errors import RecordingError, why_not_written
 from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future, ThreadPoolExecutor
 
 # The fastest level that compresses nearly as well as zstd's own default, 3, with a window of a
 # whole chunk: its default, half of one, costs up to 20 %.
@@ -65,8 +60,8 @@ class McapWriter:
         self._compression = '' if compression == 'none' else compression
         self._zstd = zstandard.ZstdCompressor(compression_params=ZSTD)
         self._chunk, self._spare = _ChunkMemory(), _ChunkMemory()
-        self._beside: Future[None] | None = None    # a chunk that another thread writes
-        self._pool: ThreadPoolExecutor | None = None
+        self._beside: threading.Thread | None = None    # writes the chunk before
+        self._beside_error: OSError | None = None
         self._next_sequence: dict[int, int] = {}    # by channel id
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
@@ -146,19 +141,25 @@ class McapWriter:
         An OSError, also that of the chunk written beside, loses its chunk, so that the file can
         be finished; an interrupt does not.
         """
-        written, self._beside = self._beside, None
-        if written is not None:
-            written.result()
+        if self._beside is not None:
+            self._beside.join()
+            self._beside, error, self._beside_error = None, self._beside_error, None
+            if error is not None:
+                raise error
         if beside:
-            if self._pool is None:      # cannot be imported while the interpreter ends
-                from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415
-                self._pool = ThreadPoolExecutor(1, 'chunks')
-            self._beside = self._pool.submit(self._write_out, self._chunk)
+            self._beside = threading.Thread(target=self._write_beside, args=(self._chunk,))
+            self._beside.start()
             self._chunk, self._spare = self._spare, self._chunk
         else:
             self._write_out(self._chunk)
 
-    def _write_out(self, chunk: _ChunkMemory) -> None:
+    def _write_beside(self, chunk: '_ChunkMemory') -> None:
+        try:
+            self._write_out(chunk)
+        except OSError as error:
+            self._beside_error = error
+
+    def _write_out(self, chunk: '_ChunkMemory') -> None:
         try:
             if chunk.size:
                 self.write_messages(chunk.plain, {
@@ -223,8 +224,6 @@ class McapWriter:
         """
         try:
             self.flush()
-            if self._pool is not None:
-                self._pool.shutdown()
             span = min(self._times_ns, default=0), max(self._times_ns, default=0)
             if bag is not None:
                 topics = [(channel, self._type_names[channel.schema_id], count) for channel, count
