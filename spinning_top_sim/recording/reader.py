@@ -35,11 +35,9 @@ MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are read together
 RUN_BYTES = 1 << 20         # of messages outside of chunks that are read together, about
 MAGIC_SIZE = len(MCAP0_MAGIC)
-FOOTER_SIZE = HEAD.size + 8 + 8 + 4
+FOOTER_SIZE, DATA_END_SIZE = HEAD.size + 8 + 8 + 4, HEAD.size + 4
 FIRST_DATE = 10 ** 17       # [ns], in 1973
 UNPACK = {b'\x28\xb5\x2f\xfd': 'zstd -d {} -o {}', b'\x04\x22\x4d\x18': 'lz4 -d {} {}'}
-
-Found = tuple[records.McapRecord, int, int]     # a record, where it begins, and where it ends
 
 
 @dataclass(frozen=True)
@@ -75,10 +73,10 @@ class Damage:
 
 
 class Part(NamedTuple):
-    """A record, or adjacent messages outside of chunks, the last of which is `record`."""
+    """A record, or adjacent messages outside of chunks."""
 
-    record: records.McapRecord
-    messages: Messages
+    record: records.McapRecord | None       # None for messages outside of chunks
+    messages: Messages                      # these, or those of a chunk
     offset: int
     end: int
 
@@ -240,7 +238,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                     or place.channel_ids.isdisjoint(wanted)):
                 continue
             try:
-                messages = self._messages(place.offset, place.end)
+                messages = self._part(place.offset, place.end).messages
             except decoding.UNREADABLE:
                 self.left_out += 1
                 continue
@@ -275,47 +273,51 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def parts(self) -> Iterator[Part]:
         """Yield what can be read, in file order; then `damage` tells what cannot."""
         damage = Damage(self._torn, reasons=[self._problem] * (not self.whole))
-        self._small_bytes = 0
-        for is_run, found in itertools.groupby(
-                self._records(damage), lambda one: isinstance(one[0], records.Message)):
-            for record, offset, end in _runs(found) if is_run else found:
-                try:
-                    messages = (self._messages(offset, end)
-                                if is_run or isinstance(record, records.Chunk)
-                                else Messages(b'', {}, [record]))
-                    self._declare(messages)
-                    yield Part(record, messages, offset, end)
-                except decoding.UNREADABLE as error:
-                    damage.lose(offset, end, str(error))
-        self._damage = damage
-
-    def _records(self, damage: Damage) -> Iterator[Found]:
-        """Yield the records of the data section, but for indexes, up to one that has no end."""
-        offset, index_bytes = MAGIC_SIZE, 0
+        offset, index_bytes, self._small_bytes = MAGIC_SIZE, 0, 0
         while offset < self._data_end:
-            opcode, end = self._head(offset)
+            opcode, end = self._end_of(offset)
             if opcode == 0 or end > self._data_end:
                 # Nothing is lost by a truncated index of the last chunk.
                 if not self._torn or opcode not in (Opcode.MESSAGE_INDEX, Opcode.DATA_END) or (
-                        self.size - offset > index_bytes):
+                        self.size - offset > index_bytes + DATA_END_SIZE):
                     damage.lose(offset, self._data_end, 'no whole record')
-                return
-            # Opcodes that are unknown belong to an application.
-            if opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE_INDEX:
-                try:
-                    record = decoding.parse(self._raw(offset, end))
-                except decoding.UNREADABLE as error:
-                    damage.lose(offset, end, str(error))
-                else:
-                    if isinstance(record, records.DataEnd):
-                        self._check_data(offset, record.data_section_crc, damage)
-                        return
-                    if isinstance(record, records.Chunk):
-                        index_bytes = record.uncompressed_size      # at most
-                    yield record, offset, end
+                break
+            try:
+                # Opcodes that are unknown belong to an application.
+                if opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE_INDEX:
+                    part = self._part(offset, end)
+                    self._declare(part.messages)
+                    self._check_data(part, damage)
+                    index_bytes = len(part.messages.plain)      # at most
+                    yield part
+            except decoding.UNREADABLE as error:
+                damage.lose(offset, end, str(error))
             offset = end
-        if not self._torn:
-            damage.reasons.append('found: the data section has no end')
+            if opcode == Opcode.DATA_END:
+                break
+        else:
+            damage.reasons += ['found: the data section has no end'] * (not self._torn)
+        self._damage = damage
+
+    def _end_of(self, offset: int) -> tuple[int, int]:
+        """Return opcode and end of a record, or the end of adjacent messages, some if many."""
+        opcode, end = self._head(offset)
+        while opcode == Opcode.MESSAGE and end - offset < RUN_BYTES and end < self._data_end:
+            following, its_end = self._head(end)
+            if following != Opcode.MESSAGE or its_end > self._data_end:
+                break
+            end = its_end
+        return opcode, end
+
+    def _part(self, offset: int, end: int) -> Part:
+        """Return what is there.  Raises UNREADABLE."""
+        raw = self._raw(offset, end)
+        if raw[:1] == bytes([Opcode.MESSAGE]):
+            return Part(None, decoding.find_messages(raw), offset, end)
+        record = decoding.parse(raw)
+        return Part(record, decoding.open_chunk(record, self._max_bytes)
+                    if isinstance(record, records.Chunk) else Messages(b'', {}, [record]),
+                    offset, end)
 
     def _head(self, offset: int) -> tuple[int, int]:
         """Return opcode and end of the record there; a head that is not whole has no end."""
@@ -328,13 +330,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             raise McapError(f'more than {self._max_bytes} bytes are not read')
         return self._file.at(offset, end)
 
-    def _check_data(self, end: int, expected: int, damage: Damage) -> None:
-        """Compare the checksum of the data section, if there is one."""
+    def _check_data(self, end: Part, damage: Damage) -> None:
+        """Compare the checksum of all data, if that is the data end and has one."""
         crc = 0
-        for begin in range(0, end if expected else 0, RUN_BYTES):
-            crc = zlib.crc32(self._file.at(begin, min(begin + RUN_BYTES, end)), crc)
-        if crc != expected:
-            damage.reasons.append('found: the checksum of the data section is wrong')
+        if isinstance(end.record, records.DataEnd) and end.record.data_section_crc:
+            for begin in range(0, end.offset, RUN_BYTES):
+                crc = zlib.crc32(self._file.at(begin, min(begin + RUN_BYTES, end.offset)), crc)
+            if crc != end.record.data_section_crc:
+                damage.reasons.append('found: the checksum of the data section is wrong')
 
     def is_declared(self, channel_id: int) -> bool:
         """Return whether a channel and its schema, if it has one, are known."""
@@ -359,16 +362,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                                 'metadata are not read')
         if not all(map(self.is_declared, messages.entries)):
             raise McapError('no whole record declares a channel of its messages')
-
-    def _messages(self, offset: int, end: int) -> Messages:
-        """Return the messages of a chunk, or of what stands outside of chunks; UNREADABLE."""
-        raw = self._raw(offset, end)
-        if raw[:1] == bytes([Opcode.MESSAGE]):
-            return decoding.find_messages(raw)
-        chunk = decoding.parse(raw)
-        if not isinstance(chunk, records.Chunk):
-            raise McapError('it is no chunk')
-        return decoding.open_chunk(chunk, self._max_bytes)
 
     def _find_places(self) -> list[Place]:
         summary = self._summary
@@ -412,18 +405,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         if len(section) <= decoding.MAX_SMALL:      # else it is read from record to record
             self._summary = NonSeekingReader(
                 CompleteReads(BytesIO(MCAP0_MAGIC + section))).get_summary() or Summary()
-
-
-def _runs(messages: Iterator[Found]) -> Iterator[Found]:
-    """Join adjacent messages."""
-    begin = None
-    for record, offset, end in messages:
-        begin = offset if begin is None else begin
-        if end - begin >= RUN_BYTES:
-            yield record, begin, end
-            begin = None
-    if begin is not None:
-        yield record, begin, end
 
 
 def _file_of(path: Path) -> Path:
