@@ -303,16 +303,29 @@ def test_recording_goes_on_while_the_disk_is_slow_and_says_what_may_be_lost(tmp_
     assert numbers_in(path) == [0, 1, 2]
 
 
-def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
+@pytest.mark.parametrize('fails', [False, True])
+def test_a_sync_that_hangs_does_not_hang_the_end_and_its_failure_is_told(
+        tmp_path, slow_disk, monkeypatch, fails):
     slow_disk.set()
     recorder = opened(Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, max_loss=0.02,
                                min_free_bytes=0))
     slow_disk.clear()
+    fsync = os.fsync
+
+    def sync(descriptor):
+        fsync(descriptor)
+        if fails and threading.current_thread().name == 'recorder sync':
+            raise OSError(5, os.strerror(5))
+
+    monkeypatch.setattr(os, 'fsync', sync)
     write(recorder, 0, 1, pose_cdr(1))
     eventually(lambda: recorder.warning)
     assert 'could not be closed within 0.05 s' in (recorder.close(timeout=0.05).error or '')
     slow_disk.set()
-    assert is_indexed(recorder.close(timeout=PATIENCE_S).path)
+    summary = recorder.close(timeout=PATIENCE_S)
+    assert is_indexed(summary.path) and summary.messages == 1
+    assert summary.error == (
+        f'recording to {summary.path} stopped: Input/output error' if fails else None)
 
 
 @pytest.fixture

@@ -81,16 +81,6 @@ class Part(NamedTuple):
     end: int
 
 
-class Place(NamedTuple):
-    """A chunk, or adjacent messages outside of chunks, in the file."""
-
-    start_ns: int                   # the earliest log time
-    end_ns: int                     # the latest
-    offset: int
-    end: int
-    channel_ids: frozenset[int]
-
-
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
     An MCAP file, open for reading; a context manager.  Raises LogError if it is none.
@@ -142,7 +132,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             self.whole = not self._problem
             self.schemas, self.channels = self._summary.schemas, self._summary.channels
             self._damage: Damage | None = None
-            self._places = self._find_places()
+            self._chunks = self._find_chunks()
         except BaseException:
             self.close()
             raise
@@ -191,8 +181,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
         Beside dates, a time of 0 does not count: it says that there was no clock yet.
         """
-        begin_ns = min((place.start_ns for place in self._places), default=0)
-        end_ns = max((place.end_ns for place in self._places), default=0)
+        begin_ns = min((chunk.message_start_time for chunk in self._chunks), default=0)
+        end_ns = max((chunk.message_end_time for chunk in self._chunks), default=0)
         if begin_ns == 0 and end_ns > FIRST_DATE:
             first = next(self.messages(start=1), None)
             begin_ns = first.log_time if first and first.log_time > FIRST_DATE else 0
@@ -223,32 +213,35 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                   if names is None or channel.topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
         mode, compression = self.compression
-        # What is read and not yet passed: log time, place and offset there
+        # What is read and not yet passed: log time, chunk, offset there
         held: list[tuple[int, int, int, Messages]] = []
         opened: list[tuple[int, int]] = []      # latest log time and size of chunks
-        for place in [*sorted(self._places), None]:
-            passed = len(held) if place is None else bisect_left(held, (place.start_ns,))
+        for chunk in [*sorted(self._chunks, key=attrgetter('message_start_time')), None]:
+            passed = len(held) if chunk is None else bisect_left(
+                held, (chunk.message_start_time,))
             for time_ns, _, offset, messages in held[:passed]:
                 if time_ns in times:
                     message = messages.message(wanted, offset)
                     yield message if mode != 'MESSAGE' else self._decompressed(
                         message, compression)
             del held[:passed]
-            if (place is None or place.end_ns < times.start or place.start_ns >= times.stop
-                    or place.channel_ids.isdisjoint(wanted)):
+            if (chunk is None or chunk.message_end_time < times.start
+                    or chunk.message_start_time >= times.stop
+                    or wanted.keys().isdisjoint(chunk.message_index_offsets)):
                 continue
+            place = chunk.chunk_start_offset
             try:
-                messages = self._part(place.offset, place.end).messages
+                messages = self._part(place, place + chunk.chunk_length).messages
             except decoding.UNREADABLE:
                 self.left_out += 1
                 continue
-            opened = [one for one in opened if one[0] >= place.start_ns]
-            opened.append((place.end_ns, len(messages.plain)))
+            opened = [one for one in opened if one[0] >= chunk.message_start_time]
+            opened.append((chunk.message_end_time, len(messages.plain)))
             if sum(size for _, size in opened) > 2 * self._max_bytes:
                 raise LogError(f'cannot read {self.path}: chunks that overlap in time have more '
                                f'than {2 * self._max_bytes} bytes')
             for number in wanted.keys() & messages.entries.keys():
-                held += ((time_ns, place.offset, offset, messages)
+                held += ((time_ns, place, offset, messages)
                          for time_ns, offset in messages.entries[number].tolist())
             held.sort()
 
@@ -363,20 +356,24 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         if not all(map(self.is_declared, messages.entries)):
             raise McapError('no whole record declares a channel of its messages')
 
-    def _find_places(self) -> list[Place]:
+    def _find_chunks(self) -> list[records.ChunkIndex]:
+        """Return where messages are; adjacent ones outside of chunks are as a chunk here."""
         summary = self._summary
         if not summary.chunk_indexes or not all(
                 one.message_index_offsets and all(map(self.is_declared, one.message_index_offsets))
                 for one in summary.chunk_indexes):
-            return [Place(*time_span(entries), part.offset, part.end, frozenset(entries))
-                    for part in self.parts() if (entries := part.messages.entries)]
+            return [records.ChunkIndex(
+                chunk_start_offset=part.offset, chunk_length=part.end - part.offset,
+                message_start_time=start_ns, message_end_time=end_ns,
+                message_index_offsets=dict.fromkeys(entries, 0), message_index_length=0,
+                compression='', compressed_size=0, uncompressed_size=0)
+                for part in self.parts() if (entries := part.messages.entries)
+                for start_ns, end_ns in [time_span(entries)]]
         with contextlib.suppress(*decoding.UNREADABLE):
             for one in summary.metadata_indexes:
                 record = decoding.parse(self._raw(one.offset, one.offset + one.length))
                 self._declare(Messages(b'', {}, [record]))
-        return [Place(one.message_start_time, one.message_end_time, one.chunk_start_offset,
-                      one.chunk_start_offset + one.chunk_length,
-                      frozenset(one.message_index_offsets)) for one in summary.chunk_indexes]
+        return sorted(summary.chunk_indexes, key=attrgetter('chunk_start_offset'))
 
     def _read_header(self) -> records.Header:
         """Return the header.  Raises LogError for no MCAP file."""

@@ -61,7 +61,7 @@ class McapWriter:
         self._zstd = zstandard.ZstdCompressor(compression_params=ZSTD)
         self._chunk, self._spare = _ChunkMemory(), _ChunkMemory()
         self._beside: threading.Thread | None = None    # writes the chunk before
-        self._beside_error: OSError | None = None
+        self._beside_error: Exception | None = None
         self._next_sequence: dict[int, int] = {}    # by channel id
         self.message_counts: dict[int, int] = {}    # messages in the file by channel id
         self.chunk_count = 0
@@ -156,7 +156,7 @@ class McapWriter:
     def _write_beside(self, chunk: '_ChunkMemory') -> None:
         try:
             self._write_out(chunk)
-        except OSError as error:
+        except Exception as error:
             self._beside_error = error
 
     def _write_out(self, chunk: '_ChunkMemory') -> None:
