@@ -310,16 +310,17 @@ def test_a_sync_that_hangs_does_not_hang_the_end_and_its_failure_is_told(
     recorder = opened(Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, max_loss=0.02,
                                min_free_bytes=0))
     slow_disk.clear()
-    fsync = os.fsync
+    fsync, begun = os.fsync, threading.Event()
 
     def sync(descriptor):
+        begun.set()
         fsync(descriptor)
         if fails and threading.current_thread().name == 'recorder sync':
             raise OSError(5, os.strerror(5))
 
     monkeypatch.setattr(os, 'fsync', sync)
     write(recorder, 0, 1, pose_cdr(1))
-    eventually(lambda: recorder.warning)
+    assert begun.wait(PATIENCE_S)
     assert 'could not be closed within 0.05 s' in (recorder.close(timeout=0.05).error or '')
     slow_disk.set()
     summary = recorder.close(timeout=PATIENCE_S)
