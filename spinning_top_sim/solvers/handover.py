@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import integrals, pivot
-from spinning_top_sim.physics.pivot import REST
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, WorldStates
 from spinning_top_sim.physics.top import State, Top
