@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
 from helpers.reference import ROOT
+from spinning_top_sim.streams.simulation import Simulation
 
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.streams.topics import all_streams
 from spinning_top_sim.tools import ensemble_part, ensemble_spec
 from spinning_top_sim.tools.ensemble import main

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from helpers.reference import CASES, SCENES, scene_parameters, start_of, top_of
 from scipy.spatial.transform import Rotation
+from spinning_top_sim.streams.simulation import Simulation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.regimes import Description, regime
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
 
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.80665}
 STATE = {'theta': 0.7, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}

@@ -21,10 +21,10 @@ from helpers.reference import ROOT
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
+from spinning_top_sim.recording.mcap_writer import McapWriter
 
 from spinning_top_sim.recording import recorder as recorder_module
 from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.recording.mcap_writer import McapWriter
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import McapRecorder, create_file
 

@@ -37,8 +37,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_strea
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
-
 from spinning_top_sim.recording.chunks import CHUNK_BYTES, ChunkBuilder
+
 from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.recorder import McapRecorder, create_file
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic

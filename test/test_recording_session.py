@@ -12,11 +12,11 @@ pytest.importorskip('rclpy')
 
 from helpers.node_harness import PATIENCE_S
 from helpers.node_logs import events_in, log_of
-from std_srvs.srv import SetBool
-
 from spinning_top_sim.nodes.pacing import FairLock
 from spinning_top_sim.nodes.recording_session import RecordingSession
 from spinning_top_sim.nodes.simulator import Simulator
+from std_srvs.srv import SetBool
+
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording import recorder as recorder_module
 from spinning_top_sim.recording.errors import RecordingError

@@ -5,7 +5,6 @@ Replay nodes over real DDS.
 No test is decided by how long something took, except that nothing may come before its time.
 """
 
-import contextlib
 import importlib
 import re
 import signal
@@ -19,10 +18,9 @@ pytest.importorskip('rclpy')
 import rclpy
 import yaml
 from geometry_msgs.msg import PoseStamped
-from helpers.definitions import add_definitions
 from helpers.node_harness import SimNode, Topic, wait_for
 from helpers.own_node import InThisProcess, run_main
-from helpers.recordings import write
+from helpers.recordings import write_rows
 from mcap.writer import Writer as McapWriter
 from nav_msgs.msg import Path as PathMessage
 from rclpy.parameter import Parameter
@@ -37,7 +35,6 @@ from spinning_top_sim.nodes import replay_node
 from spinning_top_sim.nodes.endpoints import message_class
 from spinning_top_sim.nodes.replayer import Replayer, open_log
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recorder import McapRecorder
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
 
 EPOCH_NS = 1_700_000_000_123_456_789
@@ -62,17 +59,13 @@ def twist_cdr(number):
 OURS = (('/ours/text', STRING), ('/ours/twist', TWIST))
 
 
-def write_log(path, count, step_ns=2_000_000, padding=0, topics=OURS, **options):
+def write_log(path, count, step_ns=2_000_000, padding=0, topics=OURS):
     """Record strings and twists in turn; return what is in, by topic."""
     messages = [(n % 2, EPOCH_NS + n * step_ns,
                  twist_cdr(n) if n % 2 else string_cdr(n, padding)) for n in range(count)]
     (text, _), (twist, _) = topics
-    with contextlib.closing(McapRecorder(
-            path, [RecordedTopic(text, STRING),
-                   RecordedTopic(twist, TWIST, {'depth': 7, 'reliability': 2})],
-            {}, **{'min_free_bytes': 0} | options)) as recorder:
-        for message in messages:
-            write(recorder, *message)
+    write_rows(path, [RecordedTopic(text, STRING),
+                      RecordedTopic(twist, TWIST, {'depth': 7, 'reliability': 2})], messages, 100)
     return [[data for index, _, data in messages if index == topic] for topic in (0, 1)]
 
 
@@ -212,7 +205,7 @@ def test_one_odd_channel_does_not_stop_the_others(tmp_path, capfd):
 
 def test_a_torn_log_is_refused_with_a_hint_and_played_in_part(tmp_path, capfd):
     path = tmp_path / 'torn.mcap'
-    wanted = write_log(path, 400, step_ns=100_000, padding=20_000, compression='none')
+    wanted = write_log(path, 400, step_ns=100_000, padding=20_000)
     whole = path.read_bytes()
     path.write_bytes(whole[:len(whole) // 2])
     run = run_main(replay_node.main, capfd, path)

@@ -12,10 +12,10 @@ import pytest
 pytest.importorskip('diagnostic_msgs')
 
 from builtin_interfaces.msg import Time
-
-from spinning_top_sim.nodes import node_status, terminal
 from spinning_top_sim.nodes.node_status import NodeStatus
 from spinning_top_sim.nodes.tick_loop import TickLoop
+
+from spinning_top_sim.nodes import node_status, terminal
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 

@@ -4,9 +4,9 @@
 from types import SimpleNamespace
 
 import pytest
+from spinning_top_sim.nodes.tick_loop import TickLoop
 
 from spinning_top_sim.nodes import tick_loop
-from spinning_top_sim.nodes.tick_loop import TickLoop
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 

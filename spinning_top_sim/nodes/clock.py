@@ -92,7 +92,7 @@ class SimulatedClock:
         self._scale = scale
 
     def until_grid(self, period_ns: float, source_ns: int) -> float:
-        """Return how long it is until simulated time is a multiple of a period of the source [ns]."""
+        """Return the time of the source to the next multiple of a period, from t = 0 on [ns]."""
         if self._publishers is not None:
             return period_ns
         return period_ns - (source_ns - self._source_ns + self._simulated_ns / self._scale

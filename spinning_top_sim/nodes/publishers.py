@@ -51,7 +51,7 @@ class ChannelPublishers:
                 self._node.destroy_publisher(self.by_topic.pop(topic))
 
     def update_subscribers(self, outputs: Sequence[Output]) -> bool:
-        """Connect the outputs that have subscribers; return whether that changes which are used."""
+        """Connect the outputs that have subscribers; return whether others have some now."""
         changed = False
         for output in outputs:
             publisher = self.by_topic.get(output.channel.topic)

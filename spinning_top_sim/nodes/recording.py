@@ -91,6 +91,8 @@ class Recording:
                 request.answer(recorder.error is None, _summary(recorder))
             elif recorder.error is not None:
                 request.answer(False, recorder.error)
+                if recorder is self._recorder:      # this told it
+                    self.end(error=recorder.error)
             else:
                 request.answer(True, f'recording to {recorder.path}')
         reason = self._recorder.error if self._recorder else None

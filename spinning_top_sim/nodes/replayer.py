@@ -92,7 +92,7 @@ class Replayer(Node):
                     outputs[channel.channel_id] = self._publisher(channel, profile)
                 except Exception as error:  # a log may ask for anything; the others are played
                     self.get_logger().warning(short_reason(f'{name} is not played: {error}'))
-            if differ:
+            if differ and any(channel.channel_id in outputs for channel in channels):
                 self.get_logger().warning(f'{name} was recorded with several QoS profiles: it is '
                                           f'played with {shown_qos(profile)}')
         if wanted and not outputs and not self._options.clock:

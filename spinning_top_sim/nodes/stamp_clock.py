@@ -10,8 +10,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from spinning_top_sim.nodes.clock import EPOCH_GRID_NS
-
 PATIENCE_S = 2.0        # a /clock that does not change for longer has stopped
 
 
@@ -46,12 +44,6 @@ class StampClock:
     def publishers(self) -> int:
         """Return how many nodes publish on the /clock that is followed."""
         return int(self._node.count_publishers(self._topic))
-
-    def first_ns(self) -> int:
-        """Return the date of a t = 0 that begins now [ns]."""
-        date_ns = self.now_ns()
-        # Stamps are never ahead of a /clock that is followed, and 0 means "no time".
-        return max(date_ns // EPOCH_GRID_NS, 1) * EPOCH_GRID_NS if self.follows else date_ns
 
     def is_missing(self) -> bool:
         """Return whether the /clock that is followed has not begun, or has stopped."""

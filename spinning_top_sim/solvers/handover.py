@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # Stamps of ROS end at 2^31 s; doubles hold the phases of a motion up to 2^52 half turns.
 FASTEST_RATE = math.pi * 2.0 ** 52 / 2.0 ** 31          # [rad/s]
 
-Times = NDArray[np.int64] | range
+Times = NDArray[np.int64]
 # A motion, and the vertical that it is about, if that is not the world's.
 Solution = tuple['ExactSolution | SteppedMotion', Vertical | None]
 
@@ -119,7 +119,10 @@ class Piece:
 
     def describe(self) -> Description | None:
         """Return the motion in numbers; None if it has no closed form or the pivot moves."""
-        return self._exact[0].describe() if self.rests and self._exact else None
+        exact = self._exact
+        if not self.rests or exact is None or isinstance(exact[0], SteppedMotion):
+            return None
+        return exact[0].describe()
 
     @property
     def steps(self) -> int:
@@ -161,7 +164,7 @@ class Piece:
     def posture(self, t_ns: int) -> Posture:
         """Return attitude and angular velocity in the world at a time, for what follows."""
         if isinstance(self._motion, SteppedMotion):
-            return posture_at(self.states(range(t_ns, t_ns + 1)))
+            return posture_at(self.states(np.array([t_ns])))
         return self._motion.posture(t_ns - self.start_ns, self._vertical)
 
     def forget(self, before_ns: int) -> None:
@@ -177,9 +180,7 @@ class Piece:
 
     def _in_world(self, solution: Solution, t_ns: Times) -> States:
         motion, vertical = solution
-        states = motion.states(
-            t_ns - self.start_ns if isinstance(t_ns, np.ndarray) else range(
-                t_ns.start - self.start_ns, t_ns.stop - self.start_ns, t_ns.step))
+        states = motion.states(t_ns - self.start_ns)
         if vertical is None:
             return states
-        return WorldStates(self.top, states, vertical.rotation, self.ride, np.asarray(t_ns))
+        return WorldStates(self.top, states, vertical.rotation, self.ride, t_ns)

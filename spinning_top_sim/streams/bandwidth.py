@@ -56,7 +56,7 @@ class LowPass:
                  ) -> NDArray[np.float64]:
         """Return the filtered signal at times [ns] of a motion, (columns, n)."""
         found = []
-        for piece, within in trajectory.pieces(times):
+        for piece, within in trajectory.pieces(np.arange(times.start, times.stop, times.step)):
             panels = self._panels(piece.fastest_rate)
             # Samples that see this piece alone have the same nodes; the others one at a time.
             mixed = len(range(int(within[0]), piece.start_ns + self.memory_ns, times.step))

@@ -39,7 +39,7 @@ class Samples:
 
     @cached_property
     def states(self) -> States:
-        return self.trajectory.evaluate(self.times)
+        return self.trajectory.evaluate(self.t_ns)
 
     @cached_property
     def imu(self) -> Readings:
@@ -48,7 +48,7 @@ class Samples:
 
     def at_start(self, name: str) -> Column:
         """Return `energy`, `l3` or `lz` as it was when the motion of each sample began, (n,)."""
-        return self.trajectory.constants(name, self.times)
+        return self.trajectory.constants(name, self.t_ns)
 
 
 class Encoder(Protocol):

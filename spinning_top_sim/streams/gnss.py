@@ -68,7 +68,7 @@ def _fix(values: Mapping[str, Any], deviations: tuple[float, float],
     """Return status, position, covariance and its kind; in an outage NaN, without a fix."""
     from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
     position = _measured(values, deviations, noise.Purpose.GNSS_POSITION, samples,
-                         samples.trajectory.place(samples.times).position)
+                         samples.trajectory.place(samples.t_ns).position)
     is_out = _is_out(edges_ns, samples.t_ns) == 1
     geodetic = [np.where(is_out, np.nan, part)
                 for part in enu2geodetic(*position, *values['gnss.origin'])]
@@ -80,7 +80,7 @@ def _fix(values: Mapping[str, Any], deviations: tuple[float, float],
 def _velocity(values: Mapping[str, Any], deviations: tuple[float, float],
               samples: Samples) -> Sequence[Field]:
     return list(_measured(values, deviations, noise.Purpose.GNSS_VELOCITY, samples,
-                          samples.trajectory.place(samples.times).velocity)),
+                          samples.trajectory.place(samples.t_ns).velocity)),
 
 
 def _variances(deviations: tuple[float, float]) -> tuple[float, float, float]:

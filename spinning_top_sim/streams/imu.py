@@ -130,6 +130,7 @@ class Readings:
 
     def __init__(self, imu: Imu, trajectory: Trajectory, times: range, states: States) -> None:
         self._imu, self._trajectory, self._times, self._states = imu, trajectory, times, states
+        self._t_ns = np.arange(times.start, times.stop, times.step)
 
     @cached_property
     def orientation(self) -> Quaternion:
@@ -167,7 +168,7 @@ class Readings:
         exact = (x, y, z, w), imu.mounting.from_body((v1, v2, v3))
         if sensor.is_perfect and imu.vibration.is_off:
             return exact
-        felt = imu.vibration.add(self._means, np.array(self._times), self._seconds)
+        felt = imu.vibration.add(self._means, self._t_ns, self._seconds)
         return sensor.disturb(exact, self._means, sensor.read(felt, self._times), self._seconds)
 
     @cached_property
@@ -206,7 +207,7 @@ class Readings:
             exact = (w1, w2, w3), (f1, f2, f3)
         if imu.vibration.is_off:
             return exact
-        return imu.vibration.add(exact, np.array(self._times),
+        return imu.vibration.add(exact, self._t_ns,
                                  self._seconds if imu.takes_means else 0.0)
 
     def _signal(self, states: States) -> NDArray[np.float64]:
@@ -217,7 +218,7 @@ class Readings:
     def _body_increments(self) -> Increments:
         """Increments over the intervals that end with the samples, in the frame of the body."""
         imu, period_ns, found = self._imu, self._imu.period_ns, []
-        for piece, times in self._trajectory.pieces(self._times):
+        for piece, times in self._trajectory.pieces(self._t_ns):
             # Those that may be shorter, reach back or contain a jump are computed one by one.
             since_ns = max(imu.since_ns, piece.start_ns) + 1
             single = len(range(int(times[0]), since_ns + period_ns, self._times.step))

@@ -221,7 +221,7 @@ class LiveSimulation(Simulation):
         if taken < 0.5 * seconds:
             self._span_ns = min(2 * self._span_ns, LONGEST_SPAN_NS)
         elif taken > 0.8 * seconds:
-            self._span_ns = max(self._span_ns // 2, 1)
+            self._span_ns = max(self._span_ns // 2, FIRST_SPAN_NS)
 
     def _go_ahead(self, until_ns: int, seconds: float) -> None:
         """Let the solver go on up to a time, or for about so long."""

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters, trajectory
@@ -119,7 +121,7 @@ class Simulation:
     def state(self) -> States:
         """Return the state (n = 1) in which the motion goes on after `now_ns`."""
         now_ns = max(self.now_ns, 0)
-        return self.trajectory.after(now_ns).states(range(now_ns, now_ns + 1))
+        return self.trajectory.after(now_ns).states(np.array([now_ns]))
 
     def block(self, channels: Sequence[Channel], after_ns: int, until_ns: int) -> Block:
         """
@@ -150,7 +152,7 @@ class Simulation:
     def reach(self, after_ns: int, until_ns: int) -> int:
         """Return the last time up to `until_ns` that the motion has; as `block`, raise if none."""
         try:
-            self.trajectory.evaluate(range(until_ns, until_ns + 1))
+            self.trajectory.evaluate(np.array([until_ns]))
         except IntegrationError as error:
             if error.reached_ns <= after_ns:
                 raise

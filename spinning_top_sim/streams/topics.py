@@ -57,7 +57,7 @@ def _invariants(samples: Samples) -> Sequence[Field]:
     states = samples.states
     now = (states.energy, states.l3, states.lz)
     drifts = map(relative_drift, now, map(samples.at_start, ('energy', 'l3', 'lz')))
-    error = samples.trajectory.orientation_error(states, samples.times)
+    error = samples.trajectory.orientation_error(states, samples.t_ns)
     return (*now, *drifts, states.norm_error, error),
 
 

@@ -24,7 +24,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.streams.parameters import FASTEST
 
-Times = range | NDArray[np.int64]
+Times = NDArray[np.int64]       # (n,), ascending [ns]
 
 
 class Trajectory:
@@ -80,12 +80,12 @@ class Trajectory:
     def pieces(self, t_ns: Times) -> list[tuple[Piece, Times]]:
         """Return the pieces in which times lie, with the times in each; one piece without any."""
         self._go_on(int(t_ns[-1]) if len(t_ns) else 0)
-        found, begin = [], 0
-        for piece, after in zip(self._pieces, [*self._pieces[1:], None], strict=True):
-            end = len(t_ns) if after is None else bisect_left(t_ns, after.start_ns + 1)
-            if end > begin:
-                found.append((piece, t_ns[begin:end]))
-                begin = end
+        if len(self._pieces) == 1:
+            return [(self._pieces[0], t_ns)]
+        # A piece ends with the event that begins the next one, that instant included.
+        ends = np.searchsorted(t_ns, [piece.start_ns for piece in self._pieces[1:]], 'right')
+        found = [(piece, times) for piece, times in zip(
+            self._pieces, np.split(t_ns, ends), strict=True) if len(times)]
         return found or [(self._pieces[-1], t_ns)]
 
     def _go_on(self, t_ns: int) -> None:
@@ -111,7 +111,7 @@ class Trajectory:
         """Return by how much the velocity of a point of the body jumps at a time, (1,) each."""
         if t_ns not in self._jumps:
             return np.zeros(1), np.zeros(1), np.zeros(1)
-        moment = range(t_ns, t_ns + 1)
+        moment = np.array([t_ns])
         before, after = self.evaluate(moment), self.after(t_ns).states(moment)
         (u1, u2, u3), (v1, v2, v3) = before.velocity(point), after.velocity(point)
         return v1 - u1, v2 - u2, v3 - u3
@@ -124,9 +124,9 @@ class Trajectory:
 
     def place(self, t_ns: Times) -> Kinematics:
         """Return what the pivot does at times (n,), without its motion being solved."""
-        found = self.pieces(t_ns)
-        return kinematics([piece.ride for piece, _ in found],
-                          [len(times) for _, times in found], np.asarray(t_ns))
+        return Kinematics(*(np.concatenate(rows, axis=1) for rows in zip(*(
+            kinematics(piece.ride, times)
+            for piece, times in self.pieces(t_ns)), strict=True)))
 
     def orientation_error(self, states: States, t_ns: Times) -> NDArray[np.float64]:
         """Return the angles (n,) [rad] of states to the exact ones; NaN: these are not known."""
@@ -154,7 +154,7 @@ class Trajectory:
 
     def _follow(self, event: Event, now: Piece) -> None:
         t_ns, details = event.t_ns, event.details
-        state = now.states(range(t_ns, t_ns + 1))
+        state = now.states(np.array([t_ns]))
         if event.kind == 'drive':
             repeats = self._drive is not None and event.repeats(self._drive)
             self._drive = event
@@ -173,7 +173,7 @@ class Trajectory:
             self.lz, self._jumps = start.lz, (*self._jumps, t_ns)
 
     def _path_of(self, event: Event) -> PivotPath:
-        place = self.place(range(event.t_ns, event.t_ns + 1))
+        place = self.place(np.array([event.t_ns]))
         self._driven_path = partial(
             PivotPath.to_velocity, [event.details[axis] for axis in 'xyz'],
             position=place.position[:, 0].tolist(), velocity=place.velocity[:, 0].tolist(),

@@ -10,8 +10,8 @@ from typing import Any
 import viser
 
 from spinning_top_sim.installation import parameter_files
-from spinning_top_sim.nodes.node_status import SPEED, STATE, TIME
-from spinning_top_sim.nodes.recording_session import RECORDED_FILE, RECORDER
+from spinning_top_sim.nodes.recording import RECORDED_FILE, RECORDER
+from spinning_top_sim.nodes.status import SPEED, STATE, TIME
 from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.view.node_client import NodeClient

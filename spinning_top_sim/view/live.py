@@ -16,10 +16,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import Float64MultiArray
 
-from spinning_top_sim.nodes.node_status import DRIFT, EPOCH, ERROR
-from spinning_top_sim.nodes.publishers import THROTTLED
 from spinning_top_sim.nodes.ros_parameters import SPIN
+from spinning_top_sim.nodes.status import EPOCH
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.view import shapes
 from spinning_top_sim.view.controls import Controls
@@ -34,7 +34,7 @@ SILENT_S = 5.0                  # timeout of /diagnostics, which come every seco
 RESTART_NS = NANOSECONDS        # a step back of the stamps by more is another run
 KEPT_NS = 2 * max(WINDOW_NS, shapes.TRACE_NS)
 KIND_OF = {'pose': PoseStamped, 'joint_states': JointState, 'ground_truth/odom': Odometry,
-           'ground_truth/imu': Imu}
+           'ground_truth/imu': Imu, '~/invariants': Float64MultiArray}
 
 
 class LiveView(Node):
@@ -57,7 +57,6 @@ class LiveView(Node):
         self.create_timer(0.2, self._listen_as_needed)
         self._track: Track | None = None
         self._epoch_ns: int | None = None      # stamp of t = 0; unknown before /diagnostics
-        self._errors: tuple[float, float] | None = None         # from /diagnostics, not drawn yet
         self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
         self._gone = False              # whether the page says that the node has ended
         self._stopped = False
@@ -80,13 +79,14 @@ class LiveView(Node):
             self._inbox.append((topic, data))
             self._arrived.set()
         self._listeners[topic] = self.create_subscription(
-            KIND_OF[topic], THROTTLED.get(topic, topic), _receive, QOS, raw=True)
+            KIND_OF[topic], topic.replace('~', self._client.name), _receive, QOS, raw=True)
 
     def _listen_as_needed(self) -> None:
         """Subscribe to the topics that are shown only: each message costs the node some time."""
         needed = {'pose', 'joint_states'}
-        if self.count_publishers(THROTTLED['ground_truth/odom']):     # both in one
+        if self.count_publishers('ground_truth/odom'):     # both in one
             needed = {'ground_truth/odom'}
+        needed |= {'~/invariants'}
         if self._page.arrows['specific force'].value:
             needed |= {'ground_truth/imu'}
         for topic in needed - self._listeners.keys():
@@ -105,7 +105,6 @@ class LiveView(Node):
                     # Not `|=`: that could undo what `choose` writes.
                     self._client.is_stale = True
                 self._epoch_ns = epoch_ns
-                self._errors = float(numbers[DRIFT]), float(numbers[ERROR])
 
     # The thread of the page.
 
@@ -137,9 +136,6 @@ class LiveView(Node):
         if not len(track.attitudes.rows):
             return
         newest_ns = track.span[1]
-        if self._errors is not None:
-            track.add_errors(newest_ns, *self._errors)
-            self._errors = None
         track.drop_before(max(newest_ns - KEPT_NS, min(self._epoch_ns or 0, newest_ns)))
         track.detect_motion()
         if track.motions:
@@ -155,7 +151,9 @@ class LiveView(Node):
             topic, data = self._inbox.popleft()
             arrived[topic].append(data)
         for topic, messages in arrived.items():
-            samples = self._track.decode(topic, messages)
+            # Those without a stamp belong to the newest sample.
+            samples = self._track.decode(topic, messages, None if topic != '~/invariants' else (
+                len(messages) * [self._track.span[1]]))
             known_ns = self._track.samples[topic].stamps_ns
             if len(known_ns) and (samples.stamps_ns[-1:] < known_ns[-1] - RESTART_NS).any():
                 self._track.drop_before(known_ns[-1] + 1)        # the sim_node was started again

@@ -171,12 +171,6 @@ class Track:
         """Add samples of a topic."""
         self.samples[topic] = joined([self.samples[topic], samples])
 
-    def add_errors(self, stamp_ns: int, energy_drift: float, orientation_error: float) -> None:
-        """Add what a node says of its errors as a sample of ~/invariants."""
-        row = dict.fromkeys(INVARIANTS, np.nan)
-        row.update(energy_drift=energy_drift, orientation_error=orientation_error)
-        self.add('~/invariants', Series(np.array([stamp_ns]), np.array([[*row.values()]])))
-
     def drop_before(self, before_ns: int) -> None:
         """Drop the samples before a stamp."""
         self.samples = {topic: samples.part(before_ns, np.iinfo(np.int64).max)
