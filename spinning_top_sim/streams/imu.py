@@ -223,7 +223,7 @@ class Readings:
             since_ns = max(imu.since_ns, piece.start_ns) + 1
             single = len(range(int(times[0]), since_ns + period_ns, self._times.step))
             found += [self._increments(imu.begin_ns(end_ns), end_ns)
-                      for end_ns in times[:single]]
+                      for end_ns in map(int, times[:single])]
             if single < len(times):
                 begins = range(int(times[single]) - period_ns, int(times[-1]) - period_ns + 1,
                                self._times.step)
