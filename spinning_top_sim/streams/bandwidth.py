@@ -53,11 +53,11 @@ class LowPass:
         return np.asarray(1.0 / (
             1.0 + s if self._order == 1 else 1.0 + math.sqrt(2.0) * s + s * s), np.complex128)
 
-    def filtered(self, trajectory: Trajectory, times: range, signal: Signal,
+    def filtered(self, trajectory: Trajectory, t_ns: Times, signal: Signal,
                  ) -> NDArray[np.float64]:
-        """Return the filtered signal at times [ns] of a motion, (columns, n)."""
+        """Return the filtered signal at times (n,) [ns] of a motion, (columns, n)."""
         found = []
-        for piece, within in trajectory.pieces(times):
+        for piece, within in trajectory.pieces(t_ns):
             panels = self._panels(piece.fastest_rate)
             together = max(1, MOST_TOGETHER // (NODES * panels))
             # Samples that see this piece alone have the same nodes, each of the others its own.

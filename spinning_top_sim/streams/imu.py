@@ -203,7 +203,7 @@ class Readings:
         imu, exact = self._imu, self.exact
         if imu.low_pass is not None:
             w1, w2, w3, f1, f2, f3 = imu.low_pass.filtered(
-                self._trajectory, self._times, self._signal)
+                self._trajectory, self._t_ns, self._signal)
             exact = (w1, w2, w3), (f1, f2, f3)
         if imu.vibration.is_off:
             return exact
