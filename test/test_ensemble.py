@@ -5,19 +5,18 @@ import json
 import os
 import signal
 from importlib.util import find_spec
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
 from helpers.reference import ROOT
-from spinning_top_sim.streams.simulation import Simulation
 
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams.topics import all_streams
-from spinning_top_sim.tools import ensemble_part, ensemble_spec
+from spinning_top_sim.streams.play import Simulation
+from spinning_top_sim.tools import ensemble_spec
 from spinning_top_sim.tools.ensemble import main
 from spinning_top_sim.tools.ensemble_part import EPOCH_NS, arrow_table, compute_part, samples
+from spinning_top_sim.tools.recorded_run import channels_of
 
 pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='Dask is not there')
 pa = pytest.importorskip('pyarrow')
@@ -102,15 +101,11 @@ def test_every_stream_has_columns_or_is_left_out():
         'imu/dq.quaternion.w', 'imu/dv.vector.z', 'ground_truth/imu_odom.pose.pose.position.x',
         'ground_truth/imu_timing.data.copies', 'joint_states.velocity.spin_joint',
         'imu/mag.magnetic_field_covariance.8'}
-    toy = SimpleNamespace(type_name='std_msgs/msg/Float64MultiArray', topic='toy',
-                          template=SimpleNamespace(counts=[3]))
-    with pytest.raises(ValueError, match='toy: its numbers have no names'):
-        ensemble_part._column_names(toy)
 
 
 def fields_in(log, values):
     """Return the fields of each message by topic and time."""
-    templates = {f'/{stream.topic}': stream.template for stream in all_streams(values)}
+    templates = {f'/{channel.topic}': channel.template for channel in channels_of(values)}
     fields = {topic: {} for topic in templates}
     with LogReader(log) as reader:
         for message in reader.messages(templates):
@@ -133,7 +128,7 @@ def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
     log = tmp_path / 'run.mcap'
     assert main([str(path), '--row', str(run), '-o', str(log)]) == 0
     logged, lost = fields_in(log, values), 0
-    for topic, column, field in (('imu/data_raw', 'linear_acceleration.y', 2),
+    for topic, column, field in (('imu/data_raw', 'linear_acceleration.y', 1),
                                  ('ground_truth/imu', 'orientation.w', 0)):
         values = rows[f'{topic}.{column}'].to_pylist()
         kept = {round(1e9 * (t + 1.0)): value for t, value in zip(
@@ -218,9 +213,32 @@ def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):
         assert said.count('\n') == 1
         failed = json.loads((folder / 'manifest.json').read_text())['failed']
         assert list(failed) == ['3', '4', '5']
-        assert all('ValueError: no motion from theta' in why for why in failed.values())
+        assert all('ValueError: no motion from State(theta=' in why for why in failed.values())
     part, = (folder / 'data').iterdir()
     assert set(parquet.read_table(part)['run'].to_pylist()) == {0, 1, 2}
+
+
+def test_an_ensemble_all_of_whose_runs_fail_is_a_failure(tmp_path, capsys, ensemble):
+    path = written(tmp_path, runs=2, duration=0.05, streams=[], sample={
+        'spin.lz': {'values': [1e30, -1e30]}})
+    assert ensemble(path, '-o', tmp_path / 'other') == 1
+    assert '2 of 2 runs failed' in capsys.readouterr().err
+
+
+def test_a_receiver_without_reception_is_no_failure_and_has_no_fix():
+    """Outages that begin and end within a run, and last for all of it."""
+    specification = ensemble_spec.parse({
+        'runs': 2, 'duration': 1.0, 'streams': ['gnss'], 'sample': {
+            'gnss.outages': {'values': [[0.25, 0.75], [0.0, 9.0]]}}}, 'test')
+    for run, out in ((0, slice(3, 8)), (1, slice(0, 11))):
+        columns = table_of(specification, run).to_pydict()
+        lost = np.zeros(11, bool)
+        lost[out] = True
+        assert columns['gnss/fix.status.status'] == np.where(lost, -1.0, 0.0).tolist()
+        assert np.array_equal(np.isnan(columns['gnss/fix.position.latitude']), lost)
+        assert not np.isnan(columns['ground_truth/gnss/fix.position.altitude']).any()
+        assert [value is None for value in columns['gnss/velocity.twist.twist.linear.x']] == (
+            lost.tolist())
 
 
 def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names():

@@ -47,7 +47,7 @@ def kinematics(path, times_ns):
 
 def sample(trajectory, t_ns, point):
     """Return attitude w x y z, omega and alpha in the body, and where a point is at a time."""
-    states = trajectory.after(t_ns).states(range(t_ns, t_ns + 1))
+    states = trajectory.after(t_ns).states(np.array([t_ns]))
     return (np.roll(states.quaternion[0], 1), states.angular_velocity[0],
             states.angular_acceleration[0], np.ravel(states.position(point)))
 
@@ -118,7 +118,7 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
         for one, other in zip(whole[:3], back.posture(S)[:3], strict=True):
             assert abs(one - other) < max(1, abs(one)) * 1e-30
     for t, (alpha, beta, across, _) in (0, first), (S, whole):
-        states = piece.states(range(t, t + 1))
+        states = piece.states(np.array([t]))
         q = states.quaternion[0]
         assert abs(q - [-beta.imag, beta.real, alpha.imag, alpha.real]).max() < 2e-15
         rates = np.array([across.real, across.imag], float)

@@ -2,6 +2,7 @@
 """`inspect --verify`: logs are computed again, and each difference is found and named."""
 
 import dataclasses
+import json
 import math
 import re
 
@@ -9,12 +10,17 @@ import numpy as np
 import pytest
 from helpers.inspected import as_json, log_of, rewritten, told
 from helpers.logs import flipped
+from helpers.reference import ROOT
+from helpers.simulations import MILLISECOND, SECOND, drive, publish, simulate
 from mcap.reader import make_reader
 
+from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams import messages, parameters
+from spinning_top_sim.streams.events import TOPICS, Event
 from spinning_top_sim.streams.parameter import Effect
+from spinning_top_sim.streams.topics import resolve_topic
 from spinning_top_sim.tools import recorded_run
 
 
@@ -92,10 +98,10 @@ def test_each_change_that_takes_effect_at_once_is_replayed(short):
         run = recorded_run.read_run_description(reader)
     for parameter in parameters.TABLE:
         change = {parameter.name: run.values_at_start[parameter.name]}
-        event = recorded_run.Event('parameters', run.epoch_ns + 1, 1, 1, change)
-        events = [event for _, event in recorded_run.rerun(
+        event = recorded_run.Logged(run.epoch_ns + 1, Event('parameters', 1, 1, change))
+        done = [done for _, done in recorded_run.rerun(
             dataclasses.replace(run, events=[event]), run.epoch_ns + 2)]
-        assert (event in events) is (parameter.effect is Effect.NOW), parameter.name
+        assert (event in done) is (parameter.effect is Effect.NOW), parameter.name
 
 
 def test_another_machine_is_warned_of(short, capsys, monkeypatch):
@@ -106,47 +112,81 @@ def test_another_machine_is_warned_of(short, capsys, monkeypatch):
     assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
 
 
-def test_live_logs_verify(tmp_path, capsys):
-    """From the start, and from the middle with commands before; rates change, resets happen."""
-    own_node = pytest.importorskip('helpers.own_node')
+NOISY = {'imu.gyroscope_noise_density': 0.01, 'imu.lever_arm': (0.1, -0.2, 0.3),
+         'imu.sampling': 'mean', 'increments.enabled': True, 'gnss.enabled': True,
+         'gnss.latency': 0.03, 'gnss.outages': (0.05, 0.1), 'pivot.cmd_timeout': 0.05}
+
+
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_live_logs_verify(method, tmp_path, capsys):
+    """From the start, and from the middle with every kind of event before and after."""
+    pytest.importorskip('pymap3d')
+    simulation = simulate(NOISY, solver__method=method)
+    values, recording = simulation.values, Recording(simulation, lambda channels: [
+        (resolve_topic(name, '/'), type_name, {}) for name, type_name in (
+            *((one.topic, one.type_name) for one in channels), *TOPICS.items())])
+
+    def act(kind, **details):
+        recording.write(simulation.apply(kind, **details))
+        go_on()
+
+    def go_on():
+        for _ in range(7):
+            simulation.send(simulation.now_ns + 10 * MILLISECOND)
+            simulation.look_ahead(simulation.now_ns + 50 * MILLISECOND, 1e-3)
+
+    def everything():
+        publish(simulation, 'pose')
+        act('command', l3=1.65, lz=1.4)
+        act('parameters', **{'imu.rate': 125.0, 'pose.rate': 50.0})
+        for velocity in ((0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 1.0, 0.0)):
+            recording.write(drive(simulation, *velocity))
+            simulation.send(simulation.now_ns + 12_345_678)
+        act('state', theta=1.0, theta_dot=0.2, phi=0.3, psi=0.0, l3=1.6, lz=1.2)
+        act('epoch', epoch_ns=simulation.epoch_ns + 5 * SECOND)
+
     whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
-    with own_node.OwnNode(
-            tmp_path, record__uri=str(whole), start_paused=True, increments__enabled=True,
-            imu__gyroscope_noise_density=0.01, imu__sampling='mean',
-            imu__lever_arm=[0.1, -0.2, 0.3]) as node:
-
-        def set_now(**values):
-            assert node.set(**values).successful
-            node.step(7)
-
-        assert node.set(spin__l3=1.7, spin__lz=1.4).successful
-        assert node.switch('record', True).success
-        assert node.set(spin__l3=1.65, spin__lz=1.4).successful         # before t = 0
-        node.step(10)
-        set_now(imu__rate=125.0, pose__rate=50.0)
-        set_now(spin__lz=1.3)
-        assert node.switch('record', False).success
-        set_now(record__uri=str(part), joint_states__rate=33.0)
-        assert node.switch('record', True).success
-        set_now(spin__l3=1.8)
-        set_now(imu__rate=250.0, imu__gyroscope_noise_density=0.02, solver__method='exact')
-        assert node.trigger('reset').success
-        node.step(5)
-        assert node.trigger('reset').success
-        assert node.set(spin__l3=1.9, spin__lz=1.3).successful          # before t = 0
-        node.step(1)
-        set_now(ground_truth_imu__rate=100.0)
-    capsys.readouterr()
-    for path, causes in ((whole, ['start', 'command', 'command']),
-                         (part, ['start', 'command', 'reset', 'reset', 'command'])):
+    recording.start({**values, 'record.uri': str(whole)})
+    everything()
+    assert 'stopped' not in recording.close()
+    recording.start({**values, 'imu.rate': 125.0, 'pose.rate': 50.0, 'record.uri': str(part)})
+    everything()
+    act('reset', epoch_ns=simulation.epoch_ns + SECOND,
+        parameters={**values, 'imu.gyroscope_noise_density': 0.02})
+    everything()
+    recording.close()
+    causes = ['command', 'drive', 'state', 'epoch']
+    for path, expected in ((whole, ['start', *causes]), (part, [
+            'start', *causes, 'reset', *causes])):
         code, content = as_json(capsys, path, '--verify')
         verdict = content['verify']
         assert verdict['identical'] and code == 0, verdict
-        assert sum(verdict['compared'].values()) > 100
-        assert [motion['cause'] for motion in content['motions']] == causes
+        assert sum(verdict['compared'].values()) > 300
+        assert [motion['cause'] for motion in content['motions']] == [
+            cause for cause in expected if cause != 'epoch']
         assert all(topic['missing'] == 0
                    for topic in content['topics'].values() if topic['stream'])
         assert all(error['max'] < 1e-9 for error in content['orientation_error'].values())
+
+
+def test_a_log_of_1_is_read_and_verified_by_1(capsys):
+    """Its history has lists of numbers: a command, a rate, a velocity of the pivot, a state."""
+    path = ROOT / 'test/data/log_of_1.mcap'
+    code, content = as_json(capsys, path)
+    assert code == 0 and content['whole'] and not content['notes']
+    with LogReader(path) as reader:
+        run = recorded_run.read_run_description(reader)
+    assert [(event.kind, event.t_ns) for event in run.history] == [
+        ('command', 0), ('parameters', 30_000_000), ('drive', 50_000_000), ('state', 80_000_000)]
+    assert [motion['cause'] for motion in content['motions']] == ['start', 'command', 'reset']
+    # The motion is the same, but for its last bits.
+    assert max(error['max'] for error in content['orientation_error'].values()) < 1e-11
+    assert max(drift for drifts in content['drifts'].values() for drift in drifts.values()) < 1e-14
+    assert all(topic['missing'] == 0 for topic in content['topics'].values() if topic['stream'])
+    code, _, err = told(capsys, path, '--verify')
+    assert code == 1 and err == (
+        'spinning-top inspect: --verify: it was recorded by spinning_top_sim 1.0.0, which '
+        'computes other last bits: verify it with that version\n')
 
 
 def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):
@@ -171,8 +211,7 @@ def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys
     {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18}])
 def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
     """It is left out: the run is followed to its end all the same."""
-    data = journal.event(**{'name': event['event'], 't_ns': 0, 'sent_ns': 300_000_000, **{
-        name: value for name, value in event.items() if name != 'event'}})
+    data = messages.string(json.dumps({'t_ns': 0, 'sent_ns': 300_000_000, **event}))
     path = rewritten(short, tmp_path / 'odd.mcap', lambda topic, number, old: (
         [old, data] if topic.endswith('/events') and number == 1 else old))
     code, content = as_json(capsys, path, '--verify')
@@ -191,7 +230,7 @@ def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
     monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
     monkeypatch.setattr(recorded_run, 'LEAST_STEPS', 5_000)
     t_ns = 3_999_999_998_000_000_000
-    far = journal.event('command', t_ns, t_ns, l3=1.7, lz=1.4)
+    far = Event('command', t_ns, t_ns, {'l3': 1.7, 'lz': 1.4}).encoded()
     path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (
         far if topic.endswith('/events') and number == 1 else data),
         stamp=lambda topic, number, stamp_ns: (
@@ -199,9 +238,6 @@ def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
     assert 'integration steps are too many' in told(capsys, path)[1]
 
 
-def test_topics_are_known_by_their_names_in_a_log_put_together_anew(stepped):
-    with LogReader(stepped) as reader:
-        run = recorded_run.read_run_description(reader)
-        found = recorded_run._topics(reader.topics[::-1], run.values_at_recording)
-    assert found.items() > run.topics.items()
-    assert {*found} - {*run.topics} == {'~/commands', '~/events'}
+def test_topics_are_known_by_their_names_in_a_log_put_together_anew(short, tmp_path, capsys):
+    path = rewritten(short, tmp_path / 'anew.mcap', order=reversed)
+    assert verified(capsys, path)['identical']

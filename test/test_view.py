@@ -271,7 +271,7 @@ def test_a_reset_to_another_top_shows_that_one_from_its_begin_on(page, tmp_path)
 
 def test_messages_that_show_no_attitude_are_left_out(log, shown, tmp_path):
     """Of another size, or with a quaternion of zeros."""
-    at, _ = shown.templates['ground_truth/imu']._fields[0]
+    at = shown.templates['ground_truth/imu'].fields[0].offset
     changed = {('/pose', 5): lambda data: data[:-1],
                ('/ground_truth/imu', 7): lambda data: data[:at] + bytes(32) + data[at + 32:]}
     (track,), = logs.read_logs([rewritten(
@@ -280,6 +280,16 @@ def test_messages_that_show_no_attitude_are_left_out(log, shown, tmp_path):
     for topic, number in (('pose', 5), ('ground_truth/imu', 7)):
         assert np.array_equal(track.samples[topic].stamps_ns,
                               np.delete(shown.samples[topic].stamps_ns, number))
+
+
+def test_a_log_of_1_is_shown():
+    """It was recorded from the middle of a run, and has a command and a reset to the same top."""
+    (track,), = logs.read_logs([ROOT / 'test/data/log_of_1.mcap'])
+    assert len(track.motions) == 3 and not track.note
+    after = int(track.samples['pose'].stamps_ns[-1])
+    state = solve(track.top, parameters.start_state(track.values), [
+        (after - track.motions[-1].begin_ns) * 1e-9])
+    assert track.attitudes.at(after)[1][:4] == pytest.approx(state.quaternion[0], abs=1e-9)
 
 
 def test_a_truncated_log_is_shown_as_far_as_it_goes(log, shown, tmp_path):

@@ -12,6 +12,7 @@ from spinning_top_sim.installation import version
 METADATA_NAME = 'spinning_top_sim'
 OUR_LIBRARY = 'spinning_top_sim '   # what the header of our files begins with
 
+FORMAT = '2'        # of these keys; 1.x wrote 1
 LIBRARIES = ('numpy', 'mcap', 'gmpy2', 'pymap3d')   # those installed decide the last bits
 
 
@@ -28,7 +29,7 @@ def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: in
     values_at_recording : parameters when the recording begins, with later changes
     """
     return {
-        'format': '2',      # version of these keys
+        'format': FORMAT,
         'parameters': json.dumps(dict(values_at_start), default=list, sort_keys=True),
         'parameters_now': json.dumps(dict(values_at_recording), default=list, sort_keys=True),
         'seed': str(values_at_start['seed']),

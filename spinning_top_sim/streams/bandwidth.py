@@ -8,13 +8,13 @@ motion does.  So a reading depends on the motion and on its own time only.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams.trajectory import Trajectory
+from spinning_top_sim.streams.trajectory import Times, Trajectory
 
 # The filter forgets what is older than so many time constants: e^-25 = 1e-11 is left.
 TIME_CONSTANTS = 25.0
@@ -25,6 +25,7 @@ MOST_PANELS = 256
 MOST_TOGETHER = 200_000     # states
 # Returns the signals of some states, (columns, n).
 Signal = Callable[[States], NDArray[np.float64]]
+Edges = NDArray[np.float64]
 
 
 class LowPass:
@@ -52,20 +53,23 @@ class LowPass:
         return np.asarray(1.0 / (
             1.0 + s if self._order == 1 else 1.0 + math.sqrt(2.0) * s + s * s), np.complex128)
 
-    def filtered(self, trajectory: Trajectory, times: range, signal: Signal,
+    def filtered(self, trajectory: Trajectory, t_ns: Times, signal: Signal,
                  ) -> NDArray[np.float64]:
-        """Return the filtered signal at times [ns] of a motion, (columns, n)."""
+        """Return the filtered signal at times (n,) [ns] of a motion, (columns, n)."""
         found = []
-        for piece, within in trajectory.pieces(np.arange(times.start, times.stop, times.step)):
+        for piece, within in trajectory.pieces(t_ns):
             panels = self._panels(piece.fastest_rate)
-            # Samples that see this piece alone have the same nodes; the others one at a time.
-            mixed = len(range(int(within[0]), piece.start_ns + self.memory_ns, times.step))
-            found += [self._reading(trajectory, np.array([t_ns]), self._edges(
-                trajectory, int(t_ns), panels), signal) for t_ns in within[:mixed]]
             together = max(1, MOST_TOGETHER // (NODES * panels))
+            # Samples that see this piece alone have the same nodes, each of the others its own.
+            mixed = int(np.searchsorted(within, piece.start_ns + self.memory_ns))
+            for begin in range(0, mixed, together):
+                found += self._readings(trajectory, [
+                    (within[at:at + 1], self._edges(trajectory, int(within[at]), panels))
+                    for at in range(begin, min(begin + together, mixed))], signal)
             edges = np.linspace(0.0, self.memory_ns, panels + 1)
-            found += [self._reading(trajectory, np.array(within[begin:begin + together]), edges,
-                                    signal) for begin in range(mixed, len(within), together)]
+            for begin in range(mixed, len(within), together):
+                found += self._readings(trajectory, [(within[begin:begin + together], edges)],
+                                        signal)
         return np.concatenate(found, axis=1)
 
     def _panels(self, fastest_rate: float) -> int:
@@ -73,7 +77,7 @@ class LowPass:
         seconds = ANGLE / (self._corner + 2.0 * fastest_rate)
         return min(math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS)
 
-    def _edges(self, trajectory: Trajectory, t_ns: int, panels: int) -> NDArray[np.float64]:
+    def _edges(self, trajectory: Trajectory, t_ns: int, panels: int) -> Edges:
         """Return how long before a sample panels begin and end [ns], those of pieces too."""
         edges = np.linspace(0.0, self.memory_ns, panels + 1)
         starts = [t_ns - start_ns for start_ns in trajectory.starts(
@@ -81,20 +85,30 @@ class LowPass:
         oldest = min(t_ns, self.memory_ns)
         return np.unique(np.concatenate((edges[edges < oldest], starts, [oldest])))
 
-    def _reading(self, trajectory: Trajectory, t_ns: NDArray[np.int64],
-                 edges: NDArray[np.float64], signal: Signal) -> NDArray[np.float64]:
-        """Return the readings (columns, n) of samples with these edges of panels [ns before]."""
-        lengths = np.diff(edges)[:, np.newaxis]
-        before = (edges[:-1, np.newaxis] + lengths * self._nodes).ravel()
-        weights = 1e-9 * (lengths * self._weights).ravel() * self._response(1e-9 * before)
-        # The signal that was there before t = 0 has the rest of the weight.
-        back_ns = np.append(np.rint(before), edges[-1]).astype(np.int64)
-        at_ns, places = np.unique(t_ns - back_ns[:, np.newaxis], return_inverse=True)
-        values = signal(trajectory.evaluate(at_ns))[:, places.reshape(len(back_ns), -1)]
-        total = self._rest(1e-9 * edges[-1]) * values[:, -1]
-        for node, weight in enumerate(weights):     # in one order, however many samples there are
-            total = total + weight * values[:, node]
-        return total
+    def _readings(self, trajectory: Trajectory, samples: Sequence[tuple[Times, Edges]],
+                  signal: Signal) -> list[NDArray[np.float64]]:
+        """Return the readings (columns, n) of samples (n,) with their edges [ns before]."""
+        weights, at_ns = [], []
+        for t_ns, edges in samples:
+            lengths = np.diff(edges)[:, np.newaxis]
+            before = (edges[:-1, np.newaxis] + lengths * self._nodes).ravel()
+            # The signal that was there before t = 0 has the rest of the weight.
+            weights.append(np.append(
+                1e-9 * (lengths * self._weights).ravel() * self._response(1e-9 * before),
+                self._rest(1e-9 * edges[-1])))
+            back_ns = np.append(np.rint(before), edges[-1]).astype(np.int64)
+            at_ns.append(t_ns - back_ns[:, np.newaxis])
+        unique, places = np.unique(np.concatenate(list(map(np.ravel, at_ns))),
+                                   return_inverse=True)
+        values, found, end = signal(trajectory.evaluate(unique)), [], 0
+        for own_weights, own_ns in zip(weights, at_ns, strict=True):
+            begin, end = end, end + own_ns.size
+            own = values[:, places[begin:end].reshape(own_ns.shape)]
+            total = np.zeros_like(own[:, 0])
+            for node, weight in enumerate(own_weights):     # in one order, however many there are
+                total += weight * own[:, node]
+            found.append(total)
+        return found
 
     def _response(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the impulse response [1/s]."""

@@ -244,7 +244,7 @@ class Readings:
         imu, exact = self._imu, self.exact
         if imu.low_pass is not None:
             w1, w2, w3, f1, f2, f3 = imu.low_pass.filtered(
-                self._trajectory, self._times, self._signal)
+                self._trajectory, self._t_ns, self._signal)
             exact = (w1, w2, w3), (f1, f2, f3)
         if imu.vibration.is_off:
             return exact
@@ -264,7 +264,7 @@ class Readings:
             since_ns = max(imu.since_ns, piece.start_ns) + 1
             single = len(range(int(times[0]), since_ns + period_ns, self._times.step))
             found += [self._increments(imu.begin_ns(end_ns), end_ns)
-                      for end_ns in times[:single]]
+                      for end_ns in map(int, times[:single])]
             if single < len(times):
                 begins = range(int(times[single]) - period_ns, int(times[-1]) - period_ns + 1,
                                self._times.step)

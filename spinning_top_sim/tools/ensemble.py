@@ -13,7 +13,7 @@ as after an interruption.
 
 exit codes:
   0    done; the manifest has the reasons of runs that failed
-  1    a file cannot be read or written, or the cluster is lost
+  1    every run failed, a file cannot be read or written, or the cluster is lost
   2    wrong arguments or specification
   130  interrupted
 """
@@ -102,7 +102,7 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
                        f', see {MANIFEST}; run {run}: {reason}', sys.stderr)
     if not arguments.quiet:
         cli.print_line(f'{arguments.output}: {specification.runs - len(failed)} runs')
-    return cli.OK
+    return cli.FAILED if len(failed) == specification.runs else cli.OK
 
 
 def _compute_row(arguments: argparse.Namespace) -> int:

@@ -5,8 +5,9 @@ from the data beside the exact ones. Reads damaged logs, too.
 
 exit codes:
   0    no fault was found
-  1    the file cannot be read or is damaged, --verify found a difference or
-       could not compute the run, or a picture could not be drawn
+  1    the file cannot be read or is damaged, --verify found a difference,
+       could not compute the run or is for another version (logs of 1.x), or a
+       picture could not be drawn
   2    wrong arguments
   130  interrupted
 The keys of --json are in docs/log_format.md.
@@ -29,7 +30,7 @@ from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.tools import cli, log_exports
 from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import MotionReport, Survey, survey
-from spinning_top_sim.tools.verify import Comparison, compare
+from spinning_top_sim.tools.verify import Comparison, compare, objection
 
 DEGREES = math.degrees(1.0)
 # Rows of the table of a motion: text, field of Description and Measured, factor.
@@ -64,8 +65,9 @@ def _run(arguments: argparse.Namespace) -> int:
     with LogReader(arguments.log) as reader:
         found, comparison = survey(reader), None
         exported: list[str] = []
+        refused = found.foreign_reason if found.run is None else objection(found.run)
         if found.run is not None:
-            if arguments.verify:
+            if arguments.verify and not refused:
                 begin_ns, end_ns = found.span[0], found.end_ns
                 with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
                                   quiet=arguments.json) as show:
@@ -79,9 +81,9 @@ def _run(arguments: argparse.Namespace) -> int:
             cli.print_line(line)
     for line in exported:
         cli.print_line(line, sys.stderr if arguments.json else None)
-    for option in ('verify', 'export'):
-        if found.run is None and getattr(arguments, option):
-            raise LogError(f'--{option}: {found.foreign_reason}')
+    for option, reason in (('verify', refused), ('export', found.foreign_reason)):
+        if reason and getattr(arguments, option):
+            raise LogError(f'--{option}: {reason}')
     _draw(arguments, found)
     passed = not found.damage.reasons and (comparison is None or comparison.identical)
     return cli.OK if passed else cli.FAILED

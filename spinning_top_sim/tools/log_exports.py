@@ -137,6 +137,7 @@ def _blocks(reader: LogReader, run: RunDescription, topic: str,
 # Of each kind: the topics that it needs, and the generator of its text.
 KINDS: dict[str, tuple[Sequence[str], Callable[..., Iterator[str]]]] = {
     'tum': ((ODOMETRY,), _tum), 'euroc': ((ODOMETRY, BIAS), _euroc),
-    'euroc_imu': ((RAW,), partial(_csv, RAW, EUROC_IMU_HEAD, slice(2))), 'kalibr': ((RAW,), _kalibr),
+    'euroc_imu': ((RAW,), partial(_csv, RAW, EUROC_IMU_HEAD, slice(2))),
+    'kalibr': ((RAW,), _kalibr),
     'gnss_fix': ((FIX,), partial(_csv, FIX, FIX_HEAD, slice(1, 2))),
     'gnss_velocity': ((VELOCITY,), partial(_csv, VELOCITY, VELOCITY_HEAD, slice(1)))}

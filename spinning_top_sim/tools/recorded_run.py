@@ -50,7 +50,8 @@ class RunDescription:
     epoch_ns: int                         # stamp of t = 0 [ns]
     begun_ns: int                         # simulated time at which the recording began [ns]
     history: Sequence[Event]              # what was applied before that
-    environment: Mapping[str, str]       # version, platform and libraries
+    format: str                           # of the metadata, 1 in logs of 1.x
+    environment: Mapping[str, str]        # version, platform and libraries
     topics: Mapping[str, str]             # topic in the log by that of the stream, imu/data_raw
     commands_topic: str | None            # None where the log has none
     events_topic: str | None
@@ -82,6 +83,7 @@ def read_run_description(reader: LogReader) -> RunDescription:
                 LAST_LOG_TIME_NS, reader.span[1] or LAST_LOG_TIME_NS):
             raise ValueError('times are out of order or too late')
         environment = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
+        log_format = metadata['format']
         topics = _topics(reader.topics, at_recording)
     except MALFORMED as error:
         raise ForeignLogError(
@@ -89,8 +91,9 @@ def read_run_description(reader: LogReader) -> RunDescription:
     commands_topic = topics.pop(events.COMMANDS, None)
     events_topic = topics.pop(events.EVENTS, None)
     found, broken = _events(reader, events_topic, epoch_ns)
-    return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history, environment,
-                          topics, commands_topic, events_topic, found, broken, reader.size)
+    return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history,
+                          log_format, environment, topics, commands_topic, events_topic,
+                          found, broken, reader.size)
 
 
 def channels_of(values: Mapping[str, Any]) -> list[Channel]:
@@ -142,6 +145,11 @@ def _topics(topics: Sequence[LogTopic], values: Mapping[str, Any]) -> dict[str, 
             if type_name == topic.type_name and topic.name.endswith('/' + name.lstrip('~/'))}
 
 
+def most_samples(run: RunDescription) -> int:
+    """Return how many samples a run that fits into the log has at most."""
+    return LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
+
+
 def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
           ) -> Iterator[tuple[Simulation, Logged | Block]]:
     """
@@ -155,7 +163,7 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     """
     simulation = Simulation(run.values_at_start, run.epoch_ns)
     most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
-    samples_left = LEAST_SAMPLES + SAMPLES_A_BYTE * run.log_bytes
+    samples_left = most_samples(run)
 
     def play(t_ns: int, *, with_messages: bool) -> Iterator[tuple[Simulation, Block]]:
         """Yield the blocks up to a time, as far as the equations and the limits go."""

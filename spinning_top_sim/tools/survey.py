@@ -130,7 +130,8 @@ def survey(reader: LogReader) -> Survey:
         found.end_ns = last.end_ns = max(last.begin_ns, 0, *(
             int(stamps_ns[topic].max(initial=0)) for topic in last.channels))
     for topic, report in found.topics.items():
-        _count(report, stamps_ns[topic], sections if report.stream is not None else [], topic)
+        _count(found, report, stamps_ns[topic],
+               sections if report.stream is not None else [], topic)
     for motion in found.motions:
         _measure(found, motion)
     return found
@@ -221,24 +222,30 @@ def _largest(values: Rows) -> float:
     return float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
 
 
-def _count(report: TopicReport, stamps_ns: Stamps, sections: list[Section], topic: str) -> None:
+def _count(found: Survey, report: TopicReport, stamps_ns: Stamps, sections: list[Section],
+           topic: str) -> None:
     report.count = len(stamps_ns)
     if report.count > 1:
         duration_ns = int(stamps_ns[-1] - stamps_ns[0])
         report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
     for section in sections:
         end = int(np.searchsorted(stamps_ns, section.end_ns, 'right'))
-        _count_section(report, section, section.channels[topic], stamps_ns[:end])
+        channel = section.channels[topic]
+        times = channel.times(max(section.begin_ns - section.epoch_ns, -1),
+                              section.end_ns - section.epoch_ns)
+        report.grid_rate = NANOSECONDS / channel.period_ns
+        if found.run and len(times) > recorded_run.most_samples(found.run):
+            found.notes.append(f'{topic}: what is missing is not counted: the log lacks most of '
+                               f'{len(times)} samples')
+            return
+        _count_section(report, section, channel, times, stamps_ns[:end])
         stamps_ns = stamps_ns[end:]
 
 
-def _count_section(report: TopicReport, section: Section, channel: Channel,
+def _count_section(report: TopicReport, section: Section, channel: Channel, times: range,
                    stamps_ns: Stamps) -> None:
     """Add the missing messages of a section: those that the run has sent and the log lacks."""
-    times = channel.times(max(section.begin_ns - section.epoch_ns, -1),
-                          section.end_ns - section.epoch_ns)
     due_ns = section.epoch_ns + np.unique(channel.due(np.array(times, np.int64)))
-    report.grid_rate = NANOSECONDS / channel.period_ns
     missing = ~np.isin(due_ns, stamps_ns)
     report.missing = (report.missing or 0) + int(np.sum(missing))
     edges = np.flatnonzero(np.diff(missing, prepend=False, append=False))

@@ -52,6 +52,13 @@ class Comparison:
         self.first = min(self.first or this, this, key=operator.attrgetter('stamp_ns'))
 
 
+def objection(run: RunDescription) -> str:
+    """Return why the run of a log cannot be verified by this version, '' if it can."""
+    return '' if run.format == provenance.FORMAT else (
+        f'it was recorded by spinning_top_sim {run.environment["version"]}, which computes other '
+        'last bits: verify it with that version')
+
+
 def compare(run: RunDescription, reader: LogReader, end_ns: int,
             show: Callable[[int], None]) -> Comparison:
     """
