@@ -90,8 +90,9 @@ class Segment:
         truth = self.solution.truth(times_ns)
         if truth is None:
             truth = self.solution.states(range(self.start_ns, self.start_ns + 1))
-        return tuple(np.broadcast_to(part, times_ns.shape)
-                     for part in truth.position((0.0, 0.0, along)))
+        x, y, z = (np.broadcast_to(part, times_ns.shape)
+                   for part in truth.position((0.0, 0.0, along)))
+        return x, y, z
 
 
 class Path:
@@ -114,12 +115,12 @@ class Path:
     @property
     def steps(self) -> int:
         """Integration steps taken so far."""
-        return self.gone_steps + sum(one.motion.steps for one in self._segments)
+        return self.gone_steps + sum(one.solution.steps for one in self._segments)
 
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side so far."""
-        return self.gone_evaluations + sum(one.motion.evaluations for one in self._segments)
+        return self.gone_evaluations + sum(one.solution.evaluations for one in self._segments)
 
     def after(self, t_ns: int) -> Segment:
         """
@@ -156,8 +157,8 @@ class Path:
     def _forget(self, segments: list[Segment]) -> None:
         for one in segments:
             self._segments.remove(one)
-            self.gone_steps += one.motion.steps
-            self.gone_evaluations += one.motion.evaluations
+            self.gone_steps += one.solution.steps
+            self.gone_evaluations += one.solution.evaluations
 
     def release(self, now_ns: int) -> None:
         """Forget the segments and integration steps that only times before this one [ns] need."""
