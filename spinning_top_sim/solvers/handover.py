@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.installation import needed
 from spinning_top_sim.physics import integrals, pivot
 from spinning_top_sim.physics.states import States, WorldStates
 from spinning_top_sim.physics.top import State, Top
@@ -88,8 +89,8 @@ class Piece:
         if self.ride is pivot.REST and isinstance(start, State):
             return motion_of(top, start, method=method, **settings), None
         if method == 'exact':
-            from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
-
+            with needed("method = 'exact'"):
+                from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
             return exact_about(top, start, self.ride.acceleration)
         posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
                    else start.in_doubles())
