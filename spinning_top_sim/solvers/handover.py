@@ -74,7 +74,7 @@ class Piece:
                 self._solution = self._begun(method, equations=equations, rtol=rtol, atol=atol)
                 self._motion, self._vertical = self._solution
                 self.l3, self.lz = self._motion.start.l3, self._motion.start.lz
-                self.energy = float(self._motion.states(range(1)).energy[0])
+                self.energy = self._energy()
                 self.fastest_rate = integrals.fastest_rate(
                     self._motion.top, self.l3, self.energy)
             if not self.fastest_rate <= FASTEST_RATE:
@@ -99,6 +99,14 @@ class Piece:
         state = vertical.state_of(posture, float).rounded()
         return motion_of(vertical.top, state, method=method, posture=posture,
                          **settings), vertical
+
+    def _energy(self) -> float:
+        if isinstance(self._start, State):
+            return float(self._motion.states(range(1)).energy[0])
+        # A posture tells it at a third of the time; there may be many pieces a second.
+        top, state, across = self._motion.top, self._motion.start, abs(self._start.transverse)
+        return (0.5 * (top.lambda1 * float(across) ** 2 + state.l3 / top.lambda3 * state.l3)
+                + top.gravity_torque * math.cos(state.theta))
 
     @property
     def steps(self) -> int:
