@@ -160,10 +160,7 @@ class Piece:
         return changed
 
     def _in_world(self, solution: Solution, t_ns: Times) -> States:
-        motion, vertical = solution
-        states = motion.states(
-            t_ns - self.start_ns if isinstance(t_ns, np.ndarray) else range(
-                t_ns.start - self.start_ns, t_ns.stop - self.start_ns, t_ns.step))
-        if vertical is None:
-            return states
-        return WorldStates(self.top, states, vertical.rotation, self.ride, np.asarray(t_ns))
+        (motion, vertical), times_ns = solution, pivot.ns_array(t_ns)
+        states = motion.states(times_ns - self.start_ns)
+        return states if vertical is None else WorldStates(
+            self.top, states, vertical.rotation, self.ride, times_ns)
