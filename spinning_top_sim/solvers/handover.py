@@ -23,8 +23,9 @@ from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical, p
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.exact import ExactSolution
 
-# Stamps of ROS end at 2^31 s; doubles hold the phases of a motion up to 2^52 half turns.
-FASTEST_RATE = math.pi * 2.0 ** 52 / 2.0 ** 31          # [rad/s]
+# Stamps of ROS end at 2^31 s, and doubles hold phases up to 2^52.  The fastest one is that of the
+# nutation in quarter periods: next to hanging it may nutate at twice the rate of its bound.
+FASTEST_RATE = 0.5 * math.pi * 2.0 ** 52 / 2.0 ** 31    # [rad/s]
 Times = NDArray[np.int64] | range
 # A motion, and the vertical that it is about, if that is not the world's.
 Solution = tuple['ExactSolution | SteppedMotion', Vertical | None]
