@@ -14,9 +14,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from spinning_top_sim.pictures import INK, draw_sphere, draw_tip
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State
+from spinning_top_sim.pictures import INK, draw_sphere, draw_tip
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect, simulate

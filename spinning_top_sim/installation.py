@@ -5,9 +5,11 @@ import contextlib
 import os
 import re
 import sys
+import tomllib
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 NAME = 'spinning_top_sim'
 # Libraries whose distribution has another name, and those that Ubuntu has as python3-NAME.
@@ -37,6 +39,11 @@ def share() -> Path:
                 return candidate
     raise FileNotFoundError(f'{NAME} is installed without its files: there is no share/{NAME} '
                             f'above {package}')
+
+
+def read_table(name: str) -> dict[str, Any]:
+    """Return the content of a TOML file among the modules, such as 'streams/parameters.toml'."""
+    return tomllib.loads((Path(__file__).parent / name).read_text('utf-8'))
 
 
 @contextlib.contextmanager

@@ -73,6 +73,7 @@ def test_what_is_long_due_by_the_steady_clock_is_late_and_then_slips():
 def test_what_one_message_on_a_slow_clock_makes_due_is_on_time(step_ns):
     top = Top(publishers=1).begin(100 * S + 4 * MS)
     assert top.epoch_ns == 100 * S
+    assert top.tick(0, 100 * S + 4 * MS)[:2] == (0, -1), 't = 0 is on time'
     for k in range(1, 1000):
         steady_ns = k * 10 * MS
         before, source_ns = top.sent_ns, 100 * S + 4 * MS + steady_ns // step_ns * step_ns
@@ -84,7 +85,7 @@ def test_what_one_message_on_a_slow_clock_makes_due_is_on_time(step_ns):
 def test_what_is_not_sent_half_a_second_after_its_message_is_late():
     top = Top(publishers=1).begin(100 * S)
     for steady_ns, source_ns in ((0, 101 * S), (400 * MS, 102 * S), (499 * MS, 102 * S)):
-        assert top.tick(steady_ns, source_ns).late_ns == 0
+        assert top.tick(steady_ns, source_ns).late_ns == -1
     assert top.tick(500 * MS, 102 * S).late_ns == 1 * S
     assert top.tick(900 * MS, 102 * S).late_ns == 2 * S
 
@@ -137,6 +138,14 @@ def test_of_two_clocks_the_latest_counts_and_stamps_are_never_ahead_of_it(lag_ns
     top.publishers = 1
     top.tick(5 * S, 2000 * S + 796 * MS - lag_ns)
     assert 'stepped back' in top.warnings[-1]
+
+
+def test_the_last_message_of_clocks_that_have_gone_is_no_step_back():
+    top = Top(publishers=1).begin(100 * S)
+    top.tick(0, 101 * S)
+    top.publishers = 0
+    top.tick(1 * S, 100 * S)
+    assert top.warnings == [] and top.sent_ns == 1 * S
 
 
 def test_a_date_behind_the_last_stamp_is_refused_and_0_is_no_time():

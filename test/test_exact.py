@@ -268,6 +268,22 @@ def test_near_the_separatrix_the_attitude_is_as_good_as_the_angles(theta, l3, lz
     assert np.abs(motion.quaternion - of_angles).max() <= BOUND
 
 
+SMALL_NEAR_A_SEPARATRIX = {
+    f'theta = {theta}': (UNIT, start(theta, l3=l3, lz=l3)) for theta, l3 in (
+        (1e-3, 4.4), (1e-4, 4.4), (1e-6, 4.427), (1e-8, 4.427), (1e-3, 3.0))}
+
+
+@pytest.mark.parametrize('name', [*REGIMES, *SMALL_NEAR_A_SEPARATRIX])
+def test_the_angular_velocity_is_that_of_multiprecision(name):
+    """Of the same theta functions: where a fast top hardly precesses, and next to a pole."""
+    solution = ExactSolution(*{**REGIMES, **SMALL_NEAR_A_SEPARATRIX}[name])
+    times = np.array([0, 10 ** 7, 123_456_789, 10 ** 9 // 3, 1_700_000_000, 4 * 10 ** 9])
+    found = solution.states(times).angular_velocity
+    for t, (w1, w2, _) in zip(times.tolist(), found, strict=True):
+        across = complex(solution.posture(t).transverse)
+        assert abs(complex(w1, w2) - across) <= BOUND * max(1.0, abs(across)), (name, t)
+
+
 # The fastest phase in turns per second, by hand: (phi + psi)/2 of a sleeping top, and the
 # nutation of a free rotation, which takes two quarter periods a turn.
 FASTEST_TURNS = {
@@ -305,8 +321,12 @@ def test_a_rate_of_next_to_nothing_is_right():
 
 
 def test_constants_that_lose_the_start_are_refused():
-    with pytest.raises(ValueError, match='too far apart'):
-        solve(replace(TOP, lambda1=1e-100), start(1.9e-143, 0.4, l3=1.6, lz=1.1), [0.0])
+    """By all digits, and by half of them."""
+    for top, state in ((replace(TOP, lambda1=1e-100), start(1.9e-143, 0.4, l3=1.6, lz=1.1)),
+                       (replace(UNIT, com_distance=1.2229766755947465e-36, mass=2.0),
+                        start(1.8816372025848537e-133, 0.4, l3=1.6, lz=7.077894324236906e47))):
+        with pytest.raises(ValueError, match='too far apart'):
+            solve(top, state, [0.0])
 
 
 def test_the_precision_of_the_caller_does_not_matter():

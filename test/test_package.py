@@ -18,6 +18,7 @@ from helpers.reference import ROOT
 from test_architecture import imported as module_names
 
 from spinning_top_sim.__main__ import COMMANDS
+from spinning_top_sim.installation import remedy
 
 NAME = 'spinning_top_sim'
 SCRIPTS = sorted(path for path in (ROOT / 'scripts').iterdir() if path.is_file())
@@ -187,3 +188,25 @@ def test_a_command_whose_library_is_missing_names_it_and_the_remedy(
     assert import_module('spinning_top_sim.__main__').main([name, *arguments]) == 1
     assert re.fullmatch(f'spinning-top {name}: it needs mcap, which is not installed: '
                         rf"\S+ -m pip install 'mcap[^']*'\n", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize('name', ['node', 'simulate'])
+def test_output_that_has_no_encoding_is_escaped_and_a_pager_may_end(name):
+    command = [sys.executable, '-m', NAME, name, '--scene', 'help']
+    run = subprocess.run(command, cwd=ROOT, text=True, capture_output=True, timeout=60,
+                         check=False, env={**os.environ, 'PYTHONIOENCODING': 'ascii'})
+    assert (run.returncode, run.stderr) == (0, '')
+    assert r'Br\xfcls' in run.stdout
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                          text=True) as running:
+        running.stdout.close()
+        assert (running.wait(60), running.stderr.read()) == (0, '')
+
+
+def test_a_remedy_names_the_distribution_or_the_package_of_ubuntu(monkeypatch):
+    assert remedy('yaml').startswith(f"{sys.executable} -m pip install 'PyYAML")
+    monkeypatch.setenv('ROS_DISTRO', 'jazzy')
+    monkeypatch.setattr(sys, 'prefix', sys.base_prefix)
+    assert remedy('gmpy2') == 'sudo apt install python3-gmpy2'
+    assert remedy('yaml') == 'sudo apt install python3-yaml'
+    assert "pip install 'mcap" in remedy('mcap')

@@ -30,6 +30,33 @@ def test_a_bad_constant_or_state_is_refused_by_name_and_value(field, value):
     assert repr(value) in str(error.value)
 
 
+@pytest.mark.parametrize('theta', [0.0, 1e-9, 0.7, 3.0, math.pi])
+def test_a_state_from_rates_turns_at_them(theta):
+    state = State.from_rates(theta, 3.0, -0.4, 12.0, top=Top(**TOP), phi=0.2, psi=-1.0)
+    motion = solve(Top(**TOP), state, [0.0])
+    assert (state.theta, state.phi, state.psi) == (theta, 0.2, -1.0)
+    assert motion.theta_dot[0] == pytest.approx(-0.4, rel=1e-14)
+    # At a pole only the sum or the difference of the two has a meaning.
+    turned = motion.psi_dot[0] + motion.phi_dot[0] * math.cos(theta)
+    assert turned == pytest.approx(12.0 + 3.0 * math.cos(theta), rel=1e-14)
+    if 1e-3 < theta < math.pi - 1e-3:
+        assert motion.phi_dot[0] == pytest.approx(3.0, rel=1e-13)
+
+
+@pytest.mark.parametrize(('field', 'value'), [
+    ('theta', -0.1), ('precession', math.nan), ('nutation', math.inf), ('spin', '3')])
+def test_a_bad_rate_is_refused_by_name_and_value(field, value):
+    name = 'theta_dot' if field == 'nutation' else field
+    with pytest.raises(ValueError, match=rf'{name} = .*{value}.*must be'):
+        State.from_rates(**{'theta': 0.5, 'precession': 1.0, field: value}, top=Top(**TOP))
+
+
+def test_an_energy_that_doubles_hold_is_finite_where_the_square_of_the_rate_is_not():
+    top = Top(**{**TOP, 'lambda1': 1e-200, 'lambda3': 1e-200, 'mass': 0.0})
+    energy = solve(top, State(theta=1.0, theta_dot=1e160, l3=0.0, lz=0.0), [0.0]).energy
+    assert energy[0] == pytest.approx(5e119, rel=1e-14)
+
+
 @pytest.mark.parametrize(('theta', 'lz', 'allowed'), [(0.0, 1.5, 1.6), (math.pi, 1.6, -1.6)])
 def test_at_a_pole_only_one_lz_is_possible(theta, lz, allowed):
     with pytest.raises(ValueError, match=rf'lz = {lz} .*{allowed}'):

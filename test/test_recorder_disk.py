@@ -16,17 +16,24 @@ from types import SimpleNamespace
 
 import pytest
 from helpers import recordings
-from helpers.recordings import METADATA, TOPICS, complete_messages, pose_cdr, rows_of, write
+from helpers.recordings import (
+    METADATA,
+    TOPICS,
+    complete_messages,
+    opened,
+    pose_cdr,
+    rows_of,
+    write,
+)
 from helpers.reference import ROOT
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
-from spinning_top_sim.recording.mcap_writer import McapWriter
 
 from spinning_top_sim.recording import recorder as recorder_module
-from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recorder import McapRecorder, create_file
+from spinning_top_sim.recording.recorder import Recorder, single
+from spinning_top_sim.recording.writer import McapWriter, create_file
 
 PATIENCE_S = 20.0  # for what happens at once on an idle machine
 
@@ -58,14 +65,65 @@ def refuse_to_sync(descriptor):
 def test_too_little_space_or_a_head_that_cannot_be_written_leaves_no_file(
         tmp_path, monkeypatch, least, reason):
     monkeypatch.setattr(os, 'fsync', refuse_to_sync)
-    with pytest.raises(RecordingError, match=rf'run\.mcap: {reason}'):
-        McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=least)
-    assert not list(tmp_path.iterdir())
+    recorder = opened(Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, min_free_bytes=least))
+    write(recorder, 0, 1, b'')
+    assert recorder.state == 'failed' and recorder.path is None
+    assert re.fullmatch(rf'cannot record to {tmp_path}/run\.mcap: {reason}', recorder.error)
+    summary = recorder.close()
+    assert (summary.path, summary.lost, summary.messages) == (None, 1, 0)
+    assert summary.error == recorder.error and not list(tmp_path.iterdir())
 
 
 def test_topics_twice_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="'/top/pose' is listed twice"):
-        McapRecorder(tmp_path / 'run.mcap', [TOPICS[0], TOPICS[0]], {})
+    recorder = opened(Recorder(f'{tmp_path}/run.mcap', [TOPICS[0], TOPICS[0]], {}))
+    assert recorder.error == "topic '/top/pose' is listed twice: once is allowed"
+
+
+def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeypatch):
+    """In a folder, which a name with a slash makes, the first free name is taken."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'old').mkdir()
+    monkeypatch.setattr(time, 'strftime', lambda _: 'spinning_top_now')
+    for uri, path in (('run.mcap', 'run.mcap'), ('new/er/', 'new/er/spinning_top_now.mcap'),
+                      ('old', 'old/spinning_top_now.mcap'), ('', 'spinning_top_now.mcap'),
+                      ('', 'spinning_top_now_2.mcap'), ('', 'spinning_top_now_3.mcap')):
+        summary = Recorder(uri, TOPICS, METADATA, min_free_bytes=0).close()
+        assert summary.path == tmp_path / path and is_indexed(summary.path)
+    content = (tmp_path / 'run.mcap').read_bytes()
+    for uri, reason in (('run.mcap', 'it exists, and nothing is overwritten'),
+                        ('none/a.mcap', f'there is no directory {tmp_path}/none')):
+        recorder = opened(Recorder(uri, TOPICS, METADATA, min_free_bytes=0))
+        assert recorder.error == f'cannot record to {tmp_path}/{uri}: {reason}'
+    assert 'run.mcap' in opened(Recorder('run.mcap/', TOPICS, METADATA)).error
+    assert (tmp_path / 'run.mcap').read_bytes() == content
+
+
+def test_what_is_handed_over_before_the_file_is_open_waits_and_is_kept(tmp_path, monkeypatch):
+    """The opening hangs with the disk; nothing of it is felt."""
+    disk_is_back, fsync = threading.Event(), os.fsync
+    monkeypatch.setattr(os, 'fsync', lambda fd: (disk_is_back.wait(PATIENCE_S), fsync(fd)))
+    recorder = Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0)
+    for number in range(10):
+        write(recorder, 0, number, pose_cdr(number))
+    eventually(lambda: recorder.warning)
+    assert (recorder.state, recorder.path, recorder.counters.queued) == ('opening', None, 10)
+    assert 'could not be closed' in recorder.close(0.01).error
+    disk_is_back.set()
+    assert recorder.close().error is None and recorder.state == 'closed'
+    assert numbers_in(recorder.path) == list(range(10))
+
+
+def test_what_is_not_installed_is_named_in_a_line(tmp_path):
+    """The simulation needs neither mcap nor rosbags until it records."""
+    code = ("import sys; sys.modules.update(dict.fromkeys(('mcap', 'rosbags')))\n"
+            'from spinning_top_sim.recording.recorder import Recorder\n'
+            "recorder = Recorder(sys.argv[1], [], {})\n"
+            'print(recorder.close().error)')
+    done = subprocess.run([sys.executable, '-c', code, tmp_path / 'run.mcap'], text=True,
+                          env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True,
+                          timeout=60, check=True)
+    assert re.match(r'a recording needs mcap, which is not installed: \S+ -m pip install .*mcap',
+                    done.stdout) and done.stdout.count('\n') == 1
 
 
 def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeypatch):
@@ -76,48 +134,48 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
     file = create_file(path, TOPICS, METADATA, compression='zstd')
     assert synced == [str(path), str(tmp_path)]
     synced.clear()
-    file.append(0, 1, pose_cdr(1))
-    file.flush()
+    file.add(*single(0, 1, pose_cdr(1)))
     file.finish()
     assert synced == [str(path), str(tmp_path)]
 
 
-def test_a_disk_that_fails_under_rows_is_told_and_nothing_follows(tmp_path, monkeypatch):
-    """The thread that writes has the error; the caller gets it, and can still finish the file."""
-    file = create_file(tmp_path / 'run.mcap', TOPICS, METADATA, compression='zstd')
-    file.append_rows([rows_of(0, 100)])
+def test_a_disk_that_fails_is_told_and_what_was_written_stays(tmp_path, monkeypatch):
+    """What is in memory is written, or its loss is an error: also by `finish`."""
+    path, pwrite = tmp_path / 'run.mcap', os.pwrite
+    file = create_file(path, TOPICS, METADATA, compression='zstd')
+    file.add(*rows_of(0, 100))
     file.flush()
-    pwrite = os.pwrite
+    file.add(*rows_of(100, 200))
 
     def refuse(*_):
         raise OSError(28, os.strerror(28))
 
     monkeypatch.setattr(os, 'pwrite', refuse)
     with pytest.raises(OSError, match='No space'):
-        for number in range(100, 1000, 100):
-            file.append_rows([rows_of(number, number + 100)])
         file.flush()
     monkeypatch.setattr(os, 'pwrite', pwrite)
-    file.flush()          # what was told once is not told again
     file.finish()
-    assert is_indexed(tmp_path / 'run.mcap')
-    assert numbers_in(tmp_path / 'run.mcap') == list(range(100))
+    assert is_indexed(path) and numbers_in(path) == list(range(100))
+    path.unlink()
+    file = create_file(path, TOPICS, METADATA, compression='zstd')
+    file.add(*rows_of(0, 100))
+    monkeypatch.setattr(os, 'pwrite', refuse)
+    with pytest.raises(OSError, match='No space'):
+        file.finish()
 
 
 def test_a_full_queue_says_so_and_loses_nothing(tmp_path, monkeypatch):
     blocked, disk_is_back = threading.Event(), threading.Event()
-    append_all = McapWriter.append_all
+    add = McapWriter.add
 
-    def append_slowly(self, messages, size):
-        if messages:
-            blocked.set()
-            disk_is_back.wait(PATIENCE_S)
-        return append_all(self, messages, size)
+    def add_slowly(self, *rows):
+        blocked.set()
+        disk_is_back.wait(PATIENCE_S)
+        return add(self, *rows)
 
-    monkeypatch.setattr(McapWriter, 'append_all', append_slowly)
+    monkeypatch.setattr(McapWriter, 'add', add_slowly)
     monkeypatch.setattr(recorder_module, 'QUEUE_BYTES', 10_000)
-    recorder = McapRecorder(
-        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0)
+    recorder = Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, max_loss=0.01, min_free_bytes=0)
     write(recorder, 0, 0, pose_cdr(0))
     assert blocked.wait(PATIENCE_S)  # with the first message, out of the queue
     written = 1
@@ -139,11 +197,11 @@ def test_an_interpreter_that_ends_without_closing_leaves_a_whole_file(tmp_path, 
     code = f"""
         import os, signal, sys
         from spinning_top_sim.recording.rosbag2 import RecordedTopic
-        from spinning_top_sim.recording.recorder import McapRecorder
+        from spinning_top_sim.recording.recorder import Recorder, single
         topics = [RecordedTopic('/a', {recordings.ARRAY!r})]
-        recorder = McapRecorder(sys.argv[1], topics, {{}}, min_free_bytes=0, max_loss=60.0)
+        recorder = Recorder(sys.argv[1], topics, {{}}, min_free_bytes=0, max_loss=60.0)
         for number in range(100):
-            recorder.write_all([(0, number, bytes(8))])
+            recorder.write([single(0, number, bytes(8))])
         {ending}
         """
     subprocess.run([sys.executable, '-c', textwrap.dedent(code), tmp_path / 'run.mcap'],
@@ -193,14 +251,21 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(
         on_disk = written
         flushes += 1
 
-    monkeypatch.setattr(recorder_module, 'time', SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(recorder_module, 'time', SimpleNamespace(
+        monotonic=lambda: now, strftime=time.strftime))
     monkeypatch.setattr(recorder_module, 'threading', SimpleNamespace(
         Event=Event, Thread=Thread, TIMEOUT_MAX=threading.TIMEOUT_MAX))
-    recorder = McapRecorder(
-        tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=max_loss, min_free_bytes=0)
-    monkeypatch.setattr(os, 'fsync', fsync)
-    pwrite = os.pwrite
-    monkeypatch.setattr(os, 'pwrite', lambda *of: (advance(pwrite_s), pwrite(*of))[1])
+    recorder = Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, max_loss=max_loss,
+                        min_free_bytes=0)
+    pwrite, open_file = os.pwrite, recorder._open
+
+    def open_at_once():
+        file = open_file()
+        monkeypatch.setattr(os, 'fsync', fsync)
+        monkeypatch.setattr(os, 'pwrite', lambda *of: (advance(pwrite_s), pwrite(*of))[1])
+        return file
+
+    monkeypatch.setattr(recorder, '_open', open_at_once)
     recorder._run()
     summary = recorder.close()
     assert (summary.error, summary.lost) == (None, 0)
@@ -220,8 +285,8 @@ def slow_disk(monkeypatch):
 def test_recording_goes_on_while_the_disk_is_slow_and_says_what_may_be_lost(tmp_path, slow_disk):
     path = tmp_path / 'run.mcap'
     slow_disk.set()
-    with closing(McapRecorder(
-            path, TOPICS, METADATA, max_loss=0.05, min_free_bytes=0)) as recorder:
+    with closing(opened(Recorder(str(path), TOPICS, METADATA, max_loss=0.05,
+                                 min_free_bytes=0))) as recorder:
         assert (recorder.warning, recorder.possible_loss) == (None, 0.0)
         slow_disk.clear()
         for number in range(3):
@@ -238,16 +303,30 @@ def test_recording_goes_on_while_the_disk_is_slow_and_says_what_may_be_lost(tmp_
     assert numbers_in(path) == [0, 1, 2]
 
 
-def test_a_sync_that_hangs_does_not_hang_the_end(tmp_path, slow_disk):
+@pytest.mark.parametrize('fails', [False, True])
+def test_a_sync_that_hangs_does_not_hang_the_end_and_its_failure_is_told(
+        tmp_path, slow_disk, monkeypatch, fails):
     slow_disk.set()
-    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, max_loss=0.02,
-                                 min_free_bytes=0)
+    recorder = opened(Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, max_loss=0.02,
+                               min_free_bytes=0))
     slow_disk.clear()
+    fsync, begun = os.fsync, threading.Event()
+
+    def sync(descriptor):
+        begun.set()
+        fsync(descriptor)
+        if fails and threading.current_thread().name == 'recorder sync':
+            raise OSError(5, os.strerror(5))
+
+    monkeypatch.setattr(os, 'fsync', sync)
     write(recorder, 0, 1, pose_cdr(1))
-    eventually(lambda: recorder.warning)
+    assert begun.wait(PATIENCE_S)
     assert 'could not be closed within 0.05 s' in (recorder.close(timeout=0.05).error or '')
     slow_disk.set()
-    assert is_indexed(recorder.close(timeout=PATIENCE_S).path)
+    summary = recorder.close(timeout=PATIENCE_S)
+    assert is_indexed(summary.path) and summary.messages == 1
+    assert summary.error == (
+        f'recording to {summary.path} stopped: Input/output error' if fails else None)
 
 
 @pytest.fixture
@@ -273,7 +352,7 @@ def test_a_full_disk_stops_the_recording_and_costs_what_is_not_written(
     monkeypatch.setattr(recorder_module, 'QUEUE_BYTES', 400_000)
     path, rng = tmp_path / 'run.mcap', random.Random(3)
     at_end = max_loss < 1.0
-    recorder = McapRecorder(path, TOPICS, METADATA, min_free_bytes=0, max_loss=max_loss)
+    recorder = opened(Recorder(str(path), TOPICS, METADATA, min_free_bytes=0, max_loss=max_loss))
     disk.room = disk.size if at_end else room
     for number in range(5000):      # many times half of the queue: chunks of up to 1 MB
         write(recorder, 0, number, rng.randbytes(1000))
@@ -304,7 +383,7 @@ FAULTS = {
 def test_a_fault_stops_the_recording_with_its_reason(tmp_path, monkeypatch, reason):
     path = tmp_path / 'logs' / 'run.mcap'
     path.parent.mkdir()
-    recorder = McapRecorder(path, TOPICS, METADATA, max_loss=0.02, min_free_bytes=1)
+    recorder = opened(Recorder(str(path), TOPICS, METADATA, max_loss=0.02, min_free_bytes=1))
     write(recorder, 0, 0, pose_cdr(0))
     FAULTS[reason](path, monkeypatch)
     write(recorder, 0, 1, pose_cdr(1))
@@ -318,7 +397,7 @@ def test_a_fault_stops_the_recording_with_its_reason(tmp_path, monkeypatch, reas
 
 
 def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
-    recorder = McapRecorder(tmp_path / 'run.mcap', TOPICS, METADATA, min_free_bytes=0)
+    recorder = Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, min_free_bytes=0)
     write(recorder, len(TOPICS), 0, b'')
     summary = recorder.close()
     assert recorder.state == 'failed' and 'stopped: KeyError:' in (summary.error or '')
@@ -338,14 +417,13 @@ def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return len(data) // 2
 
-    for index, stamp, data in recordings.some_messages(100):
-        file.append(index, stamp, data)
+    for message in recordings.some_messages(100):
+        file.add(*single(*message))
     monkeypatch.setattr(os, 'pwrite', interrupted)
     with pytest.raises(KeyboardInterrupt):
         file.flush()
     monkeypatch.setattr(os, 'pwrite', pwrite)
     assert file.size == path.stat().st_size == size
-    file.flush()
     file.finish()
     with path.open('rb') as stream:
         list(StreamReader(stream, validate_crcs=True).records)

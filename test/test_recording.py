@@ -14,14 +14,13 @@ from contextlib import closing
 
 import pytest
 import yaml  # type: ignore[import-untyped]
-from helpers.definitions import FILE, TYPES, definition
 from helpers.recordings import (
     EPOCH_NS,
     JAZZY,
     METADATA,
     TOPICS,
     array_cdr,
-    complete_messages,
+    opened,
     parsed_qos,
     pose_cdr,
     rows_of,
@@ -33,15 +32,18 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Chunk, DataEnd, Message, MessageIndex, SummaryOffset
-from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
-from spinning_top_sim.recording.chunks import CHUNK_BYTES, ChunkBuilder
+from rosbags.typesys import get_types_from_msg
 
-from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.recording.recorder import McapRecorder, create_file
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic
+from spinning_top_sim.recording import provenance
+from spinning_top_sim.recording.recorder import CHUNK_BYTES, Recorder, single
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic, find_definition
+from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.streams import journal, parameters
+from spinning_top_sim.streams.topics import all_streams
 
 COMPRESSIONS = ('zstd', 'lz4', 'none')
 SUMMARY_OPCODES = (
@@ -50,8 +52,8 @@ SUMMARY_OPCODES = (
 
 
 def record(path, messages, **options):
-    with closing(McapRecorder(
-            path, TOPICS, METADATA, **{'min_free_bytes': 0} | options)) as recorder:
+    with closing(Recorder(
+            str(path), TOPICS, METADATA, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
             write(recorder, *message)
         return recorder.close()
@@ -95,7 +97,7 @@ def test_checksums_are_there_and_indexes_lead_to_the_messages(tmp_path):
 def indexed_messages(content: bytes, chunk_indexes):
     for chunk_index in chunk_indexes:
         chunk = record_at(content, chunk_index.chunk_start_offset, Chunk)
-        assert chunk.uncompressed_crc != 0 and chunk.uncompressed_size <= CHUNK_BYTES + 200
+        assert chunk.uncompressed_crc != 0 and chunk.uncompressed_size < 1.1 * CHUNK_BYTES
         plain = get_chunk_data_stream(chunk, validate_crc=True)[0].read(2 * CHUNK_BYTES)
         assert sorted(chunk_index.message_index_offsets) == [1, 2]
         for channel_id, offset in chunk_index.message_index_offsets.items():
@@ -199,15 +201,31 @@ def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
 
 
 def test_the_definitions_of_all_streams_are_those_of_jazzy():
-    assert json.loads(FILE.read_bytes()) == {name: definition(name) for name in TYPES}
+    """By name; those of ROS itself have comments.  Hashes and parsed texts are the same."""
+    types = {stream.type_name for stream in all_streams(parameters.checked({}))}
+    for type_name in sorted(types | set(journal.TOPICS.values())):
+        text, type_hash = find_definition(type_name)
+        assert type_hash == JAZZY.hash_rihs01(type_name)
+        assert get_types_from_msg(text, type_name)[type_name] == JAZZY.fielddefs[type_name]
 
 
 @pytest.mark.parametrize('type_name', ['geometry_msgs/msg/NoSuchType', 'no_such_msgs/msg/Type'])
 def test_a_missing_definition_is_named(tmp_path, type_name):
-    with pytest.raises(RecordingError) as caught:
-        McapRecorder(tmp_path / 'run.mcap', [RecordedTopic('/a', type_name)], {}, min_free_bytes=0)
-    assert type_name in str(caught.value)
+    recorder = opened(Recorder(str(tmp_path / 'run.mcap'), [RecordedTopic('/a', type_name)], {},
+                               min_free_bytes=0))
+    assert recorder.state == 'failed' and type_name in recorder.error
     assert not list(tmp_path.iterdir())
+
+
+def test_what_decides_the_last_bits_is_told(monkeypatch):
+    versions = {'gmpy2': '2.2', 'pymap3d': 'unknown'}
+    monkeypatch.setattr(provenance, 'version', lambda name='': versions.get(name, '1.0'))
+    told = provenance.run_metadata({'seed': 7}, 5, -1, [{'event': 'start', 't_ns': 0}],
+                                   {'seed': 7, 'record.streams': ('all',)})
+    assert json.loads(told['libraries']) == {'numpy': '1.0', 'mcap': '1.0', 'gmpy2': '2.2'}
+    assert (told['format'], told['seed'], told['epoch_ns']) == ('2', '7', '5')
+    assert json.loads(told['history']) == [{'event': 'start', 't_ns': 0}]
+    assert json.loads(told['parameters_now'])['record.streams'] == ['all']
 
 
 def test_messages_of_any_length_are_all_kept(tmp_path):
@@ -237,49 +255,41 @@ def test_messages_of_any_length_are_all_kept(tmp_path):
 
 
 @pytest.mark.parametrize('compression', COMPRESSIONS)
-def test_rows_are_written_in_order_and_the_bytes_are_always_the_same(tmp_path, compression):
-    """Chunks are compressed by two threads; single messages keep their place among them."""
+def test_rows_are_written_as_they_come_and_the_bytes_are_always_the_same(tmp_path, compression):
+    """What is in memory when the file is finished is written, too."""
     contents = []
     for name in 'ab':
         path = tmp_path / name / 'run.mcap'
         path.parent.mkdir()
         file = create_file(path, TOPICS, METADATA, compression=compression)
-        block = rows_of(0, 1)[2].copy()
-        for number in range(0, 8000, 400):
-            file.append(1, number, array_cdr(number))
-            index, times, rows = rows_of(number, number + 400 - number % 3)
-            block = rows.copy()
-            file.append_rows([(index, times, block)])
-            file.append_rows([])        # makes no chunk
-            block[:] = 0                # the rows were copied
-        file.append(1, 8000, array_cdr(8000))
-        file.flush()
-        assert file.chunk_count == 41
+        for number in range(0, 2000, 400):
+            file.add(*single(1, number, array_cdr(number)))
+            file.add(*rows_of(number, number + 400 - number % 3))
+            file.flush()
+        file.add(*single(1, 2000, array_cdr(2000)))
         file.finish()
         contents.append(path.read_bytes())
     assert contents[0] == contents[1]
-    in_file = complete_messages(path)
-    assert [message.log_time for _, _, message in in_file] == [
-        stamp for number in range(0, 8000, 400)
-        for stamp in (number, *range(number, number + 400 - number % 3))] + [8000]
+    with path.open('rb') as stream:
+        in_file = [(channel.topic, message) for _, channel, message in make_reader(
+            stream, validate_crcs=True).iter_messages(log_time_order=False)]
+    assert [message.log_time for _, message in in_file] == [
+        stamp for number in range(0, 2000, 400)
+        for stamp in (number, *range(number, number + 400 - number % 3))] + [2000]
     for topic in (TOPICS[0].name, TOPICS[1].name):
-        assert [message.sequence for name, _, message in in_file if name == topic] == list(
-            range(sum(name == topic for name, _, _ in in_file)))
+        assert [message.sequence for name, message in in_file if name == topic] == list(
+            range(sum(name == topic for name, _ in in_file)))
     assert all(message.data == (pose_cdr if name == TOPICS[0].name else array_cdr)(
-        message.log_time) for name, _, message in in_file)
+        message.log_time) for name, message in in_file)
 
 
-@pytest.mark.parametrize(('compression', 'size'), [
-    ('zstd', CHUNK_BYTES), ('lz4', 2 * CHUNK_BYTES - 31), ('none', 2 * CHUNK_BYTES)])
-def test_a_chunk_of_noise_survives_whatever_its_size(compression, size):
-    """It becomes longer by being compressed; a message that is too long gets more memory."""
-    message = random.Random(size).randbytes(size)
-    chunk = ChunkBuilder(compression)
-    for before in (b'', b'before'):
-        chunk.clear()
-        chunk.add(1, 0, 7, 7, before)
-        chunk.add(1, 1, 5, 5, message)
-        record = chunk.record()
-        assert (record.message_start_time, record.message_end_time) == (5, 7)
-        first, second = breakup_chunk(record, validate_crc=True)
-        assert (first.data, second.data) == (before, message)
+@pytest.mark.parametrize('compression', COMPRESSIONS)
+def test_a_chunk_of_noise_survives_whatever_its_size(tmp_path, compression):
+    """It becomes longer by being compressed."""
+    noise = random.Random(3).randbytes(3_000_000)
+    path = write_rows(tmp_path / 'run.mcap', TOPICS, [(0, 7, b''), (0, 5, noise)])
+    with path.open('rb') as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert [message.data for _, _, message in reader.iter_messages()] == [noise, b'']
+        assert (reader.get_summary().statistics.message_start_time,
+                reader.get_summary().statistics.message_end_time) == (5, 7)

@@ -69,14 +69,14 @@ def test_a_name_with_a_slash_is_a_folder_and_a_second_start_or_stop_does_nothing
 def slow_disk(monkeypatch):
     """Have a log opened no sooner than `go_on` is set; `opening` says that it is at it."""
     disk = SimpleNamespace(opening=threading.Event(), go_on=threading.Event())
-    ordinary = recorder_module.McapRecorder
+    ordinary = recorder_module.Recorder
 
     def opened(*arguments, **options):
         disk.opening.set()
         assert disk.go_on.wait(PATIENCE_S)
         return ordinary(*arguments, **options)
 
-    monkeypatch.setattr(recorder_module, 'McapRecorder', opened)
+    monkeypatch.setattr(recorder_module, 'Recorder', opened)
     return disk
 
 

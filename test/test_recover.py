@@ -226,7 +226,7 @@ def test_what_cannot_be_written_is_named_and_nothing_is_overwritten(tmp_path, lo
     (b'', 'it is empty'),
     (MCAP0_MAGIC[:5], 'it is no MCAP file'),
     (b'SQLite format 3\x00' + bytes(100), 'it is no MCAP file'),
-    (MCAP0_MAGIC + bytes(100), 'its header is damaged'),
+    (MCAP0_MAGIC + bytes(100), 'it is no MCAP file'),
     (None, 'No such file or directory'),
     (os.mkdir, 'a folder must hold one .mcap file; in it: none'),
     (os.mkfifo, 'it is no regular file'),

@@ -17,10 +17,14 @@ import pytest
 from gmpy2 import mpfr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top
 from spinning_top_sim.physics import attitude, pivot
 from spinning_top_sim.physics.pivot import Kinematics, PivotPath
+from spinning_top_sim.physics.states import joined
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.multiprecision import BITS, precision
 from spinning_top_sim.streams.trajectory import Trajectory
@@ -104,9 +108,7 @@ def test_a_chain_of_exact_motions_is_the_motion_on_a_moving_pivot(name):
     State(theta=1e-15, theta_dot=1e-15, psi=1.0, l3=0.5, lz=0.5)])
 def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
     def begun(first, start_ns):
-        return Piece(TOP, first, start_ns, RIDE._replace(
-            acceleration=tuple(map(Fraction, acceleration)),
-            begins=np.array((*NOWHERE, *NOWHERE, *acceleration))), method='exact')
+        return Piece(TOP, first, start_ns, ride(acceleration), method='exact')
     piece = begun(start, 0)
     first, whole, back, now = piece.posture(0), piece.posture(S), piece, 0
     for length in (1000, S // 3, S - S // 3 - 1000):
@@ -125,6 +127,99 @@ def test_a_posture_is_handed_over_to_30_digits(start, acceleration):
     force = np.array(acceleration) + np.array((0.0, 0.0, TOP.gravity))
     felt = np.ravel(attitude.rotated(states.rows_quaternion, states.specific_force(NOWHERE)))
     assert abs(felt - force).max() <= BOUND * max(1.0, np.linalg.norm(force))
+
+
+def ride(acceleration):
+    """Return a piece of a path of the pivot that begins at rest in the origin and never ends."""
+    return RIDE._replace(acceleration=tuple(map(Fraction, acceleration)),
+                         begins=np.array((*NOWHERE, *NOWHERE, *acceleration)))
+
+
+def integrated(start, acceleration, times):
+    """
+    Return attitudes (n, 4), x y z w, by Newton and Euler in the world frame.
+
+    q' = (1/2) omega q and L' = R e3 x M (g - a), with omega = L/lambda1 + (L3/lambda3 -
+    L3/lambda1) e3: no frame of a vertical, no Euler angle but at the start.
+    """
+    first = Rotation.from_euler('ZYZ', (start.phi, start.theta, start.psi))
+    sine = math.sin(start.theta)
+    around = (start.lz - start.l3 * math.cos(start.theta)) / (TOP.lambda1 * sine)
+    across = (-around + 1j * start.theta_dot) * np.exp(-1j * start.psi)
+    momentum = first.apply((TOP.lambda1 * across.real, TOP.lambda1 * across.imag, start.l3))
+    pull = TOP.mass * (np.array((0.0, 0.0, -TOP.gravity)) - acceleration) * TOP.com_distance
+
+    def derivative(_, state):
+        (x, y, z, w), momentum = state[:4], state[4:]
+        axis = np.array((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)))
+        omega = momentum / TOP.lambda1 + (
+            start.l3 / TOP.lambda3 - start.l3 / TOP.lambda1) * axis
+        a, b, c = 0.5 * omega
+        return [a * w + b * z - c * y, b * w + c * x - a * z, c * w + a * y - b * x,
+                -a * x - b * y - c * z, *np.cross(axis, pull)]
+    found = solve_ivp(derivative, (0.0, times[-1]), (*first.as_quat(), *momentum), 'DOP853',
+                      times, rtol=3e-14, atol=4e-15)
+    return found.y[:4].T
+
+
+@pytest.mark.parametrize('tilt', [1e-9, 1e-8, 3e-8, 1e-6, 1e-3, 1.0])
+def test_a_vertical_that_turns_by_little_is_not_the_one_of_the_world(tilt):
+    acceleration = (TOP.gravity * math.tan(tilt), 0.0, 0.0)
+    expected = integrated(GENERAL, acceleration, np.linspace(0.0, 0.5, 6))
+    for method, bound in (('exact', 1e-13), ('rk45', 1e-9)):
+        piece = Piece(TOP, GENERAL, 0, ride(acceleration), method=method)
+        found = piece.states(range(0, S // 2 + 1, S // 10)).quaternion
+        assert abs(found - expected).max() <= bound
+        assert (piece.states(range(S // 10, S // 10 + 1)).quaternion[0] == found[1]).all()
+
+
+def test_where_the_equations_cannot_go_on_the_error_says_up_to_when_they_do():
+    piece = Piece(TOP, State(theta=0.8, theta_dot=-3.5, l3=0.5, lz=0.5), 5 * S,
+                  equations='euler')
+    with pytest.raises(IntegrationError, match='pole') as error:
+        piece.states(range(5 * S, 9 * S, S // 100))
+    reached_ns = error.value.reached_ns
+    assert len(piece.states(range(5 * S, reached_ns + 1, S // 100))) > 10
+    assert piece.states(range(reached_ns, reached_ns + 1)).theta[0] < 0.1
+    with pytest.raises(IntegrationError):
+        piece.states(range(reached_ns + S // 10, reached_ns + S // 10 + 1))
+
+
+@pytest.mark.parametrize('method', ['exact', 'rk45'])
+def test_pieces_are_joined_and_known_again_with_another_end(method):
+    """States of two pieces side by side, the pivot with them; a piece that turns too fast."""
+    path = PivotPath([(S, (1.0, 2.0, 0.5)), (S, (0.0, 0.0, -9.80665))])
+    first = Piece(TOP, GENERAL, 0, path.lasting(0), method=method)
+    second = Piece(TOP, first.posture(S), S, path.lasting(S), method=method)
+    parts = first.states(range(0, S, S // 10)), second.states(range(S, 2 * S, S // 10))
+    both = joined(parts)
+    for name in ('t', 'phi', 'phi_dot', 'psi_dot', 'theta_dot', 'theta_folded', 'quaternion',
+                 'angular_velocity', 'angular_acceleration', 'energy', 'l3', 'lz'):
+        assert (getattr(both, name) == np.concatenate([getattr(x, name) for x in parts])).all()
+    point = (0.1, -0.2, 0.3)
+    for name in ('specific_force', 'velocity', 'position', 'world_velocity'):
+        assert (np.array(getattr(both, name)(point)) == np.hstack(
+            [getattr(one, name)(point) for one in parts])).all(), name
+    assert both.pivot.velocity[:, 11] == pytest.approx([1.0, 2.0, 0.5 - 0.980665])
+    at = 1e-4                       # the velocity is that of the position
+    near = first.states(range(S // 2 - 100_000, S // 2 + 100_001, 100_000))
+    moved = np.diff(np.array(near.position(point))[:, ::2], axis=1)[:, 0] / (2.0 * at)
+    velocity = np.array(attitude.rotated(near.rows_quaternion, near.world_velocity(point)))[:, 1]
+    assert moved == pytest.approx(velocity, abs=1e-6)
+    truth = joined([first.truth(range(0, S, S // 10)), second.truth(range(S, 2 * S, S // 10))])
+    assert abs(both.quaternion - truth.quaternion).max() < 1e-9
+    braked = first.with_ride(first.ride._replace(end_ns=S // 2))
+    assert braked.ride.end_ns == S // 2 < first.ride.end_ns
+    assert (braked.states(range(5)).quaternion == first.states(range(5)).quaternion).all()
+    with pytest.raises(ValueError, match=r'it turns at up to .* rad/s: must be at most 6.6e\+06'):
+        Piece(TOP, State(theta=0.5, l3=1e6, lz=1.0), 0, method=method)
+
+
+def test_next_to_the_line_of_effective_gravity_an_axis_stays_what_it_is():
+    """Within 1e-30 rad it is taken for the line, as the documentation says."""
+    for theta, falls in ((1e-29, True), (1e-31, False)):
+        piece = Piece(TOP, State(theta=theta, l3=0.0, lz=0.0), 0, ride(NOWHERE), method='exact')
+        assert (piece.states(range(20 * S, 20 * S + 1)).theta_folded[0] > 0.0) == falls
 
 
 # The path of the pivot

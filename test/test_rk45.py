@@ -140,6 +140,12 @@ def test_the_literal_equations_stop_with_advice_where_they_fail(name, rtol):
     assert angle(regular.quaternion[0], exact.quaternion[0]) < 1e-7
 
 
+def test_the_literal_equations_refuse_a_disc_that_loses_their_digits():
+    top = Top(lambda1=0.123, lambda3=0.123e15, mass=2.0, com_distance=0.15, gravity=9.8)
+    with pytest.raises(ValueError, match=r'lambda3 = 1.*lambda1 for the euler equations'):
+        solve(top, State(theta=0.6, l3=1.6, lz=1.1), [1.0], method='rk45', equations='euler')
+
+
 @pytest.mark.parametrize('name', ['loop-c-thd+', 'oblate-neg-spin', 'negP-a'])
 def test_away_from_the_poles_the_literal_equations_are_right(name):
     case = CASES[name]
@@ -154,6 +160,8 @@ def test_away_from_the_poles_the_literal_equations_are_right(name):
 
 @pytest.mark.parametrize(('arguments', 'message'), [
     ({'method': 'rk4'}, "method = 'rk4'"), ({'equations': 'newton'}, "equations = 'newton'"),
+    ({'rtol': 'a'}, "rtol = 'a': must be in"), ({'atol': '1'}, "atol = '1'"),
+    ({'t': np.ma.array([1.0, 2.0], mask=[0, 1])}, r't\[1\] = nan s: must be finite'),
     ({'rtol': math.nan}, 'rtol = nan'), ({'rtol': 1.0}, r'rtol = 1\.0'),
     ({'atol': -1.0}, r'atol = -1\.0'), ({'t': [1.0, 0.5]}, r't\[1\] = 0\.5 s after 1\.0'),
     ({'t': [-1.0]}, r't\[0\] = -1\.0'), ({'t': [0.0, math.nan]}, r't\[1\] = nan'),

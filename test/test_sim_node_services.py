@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 def served(peer, tmp_path_factory):
     """A node that publishes /clock and is told to follow it: it does not wait for itself."""
     folder = tmp_path_factory.mktemp('served')
-    values = {'status_period': 0.2, 'publish_clock': True, 'use_sim_time': True}
+    values = {'status_period': 0.2, 'clock.enabled': True, 'use_sim_time': True}
     with SimNode(folder, values, namespace='/served') as node:
         clock = peer.listen('/clock', Clock).wait(3)
         pose = peer.listen(node.topic('pose'), PoseStamped).wait(3)

@@ -71,6 +71,7 @@ class SimulatedClock:
             raise ValueError('the seconds of a ROS stamp, an int32, end in January 2038')
         wait_ns = min(max(epoch_ns - date_ns, 0), EPOCH_GRID_NS)
         self.run(-int(wait_ns * self._scale), source_ns)
+        self._late_ns = -1 - wait_ns            # t = 0 is not sent yet
         return epoch_ns
 
     def run(self, sent_ns: int, source_ns: int) -> None:
@@ -108,8 +109,9 @@ class SimulatedClock:
 
     def _counting(self, source_ns: int) -> int:
         """Return the time of the source that counts: of several /clock, the latest."""
-        is_behind = source_ns < self._newest_ns and self._publishers and self._publishers() > 1
-        return self._newest_ns if is_behind else source_ns
+        if source_ns < self._newest_ns and self._publishers and self._publishers() != 1:
+            return self._newest_ns
+        return source_ns
 
     def due(self, steady_ns: int, source_ns: int, epoch_ns: int) -> Due:
         """Return what is due now; `epoch_ns` is the stamp of t = 0."""
@@ -121,7 +123,7 @@ class SimulatedClock:
             return Due(due_ns, due_ns - int(LATEST_NS * self._scale))
         step_ns, counting_ns = source_ns - self._newest_ns, self._counting(source_ns)
         if step_ns < 0 and counting_ns != source_ns:
-            if not self._told_of_several:
+            if self._publishers() > 1 and not self._told_of_several:
                 warning = (f'several nodes publish on /clock, {_seconds(-step_ns)} apart: the '
                            'latest time counts')
                 self._told_of_several = True

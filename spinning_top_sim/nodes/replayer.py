@@ -82,10 +82,8 @@ class Replayer(Node):
         for name in sorted(wanted - there):
             self.get_logger().warning(f'the log has no topic {name}')
         outputs: dict[int, Publisher] = {}
-        for name, group in itertools.groupby(
-                sorted(self._reader.topics, key=lambda channel: channel.name),
-                lambda channel: channel.name):
-            channels = [*group] if name in wanted else []
+        for name in sorted(wanted & there):
+            channels = [channel for channel in self._reader.topics if channel.name == name]
             profile, differ = used_qos([channel.qos for channel in channels])
             for channel in channels:
                 try:
@@ -255,7 +253,7 @@ def used_qos(channels: Sequence[Sequence[Mapping[str, Any]]]) -> tuple[Mapping[s
     strongest = {key: value for key, value in (
         ('history', 2), ('reliability', 1), ('durability', 1))
         if any(profile[key] == value for profile in profiles)}
-    depth = max(sum(profile['depth'] for profile in channel) for channel in channels or [[]])
+    depth = max(sum(profile['depth'] for profile in channel) for channel in channels)
     return ({**profiles[0], **strongest, 'depth': depth},
             any(profile != profiles[0] for profile in profiles))
 

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.parameter import Effect, Parameter
+from spinning_top_sim.streams.parameter import ANY, Effect, Parameter
 from spinning_top_sim.tools.scene_file import likely_name, with_doubles
 
 SPIN = ('spin.l3', 'spin.lz')
@@ -72,15 +72,15 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
         name=parameter.name, description=parameter.describe(range_too=False), dynamic_typing=True,
         read_only=parameter.effect is Effect.START,
         additional_constraints=parameter.allowed)
-    lowest = parameter.minimum if parameter.above is None else parameter.above
-    if lowest is None or parameter.maximum is None:
+    if parameter.range is ANY:
         return result
     if isinstance(parameter.default, int):
         result.integer_range = [IntegerRange(
-            from_value=int(lowest), to_value=int(parameter.maximum))]
+            from_value=int(parameter.range.lowest), to_value=int(parameter.range.highest))]
     else:               # in a list, the range of each number
+        lowest = 0.0 if parameter.range.has_zero else float(parameter.range.lowest)
         result.floating_point_range = [FloatingPointRange(
-            from_value=float(lowest), to_value=float(parameter.maximum))]
+            from_value=lowest, to_value=float(parameter.range.highest))]
     return result
 
 

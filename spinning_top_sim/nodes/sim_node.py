@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _interface() -> Iterator[str]:
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
     yield INTERFACE
-    for *_, text in parameters.STREAM_DEFAULTS:
+    for text in parameters.STREAMS.values():
         yield textwrap.fill(text, 78, initial_indent='  ', subsequent_indent=6 * ' ')
     yield 'Parameters:'
     for parameter in parameters.TABLE:

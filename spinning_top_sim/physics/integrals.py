@@ -26,6 +26,7 @@ from spinning_top_sim.physics.top import Top
 LEAST_ANGLE = 0.05
 # A panel is at most so many times 1/`fastest_rate` long; with n nodes for an angle of a = rate *
 # length, where (a/2)^n is less than this, the error of the rule, some (a/2)^2n, is a rounding.
+# So many panels hold 8 turns; with more the integrals become less exact.
 LONGEST_PANEL, HALF_THE_DIGITS, MOST_PANELS = 0.5, 1e-8, 100
 Matrix = NDArray[np.float64]
 
@@ -77,12 +78,7 @@ def fastest_rate(top: Top, l3: float, energy: float) -> float:
 
 
 def panels(rate: float, length_ns: int) -> int:
-    """
-    Return into how many panels an interval is divided for motions of this `fastest_rate`.
-
-    They are at most MOST_PANELS, which hold 8 turns: with more of them the integrals of angular
-    velocity and specific force become less exact.
-    """
+    """Return into how many panels an interval is divided for motions of this `fastest_rate`."""
     return max(1, math.ceil(min(rate * length_ns * 1e-9 / LONGEST_PANEL, MOST_PANELS)))
 
 
@@ -108,11 +104,7 @@ def increments(states: Callable[[NDArray[np.int64]], States], begins: range, len
 
 def _panels(states: Callable[[NDArray[np.int64]], States], times_ns: NDArray[np.int64],
             weights: list[float], point: Point, angle: float) -> Increments:
-    """
-    Return the increments over panels with these times, (n, nodes and both ends) [ns].
-
-    angle : by which the motion turns in a panel at most [rad]
-    """
+    """Return the increments over panels with these times, (n, nodes and both ends) [ns]."""
     now = states(times_ns.ravel())
 
     def rows_of(vector: Sequence[Column | float]) -> Matrix:
@@ -189,13 +181,9 @@ def _nodes(angle: float) -> int:
     return max(4, math.ceil(math.log(HALF_THE_DIGITS) / math.log(0.5 * angle)))
 
 
-@lru_cache(64)
+@lru_cache(64)          # 200 increments take 0.53 ms, and would take 0.80 ms
 def _rule(length_ns: int, count: int) -> tuple[tuple[int, float], ...]:
-    """
-    Return nodes [ns] and weights [s] of an interpolatory rule: Gauss' nodes, rounded.
-
-    The weights are those of the rounded nodes, from rational arithmetic: the same everywhere.
-    """
+    """Return rounded Gauss nodes [ns] and weights [s], by rational numbers: the same anywhere."""
     gauss, _ = np.polynomial.legendre.leggauss(count)
     nodes = sorted({round(0.5 * (1.0 + node) * length_ns) for node in gauss.tolist()})
     rule = []

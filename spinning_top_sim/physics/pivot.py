@@ -38,18 +38,12 @@ class Kinematics(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """
-    A time of constant acceleration.
-
-    start_ns, end_ns : first time, and the first one after it; NEVER_NS if it never ends [ns]
-    acceleration : in the world [m/s^2]
-    begins : (9,) position [m], velocity and acceleration at the start, in doubles
-    """
+    """A time of constant acceleration."""
 
     start_ns: int
-    end_ns: int
-    acceleration: Fractions
-    begins: NDArray[np.float64]
+    end_ns: int                         # the first time after it; NEVER_NS if it never ends
+    acceleration: Fractions             # in the world [m/s^2]
+    begins: NDArray[np.float64]         # (9,) position, velocity and acceleration at the start
 
 
 REST = Piece(0, NEVER_NS, ZERO, np.zeros(9))

@@ -23,15 +23,9 @@ def state_of(top: Top, quaternion: Reals, angular_velocity: Reals) -> State:
     A vertical axis has no precession angle of its own: there the angle is that of the line about
     which the axis turns, so that all of this motion is nutation.
 
-    Parameters
-    ----------
-    quaternion : (4,) q(world <- body) as x, y, z, w, of any length but 0
+    quaternion : (4,) q(world <- body) as x, y, z, w, of any length but 0; the sum and the
+        difference of phi and psi belong to its sign
     angular_velocity : (3,) in the world frame [rad/s]
-
-    Returns
-    -------
-    State
-        The sum and the difference of phi and psi belong to the sign of the quaternion.
     """
     x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
     wx, wy, wz = angular_velocity.tolist()

@@ -32,8 +32,7 @@ def relative_drift(values: NDArray[np.float64], start: Column | float) -> Column
     """
     Return how far a constant of the motion has drifted from its value at the start.
 
-    The drift is relative to that value, or absolute if that is 0.  A ratio that exceeds the range
-    of doubles becomes the largest double, with its sign.
+    Relative to that value, or absolute if that is 0; at most the largest double.
     """
     with np.errstate(over='ignore'):
         return np.clip((values - start) / np.where(start, np.abs(start), 1.0), -_LARGEST, _LARGEST)
@@ -229,15 +228,7 @@ class States:
         """
         Return the velocity omega x r of a point of the body relative to the pivot.
 
-        Parameters
-        ----------
-        point : tuple of three float
-            Position r in the body frame, from the pivot [m].
-
-        Returns
-        -------
-        tuple of three (n,) array
-            Components in the body frame [m/s].
+        As three (n,) arrays in the body frame [m/s], in which `point` is r, from the pivot [m].
         """
         (w1, w2, w3), (r1, r2, r3) = self.rows_angular_velocity, point
         return w2 * r3 - w3 * r2, w3 * r1 - w1 * r3, w1 * r2 - w2 * r1
@@ -247,17 +238,8 @@ class States:
         Return what an ideal accelerometer at a point of the body measures.
 
         It is f = omega' x r + omega x (omega x r) + g z + a with the upward vertical z and the
-        acceleration a of the pivot: at rest +g upwards, as REP-145 has it.
-
-        Parameters
-        ----------
-        point : tuple of three float
-            Position r in the body frame, from the pivot [m].
-
-        Returns
-        -------
-        tuple of three (n,) array
-            Components in the body frame [m/s^2].
+        acceleration a of the pivot: at rest +g upwards, as REP-145 has it.  As three (n,) arrays
+        in the body frame [m/s^2], in which `point` is r, from the pivot [m].
         """
         f1, f2, f3 = self._support
         if not any(point):          # the point is the pivot: no rate is needed
@@ -273,19 +255,10 @@ class States:
 
     def plot(self) -> Figure:
         """
-        Draw the motion: the path of its axis, tilt, precession rate and energy drift.
+        Return a figure of the motion: the path of its axis, tilt, precession rate, energy drift.
 
-        Returns
-        -------
-        matplotlib.figure.Figure
-            A notebook with `%matplotlib inline` shows it; `savefig` writes it to a file.
-
-        Raises
-        ------
-        ValueError
-            For fewer than two times, or times that do not ascend.
-        ImportError
-            Without matplotlib.
+        Raises ValueError for fewer than two times, or times that do not ascend, and ImportError
+        without matplotlib.
         """
         with needed('a picture', 'plot'):
             from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
@@ -293,24 +266,10 @@ class States:
 
     def animate(self, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
         """
-        Animate the motion: the body, its axis and the path of the tip.
+        Return an animation of the body, its axis and the path of the tip; raises as `plot`.
 
-        Parameters
-        ----------
-        fps : float, default 20
-            Frames per second, > 0.  Each frame shows the newest sample: no others are computed.
-        speed : float, default 1
-            Simulated over real time, > 0.
-
-        Returns
-        -------
-        matplotlib.animation.FuncAnimation
-            `to_jshtml` makes it a part of a notebook, `save` a file.
-
-        Raises
-        ------
-        ValueError, ImportError
-            As `plot`; also for numbers that are not > 0.
+        fps : frames per second, > 0; each shows the newest sample: no others are computed
+        speed : simulated over real time, > 0
         """
         with needed('a picture', 'plot'):
             from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow

@@ -7,6 +7,8 @@ ZYZ (Taylor, *Classical Mechanics*, sect. 10.9): body to space is Rz(phi) Ry(the
 the precession, theta the tilt from the upward vertical, psi the spin about the symmetry axis.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, fields
 
@@ -122,6 +124,42 @@ class State:
             raise ValueError(
                 f'lz = {self.lz!r} kg m^2/s: with the axis at a pole (theta = {self.theta!r} rad) '
                 f'it must equal {"l3" if self.theta == 0.0 else "-l3"} = {pole!r}')
+
+    @classmethod
+    def from_rates(cls, theta: float, precession: float, nutation: float = 0.0,
+                   spin: float = 0.0, *, top: Top, phi: float = 0.0, psi: float = 0.0) -> State:
+        """
+        Return the state of a top that turns at these rates of its Euler angles.
+
+        L3 = lambda3 (psi' + phi' cos theta) and Lz = lambda1 phi' sin^2 theta + L3 cos theta,
+        eqs. (7) and (11) of "Analysis of Symmetric Spinning Top".
+
+        Parameters
+        ----------
+        theta : float
+            Tilt of the axis from the upward vertical [rad], in [0, pi].
+        precession, nutation, spin : float
+            phi', theta' and psi' [rad/s].
+        top : Top
+            Whose moments of inertia count.
+        phi, psi : float, default 0
+            Precession and spin angle [rad].
+
+        Raises
+        ------
+        ValueError
+            Naming the argument or field, its value and what is allowed.
+        """
+        for name, value in (('theta', theta), ('precession', precession), ('spin', spin)):
+            if isinstance(value, bool) or not isinstance(value, int | float) or (
+                    not math.isfinite(value)):
+                raise ValueError(f'{name} = {shown(value)}: must be a finite number')
+        cosine = math.cos(theta)
+        l3 = top.lambda3 * (spin + precession * cosine)
+        pole = pole_momentum(theta, l3)
+        lz = top.lambda1 * precession * math.sin(theta) ** 2 + l3 * cosine
+        return cls(theta=theta, theta_dot=nutation, phi=phi, psi=psi, l3=l3,
+                   lz=lz if pole is None else pole)
 
 
 class ContinuedState(State):

@@ -35,11 +35,9 @@ MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are read together
 RUN_BYTES = 1 << 20         # of messages outside of chunks that are read together, about
 MAGIC_SIZE = len(MCAP0_MAGIC)
-FOOTER_SIZE = HEAD.size + 8 + 8 + 4
+FOOTER_SIZE, DATA_END_SIZE = HEAD.size + 8 + 8 + 4, HEAD.size + 4
 FIRST_DATE = 10 ** 17       # [ns], in 1973
 UNPACK = {b'\x28\xb5\x2f\xfd': 'zstd -d {} -o {}', b'\x04\x22\x4d\x18': 'lz4 -d {} {}'}
-
-Found = tuple[records.McapRecord, int, int]     # a record, where it begins, and where it ends
 
 
 @dataclass(frozen=True)
@@ -75,27 +73,17 @@ class Damage:
 
 
 class Part(NamedTuple):
-    """A record, or adjacent messages outside of chunks, the last of which is `record`."""
+    """A record, or adjacent messages outside of chunks."""
 
-    record: records.McapRecord
-    messages: Messages
+    record: records.McapRecord | None       # None for messages outside of chunks
+    messages: Messages                      # these, or those of a chunk
     offset: int
     end: int
-
-
-class Place(NamedTuple):
-    """A chunk, or adjacent messages outside of chunks, in the file."""
-
-    start_ns: int                   # the earliest log time
-    end_ns: int                     # the latest
-    offset: int
-    end: int
-    channel_ids: frozenset[int]
 
 
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
-    An MCAP file, open for reading; a context manager.
+    An MCAP file, open for reading; a context manager.  Raises LogError if it is none.
 
     A file with a summary opens at once, any other is read through.  What is damaged is left out.
 
@@ -108,10 +96,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     Attributes
     ----------
-    path : Path
-        The file; of a folder, the one in it.
-    size : int
-        Its size when it was opened [bytes]: what is written later is not read.
+    path, size : Path, int
+        The file, of a folder the one in it, and its size when it was opened [bytes].
     profile, library : str
         What its header says: such as 'ros2', and the program that wrote it.
     whole : bool
@@ -122,11 +108,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         mcap's records by id.
     left_out : int
         Damaged chunks that `messages` has skipped so far.
-
-    Raises
-    ------
-    LogError
-        For what is no MCAP file, or cannot be read.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
@@ -147,13 +128,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             try:
                 self._read_summary()
             except decoding.UNREADABLE as error:
-                self._problem = f'found: the summary is not used: {error}'
-                if self._torn:
-                    self._problem = 'found: the file does not end as an MCAP file ends'
+                self._problem = f'found: no summary: {error or "the file is truncated"}'
             self.whole = not self._problem
             self.schemas, self.channels = self._summary.schemas, self._summary.channels
             self._damage: Damage | None = None
-            self._places = self._find_places()
+            self._chunks = self._find_chunks()
         except BaseException:
             self.close()
             raise
@@ -202,8 +181,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
         Beside dates, a time of 0 does not count: it says that there was no clock yet.
         """
-        begin_ns = min((place.start_ns for place in self._places), default=0)
-        end_ns = max((place.end_ns for place in self._places), default=0)
+        begin_ns = min((chunk.message_start_time for chunk in self._chunks), default=0)
+        end_ns = max((chunk.message_end_time for chunk in self._chunks), default=0)
         if begin_ns == 0 and end_ns > FIRST_DATE:
             first = next(self.messages(start=1), None)
             begin_ns = first.log_time if first and first.log_time > FIRST_DATE else 0
@@ -234,32 +213,35 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                   if names is None or channel.topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
         mode, compression = self.compression
-        # What is read and not yet passed: log time, place and offset there
+        # What is read and not yet passed: log time, chunk, offset there
         held: list[tuple[int, int, int, Messages]] = []
         opened: list[tuple[int, int]] = []      # latest log time and size of chunks
-        for place in [*sorted(self._places), None]:
-            passed = len(held) if place is None else bisect_left(held, (place.start_ns,))
+        for chunk in [*sorted(self._chunks, key=attrgetter('message_start_time')), None]:
+            passed = len(held) if chunk is None else bisect_left(
+                held, (chunk.message_start_time,))
             for time_ns, _, offset, messages in held[:passed]:
                 if time_ns in times:
                     message = messages.message(wanted, offset)
                     yield message if mode != 'MESSAGE' else self._decompressed(
                         message, compression)
             del held[:passed]
-            if (place is None or place.end_ns < times.start or place.start_ns >= times.stop
-                    or place.channel_ids.isdisjoint(wanted)):
+            if (chunk is None or chunk.message_end_time < times.start
+                    or chunk.message_start_time >= times.stop
+                    or wanted.keys().isdisjoint(chunk.message_index_offsets)):
                 continue
+            place = chunk.chunk_start_offset
             try:
-                messages = self._messages(place.offset, place.end)
+                messages = self._part(place, place + chunk.chunk_length).messages
             except decoding.UNREADABLE:
                 self.left_out += 1
                 continue
-            opened = [one for one in opened if one[0] >= place.start_ns]
-            opened.append((place.end_ns, len(messages.plain)))
+            opened = [one for one in opened if one[0] >= chunk.message_start_time]
+            opened.append((chunk.message_end_time, len(messages.plain)))
             if sum(size for _, size in opened) > 2 * self._max_bytes:
                 raise LogError(f'cannot read {self.path}: chunks that overlap in time have more '
                                f'than {2 * self._max_bytes} bytes')
             for number in wanted.keys() & messages.entries.keys():
-                held += ((time_ns, place.offset, offset, messages)
+                held += ((time_ns, place, offset, messages)
                          for time_ns, offset in messages.entries[number].tolist())
             held.sort()
 
@@ -284,47 +266,51 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def parts(self) -> Iterator[Part]:
         """Yield what can be read, in file order; then `damage` tells what cannot."""
         damage = Damage(self._torn, reasons=[self._problem] * (not self.whole))
-        self._small_bytes = 0
-        for is_run, found in itertools.groupby(
-                self._records(damage), lambda one: isinstance(one[0], records.Message)):
-            for record, offset, end in _runs(found) if is_run else found:
-                try:
-                    messages = (self._messages(offset, end)
-                                if is_run or isinstance(record, records.Chunk)
-                                else Messages(b'', {}, [record]))
-                    self._declare(messages)
-                    yield Part(record, messages, offset, end)
-                except decoding.UNREADABLE as error:
-                    damage.lose(offset, end, str(error))
-        self._damage = damage
-
-    def _records(self, damage: Damage) -> Iterator[Found]:
-        """Yield the records of the data section, but for indexes, up to one that has no end."""
-        offset, index_bytes = MAGIC_SIZE, 0
+        offset, index_bytes, self._small_bytes = MAGIC_SIZE, 0, 0
         while offset < self._data_end:
-            opcode, end = self._head(offset)
+            opcode, end = self._end_of(offset)
             if opcode == 0 or end > self._data_end:
                 # Nothing is lost by a truncated index of the last chunk.
                 if not self._torn or opcode not in (Opcode.MESSAGE_INDEX, Opcode.DATA_END) or (
-                        self.size - offset > index_bytes):
+                        self.size - offset > index_bytes + DATA_END_SIZE):
                     damage.lose(offset, self._data_end, 'no whole record')
-                return
-            # Opcodes that are unknown belong to an application.
-            if opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE_INDEX:
-                try:
-                    record = decoding.parse(self._raw(offset, end))
-                except decoding.UNREADABLE as error:
-                    damage.lose(offset, end, str(error))
-                else:
-                    if isinstance(record, records.DataEnd):
-                        self._check_data(offset, record.data_section_crc, damage)
-                        return
-                    if isinstance(record, records.Chunk):
-                        index_bytes = record.uncompressed_size      # at most
-                    yield record, offset, end
+                break
+            try:
+                # Opcodes that are unknown belong to an application.
+                if opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE_INDEX:
+                    part = self._part(offset, end)
+                    self._declare(part.messages)
+                    self._check_data(part, damage)
+                    index_bytes = len(part.messages.plain)      # at most
+                    yield part
+            except decoding.UNREADABLE as error:
+                damage.lose(offset, end, str(error))
             offset = end
-        if not self._torn:
-            damage.reasons.append('found: the data section has no end')
+            if opcode == Opcode.DATA_END:
+                break
+        else:
+            damage.reasons += ['found: the data section has no end'] * (not self._torn)
+        self._damage = damage
+
+    def _end_of(self, offset: int) -> tuple[int, int]:
+        """Return opcode and end of a record, or the end of adjacent messages, some if many."""
+        opcode, end = self._head(offset)
+        while opcode == Opcode.MESSAGE and end - offset < RUN_BYTES and end < self._data_end:
+            following, its_end = self._head(end)
+            if following != Opcode.MESSAGE or its_end > self._data_end:
+                break
+            end = its_end
+        return opcode, end
+
+    def _part(self, offset: int, end: int) -> Part:
+        """Return what is there.  Raises UNREADABLE."""
+        raw = self._raw(offset, end)
+        if raw[:1] == bytes([Opcode.MESSAGE]):
+            return Part(None, decoding.find_messages(raw), offset, end)
+        record = decoding.parse(raw)
+        return Part(record, decoding.open_chunk(record, self._max_bytes)
+                    if isinstance(record, records.Chunk) else Messages(b'', {}, [record]),
+                    offset, end)
 
     def _head(self, offset: int) -> tuple[int, int]:
         """Return opcode and end of the record there; a head that is not whole has no end."""
@@ -337,13 +323,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             raise McapError(f'more than {self._max_bytes} bytes are not read')
         return self._file.at(offset, end)
 
-    def _check_data(self, end: int, expected: int, damage: Damage) -> None:
-        """Compare the checksum of the data section, if there is one."""
+    def _check_data(self, end: Part, damage: Damage) -> None:
+        """Compare the checksum of all data, if that is the data end and has one."""
         crc = 0
-        for begin in range(0, end if expected else 0, RUN_BYTES):
-            crc = zlib.crc32(self._file.at(begin, min(begin + RUN_BYTES, end)), crc)
-        if crc != expected:
-            damage.reasons.append('found: the checksum of the data section is wrong')
+        if isinstance(end.record, records.DataEnd) and end.record.data_section_crc:
+            for begin in range(0, end.offset, RUN_BYTES):
+                crc = zlib.crc32(self._file.at(begin, min(begin + RUN_BYTES, end.offset)), crc)
+            if crc != end.record.data_section_crc:
+                damage.reasons.append('found: the checksum of the data section is wrong')
 
     def is_declared(self, channel_id: int) -> bool:
         """Return whether a channel and its schema, if it has one, are known."""
@@ -369,43 +356,34 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         if not all(map(self.is_declared, messages.entries)):
             raise McapError('no whole record declares a channel of its messages')
 
-    def _messages(self, offset: int, end: int) -> Messages:
-        """Return the messages of a chunk, or of what stands outside of chunks; UNREADABLE."""
-        raw = self._raw(offset, end)
-        if raw[:1] == bytes([Opcode.MESSAGE]):
-            return decoding.find_messages(raw)
-        chunk = decoding.parse(raw)
-        if not isinstance(chunk, records.Chunk):
-            raise McapError('it is no chunk')
-        return decoding.open_chunk(chunk, self._max_bytes)
-
-    def _find_places(self) -> list[Place]:
+    def _find_chunks(self) -> list[records.ChunkIndex]:
+        """Return where messages are; adjacent ones outside of chunks are as a chunk here."""
         summary = self._summary
         if not summary.chunk_indexes or not all(
                 one.message_index_offsets and all(map(self.is_declared, one.message_index_offsets))
                 for one in summary.chunk_indexes):
-            return [Place(*time_span(entries), part.offset, part.end, frozenset(entries))
-                    for part in self.parts() if (entries := part.messages.entries)]
+            return [records.ChunkIndex(
+                chunk_start_offset=part.offset, chunk_length=part.end - part.offset,
+                message_start_time=start_ns, message_end_time=end_ns,
+                message_index_offsets=dict.fromkeys(entries, 0), message_index_length=0,
+                compression='', compressed_size=0, uncompressed_size=0)
+                for part in self.parts() if (entries := part.messages.entries)
+                for start_ns, end_ns in [time_span(entries)]]
         with contextlib.suppress(*decoding.UNREADABLE):
             for one in summary.metadata_indexes:
                 record = decoding.parse(self._raw(one.offset, one.offset + one.length))
                 self._declare(Messages(b'', {}, [record]))
-        return [Place(one.message_start_time, one.message_end_time, one.chunk_start_offset,
-                      one.chunk_start_offset + one.chunk_length,
-                      frozenset(one.message_index_offsets)) for one in summary.chunk_indexes]
+        return sorted(summary.chunk_indexes, key=attrgetter('chunk_start_offset'))
 
     def _read_header(self) -> records.Header:
         """Return the header.  Raises LogError for no MCAP file."""
-        magic, reason = self._file.read(min(MAGIC_SIZE, self.size)), 'it is no MCAP file'
-        if magic == MCAP0_MAGIC:
-            with contextlib.suppress(*decoding.UNREADABLE):
-                header = decoding.parse(self._raw(MAGIC_SIZE, self._head(MAGIC_SIZE)[1]))
-                if isinstance(header, records.Header):
-                    return header
-            reason = 'its header is damaged'
-        elif not magic:
-            reason = 'it is empty'
-        elif magic[:4] in UNPACK:
+        magic = self._file.read(min(MAGIC_SIZE, self.size))
+        with contextlib.suppress(*decoding.UNREADABLE):
+            header = decoding.parse(self._raw(MAGIC_SIZE, self._head(MAGIC_SIZE)[1]))
+            if magic == MCAP0_MAGIC and isinstance(header, records.Header):
+                return header
+        reason = 'it is no MCAP file' if magic else 'it is empty'
+        if magic[:4] in UNPACK:
             reason = 'it is compressed as a whole, unpack it by ' + UNPACK[magic[:4]].format(
                 self.path, self.path.with_suffix(''))
         raise LogError(f'cannot read {self.path}: {reason}')
@@ -415,7 +393,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         footer_at = self.size - MAGIC_SIZE - FOOTER_SIZE
         footer = decoding.parse(self._file.at(footer_at, self.size - MAGIC_SIZE))
         if self._file.read(MAGIC_SIZE) != MCAP0_MAGIC or not isinstance(footer, records.Footer):
-            raise McapError
+            raise McapError('the file does not end as an MCAP file ends')
         self._torn, start = False, footer.summary_start or footer_at
         section = self._file.at(start, self.size)
         if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
@@ -424,18 +402,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         if len(section) <= decoding.MAX_SMALL:      # else it is read from record to record
             self._summary = NonSeekingReader(
                 CompleteReads(BytesIO(MCAP0_MAGIC + section))).get_summary() or Summary()
-
-
-def _runs(messages: Iterator[Found]) -> Iterator[Found]:
-    """Join adjacent messages."""
-    begin = None
-    for record, offset, end in messages:
-        begin = offset if begin is None else begin
-        if end - begin >= RUN_BYTES:
-            yield record, begin, end
-            begin = None
-    if begin is not None:
-        yield record, begin, end
 
 
 def _file_of(path: Path) -> Path:

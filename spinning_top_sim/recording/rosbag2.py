@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 
@@ -98,40 +98,33 @@ def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
     """
     Return the QoS profiles in the metadata of a channel, with policies by number or name.
 
-    A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
+    A policy that is missing or of another type is as in DEFAULT_QOS; a text that is no list of
     profiles has none.
     """
     text = channel.metadata.get('offered_qos_profiles', '')
     if len(text) > 1 << 16 or '<<' in text:     # merged keys may grow exponentially
         return ()
     try:
-        profiles = yaml.safe_load(text)
+        return tuple({key: _policy(key, profile.get(key)) for key in DEFAULT_QOS}
+                     for profile in yaml.safe_load(text))
     except Exception:   # PyYAML raises many kinds for what it does not understand
         return ()
-    if not isinstance(profiles, list) or not all(isinstance(one, dict) for one in profiles):
-        return ()
-    return tuple({key: _parsed_policy(key, profile.get(key)) for key in DEFAULT_QOS}
-                 for profile in profiles)
 
 
-def _parsed_policy(key: str, value: object) -> int | bool | Mapping[str, int]:
+def _policy(key: str, value: Any) -> Any:
     default, names = DEFAULT_QOS[key], _POLICY_NAMES.get(key)
-    if isinstance(default, Mapping):
-        parts = value if isinstance(value, Mapping) else {}
-        right = all(_is_int64(parts.get(part)) for part in default)
-        return {part: parts[part] for part in default} if right else default
-    if isinstance(default, bool):
-        return value if isinstance(value, bool) else default
-    if names is not None:
-        if value in names:
-            value = names.index(value)
-        if value not in range(len(names)) or value == names.index('unknown'):
-            return default
-    return value if _is_int64(value) else default
+    if isinstance(default, dict):
+        parts = value if isinstance(value, dict) else {}
+        return {part: _number(parts.get(part), known) for part, known in default.items()}
+    if names is None:
+        return _number(value, default)
+    number = names.index(value) if value in names else _number(value, default)
+    return number if number in range(len(names)) and names[number] != 'unknown' else default
 
 
-def _is_int64(value: object) -> TypeGuard[int]:
-    return type(value) is int and -1 << 63 <= value < 1 << 63
+def _number(value: Any, default: int) -> int:
+    """Return an integer of 64 bits or a truth value, of the kind of the default."""
+    return value if type(value) is type(default) and -1 << 63 <= value < 1 << 63 else default
 
 
 def compression_of(text: str) -> Compression:

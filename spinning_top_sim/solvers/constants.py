@@ -75,7 +75,6 @@ from spinning_top_sim.solvers.multiprecision import (
     Series,
     ThetaForm,
     argument,
-    as_mpfr,
     atan2,
     cubic_roots,
     phase,
@@ -188,8 +187,8 @@ class _Side(NamedTuple):
 
 
 def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
-    torque = as_mpfr(top.mass) * gravity * as_mpfr(top.com_distance)
-    lambda1, lambda3 = as_mpfr(top.lambda1), as_mpfr(top.lambda3)
+    torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
+    lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
     sin_half, cos_half, theta_dot, alpha, beta, l3, lz = (
         start if isinstance(start, PreciseState) else precise(start))
     spin = l3 * (1 / lambda3 - 1 / lambda1)

@@ -182,18 +182,13 @@ class ThetaArrays:
         return low, high
 
     @cached_property
-    def rests(self) -> bool:
-        """Whether theta is constant."""
-        return not self.u_dot.any()
-
-    @cached_property
     def precesses_slowly(self) -> bool:
         """
         Whether p + q theta1^2/D^2 has smaller terms than the half angles have; see `across`.
 
         Their largest values decide.  A fast top hardly precesses, and the half angles cancel.
         """
-        if self.rests or self.on_line:
+        if self.on_line or not self.u_dot.any():
             return False
         low, high = (0.5 * theta for theta in self.bounds)
         least = min(math.sin(2.0 * low), math.sin(2.0 * high))
@@ -309,7 +304,7 @@ class ThetaValues:
     def theta_dot(self) -> Column:
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.
         arrays, xi, (alpha, beta) = self._arrays, self._xi, self.moduli
-        if arrays.rests:                # perhaps at a pole
+        if not arrays.u_dot.any():      # it rests, perhaps at a pole
             return np.zeros(len(xi))
         size, prefactor, without = alpha * alpha + beta * beta, self._sin_cos, [alpha, beta]
         for k, parity in arrays.zeros.items():    # there sin y is divided out

@@ -28,7 +28,7 @@ from spinning_top_sim.physics.states import TIMES_TOGETHER, States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set_up
 from spinning_top_sim.solvers.evaluate import ThetaArrays, ThetaValues, Times
-from spinning_top_sim.solvers.multiprecision import SIN_ODD, as_mpfr, phase, precision
+from spinning_top_sim.solvers.multiprecision import SIN_ODD, phase, precision
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
@@ -88,7 +88,7 @@ class ExactSolution:
                 phi=start.phi + half_turn, psi=start.psi - half_turn, l3=start.l3, lz=start.lz)
         with precision():
             self._motion = motion = set_up(
-                top, as_mpfr(top.gravity) if gravity is None else gravity, start)
+                top, mpfr(top.gravity) if gravity is None else gravity, start)
             alpha, beta, self.m, self.m1 = (
                 motion.alpha, motion.beta, float(motion.m), float(motion.m1))
             # 2 K/w, two quarter periods
@@ -188,7 +188,7 @@ class ExactSolution:
                 if abs(product):        # a zero mpc is true
                     momentum = precession_momentum(start.l3, start.lz, abs(beta) ** 2,
                                                    abs(alpha) ** 2)
-                    transverse = -(momentum / as_mpfr(self.top.lambda1) + 1j * u_dot) / product
+                    transverse = -(momentum / mpfr(self.top.lambda1) + 1j * u_dot) / product
                 found = Posture(alpha, beta, transverse, found.l3)
             if self.turns % 2:
                 found = found._replace(alpha=-found.alpha, beta=-found.beta)

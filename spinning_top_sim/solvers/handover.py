@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import integrals, pivot
-from spinning_top_sim.physics.pivot import REST
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, WorldStates
 from spinning_top_sim.physics.top import State, Top
@@ -67,9 +66,9 @@ class Piece:
         Naming what is off, where no motion begins.
     """
 
-    def __init__(self, top: Top, start: State | Posture, start_ns: int, ride: pivot.Piece = REST,
-                 *, method: str = 'rk45', equations: str = 'transport', rtol: float = 1e-11,
-                 atol: float = 1e-12) -> None:
+    def __init__(self, top: Top, start: State | Posture, start_ns: int,
+                 ride: pivot.Piece = pivot.REST, *, method: str = 'rk45',
+                 equations: str = 'transport', rtol: float = 1e-11, atol: float = 1e-12) -> None:
         self.top, self.start_ns, self.ride, self._start = top, start_ns, ride, start
         try:
             with np.errstate(over='ignore', invalid='ignore'):
@@ -88,7 +87,7 @@ class Piece:
 
     def _begun(self, method: str, **settings: Any) -> Solution:
         top, start = self.top, self._start
-        if self.ride is REST and isinstance(start, State):
+        if self.ride is pivot.REST and isinstance(start, State):
             return motion_of(top, start, method=method, **settings), None
         if method == 'exact':
             from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
@@ -137,11 +136,8 @@ class Piece:
         Return the states in the world, the pivot included, at ascending times from the start on.
 
         The steps that are missing are taken here, and the newest are kept until `forget`.
-
-        Raises
-        ------
-        IntegrationError
-            Where the equations cannot go on; its `reached_ns` says up to when they do [ns].
+        Raises IntegrationError where the equations cannot go on; its `reached_ns` says up to when
+        there are states.
         """
         try:
             return self._in_world(self._solution, t_ns)

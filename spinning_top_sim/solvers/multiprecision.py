@@ -27,7 +27,7 @@ Positive constants that all series of a form share are left out.
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache, reduce
+from functools import reduce
 from itertools import count, zip_longest
 from operator import add, mul
 from typing import NamedTuple
@@ -40,8 +40,6 @@ BITS = 192
 # An infinity or a NaN raises ArithmeticError.
 TRAPS = {f'trap_{name}': True for name in ('divzero', 'invalid', 'overflow')}
 ZERO, ONE, IMAGINARY = mpfr(0), mpfr(1), mpc(1j)
-# A double as it is, where 53 bits or more are set.  The constants of a top come again and again.
-as_mpfr = lru_cache(64)(mpfr)
 
 
 @contextmanager

@@ -36,7 +36,7 @@ ONE_STATE: Functions = math.sqrt, math.copysign, lambda condition, x, y: x if co
 
 class TransportMotion(SteppedMotion):
     """
-    The default: regular at every attitude.
+    Regular at every attitude.
 
     Unknowns are the Cayley-Klein parameters and the horizontal angular momentum in the world,
     m = i (L_x + i L_y)/(2 lambda1).  From q' = (1/2) omega q and L' = torque,
@@ -66,10 +66,7 @@ class TransportMotion(SteppedMotion):
 
     The unknowns are scaled to 1, so the tolerated errors `rtol` and `atol` of a step add up.
 
-    spin_rate : chi [rad/s]
-    uniform_rates : rate of the uniform part of alpha's phase, in the frame that is stepped and in
-        the body [rad/s].  They differ by chi/2.  Those of beta have the other sign.
-    momenta : Lz + L3, Lz - L3 and 0: their signs are the senses in which the phases turn
+    posture : of `start`, in doubles that know more of it
     """
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float,
@@ -78,6 +75,8 @@ class TransportMotion(SteppedMotion):
         self.top, self._l3, self._lz = top, l3, lz
         carried = 0.5 * l3                                              # c
         self.spin_rate = l3 / top.lambda3 - (l3 - carried) / lambda1
+        # Of the uniform part of alpha's phase, in the frame that is stepped and in the body: they
+        # differ by chi/2.  Those of beta have the other sign.
         self.uniform_rates = -0.5 * carried / lambda1, 0.5 * (l3 / top.lambda3 - l3 / lambda1)
         self._turn_alpha = 0.5j * (lz - carried) / lambda1
         self._turn_beta = 0.5j * (lz + carried) / lambda1
@@ -91,8 +90,8 @@ class TransportMotion(SteppedMotion):
         self._scale = math.sqrt(0.5 * above_lowest / lambda1) or 1.0
         self._tolerance = rtol + atol
         self._large_enough = NUTATION_SHARE * self._scale ** 2
-        # A posture that is handed over does not tell whether it passes a pole exactly.
-        self.momenta = (1.0, 1.0, 0.0) if posture else (lz + l3, lz - l3, 0.0)
+        # Their signs are the senses in which the phases and theta turn.
+        self.momenta = lz + l3, lz - l3, 0.0
         half = 0.5 * start.theta
         # Of the moduli, where theta is continued out of [0, pi].
         self._signs = math.copysign(1.0, math.cos(half)), math.copysign(1.0, math.sin(half))
@@ -167,11 +166,11 @@ class TransportMotion(SteppedMotion):
             where(at_pole, m_real, (u * axis_real - v * axis_imag) / divisor),
             where(at_pole, m_imag, (u * axis_imag + v * axis_real) / divisor))
 
-    def polar(self, y: Sequence[Column], uniform: Column) -> tuple[list[Column], list[Column]]:
+    def phases(self, y: Sequence[Column], uniform: Column) -> list[Column]:
         """
-        Return the signed moduli of alpha and beta, and their phases less the uniform parts.
+        Return the phases of alpha and beta less the uniform parts, and theta/2.
 
-        The phases are known but for whole turns; theta/2 follows them.
+        The phases are known but for whole turns.
 
         y : real and imaginary parts of alpha and beta, and more
         uniform : the uniform part of alpha's phase in the same frame [rad]
@@ -185,7 +184,7 @@ class TransportMotion(SteppedMotion):
             else:       # it moves on a line through zero
                 moduli.append(real * np.cos(start + part) + imag * np.sin(start + part))
                 phases.append(np.full(len(part), start))
-        return moduli, [*phases, np.arctan2(moduli[1], moduli[0])]
+        return [*phases, np.arctan2(moduli[1], moduli[0])]
 
     def _unwrap(self) -> None:
         """Follow the phases to the begins of all steps that are kept."""
@@ -193,7 +192,7 @@ class TransportMotion(SteppedMotion):
         if new:
             t = np.array([step.t0 for step in new])
             y = tuple(components([step.y0 for step in new]))
-            _, phases = self.polar(y, self.uniform_rates[0] * t)
+            phases = self.phases(y, self.uniform_rates[0] * t)
             self._begins = np.concatenate((self._begins, [
                 phase + math.tau * np.cumsum(turns_to_follow(
                     phase, np.concatenate(([before], phase[:-1])), momentum))
@@ -241,11 +240,7 @@ def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
 
 
 class _TransportStates(States):
-    """
-    States known by alpha, beta and the momentum.
-
-    rows : what `TransportMotion._unknowns` returns
-    """
+    """States known by what `TransportMotion._unknowns` returns."""
 
     method = 'rk45'
 
@@ -272,7 +267,7 @@ class _TransportStates(States):
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
         uniform = self._motion.uniform_rates[1] * self.t
-        _, phases = self._motion.polar(self._projected, uniform)
+        phases = self._motion.phases(self._projected, uniform)
         # theta/2 turns by less than half a turn within a step.
         half_sum, half_difference, half = (
             phase + math.tau * turns_to_follow(phase, begin, momentum)

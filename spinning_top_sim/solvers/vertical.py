@@ -37,7 +37,7 @@ THROUGH = 1e-19
 
 class Posture(NamedTuple):
     """
-    Attitude and angular velocity of a top at one instant.
+    Attitude and angular velocity at one instant.
 
     alpha, beta : Cayley-Klein parameters of the body in the world, as in `physics.attitude`
     transverse : omega_1 + i omega_2 in the body [rad/s]

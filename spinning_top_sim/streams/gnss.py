@@ -53,21 +53,21 @@ def _is_out(edges_ns: NDArray[np.int64], t_ns: NDArray[np.int64]) -> NDArray[np.
     return np.searchsorted(edges_ns, t_ns, 'right') % 2
 
 
-def _measured(values: Mapping[str, Any], deviations: tuple[float, float], purpose: noise.Purpose,
+def _measured(values: Mapping[str, Any], deviations: tuple[float, float], kind: noise.Kind,
               samples: Samples, exact: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return measurements (3, n); deviations are those of a horizontal axis and the vertical."""
     if not any(deviations):
         return exact
     level, vertical = deviations
     return exact + np.array([[level], [level], [vertical]]) * noise.white(
-        values['seed'], purpose, samples.t_ns // samples.times.step, 3)
+        values['seed'], kind, noise.Part.WHITE, samples.t_ns // samples.times.step, 3)
 
 
 def _fix(values: Mapping[str, Any], deviations: tuple[float, float],
          edges_ns: NDArray[np.int64], samples: Samples) -> Sequence[Field]:
     """Return status, position, covariance and its kind; in an outage NaN, without a fix."""
     from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
-    position = _measured(values, deviations, noise.Purpose.GNSS_POSITION, samples,
+    position = _measured(values, deviations, noise.Kind.GNSS_POSITION, samples,
                          samples.trajectory.place(samples.t_ns).position)
     is_out = _is_out(edges_ns, samples.t_ns) == 1
     geodetic = [np.where(is_out, np.nan, part)
@@ -79,7 +79,7 @@ def _fix(values: Mapping[str, Any], deviations: tuple[float, float],
 
 def _velocity(values: Mapping[str, Any], deviations: tuple[float, float],
               samples: Samples) -> Sequence[Field]:
-    return list(_measured(values, deviations, noise.Purpose.GNSS_VELOCITY, samples,
+    return list(_measured(values, deviations, noise.Kind.GNSS_VELOCITY, samples,
                           samples.trajectory.place(samples.t_ns).velocity)),
 
 

@@ -6,11 +6,10 @@ Conventions: REP-145 (at rest an accelerometer reads +g upwards), REP-103 (x, y,
 URDF roll-pitch-yaw.
 """
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -21,10 +20,12 @@ from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import Point, States
 from spinning_top_sim.solvers.handover import Piece
+from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.bandwidth import LowPass
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.inertial_sensor import Sensor
+from spinning_top_sim.streams.noise import Kind, Part
 from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
+from spinning_top_sim.streams.sensor import Sensor, transformed
 from spinning_top_sim.streams.trajectory import Trajectory
 from spinning_top_sim.streams.vibration import Vibration
 
@@ -76,7 +77,9 @@ class Imu:
     """
     An IMU that takes a sample every `period_ns`, since a change of its rate.
 
-    mounting, sensor : where it is, and the errors of its readings
+    mounting : where it is
+    gyroscope, accelerometer : the errors of its readings
+    orientation_variances : of the orientation that it estimates, about its axes [rad^2]
     takes_means : whether a sample is the mean over the interval before it (`imu.sampling`)
     memory_ns : the time before a sample that its reading depends on [ns]
 
@@ -92,11 +95,35 @@ class Imu:
         self.since_ns, self.first_begin_ns = since_ns, first_begin_ns
         self.mounting = Mounting.of(values)
         self.takes_means = values['imu.sampling'] == 'mean'
-        self.sensor = Sensor(values, period_ns)
+        self.gyroscope = Sensor(values, 'imu.gyroscope_', Kind.GYROSCOPE, period_ns,
+                                matrix=values['imu.gyroscope_M'])
+        self.accelerometer = Sensor(values, 'imu.accelerometer_', Kind.ACCELEROMETER, period_ns,
+                                    matrix=values['imu.accelerometer_M'])
+        self._g_sensitivity = values['imu.gyroscope_A']
+        self.orientation_variances = tuple(one * one for one in values['imu.orientation_stddev'])
+        self.is_perfect = (self.gyroscope.is_perfect and self.accelerometer.is_perfect
+                           and not any(self._g_sensitivity))
         bandwidth = values['imu.bandwidth']
         self.low_pass = LowPass(bandwidth, values['imu.bandwidth_order']) if bandwidth else None
         self.vibration = Vibration(
             values, self.low_pass.response if self.low_pass else np.ones_like)
+
+    def read(self, true: tuple[Vector, Vector], t_ns: NDArray[np.int64]) -> tuple[Vector, Vector]:
+        """Return the readings [rad/s], [m/s^2] of true rates and forces at times (n,) [ns]."""
+        if self.is_perfect:
+            return true
+        rates, force = true
+        added = transformed(self._g_sensitivity, force) if any(self._g_sensitivity) else None
+        return (self.gyroscope.read(rates, self.gyroscope.errors(t_ns), added),
+                self.accelerometer.read(force, self.accelerometer.errors(t_ns)))
+
+    def estimated(self, orientation: Quaternion, t_ns: NDArray[np.int64]) -> Quaternion:
+        """Return an orientation at times (n,) [ns] as the IMU estimates it, with noise."""
+        if not any(self.orientation_variances):
+            return orientation
+        x, y, z = np.sqrt(self.orientation_variances)[:, np.newaxis] * noise.white(
+            self._values['seed'], Kind.ORIENTATION, Part.WHITE, t_ns // self.period_ns, 3)
+        return attitude.product(orientation, attitude.quaternion_of_vector((x, y, z)))
 
     @property
     def memory_ns(self) -> int:
@@ -145,31 +172,45 @@ class Readings:
     @cached_property
     def read(self) -> tuple[Vector, Vector]:
         """Rates [rad/s] and forces [m/s^2] as the sensor reads them."""
-        return self._imu.sensor.read(self._felt, self._times)
+        return self._imu.read(self._felt, self._t_ns)
 
     @cached_property
     def bias(self) -> tuple[Vector, Vector]:
         """The biases that are in `read`."""
-        return self._imu.sensor.bias(self._times)
+        (_, (a, b, c)), (_, (d, e, f)) = (sensor.errors(self._t_ns) for sensor in (
+            self._imu.gyroscope, self._imu.accelerometer))
+        return (a, b, c), (d, e, f)
 
     @cached_property
     def estimated_orientation(self) -> Quaternion:
         """`orientation` with the noise of an IMU that estimates it."""
-        return self._imu.sensor.orientation(self.orientation, self._times)
+        return self._imu.estimated(self.orientation, self._t_ns)
 
     @cached_property
     def increments(self) -> tuple[Quaternion, Vector]:
-        """Measured rotation and velocity increment [m/s] over the intervals that end there."""
-        imu, sensor = self._imu, self._imu.sensor
+        """
+        Measured rotation and velocity increment [m/s] over the intervals that end there.
+
+        The error of the mean readings acts throughout an interval, in the frame of the sensor: it
+        adds to the rotation vector, and to the velocity half-way through the rotation.
+        """
+        imu = self._imu
         x, y, z, w = self._body_increments.rotation
         v1, v2, v3 = self._body_increments.velocity
         if imu.mounting.rotation is not None:
             x, y, z = attitude.rotated_back(imu.mounting.rotation, (x, y, z))
-        exact = (x, y, z, w), imu.mounting.from_body((v1, v2, v3))
-        if sensor.is_perfect and imu.vibration.is_off:
-            return exact
-        felt = imu.vibration.add(self._means, self._t_ns, self._seconds)
-        return sensor.disturb(exact, self._means, sensor.read(felt, self._times), self._seconds)
+        v1, v2, v3 = imu.mounting.from_body((v1, v2, v3))
+        if imu.is_perfect and imu.vibration.is_off:
+            return (x, y, z, w), (v1, v2, v3)
+        readings = imu.read(imu.vibration.add(self._means, self._t_ns, self._seconds), self._t_ns)
+        r1, r2, r3, *force = (self._seconds * (reading - mean) for reading, mean in zip(
+            chain(*readings), chain(*self._means), strict=True))
+        x, y, z = attitude.rotation_vector((x, y, z, w))
+        f1, f2, f3 = attitude.rotated_back(
+            attitude.quaternion_of_vector((-0.5 * x, -0.5 * y, -0.5 * z)),
+            (force[0], force[1], force[2]))
+        return (attitude.quaternion_of_vector((x + r1, y + r2, z + r3)),
+                (v1 + f1, v2 + f2, v3 + f3))
 
     @cached_property
     def motion(self) -> tuple[Vector, Quaternion, Vector]:
@@ -212,7 +253,7 @@ class Readings:
 
     def _signal(self, states: States) -> NDArray[np.float64]:
         return np.stack(np.broadcast_arrays(
-            *itertools.chain(*self._imu.mounting.felt(states)), np.zeros(len(states)))[:6])
+            *chain(*self._imu.mounting.felt(states)), np.zeros(len(states)))[:6])
 
     @cached_property
     def _body_increments(self) -> Increments:

@@ -7,6 +7,7 @@ what was drawn before.  A jump in time therefore draws as few numbers as the nex
 """
 
 import enum
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -22,33 +23,37 @@ DRAWN_TOGETHER = 512
 SPACING = 8.0
 
 
-class Purpose(enum.IntEnum):
-    """What a random number is used for; numbers for different purposes are independent."""
+class Kind(enum.IntEnum):
+    """What random numbers are for; those of different kinds are independent."""
 
-    WHITE, TURN_ON, WALK, GAUSS_MARKOV, FLICKER, ORIENTATION = range(6)
-    TIMING, MAG_WHITE, MAG_WALK, VIBRATION_RATE, VIBRATION_FORCE = range(6, 11)
-    GNSS_POSITION, GNSS_VELOCITY = range(11, 13)
+    GYROSCOPE, ACCELEROMETER, MAGNETOMETER, ORIENTATION, TIMING = range(5)
+    VIBRATION_RATE, VIBRATION_FORCE, GNSS_POSITION, GNSS_VELOCITY = range(5, 9)
 
 
-def white(seed: int, purpose: Purpose, numbers: NDArray[np.int64], columns: int,
+class Part(enum.IntEnum):
+    """Of what error of a sensor; these are independent, too."""
+
+    WHITE, TURN_ON, WALK, GAUSS_MARKOV, FLICKER = range(5)
+
+
+def white(seed: int, kind: Kind, part: Part, numbers: NDArray[np.int64], columns: int,
           ) -> NDArray[np.float64]:
     """Return standard normal numbers (columns, n) for samples with ascending numbers (n,)."""
-    return _gathered(partial(_normal, seed, purpose, columns=columns), numbers)
+    return _gathered(partial(_normal, seed, kind, part, columns=columns), numbers)
 
 
-def constants(seed: int, purpose: Purpose, columns: int) -> NDArray[np.float64]:
-    """Return standard normal numbers (columns, 1): those of `white` for the sample 0."""
-    return _normal(seed, purpose, 0, columns, 1).T
+def constants(seed: int, kind: Kind, part: Part, columns: int) -> NDArray[np.float64]:
+    """Return standard normal numbers (columns, 1)."""
+    return _normal(seed, kind, part, 0, columns, 1).T
 
 
 @dataclass(frozen=True)
 class RandomPath:
     """
-    Independent random functions of time, each a sum of Gauss-Markov processes.
+    Random functions of time of three axes, each a sum of independent Gauss-Markov processes.
 
-    times : correlation time [s] of each process, parts x columns; inf for a random walk from 0,
-        all others are stationary
-    scales : standard deviation of each process; of a random walk, its density [1/sqrt(s)]
+    processes : correlation time [s] and standard deviation of each; with the time inf a random
+        walk from 0, and its density [1/sqrt(s)]; all others are stationary
 
     Steps are exact for any correlation time (D. Gillespie, "Exact numerical simulation of the
     Ornstein-Uhlenbeck process and its integral", Phys. Rev. E 54 (1996) 2084).  Values between
@@ -56,49 +61,24 @@ class RandomPath:
     """
 
     seed: int
-    purpose: Purpose
-    times: tuple[tuple[float, ...], ...]
-    scales: tuple[tuple[float, ...], ...]
+    kind: Kind
+    part: Part
+    processes: tuple[tuple[float, float], ...]
 
     def at(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the values (columns, n) at ascending times (n,) >= 0 [ns]."""
+        """Return the values (3, n) at ascending times (n,) >= 0 [ns]."""
         return _gathered(partial(_path, self), t_ns // STEP_NS)
 
     def law(self, steps: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the decay of each process over a number of steps, and the variance it gains."""
-        times, seconds = np.array(self.times), steps * STEP_NS * 1e-9
+        times, seconds = np.array([[time] for time, _ in self.processes]), steps * STEP_NS * 1e-9
         return np.exp(-seconds / times), np.where(
             np.isinf(times), seconds, -np.expm1(-2.0 * seconds / times))
 
-
-class SensorNoise:
-    """
-    The noise of a sensor: white noise, numbered by sample, and a bias, which is a path in time.
-
-    deviation : standard deviation of the white noise, (columns, 1)
-    offset : constant part of the bias, (columns, 1)
-    """
-
-    def __init__(self, seed: int, purpose: Purpose, period_ns: int,
-                 deviation: NDArray[np.float64], offset: NDArray[np.float64],
-                 paths: Sequence[RandomPath] = ()) -> None:
-        self._seed, self._purpose, self._period_ns = seed, purpose, period_ns
-        # Adding 0.0 turns -0.0 into 0.0.
-        self._deviation, self._offset, self._paths = deviation, offset + 0.0, paths
-        self._newest = range(0), offset, offset
-
-    def at(self, times: range) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return white noise and bias at these times [ns], (columns, n) or (columns, 1) each."""
-        if self._newest[0] != times:      # streams of one rate ask for the same times
-            t_ns = np.arange(times.start, times.stop, times.step)
-            noise, bias = np.zeros_like(self._deviation), self._offset
-            if self._deviation.any():
-                noise = self._deviation * white(self._seed, self._purpose,
-                                                t_ns // self._period_ns, len(self._deviation))
-            for path in self._paths:
-                bias = bias + path.at(t_ns)
-            self._newest = times, noise, bias
-        return self._newest[1:]
+    def draw(self, block: int, count: int = 1, *, of_ends: bool = False) -> NDArray[np.float64]:
+        """Return standard normal numbers (count, processes, 3) of a block."""
+        return _normal(self.seed, self.kind, self.part, block, 3 * len(self.processes), count,
+                       of_ends).reshape(count, -1, 3)
 
 
 def flicker_parts(shortest: float, longest: float) -> Sequence[tuple[float, float]]:
@@ -141,7 +121,7 @@ def _gathered(block: Callable[[int], NDArray[np.float64]], numbers: NDArray[np.i
 
 
 @lru_cache(16)
-def _normal(seed: int, purpose: Purpose, number: int, columns: int,
+def _normal(seed: int, kind: Kind, part: Part, number: int, columns: int,
             count: int = DRAWN_TOGETHER, of_ends: bool = False) -> NDArray[np.float64]:
     """
     Return standard normal numbers (count, columns) that depend on the arguments alone.
@@ -149,43 +129,40 @@ def _normal(seed: int, purpose: Purpose, number: int, columns: int,
     Philox is a counter-based generator (J. Salmon et al., "Parallel random numbers: as easy as 1,
     2, 3", SC11).
     """
-    counter = [0, int(of_ends), int(purpose), number]
+    counter = [0, int(of_ends), len(Part) * int(kind) + int(part), number]
     return np.random.Generator(np.random.Philox(key=seed, counter=counter)
                                ).standard_normal((count, columns))
 
 
-@lru_cache(8)
+@lru_cache(16)
 def _path(path: RandomPath, block: int) -> NDArray[np.float64]:
-    """Return the values of a path at the steps of a block, (DRAWN_TOGETHER, columns)."""
-    parts, columns = np.shape(path.times)
-    normal = _normal(path.seed, path.purpose, block, parts * columns).reshape(-1, parts, columns)
-    steps = np.empty((DRAWN_TOGETHER + 1, parts, columns))
+    """Return the values of a path at the steps of a block, (DRAWN_TOGETHER, 3)."""
+    normal = path.draw(block, DRAWN_TOGETHER)
+    steps = np.empty((DRAWN_TOGETHER + 1, len(path.processes), 3))
     steps[0], steps[-1] = _begin(path, block), _begin(path, block + 1)
     apart = DRAWN_TOGETHER // 2
     while apart:
         steps[apart::2 * apart] = _between(path, apart, steps[:-1:2 * apart],
                                            steps[2 * apart::2 * apart], normal[apart::2 * apart])
         apart //= 2
-    steps[:-1] *= path.scales
-    total: NDArray[np.float64] = steps[:-1, 0]
-    for part in range(1, parts):        # np.sum may add in another order
-        total = total + steps[:-1, part]
+    total = np.zeros((DRAWN_TOGETHER, 3))
+    for number, (_, scale) in enumerate(path.processes):    # np.sum may add in another order
+        total = total + scale * steps[:-1, number]
     return total
 
 
-@lru_cache(256)
+@lru_cache(512)
 def _begin(path: RandomPath, block: int) -> NDArray[np.float64]:
     """
-    Return the processes of a path where a block begins, (parts, columns).
+    Return the processes of a path where a block begins, (processes, 3).
 
     The block with the number 2^k follows from the block 2^(k-1).  Every other block is half-way
     between two with fewer digits, so that some log2(block) values are computed.
     """
-    shape = np.shape(path.times)
-    normal: NDArray[np.float64] = _normal(path.seed, path.purpose, block, shape[0] * shape[1], 1,
-                                          True).reshape(shape)
+    normal: NDArray[np.float64] = path.draw(block, of_ends=True)[0]
     if block == 0:
-        return np.where(np.isinf(path.times), 0.0, normal)
+        return np.array([[0.0 if math.isinf(time) else 1.0] for time, _ in path.processes]
+                        ) * normal
     apart = block & -block          # the largest power of two that divides the number
     if block == apart:
         before = block // 2

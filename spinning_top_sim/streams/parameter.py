@@ -4,9 +4,11 @@
 import contextlib
 import enum
 import math
+import re
+import sys
 from collections.abc import Mapping, Set
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 from spinning_top_sim.physics.top import shown
 
@@ -20,29 +22,66 @@ class Effect(enum.Enum):
     START = 'cannot be changed while the node runs'
 
 
+_RANGE = re.compile(r'(0 or )?([\[(])(\S+), (\S+)\]')
+
+
+@dataclass(frozen=True)
+class Range:
+    """
+    The numbers from `lowest` to `highest`, which belongs to them.
+
+    is_open : whether `lowest` does not belong to them
+    has_zero : whether 0 does, too
+    """
+
+    lowest: float
+    highest: float
+    is_open: bool = False
+    has_zero: bool = False
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return a range from [a, b], (a, b] or '0 or [a, b]'; a bound may be pi."""
+        match = _RANGE.fullmatch(text)
+        assert match is not None, text
+        zero, bracket, *bounds = match.groups()
+        lowest, highest = (math.pi if bound == 'pi' else int(bound) if bound.isdigit()
+                           else float(bound) for bound in bounds)
+        return cls(lowest, highest, bracket == '(', bool(zero))
+
+    def __contains__(self, number: object) -> bool:
+        return isinstance(number, int | float) and not isinstance(number, bool) and (
+            (self.has_zero and number == 0)
+            or (self.lowest <= number <= self.highest and not (
+                self.is_open and number == self.lowest)))
+
+    def __str__(self) -> str:
+        sign = '>' if self.is_open else '0 or >=' if self.has_zero else '>='
+        return f'{sign} {self.lowest:g} and <= {self.highest:g}'
+
+
+ANY = Range(-sys.float_info.max, sys.float_info.max)
+
+
 @dataclass(frozen=True)
 class Parameter:
     """
     One parameter.  Its type is the type of the default; a default of None is an unset double.
 
-    minimum, maximum : bounds of a number, or of each number in a list
-    above : exclusive lower bound
-    smallest : smallest number that is allowed besides 0
+    range : of a number, or of each number in a list
     choices : allowed strings
-    is_repeated : whether a list may have several times as many numbers as the default
+    repeated : whether a list may have several times as many numbers as the default
+    effect : when a changed value is used
     """
 
     name: str
-    default: Any
     text: str
-    unit: str = ''
-    minimum: float | None = None
-    maximum: float | None = None
-    above: float | None = None
-    smallest: float | None = None
+    default: Any = None
+    range: Range = ANY
     choices: tuple[str, ...] = ()
-    is_repeated: bool = False
-    effect: Effect = field(kw_only=True)
+    repeated: bool = False
+    unit: str = ''
+    effect: Effect = Effect.RESET
 
     @property
     def is_double(self) -> bool:
@@ -58,13 +97,8 @@ class Parameter:
     def describe(self, range_too: bool = True) -> str:
         return '; '.join(filter(None, (
             self.text + (f' [{self.unit}]' if self.unit else ''),
-            self.allowed if range_too and (self.choices or self._bounds()) else '',
+            self.allowed if range_too and (self.choices or self.range is not ANY) else '',
             self.effect.value)))
-
-    def _bounds(self) -> str:
-        bounds = (('0 or >=', self.smallest) if self.smallest else ('>=', self.minimum),
-                  ('>', self.above), ('<=', self.maximum))
-        return ' and '.join(f'{sign} {bound:g}' for sign, bound in bounds if bound is not None)
 
     @property
     def allowed(self) -> str:
@@ -75,8 +109,8 @@ class Parameter:
         if isinstance(self.default, tuple):
             kind = ('a list of strings' if isinstance(self.default[0], str)
                     else f'a list of {len(self.default)} numbers'
-                    + (', or a multiple of that,' if self.is_repeated else ''))
-        return f'must be {kind} {self._bounds()}'.rstrip()
+                    + (', or a multiple of that,' if self.repeated else ''))
+        return f'must be {kind}' + (f' {self.range}' if self.range is not ANY else '')
 
     def check(self, value: Any) -> Any:
         """Return the value in the type of the default.  Raises ValueError if it is not allowed."""
@@ -97,16 +131,9 @@ class Parameter:
                 return False
             if isinstance(default[0], str):
                 return all(isinstance(item, str) for item in value)
-            count = len(value) // len(default) if self.is_repeated else 1
+            count = len(value) // len(default) if self.repeated else 1
             return len(value) == max(count, 1) * len(default) and all(
-                map(self._is_in_range, value))
+                item in self.range for item in value)
         if isinstance(default, bool | str):
             return isinstance(value, type(default)) and (not self.choices or value in self.choices)
-        return (self.is_double or isinstance(value, int)) and self._is_in_range(value)
-
-    def _is_in_range(self, number: Any) -> bool:
-        return (isinstance(number, int | float) and not isinstance(number, bool)
-                and math.isfinite(number) and (self.above is None or number > self.above)
-                and (self.minimum is None or number >= self.minimum)
-                and (self.maximum is None or number <= self.maximum)
-                and not (self.smallest and 0 < number < self.smallest))
+        return (self.is_double or isinstance(value, int)) and value in self.range

@@ -55,4 +55,5 @@ class Timing:
                         np.where(repeat < self._repeated_below, 2, 1))
 
     def _draw(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        return noise.white(self._seed, noise.Purpose.TIMING, t_ns // self._period_ns, 3)
+        return noise.white(self._seed, noise.Kind.TIMING, noise.Part.WHITE,
+                           t_ns // self._period_ns, 3)

@@ -62,10 +62,9 @@ def _invariants(samples: Samples) -> Sequence[Field]:
 
 
 def _magnetic_field(mounting: Mounting, sensor: Magnetometer, samples: Samples) -> Sequence[Field]:
-    orientation = mounting.orientation(samples.states)
-    field = sensor.disturbed(sensor.true(orientation), orientation, mounting.from_body,
-                             samples.t_ns)
-    return sensor.read(field, samples.times), messages.diagonal(*3 * (sensor.variance,))
+    field = sensor.felt(mounting.orientation(samples.states), samples.t_ns)
+    return (sensor.read(field, sensor.errors(samples.t_ns)),
+            messages.diagonal(*3 * (sensor.variance,)))
 
 
 def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
@@ -134,9 +133,9 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
 
 def imu_noise_covariances(imu: Imu) -> list[tuple[float, ...]]:
     """Return the covariances of orientation, angular velocity and specific force."""
-    sensor = imu.sensor
     return [messages.diagonal(*variances) for variances in (
-        sensor.orientation_variances, 3 * (sensor.rate_variance,), 3 * (sensor.force_variance,))]
+        imu.orientation_variances, 3 * (imu.gyroscope.variance,),
+        3 * (imu.accelerometer.variance,))]
 
 
 def recorded(channels: Sequence[Channel], values: Mapping[str, Any]) -> list[Channel]:

@@ -36,8 +36,8 @@ class Vibration:
     """
 
     def __init__(self, values: Mapping[str, Any], response: Response) -> None:
-        self._kinds = [_lines(values, kind, purpose, response) for kind, purpose in (
-            ('rate', noise.Purpose.VIBRATION_RATE), ('force', noise.Purpose.VIBRATION_FORCE))]
+        self._kinds = [_lines(values, name, kind, response) for name, kind in (
+            ('rate', noise.Kind.VIBRATION_RATE), ('force', noise.Kind.VIBRATION_FORCE))]
         self.is_off = not any(map(len, self._kinds))
 
     def add(self, true: tuple[Vector, Vector], t_ns: NDArray[np.int64],
@@ -66,18 +66,19 @@ def _sum(lines: Matrix, middle: Column, seconds: Column | float, vector: Vector)
     return x + total[0], y + total[1], z + total[2]
 
 
-def _lines(values: Mapping[str, Any], kind: str, purpose: noise.Purpose,
+def _lines(values: Mapping[str, Any], name: str, kind: noise.Kind,
            response: Response) -> Matrix:
     """Return frequencies [Hz], amplitudes and phases [turns] of the sines, (lines, 3, 3 axes)."""
     lines = np.empty((0, 3, 3))
-    amplitude = values[f'imu.vibration.{kind}']
+    amplitude = values[f'imu.vibration.{name}']
     if any(amplitude):
         frequency = 3 * (values['imu.vibration.frequency'],)
         lines = np.array([[frequency, amplitude, 3 * (0.0,)]])
-    profile = np.reshape(values[f'imu.vibration.{kind}_psd'], (-1, 2))
+    profile = np.reshape(values[f'imu.vibration.{name}_psd'], (-1, 2))
     if profile.any():
         # The angle of two normal numbers is uniform.
-        normal = noise.white(values['seed'], purpose, np.arange(LINES), 12).reshape(2, 2, 3, -1)
+        normal = noise.white(values['seed'], kind, noise.Part.WHITE, np.arange(LINES), 12
+                             ).reshape(2, 2, 3, -1)
         uniform = np.arctan2(normal[0], normal[1]) / math.tau + 0.5
         edges = np.linspace(profile[0, 0], profile[-1, 0], LINES + 1)
         powers = np.diff([power_below(profile.tolist(), edge) for edge in edges.tolist()])

@@ -46,7 +46,6 @@ def run(name: str, help_text: str | None,
     try:
         with reader_may_end():
             code = command(arguments)
-        return code
     except (ValueError, RuntimeError, ArithmeticError, OSError, ImportError) as error:
         print_line(f'{parser.prog}: {text_of(error)}', sys.stderr)
         return WRONG_USAGE if isinstance(error, ValueError) else FAILED
@@ -54,6 +53,7 @@ def run(name: str, help_text: str | None,
         what = f'; {interrupt}' if interrupt.args else ''
         print_line(f'{parser.prog}: interrupted{what}', sys.stderr)
         return INTERRUPTED
+    return code
 
 
 @contextlib.contextmanager

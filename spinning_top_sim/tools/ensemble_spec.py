@@ -14,22 +14,23 @@ import numpy as np
 
 from spinning_top_sim.physics.top import shown
 from spinning_top_sim.streams import parameters, topics
-from spinning_top_sim.streams.parameter import Effect, Parameter
+from spinning_top_sim.streams.parameter import Parameter, Range
 from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_scene
 
 DEFAULTS = {parameter.name: parameter.default for parameter in parameters.TABLE}
 # Streams that a table can have; only a log has the others.
-STREAMS = tuple(row[0] for row in parameters.STREAM_DEFAULTS if row[0] not in ('clock', 'markers'))
+STREAMS = tuple(name for name in parameters.STREAMS if name not in ('clock', 'markers'))
 # By default a part has at most this many rows, or one run, and a large ensemble at least this
 # many parts.  Larger parts take more memory, and are no faster.
 ROWS_IN_A_PART, LEAST_PARTS = 50_000, 50
 VALUES, PARAMS = 'values', 'params'
-_entry = partial(Parameter, text='', effect=Effect.START)
+_entry = partial(Parameter, text='')
+_COUNT = Range(0, 2 ** 63 - 1)
 ENTRIES = (
-    _entry('runs', 1, minimum=1, maximum=2 ** 63 - 1),
-    _entry('duration', 1.0, minimum=1e-9, maximum=parameters.LONGEST),
-    _entry('seed', 0, minimum=0, maximum=2 ** 63 - 1), _entry('streams', ('imu',)),
-    _entry('runs_per_part', 0, minimum=0, maximum=2 ** 63 - 1))
+    _entry('runs', default=1, range=Range(1, 2 ** 63 - 1)),
+    _entry('duration', default=1.0, range=Range(1e-9, parameters.LONGEST)),
+    _entry('seed', default=0, range=_COUNT), _entry('streams', default=('imu',)),
+    _entry('runs_per_part', default=0, range=_COUNT))
 
 
 def _log_uniform(random: np.random.Generator, low: float, high: float) -> float:
@@ -203,7 +204,7 @@ def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
     if parameter is None or not parameter.is_double:
         raise ValueError(f'{what}: {kind}: must be values, because the parameter is no double')
     _, allowed, is_allowed = DISTRIBUTIONS[kind]
-    bounds = list(_entry(f'{what}: {kind}', (0.0, 0.0)).check(items))
+    bounds = list(_entry(f'{what}: {kind}', default=(0.0, 0.0)).check(items))
     if not is_allowed(*bounds):
         raise ValueError(f'{what}: {kind} = {shown(items)}: must be {allowed}')
     for bound in bounds[:1] if kind == 'normal' else bounds:

@@ -19,7 +19,7 @@ from typing import Any
 
 from spinning_top_sim.recording.provenance import run_metadata
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recorder import CHUNK_BYTES, single
+from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import create_file
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
@@ -183,8 +183,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
             if isinstance(done, Block):
                 for channel, t_ns, rows in done.messages:
                     file.add(channels.index(channel), epoch_ns + t_ns, rows)
-                if file.pending >= CHUNK_BYTES:
-                    file.flush()
+                file.flush(beside=True)
             else:
                 add(done)
     except KeyboardInterrupt as interrupt:

@@ -89,9 +89,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _show_logs(arguments: argparse.Namespace) -> int:
     if len(arguments.log) > 2:
         raise ValueError(f'{len(arguments.log)} logs: must be one or two')
-    for option in ('scene', 'imu', 'params', 'param'):
-        if value := getattr(arguments, option):
-            raise ValueError(f'--{option} {value}: must be without a log, which has its own')
+    for option, values in (('--scene', [arguments.scene]), ('--imu', [arguments.imu]),
+                           ('--params', arguments.params), ('-p', arguments.param)):
+        for value in filter(None, values):
+            raise ValueError(f'{option} {value}: must be without a log, which has its own')
     if arguments.html is not None:
         cli.check_output(arguments.html)
     with needed('the page', 'view'):

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The errors of a sensor of three axes, with kalibr's names; docs/sensor.md has the chain."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics.attitude import Column, Vector
+from spinning_top_sim.streams import noise
+from spinning_top_sim.streams.noise import Part, RandomPath
+from spinning_top_sim.streams.parameters import IDENTITY
+
+Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+class Sensor:
+    """
+    A sensor that takes a sample of three axes every `period_ns`.
+
+    White noise is numbered by sample: it depends on the seed and the number alone.  The bias is a
+    path in time that depends on the seed alone: a change of the rate does not change it.  A
+    reading between two samples has the white noise of the one before, as from a driver that
+    repeats the newest sample.  So all streams agree at the times that they have in common.
+
+    values, prefix : parameters, and what their names begin with; an error that has none is 0
+    kind : tells the random numbers of sensors apart
+    matrix : scale and misalignment, or soft iron, row by row
+    offset : constant part of the bias, x, y, z
+    variance : of white noise and rounding together
+    is_perfect : whether the readings are the true values
+
+    (kalibr, "IMU Noise Model"; for the matrices J. Rehder et al., "Extending kalibr", ICRA 2016,
+    and V. Renaudin et al., "Complete triaxis magnetometer calibration in the magnetic domain",
+    Journal of Sensors 2010)
+    """
+
+    def __init__(self, values: Mapping[str, Any], prefix: str, kind: noise.Kind, period_ns: int, *,
+                 matrix: Sequence[float], offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        def given(error: str) -> float:
+            return float(values.get(prefix + error, 0.0))
+
+        self._seed, self._kind, self._period_ns = values['seed'], kind, period_ns
+        self._matrix, self._resolution, self._range = matrix, given('resolution'), given('range')
+        self._deviation = given('noise_density') / math.sqrt(period_ns * 1e-9)
+        self.variance = self._deviation ** 2 + self._resolution ** 2 / 12.0
+        # Adding 0.0 turns -0.0 into 0.0.
+        self._offset = np.array(offset)[:, np.newaxis] + 0.0
+        if turn_on := given('turn_on_bias'):
+            self._offset = self._offset + turn_on * noise.constants(
+                self._seed, kind, Part.TURN_ON, 3)
+        self._paths = []
+        if walk := given('random_walk'):
+            self._paths.append(RandomPath(self._seed, kind, Part.WALK, ((math.inf, walk),)))
+        if deviation := given('bias_stddev'):
+            self._paths.append(RandomPath(self._seed, kind, Part.GAUSS_MARKOV, (
+                (given('bias_correlation_time'), deviation),)))
+        if flat := given('bias_instability'):
+            self._paths.append(RandomPath(self._seed, kind, Part.FLICKER, tuple(
+                (time, part * flat) for time, part in noise.flicker_parts(
+                    *values['imu.bias_instability_band']))))
+        self.is_perfect = not (self.variance or self._range or self._paths or self._offset.any()
+                               or tuple(matrix) != IDENTITY)
+
+    def errors(self, t_ns: NDArray[np.int64]) -> Errors:
+        """Return white noise and bias at times (n,) [ns], (3, n) or (3, 1) each."""
+        white, bias = np.zeros((3, 1)), self._offset
+        if self._deviation:
+            white = self._deviation * noise.white(
+                self._seed, self._kind, Part.WHITE, t_ns // self._period_ns, 3)
+        for path in self._paths:
+            bias = bias + path.at(t_ns)
+        return white, bias
+
+    def read(self, true: Vector, errors: Errors, added: Vector | None = None) -> Vector:
+        """Return the readings of true values; `added` comes behind the matrix."""
+        seen = transformed(self._matrix, true)
+        if added is not None:
+            seen = seen[0] + added[0], seen[1] + added[1], seen[2] + added[2]
+        x, y, z = (converted(value + bias + white, self._resolution, self._range)
+                   for value, white, bias in zip(seen, *errors, strict=True))
+        return x, y, z
+
+
+def converted(value: Column, resolution: float, largest: float) -> Column:
+    """
+    Return readings (n,) of an analog-to-digital converter: rounded, then clipped to a range.
+
+    The limits are the largest multiples of the resolution within the range.  A resolution or a
+    range of 0 means none.
+    """
+    limit = largest or math.inf
+    if resolution:
+        if largest:
+            steps = math.floor(largest / resolution)
+            limit = (steps if steps * resolution <= largest else steps - 1) * resolution
+        # Adding 0.0 turns -0.0 into 0.0.
+        value = (np.rint(value / resolution) + 0.0) * resolution
+    return np.clip(value, -limit, limit)
+
+
+def transformed(matrix: Sequence[float], vector: Vector) -> Vector:
+    """Return a row-major matrix times a vector; the identity returns the vector unchanged."""
+    if tuple(matrix) == IDENTITY:
+        return vector
+    x, y, z = vector
+    a, b, c, d, e, f, g, h, i = matrix
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
