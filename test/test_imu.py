@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim import solve
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.imu import Mounting
-from spinning_top_sim.streams.inertial_sensor import Sensor
+from spinning_top_sim.streams.imu import Imu, Mounting
 
 # Central differences of order 8 (Fornberg, Math. Comp. 51 (1988) 699-706).
 FIRST = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
@@ -56,12 +55,12 @@ def test_sample_k_depends_on_seed_and_k_alone():
     """Read forwards, backwards, at random, one by one and many together, across blocks of 512."""
     period_ns, count = 5 * MILLISECOND, 3000
     whole, biases = read(NOISY, range(0, count * period_ns, period_ns))
-    sensor = Sensor(parameters.checked(NOISY), period_ns)
+    imu = Imu(parameters.checked(NOISY), period_ns)
     begins = [0, 102, 103, 511, 512, 1024, count - 1, *range(0, count, 373)]
     for order in (begins, begins[::-1], random.Random(1).sample(begins, len(begins))):
         for begin in order:
             for end in (begin + 1, min(begin + 2, count), min(begin + 600, count)):
-                found, bias = read(sensor, range(begin * period_ns, end * period_ns, period_ns))
+                found, bias = read(imu, range(begin * period_ns, end * period_ns, period_ns))
                 assert np.array_equal(found, whole[begin:end])
                 assert np.array_equal(bias, biases[begin:end])
     other, bias = read({**NOISY, 'seed': 1}, range(0, 10 * period_ns, period_ns))

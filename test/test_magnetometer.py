@@ -45,7 +45,8 @@ def test_the_chain_by_hand():
         'mag.soft_iron': (1.0, 0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 3.0),
         'mag.hard_iron': (1e-6, 0.0, -2e-6), 'mag.resolution': 1e-6, 'mag.range': 100.5e-6,
     }), 10_000_000)
-    found = magnetometer.read(tuple(np.array([one]) for one in (10e-6, 20e-6, -40e-6)), range(1))
+    found = magnetometer.read(tuple(np.array([one]) for one in (10e-6, 20e-6, -40e-6)),
+                              magnetometer.errors(np.zeros(1, np.int64)))
     assert np.ravel(found) * 1e6 == pytest.approx([21.0, 20.0, -100.0], abs=1e-9)
 
 
