@@ -10,7 +10,7 @@ elements, then the elements.  Padding is zero, so that equal messages have equal
 
 import struct
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,8 @@ NANOSECONDS = 1_000_000_000
 LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
 
 # The numbers of a field in n messages: an array (n, count), or `count` columns or numbers.
-Field = NDArray[Any] | Sequence[NDArray[Any] | float]
+Values = NDArray[Any] | Sequence[NDArray[Any] | float]
 
-
-class Place(NamedTuple):
-    """Where a field stands in a message: its name, code of `struct`, how many, and offset."""
-
-    name: str
-    code: str
-    numbers: int
-    offset: int
 
 
 def stamp_text(time_ns: int) -> str:
@@ -38,50 +30,29 @@ def stamp_text(time_ns: int) -> str:
     return f'{time_ns // NANOSECONDS}.{time_ns % NANOSECONDS:09d}'
 
 
-class CdrWriter:
-    """
-    Appends the parts of a message in the order of its definition; its methods return itself.
+class Field(NamedTuple):
+    """Numbers that differ from message to message: name in the definition, how many, their type."""
 
-    stamps_at : offset of each stamp
-    fields : the numbers that differ from message to message
-    """
+    name: str
+    count: int
+    code: str = 'd'         # a format character of `struct`
 
-    def __init__(self) -> None:
-        self.buffer = bytearray(ENCAPSULATION)
-        self.stamps_at: list[int] = []
-        self.fields: list[Place] = []
 
-    def append(self, code: str, *values: float) -> Self:
-        """Append numbers of one type, a format character of `struct`, aligned to its size."""
-        if values:
-            size = struct.calcsize('<' + code)
-            self.buffer += bytes(-(len(self.buffer) - len(ENCAPSULATION)) % size)
-        self.buffer += struct.pack(f'<{len(values)}{code}', *values)
-        return self
+class Numbers(NamedTuple):
+    """Numbers of one type that are the same in all messages."""
 
-    def field(self, name: str, count: int, code: str = 'd') -> Self:
-        """Append a field, under its name in the definition."""
-        self.append(code, *(count * (0,)))
-        self.fields.append(Place(name, code, count, len(self.buffer) - count * struct.calcsize(
-            '<' + code)))
-        return self
+    code: str
+    values: tuple[float, ...]
 
-    def stamp(self) -> Self:
-        """Append a builtin_interfaces/Time that differs from message to message."""
-        self.append('I', 0, 0)
-        self.stamps_at.append(len(self.buffer) - 8)
-        return self
 
-    def string(self, *texts: str) -> Self:
-        for text in texts:
-            data = text.encode() + b'\0'
-            self.append('I', len(data))
-            self.buffer += data
-        return self
+class Header(NamedTuple):
+    """A std_msgs/Header: its stamp, which differs, and a frame; None: the stamp alone."""
 
-    def header(self, frame_id: str) -> Self:
-        """Append a std_msgs/Header: its stamp, which differs, and a frame."""
-        return self.stamp().string(frame_id)
+    frame_id: str | None
+
+
+# In the order of the definition; a str is a string that is the same in all messages.
+Part = Field | Numbers | Header | str
 
 
 class Template:
@@ -89,35 +60,49 @@ class Template:
     A serialized message whose stamps and fields are replaced, many messages at a time.
 
     fields : in the order in which `encode` takes them
+    data : the message with zeros in their place
     """
 
-    def __init__(self, writer: CdrWriter) -> None:
+    def __init__(self, *parts: Part) -> None:
+        buffer, self._stamps_at, self._places = bytearray(ENCAPSULATION), [], []
+        self.fields = tuple(part for part in parts if isinstance(part, Field))
+        for part in parts:
+            if isinstance(part, Header):
+                self._stamps_at.append(_append(buffer, 'I', (0, 0)))
+                part = part.frame_id        # noqa: PLW2901
+            if isinstance(part, str):
+                text = part.encode() + b'\0'
+                _append(buffer, 'I', (len(text),))
+                buffer += text
+            elif isinstance(part, Field):
+                self._places.append(_append(buffer, part.code, part.count * (0,)))
+            elif part is not None:
+                _append(buffer, *part)
         # RTPS pads to four bytes; a template does so too, so that logs have what subscribers get.
-        self._buffer = bytes(writer.buffer + bytes(-len(writer.buffer) % 4))
-        self.fields, self._stamps_at = tuple(writer.fields), writer.stamps_at
+        self.data = bytes(buffer + bytes(-len(buffer) % 4))
         # A message as a type of NumPy: the fields by number, then the stamps.
-        places: list[tuple[str, Any, int]] = [
-            (f'{i}', (f'<{one.code}', (one.numbers,)), one.offset)
-            for i, one in enumerate(self.fields)]
+        columns: list[tuple[str, Any, int]] = [
+            (f'{i}', (f'<{field.code}', (field.count,)), at)
+            for i, (field, at) in enumerate(zip(self.fields, self._places, strict=True))]
         for at in self._stamps_at:
-            places += [(f'sec{at}', '<i4', at), (f'nanosec{at}', '<u4', at + 4)]
-        names, formats, offsets = zip(*places, strict=True)
-        self._row_type = np.dtype({'names': names, 'formats': formats, 'offsets': offsets,
-                                   'itemsize': len(self._buffer)})
+            columns += [(f'sec{at}', '<i4', at), (f'nanosec{at}', '<u4', at + 4)]
+        self._row_type = np.dtype({
+            'names': [name for name, _, _ in columns], 'formats': [one for _, one, _ in columns],
+            'offsets': [at for _, _, at in columns], 'itemsize': len(self.data)})
 
     def __len__(self) -> int:
-        return len(self._buffer)
+        return len(self.data)
 
-    def encode(self, stamps_ns: NDArray[np.int64], fields: Sequence[Field]) -> NDArray[np.uint8]:
+    def encode(self, stamps_ns: NDArray[np.int64], fields: Sequence[Values]) -> NDArray[np.uint8]:
         """Return messages (n, size) with stamps (n,) [ns]."""
         count = len(stamps_ns)
-        rows = np.frombuffer(bytearray(count * self._buffer), self._row_type)
+        rows = np.frombuffer(bytearray(count * self.data), self._row_type)
         for at in self._stamps_at:
             rows[f'sec{at}'], rows[f'nanosec{at}'] = np.divmod(stamps_ns, NANOSECONDS)
         fill([rows[f'{i}'] for i in range(len(self.fields))], fields)
         return rows.view(np.uint8).reshape(count, len(self))
 
-    def encode_one(self, stamp_ns: int, *fields: Field) -> bytes:
+    def encode_one(self, stamp_ns: int, *fields: Values) -> bytes:
         return self.encode(np.array([stamp_ns]), fields).tobytes()
 
     def decode(self, data: bytes | NDArray[np.uint8]) -> tuple[NDArray[Any], ...]:
@@ -139,17 +124,26 @@ class Template:
                 return 'header.stamp', [
                     '{}.{:09d}'.format(*struct.unpack_from('<iI', one, stamp_at))
                     for one in messages]
-        for name, code, count, offset in self.fields:
-            size = struct.calcsize('<' + code)
-            if 0 <= at - offset < count * size:
+        for field, offset in zip(self.fields, self._places, strict=True):
+            size = struct.calcsize('<' + field.code)
+            if 0 <= at - offset < field.count * size:
                 element = (at - offset) // size
-                return f'{name}[{element}]', [
-                    repr(*struct.unpack_from('<' + code, one, offset + element * size))
+                return f'{field.name}[{element}]', [
+                    repr(*struct.unpack_from('<' + field.code, one, offset + element * size))
                     for one in messages]
         return f'byte {at}', [f'0x{one[at]:02x}' for one in messages]
 
 
-def fill(rows: Sequence[NDArray[Any]], fields: Sequence[Field]) -> None:
+def _append(buffer: bytearray, code: str, values: Sequence[float]) -> int:
+    """Append numbers of one type, aligned to its size; return the offset of the first."""
+    size = struct.calcsize('<' + code)
+    if values:
+        buffer += bytes(-(len(buffer) - len(ENCAPSULATION)) % size)
+    buffer += struct.pack(f'<{len(values)}{code}', *values)
+    return len(buffer) - len(values) * size
+
+
+def fill(rows: Sequence[NDArray[Any]], fields: Sequence[Values]) -> None:
     """Fill fields (n, count) from those of n messages."""
     for row, field in zip(rows, fields, strict=True):
         if isinstance(field, np.ndarray):

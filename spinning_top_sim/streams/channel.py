@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
+from spinning_top_sim.streams.cdr import NANOSECONDS, Template, Values
 from spinning_top_sim.streams.imu import Imu, Readings
 from spinning_top_sim.streams.trajectory import Trajectory
 
@@ -55,7 +55,7 @@ class Encoder(Protocol):
     """Makes rows of stamps (n,) [ns] and fields; its length is the size of a row [bytes]."""
 
     def __len__(self) -> int: ...
-    def encode(self, stamps_ns: Stamps, fields: Sequence[Field]) -> Rows: ...
+    def encode(self, stamps_ns: Stamps, fields: Sequence[Values]) -> Rows: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class Channel:
     type_name: str
     period_ns: int
     encoder: Encoder
-    fields: Callable[[Samples], Sequence[Field]]
+    fields: Callable[[Samples], Sequence[Values]]
     stamps: Callable[[int, Stamps], Stamps] | None = None
     copies: Callable[[Stamps], NDArray[np.int64]] | None = None
     delay_ns: int = 0

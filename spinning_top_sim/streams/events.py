@@ -80,8 +80,10 @@ class Event:
     @classmethod
     def decoded(cls, data: bytes) -> Self:
         """Return a logged event.  Raises one of MALFORMED for any other message."""
-        mapping = json.loads(data[len(ENCAPSULATION) + 4:-1])      # 4 for the length of the text
-        if messages.string(json.dumps(mapping)) != data:
+        begin = len(ENCAPSULATION) + 4
+        end = begin + int.from_bytes(data[begin - 4:begin], 'little')       # of the text
+        mapping = json.loads(data[begin:end - 1])
+        if messages.string(json.dumps(mapping))[:end] != data[:end]:
             raise ValueError('the bytes of the entry are not as it was written')
         return cls.from_mapping(mapping)
 

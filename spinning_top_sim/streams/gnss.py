@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.streams import messages, noise
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field
+from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Header, Numbers, Values
 from spinning_top_sim.streams.channel import Channel, Samples, period_ns
+from spinning_top_sim.streams.messages import message
 
 NO_FIX, FIX = -1, 0         # sensor_msgs/NavSatStatus
 UNKNOWN, DIAGONAL_KNOWN = 0, 2      # sensor_msgs/NavSatFix
@@ -29,14 +30,19 @@ def channels(values: Mapping[str, Any]) -> list[Channel]:
     edges_ns = np.rint(np.array(values['gnss.outages']) * NANOSECONDS).astype(np.int64)
     channel = partial(Channel, 'gnss', period_ns=period)
     fix = partial(channel, type_name='sensor_msgs/msg/NavSatFix',
-                  encoder=messages.nav_sat_fix(values['body_frame']))
+                  encoder=message(
+                      Header(values['body_frame']), Field('status.status', 1, 'b'),
+                      Numbers('H', (1,)), Field('position', 3), Field('position_covariance', 9),
+                      Field('position_covariance_type', 1, 'B')))
     position_noise, velocity_noise = values['gnss.position_noise'], values['gnss.velocity_noise']
     none = 0.0, 0.0
 
     def velocity(topic: str, deviations: tuple[float, float], **more: Any) -> Channel:
         return channel(topic, 'geometry_msgs/msg/TwistWithCovarianceStamped',
-                       encoder=messages.twist_with_covariance(
-                           values['world_frame'], _variances(deviations)),
+                       encoder=message(
+                           Header(values['world_frame']), Field('twist.twist.linear', 3),
+                           Numbers('d', (*messages.ORIGIN, *messages.diagonal(
+                               *_variances(deviations), *3 * (-1.0,))))),
                        fields=partial(_velocity, values, deviations), **more)
 
     return [
@@ -64,7 +70,7 @@ def _measured(values: Mapping[str, Any], deviations: tuple[float, float], kind: 
 
 
 def _fix(values: Mapping[str, Any], deviations: tuple[float, float],
-         edges_ns: NDArray[np.int64], samples: Samples) -> Sequence[Field]:
+         edges_ns: NDArray[np.int64], samples: Samples) -> Sequence[Values]:
     """Return status, position, covariance and its kind; in an outage NaN, without a fix."""
     from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
     position = _measured(values, deviations, noise.Kind.GNSS_POSITION, samples,
@@ -78,7 +84,7 @@ def _fix(values: Mapping[str, Any], deviations: tuple[float, float],
 
 
 def _velocity(values: Mapping[str, Any], deviations: tuple[float, float],
-              samples: Samples) -> Sequence[Field]:
+              samples: Samples) -> Sequence[Values]:
     return list(_measured(values, deviations, noise.Kind.GNSS_VELOCITY, samples,
                           samples.trajectory.place(samples.t_ns).velocity)),
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.states import Point
 from spinning_top_sim.physics.top import Shape
 from spinning_top_sim.streams import messages, parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field
+from spinning_top_sim.streams.cdr import NANOSECONDS, Values
 from spinning_top_sim.streams.channel import Channel, Samples, period_ns
 from spinning_top_sim.streams.trajectory import Trajectory
 
@@ -43,7 +43,7 @@ def markers(values: Mapping[str, Any]) -> Channel:
                    partial(_fields, shape, count, length_ns // count if count else 0))
 
 
-def _fields(shape: Shape, count: int, spacing_ns: int, samples: Samples) -> Sequence[Field]:
+def _fields(shape: Shape, count: int, spacing_ns: int, samples: Samples) -> Sequence[Values]:
     states = samples.states
     body = (states.position((0.0, 0.0, shape.centre)), states.rows_quaternion,
             (*states.pivot.position,), states.rows_quaternion)

@@ -10,11 +10,12 @@ import numpy as np
 
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.streams import gnss, messages, parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Template
+from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Header, Numbers, Template, Values
 from spinning_top_sim.streams.channel import Channel, Samples, period_ns
 from spinning_top_sim.streams.imu import Imu, Mounting
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.markers import markers
+from spinning_top_sim.streams.messages import message
 from spinning_top_sim.streams.timing import Timing
 
 NODE_NAME = 'spinning_top'
@@ -27,24 +28,24 @@ ARRAY, MAGNETIC_FIELD = 'std_msgs/msg/Float64MultiArray', 'sensor_msgs/msg/Magne
 EXACT = 3 * (messages.EXACT,)
 
 
-def _pose(samples: Samples) -> Sequence[Field]:
+def _pose(samples: Samples) -> Sequence[Values]:
     states = samples.states
     return (*states.pivot.position,), states.rows_quaternion
 
 
-def _odometry(samples: Samples) -> Sequence[Field]:
+def _odometry(samples: Samples) -> Sequence[Values]:
     states = samples.states
     return (*_pose(samples), states.world_velocity(messages.ORIGIN),
             states.rows_angular_velocity)
 
 
-def _joints(samples: Samples) -> Sequence[Field]:
+def _joints(samples: Samples) -> Sequence[Values]:
     states = samples.states
     return ((states.phi, states.theta, states.psi),
             (states.phi_dot, states.theta_dot, states.psi_dot))
 
 
-def _timing(timing: Timing, samples: Samples) -> Sequence[Field]:
+def _timing(timing: Timing, samples: Samples) -> Sequence[Values]:
     """Return stamp and true time of each sample of the IMU, and how often it was sent."""
     true_ns = samples.epoch_ns + samples.t_ns
     stamps_ns = timing.stamps(samples.epoch_ns, samples.t_ns)
@@ -52,7 +53,7 @@ def _timing(timing: Timing, samples: Samples) -> Sequence[Field]:
             timing.copies(samples.t_ns)),
 
 
-def _invariants(samples: Samples) -> Sequence[Field]:
+def _invariants(samples: Samples) -> Sequence[Values]:
     """Return the constants of the motion, drifts, and errors of norm and orientation."""
     states = samples.states
     now = (states.energy, states.l3, states.lz)
@@ -61,7 +62,7 @@ def _invariants(samples: Samples) -> Sequence[Field]:
     return (*now, *drifts, states.norm_error, error),
 
 
-def _magnetic_field(mounting: Mounting, sensor: Magnetometer, samples: Samples) -> Sequence[Field]:
+def _magnetic_field(mounting: Mounting, sensor: Magnetometer, samples: Samples) -> Sequence[Values]:
     field = sensor.felt(mounting.orientation(samples.states), samples.t_ns)
     return (sensor.read(field, sensor.errors(samples.t_ns)),
             messages.diagonal(*3 * (sensor.variance,)))
@@ -78,7 +79,7 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
     mounting, timing = imu.mounting, Timing(values, imu.period_ns)
 
     def channel(name: str, topic: str, type_name: str, encoder: Template,
-                fields: Callable[[Samples], Sequence[Field]] = lambda _: (),
+                fields: Callable[[Samples], Sequence[Values]] = lambda _: (),
                 rate: str = '') -> Channel:
         return Channel(name, topic, type_name, period_ns(values[rate or f'{name}.rate']), encoder,
                        fields)
@@ -94,12 +95,19 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
     unknown = messages.UNKNOWN_ORIENTATION
     magnetometer = Magnetometer(values, period_ns(values['mag.rate']))
     increment = partial(channel, 'increments', rate='imu.rate')
+    magnetic_field = message(Header(frame), Field('magnetic_field', 3),
+                             Field('magnetic_field_covariance', 9))
     return [
-        channel('clock', '/clock', 'rosgraph_msgs/msg/Clock', messages.clock()),
-        channel('pose', 'pose', 'geometry_msgs/msg/PoseStamped', messages.pose(world), _pose),
-        channel('tf', '/tf', 'tf2_msgs/msg/TFMessage', messages.transform(world, body), _pose),
+        channel('clock', '/clock', 'rosgraph_msgs/msg/Clock', message(Header(None))),
+        channel('pose', 'pose', 'geometry_msgs/msg/PoseStamped', message(
+            Header(world), Field('pose.position', 3), Field('pose.orientation', 4)), _pose),
+        channel('tf', '/tf', 'tf2_msgs/msg/TFMessage', message(
+            Numbers('I', (1,)), Header(world), body, Field('transforms[0].transform.translation', 3),
+            Field('transforms[0].transform.rotation', 4)), _pose),
         channel('joint_states', 'joint_states', 'sensor_msgs/msg/JointState',
-                messages.joint_state(JOINTS), _joints),
+                message(
+            Header(''), Numbers('I', (3,)), *JOINTS, Numbers('I', (3,)), Field('position', 3),
+            Numbers('I', (3,)), Field('velocity', 3), Numbers('I', (0,))), _joints),
         timed(of_imu('imu', 'imu/data_raw', encoder=messages.imu(frame, unknown, *noisy[1:]),
                      fields=lambda samples: samples.imu.read)),
         timed(of_imu('imu_data', 'imu/data', encoder=messages.imu(frame, *noisy),
@@ -111,15 +119,15 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
                fields=lambda samples: (samples.imu.orientation, *samples.imu.exact)),
         channel('imu_timing', 'ground_truth/imu_timing', ARRAY,
                 messages.float64_multi_array(TIMING), partial(_timing, timing), 'imu.rate'),
-        channel('mag', 'imu/mag', MAGNETIC_FIELD, messages.magnetic_field(frame),
+        channel('mag', 'imu/mag', MAGNETIC_FIELD, magnetic_field,
                 partial(_magnetic_field, mounting, magnetometer)),
-        channel('mag', 'ground_truth/mag', MAGNETIC_FIELD, messages.magnetic_field(frame),
+        channel('mag', 'ground_truth/mag', MAGNETIC_FIELD, magnetic_field,
                 lambda samples: (magnetometer.true(mounting.orientation(samples.states)),
                                  messages.EXACT)),
         *gnss.channels(values),
         timed(increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped',
-                        messages.quaternion(frame), lambda samples: samples.imu.increments[:1])),
-        timed(increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', messages.vector(frame),
+                        message(Header(frame), Field('quaternion', 4)), lambda samples: samples.imu.increments[:1])),
+        timed(increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', message(Header(frame), Field('vector', 3)),
                         lambda samples: samples.imu.increments[1:])),
         channel('ground_truth_odom', 'ground_truth/odom', ODOMETRY,
                 messages.odometry(world, body), _odometry),

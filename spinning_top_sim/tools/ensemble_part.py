@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import reason_of
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field, fill
+from spinning_top_sim.streams.cdr import NANOSECONDS, Values, fill
 from spinning_top_sim.streams.channel import Channel, Rows, Stamps
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.streams.topics import ARRAY, INVARIANTS, JOINTS, TIMING, recorded
@@ -55,7 +55,7 @@ def versions() -> dict[str, str]:
 def _column_names(channel: Channel) -> list[str]:
     """Return the names of the numbers in the fields of a message."""
     names = []
-    for name, _, count, _ in channel.template.fields:
+    for name, count, _ in channel.template.fields:
         labels: Any = LABELS.get((channel.topic, name)) or (
             [''] if count == 1 else 'xyzw'[:count] if count <= 4 else range(count))
         if channel.type_name == ARRAY and (channel.topic, name) not in LABELS:
@@ -73,7 +73,7 @@ class _Columns:
     def __len__(self) -> int:
         return 8 * sum(self._counts)
 
-    def encode(self, stamps_ns: Stamps, fields: Sequence[Field]) -> Rows:
+    def encode(self, stamps_ns: Stamps, fields: Sequence[Values]) -> Rows:
         columns = np.empty((sum(self._counts), len(stamps_ns)))
         fill([field.T for field in np.split(columns, np.cumsum(self._counts)[:-1])], fields)
         return columns.T
@@ -93,7 +93,7 @@ def samples(specification: Specification, simulation: Simulation) -> Samples:
         if channel.name in specification.kept:
             names[channel.topic] = _column_names(channel)
             tables.append(replace(channel, encoder=_Columns(
-                [field.numbers for field in channel.template.fields])))
+                [field.count for field in channel.template.fields])))
     times: dict[str, list[Stamps]] = {topic: [] for topic in names}
     numbers: dict[str, list[Rows]] = {topic: [] for topic in names}
     for block in simulation.play(recorded(tables, values),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field
+from spinning_top_sim.streams.cdr import NANOSECONDS, Values
 from spinning_top_sim.streams.channel import Channel, Rows, Samples, Stamps
 
 # Names and units of the columns of a table.
@@ -29,7 +29,7 @@ class TableRows:
     def __len__(self) -> int:
         return 8 * len(self.units)
 
-    def encode(self, stamps_ns: Stamps, fields: Sequence[Field]) -> Rows:
+    def encode(self, stamps_ns: Stamps, fields: Sequence[Values]) -> Rows:
         rows = np.empty((len(stamps_ns), len(self.units)))
         for column, numbers in zip(rows.T, fields, strict=True):
             column[:] = numbers
@@ -43,7 +43,7 @@ def true_states(period_ns: int, *, pivot_moves: bool) -> Channel:
                    lambda samples: _true(samples, pivot_moves))
 
 
-def _true(samples: Samples, pivot_moves: bool) -> Sequence[Field]:
+def _true(samples: Samples, pivot_moves: bool) -> Sequence[Values]:
     states = samples.states
     return (
         samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
