@@ -10,7 +10,6 @@ from helpers.simulations import calls_of, channel, drive, play, run, simulate
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.solvers.handover import Piece
-from spinning_top_sim.tools import simulate as command
 
 S = 10 ** 9
 SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.speed': 1.5,
@@ -35,17 +34,6 @@ def test_a_run_begins_in_its_start_state_however_little_the_vertical_is_turned(a
             {}, {'pivot.path': (30.0, acceleration, 0.0, 0.0)}))
         assert abs(rest.quaternion - moves.quaternion).max() < 4e-16
         assert abs(rest.angular_velocity - moves.angular_velocity).max() < bound
-
-
-def test_the_specific_force_is_that_of_the_place_in_the_world():
-    values = {'solver.method': 'exact', 'imu.lever_arm': (0.1, -0.2, 0.3),
-              'ground_truth_imu.rate': 1000.0, 'ground_truth_imu_odom.rate': 1000.0, **SHUTTLE}
-    _, found = run(values, S // 2, IMU, 'ground_truth/imu_odom')
-    (_, _, q, _, force), (_, _, place, *_) = found.values()
-    acceleration = (place[2:] - 2 * place[1:-1] + place[:-2]) * 1e6
-    expected = attitude.rotated_back(tuple(q[1:-1].T),
-                                     tuple((acceleration + np.array((0.0, 0.0, 9.80665))).T))
-    assert np.stack(expected, axis=-1) == pytest.approx(force[1:-1], abs=2e-2)
 
 
 @pytest.mark.parametrize('method', METHODS)
@@ -139,20 +127,6 @@ def test_rates_of_the_angles_are_their_derivatives_in_the_world(method):
         found = (np.unwrap(angle)[2:] - np.unwrap(angle)[:-2]) / 4e-5
         assert found == pytest.approx(rate[1:-1], rel=1e-6, abs=1e-6)
         assert np.ptp(rate) > 1e-3
-
-
-def test_a_table_has_the_pivot(tmp_path):
-    path = tmp_path / 'truth.csv'
-    assert command.main(['--scene', 'shuttle', '--duration', '3', '--quiet', '-o',
-                         str(path)]) == 0
-    table = np.genfromtxt(path, delimiter=',', names=True)
-    t = table['t_s']
-    late = np.maximum(t - 2.0, 0.0)         # 2 m/s^2 for 2 s, 4 m/s for 0.5 s, then braking
-    assert table['vx_ms'] == pytest.approx(
-        2.0 * np.minimum(t, 2.0) - 2.0 * np.maximum(late - 0.5, 0.0), abs=1e-12)
-    assert table['x_m'] == pytest.approx(
-        np.minimum(t, 2.0) ** 2 + 4.0 * late - np.maximum(late - 0.5, 0.0) ** 2, abs=1e-12)
-    assert not any(table[name].any() for name in ('y_m', 'z_m', 'vy_ms', 'vz_ms'))
 
 
 @pytest.mark.parametrize(('scene', 'expected'), [

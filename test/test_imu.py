@@ -1,19 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The IMU: kinematics against differences of the exact pose, and how its errors are drawn."""
 
-import random
 
 import numpy as np
 import pytest
 from helpers.reference import SCENES, scene_parameters
-from helpers.simulations import MILLISECOND, SECOND, read, run
+from helpers.simulations import SECOND, read, run
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Mounting
-from spinning_top_sim.streams.inertial_sensor import Sensor
 
 # Central differences of order 8 (Fornberg, Math. Comp. 51 (1988) 699-706).
 FIRST = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
@@ -50,22 +48,6 @@ def test_readings_are_the_derivatives_of_the_exact_pose(scene):
         assert force == pytest.approx(expected_force, abs=1e-7 * scale)
         turned = Rotation.from_quat(np.ravel(sensor.orientation(states)))
         assert (turned.inv() * middle).magnitude() < 1e-12
-
-
-def test_sample_k_depends_on_seed_and_k_alone():
-    """Read forwards, backwards, at random, one by one and many together, across blocks of 512."""
-    period_ns, count = 5 * MILLISECOND, 3000
-    whole, biases = read(NOISY, range(0, count * period_ns, period_ns))
-    sensor = Sensor(parameters.checked(NOISY), period_ns)
-    begins = [0, 102, 103, 511, 512, 1024, count - 1, *range(0, count, 373)]
-    for order in (begins, begins[::-1], random.Random(1).sample(begins, len(begins))):
-        for begin in order:
-            for end in (begin + 1, min(begin + 2, count), min(begin + 600, count)):
-                found, bias = read(sensor, range(begin * period_ns, end * period_ns, period_ns))
-                assert np.array_equal(found, whole[begin:end])
-                assert np.array_equal(bias, biases[begin:end])
-    other, bias = read({**NOISY, 'seed': 1}, range(0, 10 * period_ns, period_ns))
-    assert np.all(other != whole[:10]) and np.all(bias != biases[:10])
 
 
 @pytest.mark.parametrize(('rate', 'other'), [(100.0, 250.0), (1000.0, 40.0)])

@@ -23,41 +23,25 @@ ALL_ERRORS = {name for name in parameters.BY_NAME if name.startswith(('imu.', 'm
 DEG, G = math.radians(1.0), 9.80665
 
 
-def sensor(values, kind):
-    """Return noise density, instability, turn-on bias, range, resolution of a kind of axes."""
-    return tuple(values[f'imu.{kind}_{name}'] for name in (
-        'noise_density', 'bias_instability', 'turn_on_bias', 'range', 'resolution'))
-
-
 def one_sided(density):
     """Return the two-sided density of a one-sided one: half the power on either side."""
     return density / math.sqrt(2.0)
 
 
-def in_16_bits(nominal, resolution):
-    """Return the largest reading within a range: codes of 16 bits end at 32767."""
-    return min(nominal, 32767 * resolution)
-
-
-ADIS_RATE, ADIS_FORCE = 0.34 * DEG / 60.0, 0.037 / 60.0
 # Of gyroscope and accelerometer: noise density, instability, turn-on bias, range, resolution.
+# A range ends at the last code of 16 bits, 32767.
+GYRO, ACCEL = DEG / 16.4, G / 2048.0
 DATA_SHEETS = {
     'perfect': (5 * (0.0,), 5 * (0.0,)),
-    'bmi088': ((one_sided(0.014 * DEG), 0.0, 1.0 * DEG,
-                in_16_bits(2000.0 * DEG, DEG / 16.384), DEG / 16.384),
+    'bmi088': ((one_sided(0.014 * DEG), 0.0, 1.0 * DEG, 32767 * DEG / 16.384, DEG / 16.384),
                (one_sided(190e-6 * G), 0.0, 0.020 * G, 6.0 * G, G / 5460.0)),
-    'icm_42688_p': ((one_sided(0.0028 * DEG), 0.0, 0.5 * DEG,
-                     in_16_bits(2000.0 * DEG, DEG / 16.4), DEG / 16.4),
-                    (one_sided(70e-6 * G), 0.0, 0.020 * G,
-                     in_16_bits(16.0 * G, G / 2048.0), G / 2048.0)),
-    'icm_20948': ((one_sided(0.015 * DEG), 0.0, 5.0 * DEG,
-                   in_16_bits(2000.0 * DEG, DEG / 16.4), DEG / 16.4),
-                  (one_sided(230e-6 * G), 0.0, 0.025 * G,
-                   in_16_bits(16.0 * G, G / 2048.0), G / 2048.0)),
-    'adis16470': ((ADIS_RATE, 8.0 * DEG / 3600.0, 0.2 * DEG, 2000.0 * DEG,
-                   0.1 * DEG),
-                  (ADIS_FORCE, 13e-6 * G, 0.004 * G, 40.0 * G, 1.25e-3 * G)),
-}
+    'icm_42688_p': ((one_sided(0.0028 * DEG), 0.0, 0.5 * DEG, 32767 * GYRO, GYRO),
+                    (one_sided(70e-6 * G), 0.0, 0.020 * G, 32767 * ACCEL, ACCEL)),
+    'icm_20948': ((one_sided(0.015 * DEG), 0.0, 5.0 * DEG, 32767 * GYRO, GYRO),
+                  (one_sided(230e-6 * G), 0.0, 0.025 * G, 32767 * ACCEL, ACCEL)),
+    'adis16470': ((0.34 * DEG / 60.0, 8.0 * DEG / 3600.0, 0.2 * DEG, 2000.0 * DEG, 0.1 * DEG),
+                  (0.037 / 60.0, 13e-6 * G, 0.004 * G, 40.0 * G, 1.25e-3 * G))}
+FIGURES = ('noise_density', 'bias_instability', 'turn_on_bias', 'range', 'resolution')
 
 
 @pytest.mark.parametrize('name', sorted(path.stem for path in FOLDER.glob('*.yaml')))
@@ -78,6 +62,6 @@ def test_a_preset_sets_all_errors_of_the_imu_and_nothing_else(name):
     assert not any(value for key, value in given.items() if key.endswith('_random_walk'))
     values = parameters.checked({**scene_parameters('wavy'), **given})
     for kind, figures in zip(('gyroscope', 'accelerometer'), DATA_SHEETS[name], strict=True):
-        assert sensor(values, kind) == pytest.approx(figures, rel=2e-5), kind
-        *_, limit, step = sensor(values, kind)
-        assert limit <= 32767.5 * step, 'what 16 bits hold'
+        found = [values[f'imu.{kind}_{one}'] for one in FIGURES]
+        assert found == pytest.approx(figures, rel=2e-5), kind
+        assert found[3] <= 32767.5 * found[4], 'what 16 bits hold'

@@ -54,78 +54,60 @@ def test_increments_and_means_are_those_of_thirty_digits(case):
         assert error <= bound, (name, error)
 
 
-def assert_they_connect(found, tolerance):
-    """Every increment leads from one sample of the odometry to the next."""
-    (times_ns, _, dq), (*_, dv), (odometry_ns, _, _, orientation, velocity, _) = found.values()
+# Parameters, end, events, and bounds of exact and rk45: parts of intervals are integrals, as good
+# as its steps; whole ones are differences, so that errors do not add up in a strapdown.
+MS = MILLISECOND
+RUNS = {
+    'no event': ({}, SECOND, (), (3e-15, 3e-15)),
+    # Two in an interval, one at a sample, one at the first one.
+    'commands': ({}, 200 * MS, (
+        command(0, 1.1, 1.0), command(12_345_678, 1.2, 1.1), command(12_345_679, 0.8, 1.2),
+        command(14_000_000, 0.9, 0.8), command(40 * MS, 1.1, 0.9), command(99_999_999, 0.7, 1.0)),
+        (3e-15, 3e-12)),
+    # Faster and slower, between two samples, twice before the next sample.
+    'rates': ({'ground_truth_imu_odom.rate': 1000.0}, 120 * MS, (
+        rate(22 * MS, 1000.0), rate(30_500_000, 100.0), rate(33_000_000, 50.0),
+        command(34_000_000, 1.1, 0.9), rate(90 * MS, 200.0), rate(112 * MS, 1000.0),
+        rate(112_500_000, 100.0)), (3e-15, 3e-12)),
+    # One of the commands is where the acceleration changes.
+    'path of the pivot': (
+        {'pivot.path': (0.7, 1.0, 0.5, 9.0, 0.9025, -1.0, 0.0, -9.0)}, 2 * SECOND,
+        (command(700 * MS, 1.1, 1.0), command(1_234_567_890, 0.9, 1.0)), (1e-14, 3e-12)),
+    'slow': ({**scene_parameters('near_separatrix'), 'imu.rate': 3.0,
+              'ground_truth_imu_odom.rate': 3.0}, SECOND, (), (1e-13, 1e-9)),
+    'fast': ({'imu.rate': 10_000.0, 'ground_truth_imu_odom.rate': 10_000.0}, SECOND // 5, (),
+             (1e-13, 1e-13))}
+SAMPLED_MS = {'no event': range(0, 1001, 5), 'commands': range(0, 201, 5), 'rates': (
+    0, 5, 10, 15, 20, 23, 24, 25, 26, 27, 28, 29, 30, 40, 60, 80, 95, 100, 105, 110, 120)}
+
+
+@pytest.mark.parametrize('name', RUNS)
+@BOTH
+def test_every_increment_leads_from_one_sample_of_the_odometry_to_the_next(method, name):
+    values, until_ns, events, bounds = RUNS[name]
+    tolerance = bounds[method == 'rk45']
+    _, found = run({**MOUNTED, **values, 'solver.method': method}, until_ns, *TOPICS,
+                   events=events)
+    (times_ns, _, dq), (*_, dv), (odometry_ns, _, position, orientation, velocity, rates) = (
+        found.values())
+    assert name not in SAMPLED_MS or times_ns.tolist() == [ms * MS for ms in SAMPLED_MS[name]]
     places = np.searchsorted(odometry_ns, times_ns)
     assert np.array_equal(odometry_ns[places], times_ns)
+    assert np.array_equal(dq[0], (0.0, 0.0, 0.0, 1.0)) and not dv[0].any()
     turned = Rotation.from_quat(orientation[places])
     world = turned.apply(velocity[places])
-    assert np.array_equal(dq[0], (0.0, 0.0, 0.0, 1.0))
-    assert not dv[0].any()
     step = turned[:-1].inv() * turned[1:]
-    apart = (step.inv() * Rotation.from_quat(dq[1:])).magnitude()
-    assert apart.max() <= tolerance
+    assert (step.inv() * Rotation.from_quat(dq[1:])).magnitude().max() <= tolerance
     change = np.diff(world, axis=0)
     change[:, 2] += GRAVITY * np.diff(times_ns) * 1e-9
     assert np.abs(turned[:-1].inv().apply(change) - dv[1:]).max() <= tolerance * (
         1.0 + np.abs(world).max())
-    return times_ns, world
-
-
-@BOTH
-def test_increments_connect_the_samples_across_commands(method):
-    """Two commands within an interval, one at a sample, one at the first: jumps belong to dv."""
-    _, found = run({**MOUNTED, 'solver.method': method}, 200 * MILLISECOND, *TOPICS, events=(
-        command(0, 1.1, 1.0), command(12_345_678, 1.2, 1.1), command(12_345_679, 0.8, 1.2),
-        command(14_000_000, 0.9, 0.8), command(40 * MILLISECOND, 1.1, 0.9),
-        command(99_999_999, 0.7, 1.0)))
-    # Parts of intervals are integrals, which rk45 has to its own accuracy.
-    times_ns, world = assert_they_connect(found, 3e-15 if method == 'exact' else 3e-12)
-    assert len(times_ns) == 41
-    # They are jumps: far more than gravity and the motion give in an interval.
-    assert np.abs(np.diff(world, axis=0)).max() > 0.2
-
-
-@BOTH
-def test_after_a_change_of_the_rate_nothing_is_left_out(method):
-    """Faster and slower, between two samples, twice before the next sample, with a command."""
-    _, found = run(
-        {**MOUNTED, 'solver.method': method, 'ground_truth_imu_odom.rate': 1000.0},
-        120 * MILLISECOND, *TOPICS, events=(
-            rate(22 * MILLISECOND, 1000.0), rate(30_500_000, 100.0), rate(33_000_000, 50.0),
-            command(34_000_000, 1.1, 0.9), rate(90 * MILLISECOND, 200.0),
-            rate(112 * MILLISECOND, 1000.0), rate(112_500_000, 100.0)))
-    times_ns, _ = assert_they_connect(found, 3e-15 if method == 'exact' else 3e-12)
-    assert times_ns.tolist() == [ms * MILLISECOND for ms in (
-        0, 5, 10, 15, 20, 23, 24, 25, 26, 27, 28, 29, 30, 40, 60, 80, 95, 100, 105, 110, 120)]
-
-
-@pytest.mark.parametrize(('hertz', 'until_ns'), [(3.0, SECOND), (10_000.0, SECOND // 5)])
-def test_long_and_short_intervals_connect(hertz, until_ns):
-    _, found = run({**MOUNTED, **scene_parameters('near_separatrix'), 'solver.method': 'exact',
-                    'imu.rate': hertz, 'ground_truth_imu_odom.rate': hertz}, until_ns, *TOPICS)
-    assert_they_connect(found, 1e-13)
-
-
-@BOTH
-def test_increments_connect_the_samples_of_the_lever_arms_end(method):
-    """They are differences: the errors of the solver do not add up in a strapdown."""
-    _, found = run({**MOUNTED, 'solver.method': method}, SECOND, *TOPICS)
-    assert_they_connect(found, 3e-15)
-    _, _, position, orientation, velocity, rates = found[ODOMETRY]
-    arm = Rotation.from_euler('xyz', MOUNTED['imu.rpy']).inv().apply(MOUNTED['imu.lever_arm'])
-    assert position == pytest.approx(Rotation.from_quat(orientation).apply(arm), abs=1e-14)
-    assert velocity == pytest.approx(np.cross(rates, arm), abs=1e-13)
-
-
-@BOTH
-def test_increments_connect_the_samples_along_a_path_of_the_pivot(method):
-    """With commands, one of them where the acceleration changes."""
-    _, found = run({**MOUNTED, 'solver.method': method, 'pivot.path': (
-        0.7, 1.0, 0.5, 9.0, 0.9025, -1.0, 0.0, -9.0)}, 2 * SECOND, *TOPICS, events=(
-            command(700 * MILLISECOND, 1.1, 1.0), command(1_234_567_890, 0.9, 1.0)))
-    assert_they_connect(found, 1e-14 if method == 'exact' else 3e-12)
+    # The jumps of commands are far more than gravity and the motion give in an interval.
+    assert name != 'commands' or np.abs(np.diff(world, axis=0)).max() > 0.2
+    if 'pivot.path' not in values:      # the odometry is that of the lever arm's end
+        arm = Rotation.from_euler('xyz', MOUNTED['imu.rpy']).inv().apply(MOUNTED['imu.lever_arm'])
+        assert position == pytest.approx(Rotation.from_quat(orientation).apply(arm), abs=1e-14)
+        assert velocity == pytest.approx(np.cross(rates, arm), abs=1e-13)
 
 
 def test_the_noise_of_increments_is_that_of_the_readings():

@@ -8,7 +8,6 @@ import pytest
 from helpers.simulations import SECOND, run
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.magnetometer import Magnetometer
 
 STANDING = {'initial.theta': 0.0, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method': 'exact'}
 ALONG = {'E': 1e-6, 'N': 20e-6, 'U': -40e-6, 'W': -1e-6, 'S': -20e-6, 'D': 40e-6}
@@ -39,16 +38,6 @@ def test_the_default_is_the_world_magnetic_model_in_munich():
         (1e-9 * wmm.Y, 1e-9 * wmm.X, -1e-9 * wmm.Z), abs=10e-9)
 
 
-def test_the_chain_by_hand():
-    """Soft iron, hard iron, rounding, then the range at the last code within it."""
-    magnetometer = Magnetometer(parameters.checked({
-        'mag.soft_iron': (1.0, 0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 3.0),
-        'mag.hard_iron': (1e-6, 0.0, -2e-6), 'mag.resolution': 1e-6, 'mag.range': 100.5e-6,
-    }), 10_000_000)
-    found = magnetometer.read(tuple(np.array([one]) for one in (10e-6, 20e-6, -40e-6)), range(1))
-    assert np.ravel(found) * 1e6 == pytest.approx([21.0, 20.0, -100.0], abs=1e-9)
-
-
 NOISY = {**STANDING, 'mag.noise_density': 1e-7, 'mag.resolution': 1.5e-7}
 
 
@@ -66,10 +55,3 @@ def test_noise_has_the_covariance_that_is_published_at_each_rate():
             covariance[0, [0, 4, 8]], abs=0.0, rel=4.0 * math.sqrt(2.0 / len(errors)))
         assert np.abs(np.corrcoef(errors.T) - np.eye(3)).max() < 4.0 / math.sqrt(len(errors))
     assert known[[0, 4, 8]].tolist() == 3 * [1e-18]
-
-
-def test_the_bias_walks_with_its_density():
-    _, found = run({**STANDING, 'mag.random_walk': 1e-8}, 200 * SECOND, 'imu/mag')
-    steps = np.diff(found['imu/mag'][2], axis=0)
-    assert np.std(steps) == pytest.approx(1e-8 * math.sqrt(0.01),
-                                          rel=4.0 / math.sqrt(2.0 * steps.size))

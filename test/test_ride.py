@@ -8,8 +8,6 @@ the frame of the pivot (data/make_references.py): nothing of a closed form is in
 
 import json
 import math
-from contextlib import suppress
-from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
@@ -170,21 +168,21 @@ def test_a_vertical_that_turns_by_little_is_not_the_one_of_the_world(tilt):
     expected = integrated(GENERAL, acceleration, np.linspace(0.0, 0.5, 6))
     for method, bound in (('exact', 1e-13), ('rk45', 1e-9)):
         piece = Piece(TOP, GENERAL, 0, ride(acceleration), method=method)
-        found = piece.states(range(0, S // 2 + 1, S // 10)).quaternion
+        found = piece.states(np.arange(0, S // 2 + 1, S // 10)).quaternion
         assert abs(found - expected).max() <= bound
-        assert (piece.states(range(S // 10, S // 10 + 1)).quaternion[0] == found[1]).all()
+        assert (piece.states(np.arange(S // 10, S // 10 + 1)).quaternion[0] == found[1]).all()
 
 
 def test_where_the_equations_cannot_go_on_the_error_says_up_to_when_they_do():
     piece = Piece(TOP, State(theta=0.8, theta_dot=-3.5, l3=0.5, lz=0.5), 5 * S,
                   equations='euler')
     with pytest.raises(IntegrationError, match='pole') as error:
-        piece.states(range(5 * S, 9 * S, S // 100))
+        piece.states(np.arange(5 * S, 9 * S, S // 100))
     reached_ns = error.value.reached_ns
-    assert len(piece.states(range(5 * S, reached_ns + 1, S // 100))) > 10
-    assert piece.states(range(reached_ns, reached_ns + 1)).theta[0] < 0.1
+    assert len(piece.states(np.arange(5 * S, reached_ns + 1, S // 100))) > 10
+    assert piece.states(np.arange(reached_ns, reached_ns + 1)).theta[0] < 0.1
     with pytest.raises(IntegrationError):
-        piece.states(range(reached_ns + S // 10, reached_ns + S // 10 + 1))
+        piece.states(np.arange(reached_ns + S // 10, reached_ns + S // 10 + 1))
 
 
 @pytest.mark.parametrize('method', ['exact', 'rk45'])
@@ -193,7 +191,7 @@ def test_pieces_are_joined_and_known_again_with_another_end(method):
     path = PivotPath([(S, (1.0, 2.0, 0.5)), (S, (0.0, 0.0, -9.80665))])
     first = Piece(TOP, GENERAL, 0, path.lasting(0), method=method)
     second = Piece(TOP, first.posture(S), S, path.lasting(S), method=method)
-    parts = first.states(range(0, S, S // 10)), second.states(range(S, 2 * S, S // 10))
+    parts = first.states(np.arange(0, S, S // 10)), second.states(np.arange(S, 2 * S, S // 10))
     both = joined(parts)
     for name in ('t', 'phi', 'phi_dot', 'psi_dot', 'theta_dot', 'theta_folded', 'quaternion',
                  'angular_velocity', 'angular_acceleration', 'energy', 'l3', 'lz'):
@@ -204,36 +202,25 @@ def test_pieces_are_joined_and_known_again_with_another_end(method):
             [getattr(one, name)(point) for one in parts])).all(), name
     assert both.pivot.velocity[:, 11] == pytest.approx([1.0, 2.0, 0.5 - 0.980665])
     at = 1e-4                       # the velocity is that of the position
-    near = first.states(range(S // 2 - 100_000, S // 2 + 100_001, 100_000))
+    near = first.states(np.arange(S // 2 - 100_000, S // 2 + 100_001, 100_000))
     moved = np.diff(np.array(near.position(point))[:, ::2], axis=1)[:, 0] / (2.0 * at)
     velocity = np.array(attitude.rotated(near.rows_quaternion, near.world_velocity(point)))[:, 1]
     assert moved == pytest.approx(velocity, abs=1e-6)
-    truth = joined([first.truth(range(0, S, S // 10)), second.truth(range(S, 2 * S, S // 10))])
+    truth = joined([one.truth(begin + np.arange(0, S, S // 10)) for one, begin in (
+        (first, 0), (second, S))])
     assert abs(both.quaternion - truth.quaternion).max() < 1e-9
     braked = first.with_ride(first.ride._replace(end_ns=S // 2))
     assert braked.ride.end_ns == S // 2 < first.ride.end_ns
-    assert (braked.states(range(5)).quaternion == first.states(range(5)).quaternion).all()
-    with pytest.raises(ValueError, match=r'it turns at up to .* rad/s: must be at most 3.3e\+06'):
+    assert (braked.states(np.arange(5)).quaternion == first.states(np.arange(5)).quaternion).all()
+    with pytest.raises(ValueError, match=r'it turns at up to .* rad/s: must be at most 6.6e\+06'):
         Piece(TOP, State(theta=0.5, l3=1e6, lz=1.0), 0, method=method)
-
-
-def test_a_piece_that_is_not_refused_has_states_up_to_the_last_stamp():
-    """Next to hanging, where the nutation is twice as fast as anything that its bound has."""
-    top = Top(lambda1=1.0, lambda3=1.0, mass=1.0, com_distance=1.0, gravity=1.0)
-    for gravity in np.geomspace(1e10, 1e14, 30).tolist():
-        with suppress(ValueError):
-            piece = Piece(replace(top, gravity=gravity), State(theta=math.pi - 1e-6, l3=0.0,
-                                                               lz=0.0), 0, method='exact')
-            fastest = piece.fastest_rate
-            assert np.isfinite(piece.states(range(2 ** 31 * S - 1, 2 ** 31 * S)).quaternion).all()
-    assert fastest > 1e6
 
 
 def test_next_to_the_line_of_effective_gravity_an_axis_stays_what_it_is():
     """Within 1e-30 rad it is taken for the line, as the documentation says."""
     for theta, falls in ((1e-29, True), (1e-31, False)):
         piece = Piece(TOP, State(theta=theta, l3=0.0, lz=0.0), 0, ride(NOWHERE), method='exact')
-        assert (piece.states(range(20 * S, 20 * S + 1)).theta_folded[0] > 0.0) == falls
+        assert (piece.states(np.array([20 * S])).theta_folded[0] > 0.0) == falls
 
 
 # The path of the pivot

@@ -16,10 +16,7 @@ from helpers.simulations import MILLISECOND, SECOND, read, run
 from scipy.special import chdtri
 from stress import sensor as statistics
 
-from spinning_top_sim.physics.attitude import rotation_vector
-from spinning_top_sim.streams import noise, parameters
-from spinning_top_sim.streams.inertial_sensor import Sensor
-from spinning_top_sim.streams.magnetometer import Magnetometer
+from spinning_top_sim.streams import noise
 
 ALL_BIASES = {f'imu.{kind}_{name}': value for kind in ('gyroscope', 'accelerometer')
               for name, value in (('random_walk', 1e-2), ('bias_stddev', 0.1),
@@ -64,27 +61,15 @@ def test_the_bias_begins_with_the_turn_on_bias_and_walks_with_its_density():
     assert np.abs(np.diff(biases, axis=0)[seams] / deviations).max() < 5.0
 
 
-def test_no_two_kinds_of_noise_have_a_number_in_common():
-    """Of deviation 1: white noise, turn-on bias, steps of walks, noise of the orientation."""
+def test_turn_on_bias_white_noise_and_walks_have_no_number_in_common():
+    """Each of deviation 1."""
     period_ns = noise.DRAWN_TOGETHER * noise.STEP_NS
     times, root = range(0, 100 * period_ns, period_ns), math.sqrt(1e-9 * period_ns)
-
-    def imu(name, value):
-        return read({f'imu.{kind}_{name}': value for kind in ('gyroscope', 'accelerometer')},
-                    times)[0]
-
-    def magnetometer(name, value):
-        values = parameters.checked({'mag.field': 3 * (0.0,), f'mag.{name}': value})
-        return np.array(Magnetometer(values, period_ns).read(3 * (np.zeros(100),), times))
-
-    sensor = Sensor(parameters.checked({'imu.orientation_stddev': 3 * (0.01,)}), period_ns)
-    turned = rotation_vector(sensor.orientation((0.0, 0.0, 0.0, 1.0), times))
-    turn_on = imu('turn_on_bias', 1.0)[0]
-    assert np.ptp(turn_on) > 0.1
-    kinds = (turn_on, imu('noise_density', root), magnetometer('noise_density', root),
-             np.diff(imu('random_walk', 1.0 / root), axis=0),
-             np.diff(magnetometer('random_walk', 1.0 / root)), 100.0 * np.array(turned))
-    for one, two in combinations(map(np.ravel, kinds), 2):
+    turn_on, white, walk = (read({f'imu.{kind}_{name}': value for kind in (
+        'gyroscope', 'accelerometer')}, times)[0] for name, value in (
+            ('turn_on_bias', 1.0), ('noise_density', root), ('random_walk', 1.0 / root)))
+    assert np.ptp(turn_on[0]) > 0.1
+    for one, two in combinations(map(np.ravel, (turn_on[0], white, np.diff(walk, axis=0))), 2):
         assert np.abs(one[:, np.newaxis] - two).min() > 1e-8
 
 
@@ -98,8 +83,9 @@ def test_a_gauss_markov_bias_has_its_variance_and_its_correlation_time():
 def test_a_gauss_markov_bias_is_stationary_at_any_time(time):
     """At the start, at a second and after three years it has one variance: 2400 numbers each."""
     times_ns = np.array([0, SECOND, 94_608_000 * SECOND])
-    rows = np.concatenate([noise.RandomPath(seed, noise.Purpose.GAUSS_MARKOV, (120 * (time,),),
-                                      (120 * (2.0,),)).at(times_ns) for seed in range(20)])
+    rows = np.concatenate([noise.RandomPath(
+        seed, noise.Kind.GYROSCOPE, noise.Part.GAUSS_MARKOV, ((time, 2.0),)).at(times_ns)
+        for seed in range(800)])
     assert np.std(rows, axis=0) == pytest.approx(2.0, rel=4.0 / math.sqrt(2.0 * len(rows)))
     correlation = np.mean(rows[:, 0] * rows[:, 1]) / 4.0
     assert correlation == pytest.approx(math.exp(-1.0 / time), abs=4.0 / math.sqrt(len(rows)))
@@ -123,17 +109,17 @@ def test_the_law_of_a_flicker_bias_is_flat_for_every_band(lowest):
 
 
 def test_a_jump_of_three_years_draws_few_numbers(monkeypatch):
-    """By way of some log2 of the blocks before, for each of three paths."""
+    """By way of some log2 of the blocks before, for each of six paths."""
     draws, philox = [], np.random.Philox
     monkeypatch.setattr(np.random, 'Philox',
                         lambda **keys: (draws.append(keys), philox(**keys))[1])
     begin, values = 94_608_000 * SECOND, {**ALL_BIASES, 'seed': 77}
     there, _ = read(values, range(begin, begin + SECOND, MILLISECOND))
-    assert 3 * 20 < len(draws) < 3 * 100
+    assert 6 * 20 < len(draws) < 6 * 100
     assert np.isfinite(there).all() and np.std(there, axis=0).min() > 0.0
     draws.clear()
     later, _ = read(values, range(begin + SECOND, begin + 2 * SECOND, MILLISECOND))
-    assert len(draws) < 3 * 20
+    assert len(draws) < 6 * 20
     assert np.std(there - later, axis=0).min() > 0.0
 
 

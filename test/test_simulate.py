@@ -62,6 +62,18 @@ def test_a_table_of_the_truth(tmp_path):
     assert table == pytest.approx(np.loadtxt(exact, delimiter=',', skiprows=1), abs=1e-9)
 
 
+def test_a_table_has_the_pivot(tmp_path):
+    table = np.genfromtxt(simulate(tmp_path / 'truth.csv', '--scene', 'shuttle', '--duration', 3),
+                          delimiter=',', names=True)
+    t = table['t_s']
+    late = np.maximum(t - 2.0, 0.0)         # 2 m/s^2 for 2 s, 4 m/s for 0.5 s, then braking
+    assert table['vx_ms'] == pytest.approx(
+        2.0 * np.minimum(t, 2.0) - 2.0 * np.maximum(late - 0.5, 0.0), abs=1e-12)
+    assert table['x_m'] == pytest.approx(
+        np.minimum(t, 2.0) ** 2 + 4.0 * late - np.maximum(late - 0.5, 0.0) ** 2, abs=1e-12)
+    assert not any(table[name].any() for name in ('y_m', 'z_m', 'vy_ms', 'vz_ms'))
+
+
 def test_commands_at_one_time_are_applied_in_the_order_given(tmp_path):
     """The last one given holds, whether its momenta are larger or smaller."""
     for number, (first, last) in enumerate((('2.0:1.5', '1.7:1.4'), ('1.7:1.4', '2.0:1.5'))):

@@ -186,7 +186,7 @@ def test_a_log_of_1_is_read_and_verified_by_1(capsys):
     code, _, err = told(capsys, path, '--verify')
     assert code == 1 and err == (
         'spinning-top inspect: --verify: it was recorded by spinning_top_sim 1.0.0, which '
-        'computes other last bits: verify it with that version\n')
+        'draws other noise and computes other last bits: verify it with that version\n')
 
 
 def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):

@@ -55,8 +55,8 @@ class Comparison:
 def objection(run: RunDescription) -> str:
     """Return why the run of a log cannot be verified by this version, '' if it can."""
     return '' if run.format == provenance.FORMAT else (
-        f'it was recorded by spinning_top_sim {run.environment["version"]}, which computes other '
-        'last bits: verify it with that version')
+        f'it was recorded by spinning_top_sim {run.environment["version"]}, which draws other '
+        'noise and computes other last bits: verify it with that version')
 
 
 def compare(run: RunDescription, reader: LogReader, end_ns: int,

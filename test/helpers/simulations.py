@@ -4,7 +4,7 @@
 import numpy as np
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.inertial_sensor import Sensor
+from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.live import LiveSimulation
 
 SECOND = 1_000_000_000
@@ -92,17 +92,17 @@ def drive(simulation, *velocity):
     return simulation.apply('drive', **simulation.drive_details(velocity))
 
 
-def read(sensor, times_ns, exact=STILL):
+def read(imu, times_ns, exact=STILL):
     """
     Return what an IMU reads at these times [ns], and its bias, (n, 6) each.
 
-    sensor : or the parameters of one that takes its samples at these times
+    imu : or the parameters of one that takes its samples at these times
     """
-    if not isinstance(sensor, Sensor):
-        sensor = Sensor(parameters.checked(sensor), times_ns.step)
-    return tuple(np.column_stack([np.broadcast_to(axis, len(times_ns)) for kind in found
-                                  for axis in kind])
-                 for found in (sensor.read(exact, times_ns), sensor.bias(times_ns)))
+    imu = imu if isinstance(imu, Imu) else Imu(parameters.checked(imu), times_ns.step)
+    t_ns = np.asarray(times_ns)
+    biases = [sensor.errors(t_ns)[1] for sensor in (imu.gyroscope, imu.accelerometer)]
+    return tuple(np.column_stack([np.broadcast_to(axis, len(t_ns)) for kind in found
+                                  for axis in kind]) for found in (imu.read(exact, t_ns), biases))
 
 
 def calls_of(monkeypatch, owner, name, number=lambda *arguments: 1):

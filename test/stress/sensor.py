@@ -154,18 +154,16 @@ def correlations(seeds, count):
     """
     Return {between what: (correlations, how many products each is the mean of)}.
 
-    Columns are the axes of gyroscope, accelerometer, orientation and magnetometer, the numbers of
-    timing, and steps of the paths of biases; there are `count` numbers of each.
+    Columns are white noise of every kind, and steps of the paths of biases; there are `count`
+    numbers of each.
     """
-    purpose, numbers, drawn = noise.Purpose, np.arange(count), []
+    kinds, part, numbers, drawn = noise.Kind, noise.Part, np.arange(count), []
     for seed in seeds:
-        columns = [noise.white(seed, one, numbers, width) for one, width in (
-            (purpose.WHITE, 6), (purpose.ORIENTATION, 3), (purpose.MAG_WHITE, 3),
-            (purpose.TIMING, 3))]
+        columns = [noise.white(seed, kind, part.WHITE, numbers, 3) for kind in kinds]
         # Correlation times far below a step: every step is new.
-        columns += [noise.RandomPath(seed, one, (3 * (1e-5,),), (3 * (1.0,),)).at(
-            numbers * MILLISECOND) for one in (
-                purpose.GAUSS_MARKOV, purpose.FLICKER, purpose.WALK, purpose.MAG_WALK)]
+        columns += [noise.RandomPath(seed, kind, one, ((1e-5, 1.0),)).at(numbers * MILLISECOND)
+                    for kind in (kinds.GYROSCOPE, kinds.ACCELEROMETER, kinds.MAGNETOMETER)
+                    for one in (part.WALK, part.GAUSS_MARKOV, part.FLICKER)]
         drawn.append(np.concatenate(columns))
     drawn = np.array(drawn)                     # (seeds, columns, numbers)
 
