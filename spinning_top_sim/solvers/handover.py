@@ -82,8 +82,8 @@ class Piece:
                 raise ValueError(f'it turns at up to {self.fastest_rate:.3g} rad/s: must be at '
                                  f'most {FASTEST_RATE:.2g}')
         except (ArithmeticError, IntegrationError, ValueError) as error:
-            whence = (f'theta = {start.theta!r} rad, theta_dot = {start.theta_dot!r} rad/s with l3 '
-                      f'= {start.l3!r}, lz = {start.lz!r} kg m^2/s' if isinstance(start, State)
+            whence = (f'theta = {start.theta!r} rad, theta_dot = {start.theta_dot!r} rad/s with '
+                      f'l3 = {start.l3!r}, lz = {start.lz!r} kg m^2/s' if isinstance(start, State)
                       else f't = {start_ns / pivot.NANOSECONDS!r} s on')
             raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
 
