@@ -84,7 +84,9 @@ class Piece:
                 raise ValueError(f'it turns at up to {self.fastest_rate:.3g} rad/s: must be at '
                                  f'most {FASTEST_RATE:.2g}')
         except (ArithmeticError, IntegrationError, ValueError) as error:
-            whence = start if isinstance(start, State) else f't = {start_ns * 1e-9!r} s on'
+            whence = (f'theta = {start.theta!r} rad, theta_dot = {start.theta_dot!r} rad/s with '
+                      f'l3 = {start.l3!r}, lz = {start.lz!r} kg m^2/s' if isinstance(start, State)
+                      else f't = {start_ns / pivot.NANOSECONDS!r} s on')
             raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
 
     def _begun(self, method: str, **settings: Any) -> Solution:
