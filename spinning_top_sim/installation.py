@@ -2,6 +2,8 @@
 """What is installed: the version, the shared files, and how to install what is missing."""
 
 import contextlib
+import functools
+import json
 import os
 import re
 import sys
@@ -41,9 +43,12 @@ def share() -> Path:
                             f'above {package}')
 
 
+@functools.cache
 def read_table(name: str) -> dict[str, Any]:
-    """Return the content of a TOML file among the modules, such as 'streams/parameters.toml'."""
-    return tomllib.loads((Path(__file__).parent / name).read_text('utf-8'))
+    """Return the content of a data file among the modules, such as 'streams/parameters.toml'."""
+    text = (Path(__file__).parent / name).read_text('utf-8')
+    content: dict[str, Any] = (json.loads if name.endswith('.json') else tomllib.loads)(text)
+    return content
 
 
 @contextlib.contextmanager

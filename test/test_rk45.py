@@ -8,6 +8,9 @@ test_exact.py holds against the same data.
 
 import gc
 import math
+import re
+import subprocess
+import sys
 import weakref
 from fractions import Fraction
 
@@ -209,6 +212,34 @@ def test_a_free_planar_rotation_counts_its_turns(theta_dot):
     expected = np.array([-np.sin(half) * math.sin(0.35), np.sin(half) * math.cos(0.35),
                          np.cos(half) * math.sin(-0.05), np.cos(half) * math.cos(-0.05)]).T
     assert np.abs(motion.quaternion - expected).max() <= 5e-14
+
+
+WITHOUT_GMPY2 = """
+import sys
+sys.modules['gmpy2'] = None
+from spinning_top_sim import State, Top, solve
+from spinning_top_sim.physics.pivot import PivotPath
+from spinning_top_sim.solvers.handover import Piece
+top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
+print(solve(top, State(theta=0.0, l3=1.6, lz=1.6), [1.0], method='rk45').phi_dot[0])
+path = PivotPath([(10 ** 9, (1.0, 0.0, 0.0))])
+first = Piece(top, State(theta=0.5, l3=1.6, lz=1.3), 0, path.lasting(0))
+second = Piece(top, first.posture(10 ** 9), 10 ** 9, path.lasting(10 ** 9))
+print(len(second.states(range(10 ** 9, 2 * 10 ** 9, 10 ** 8))), second.truth(range(3)))
+try:
+    solve(top, State(theta=0.5, l3=1.6, lz=1.3), [1.0])
+except ImportError as error:
+    print(error)
+"""
+
+
+def test_steps_need_no_multiprecision_and_the_exact_solution_says_what_it_needs():
+    run = subprocess.run([sys.executable, '-c', WITHOUT_GMPY2], capture_output=True, text=True,
+                         timeout=60, check=True)
+    rate, piece, said = run.stdout.splitlines()
+    assert float(rate) == pytest.approx(0.5 * 1.6 / 0.123, rel=1e-12)
+    assert piece == '10 None'
+    assert re.match(r"method = 'exact' needs gmpy2, which is not installed: .*pip install", said)
 
 
 def looping_motion():

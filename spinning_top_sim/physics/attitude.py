@@ -99,7 +99,7 @@ def precession_rate(top: Top, l3: float, lz: float, cos2_half: Number,
     """
     bottom = (lz + l3) / cos2_half if lz + l3 else 0.0 * cos2_half
     upright = (lz - l3) / sin2_half if lz - l3 else 0.0 * sin2_half
-    return 0.25 / top.lambda1 * (bottom + upright)
+    return (bottom + upright) / (4.0 * top.lambda1)
 
 
 def transverse(theta_dot: Column, across: Column, cos_psi: Column, sin_psi: Column,

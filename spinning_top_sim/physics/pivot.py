@@ -49,6 +49,13 @@ class Piece(NamedTuple):
 REST = Piece(0, NEVER_NS, ZERO, np.zeros(9))
 
 
+def ns_array(times: NDArray[np.int64] | range) -> NDArray[np.int64]:
+    """Return times [ns] as an array."""
+    if isinstance(times, range):        # `numpy.arange` takes its length from doubles
+        return times.start + times.step * np.arange(len(times), dtype=np.int64)
+    return np.asarray(times)
+
+
 def kinematics(piece: Piece, times_ns: NDArray[np.int64]) -> Kinematics:
     """Return what the pivot does in a piece at times (n,) [ns]."""
     start, velocity, acceleration = piece.begins.reshape(3, 3, 1)

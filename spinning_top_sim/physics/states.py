@@ -76,7 +76,6 @@ class States:
     """
 
     method: str
-    _acceleration = 0.0, 0.0, 0.0       # of the pivot
 
     def __init__(self, top: Top, start: State, n: int) -> None:
         self.top, self.start, self._n = top, start, n
@@ -186,12 +185,8 @@ class States:
     @cached_property
     def _support(self) -> Vector:
         """Specific force of the pivot in the body [m/s^2]: g z + its acceleration."""
-        x, y, z = self._acceleration
-        upward = self.top.gravity + z
-        if x or y:
-            return attitude.rotated_back(self.rows_quaternion, (x, y, upward))
-        z1, z2, z3 = self.rows_vertical
-        return upward * z1, upward * z2, upward * z3
+        gravity, (z1, z2, z3) = self.top.gravity, self.rows_vertical
+        return gravity * z1, gravity * z2, gravity * z3
 
     @cached_property
     def rows_angular_acceleration(self) -> Vector:
@@ -291,15 +286,15 @@ class WorldStates(States):
     times_ns : (n,) simulated times [ns], on which the pivot depends
     """
 
-    t, l3, transverse_velocity = (cached_property(attrgetter(f'_moved.{name}')) for name in (
-        't', 'l3', 'transverse_velocity'))
+    t, l3, transverse_velocity, _support = (
+        cached_property(attrgetter(f'_moved.{name}')) for name in (
+            't', 'l3', 'transverse_velocity', '_support'))
 
     def __init__(self, top: Top, moved: States, rotation: Quaternion, ride: Piece,
                  times_ns: NDArray[np.int64]) -> None:
         super().__init__(top, moved.start, len(moved))
         self.method, self._moved, self._rotation = moved.method, moved, rotation
         self._ride, self._times_ns = ride, times_ns
-        self._acceleration = tuple(ride.begins[6:].tolist())
 
     @cached_property
     def pivot(self) -> Kinematics:

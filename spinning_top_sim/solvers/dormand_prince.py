@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.physics.pivot import NANOSECONDS
+from spinning_top_sim.physics.pivot import NANOSECONDS, ns_array
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 
@@ -208,7 +208,7 @@ class SteppedMotion(ABC):
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """Return the states at ascending times (n,) [ns]; see `states_at_seconds`."""
-        return self.states_at_seconds(np.asarray(times_ns, np.float64) / NANOSECONDS)
+        return self.states_at_seconds(ns_array(times_ns) / NANOSECONDS)
 
     def states_at_seconds(self, t: Column) -> States:
         """

@@ -23,7 +23,7 @@ from gmpy2 import const_pi, mpfr, rint
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number
-from spinning_top_sim.physics.pivot import NANOSECONDS
+from spinning_top_sim.physics.pivot import NANOSECONDS, ns_array
 from spinning_top_sim.solvers.constants import ThetaMotion
 from spinning_top_sim.solvers.multiprecision import SIN_ODD, double_double, precision
 
@@ -55,16 +55,13 @@ class Times(NamedTuple):
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
         """Return the times of integer nanoseconds (n,).  Raises ValueError."""
-        if isinstance(ns, range):
-            if not all(abs(x) < 2 ** 63 for x in (ns.start, ns.stop, ns.step)):
-                raise ValueError(f'times_ns = {ns!r}: must be within int64')
-            # `numpy.arange` takes its length from doubles.
-            count = ns.start + ns.step * np.arange(len(ns), dtype=np.int64)
-        else:
-            count = np.asarray(ns)
-            if count.ndim != 1 or count.dtype.kind != 'i':
-                raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must '
-                                 'be (n,) nanoseconds, int64')
+        if isinstance(ns, range) and not all(
+                abs(x) < 2 ** 63 for x in (ns.start, ns.stop, ns.step)):
+            raise ValueError(f'times_ns = {ns!r}: must be within int64')
+        count = ns_array(ns)
+        if count.ndim != 1 or count.dtype.kind != 'i':
+            raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
+                             '(n,) nanoseconds, int64')
         high = count.astype(np.float64)
         if np.abs(high).max(initial=0.0) < 2.0 ** 53:
             return cls(NANOSECONDS, high)

@@ -104,7 +104,8 @@ class ExactSolution:
                 abs(motion.quarter_rate), abs(alpha.rate) / (2 * const_pi()),
                 abs(beta.rate) / (2 * const_pi()), 1e-290))
             self.arrays = ThetaArrays(motion)
-        self._check_start()
+        if gravity is None:
+            self._check_start()
 
     def _check_start(self) -> None:
         """Refuse constants so large, or so far apart, that doubles lose the start among them."""

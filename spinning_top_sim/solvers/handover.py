@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.installation import needed
 from spinning_top_sim.physics import integrals, pivot
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import States, WorldStates
@@ -23,10 +24,11 @@ from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical, p
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.exact import ExactSolution
 
-# Stamps of ROS end at 2^31 s; doubles hold the phases of a motion up to 2^52 half turns.
-FASTEST_RATE = math.pi * 2.0 ** 52 / 2.0 ** 31          # [rad/s]
+# Stamps of ROS end at 2^31 s, and doubles hold phases up to 2^52.  The fastest one is that of the
+# nutation in quarter periods: next to hanging it may nutate at twice the rate of its bound.
+FASTEST_RATE = 0.5 * math.pi * 2.0 ** 52 / 2.0 ** 31    # [rad/s]
 
-Times = NDArray[np.int64]
+Times = NDArray[np.int64] | range
 # A motion, and the vertical that it is about, if that is not the world's.
 Solution = tuple['ExactSolution | SteppedMotion', Vertical | None]
 
@@ -75,14 +77,16 @@ class Piece:
                 self._solution = self._begun(method, equations=equations, rtol=rtol, atol=atol)
                 self._motion, self._vertical = self._solution
                 self.l3, self.lz = self._motion.start.l3, self._motion.start.lz
-                self.energy = float(self._motion.states(range(1)).energy[0])
+                self.energy = self._energy()
                 self.fastest_rate = integrals.fastest_rate(
                     self._motion.top, self.l3, self.energy)
             if not self.fastest_rate <= FASTEST_RATE:
                 raise ValueError(f'it turns at up to {self.fastest_rate:.3g} rad/s: must be at '
                                  f'most {FASTEST_RATE:.2g}')
         except (ArithmeticError, IntegrationError, ValueError) as error:
-            whence = start if isinstance(start, State) else f't = {start_ns * 1e-9!r} s on'
+            whence = (f'theta = {start.theta!r} rad, theta_dot = {start.theta_dot!r} rad/s with '
+                      f'l3 = {start.l3!r}, lz = {start.lz!r} kg m^2/s' if isinstance(start, State)
+                      else f't = {start_ns / pivot.NANOSECONDS!r} s on')
             raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
 
     def _begun(self, method: str, **settings: Any) -> Solution:
@@ -90,8 +94,8 @@ class Piece:
         if self.ride is pivot.REST and isinstance(start, State):
             return motion_of(top, start, method=method, **settings), None
         if method == 'exact':
-            from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
-
+            with needed("method = 'exact'"):
+                from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
             return exact_about(top, start, self.ride.acceleration)
         posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
                    else start.in_doubles())
@@ -100,6 +104,14 @@ class Piece:
         state = vertical.state_of(posture, float).rounded()
         return motion_of(vertical.top, state, method=method, posture=posture,
                          **settings), vertical
+
+    def _energy(self) -> float:
+        if isinstance(self._start, State):
+            return float(self._motion.states(range(1)).energy[0])
+        # A posture tells it at a third of the time; there may be many pieces a second.
+        top, state, across = self._motion.top, self._motion.start, abs(self._start.transverse)
+        return (0.5 * (top.lambda1 * float(across) ** 2 + state.l3 / top.lambda3 * state.l3)
+                + top.gravity_torque * math.cos(state.theta))
 
     @property
     def start(self) -> State:
@@ -175,8 +187,7 @@ class Piece:
         return changed
 
     def _in_world(self, solution: Solution, t_ns: Times) -> States:
-        motion, vertical = solution
-        states = motion.states(t_ns - self.start_ns)
-        if vertical is None:
-            return states
-        return WorldStates(self.top, states, vertical.rotation, self.ride, t_ns)
+        (motion, vertical), times_ns = solution, pivot.ns_array(t_ns)
+        states = motion.states(times_ns - self.start_ns)
+        return states if vertical is None else WorldStates(
+            self.top, states, vertical.rotation, self.ride, times_ns)

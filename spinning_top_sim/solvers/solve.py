@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spinning_top_sim.installation import needed
 from spinning_top_sim.physics.regimes import axis_rests
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top, shown
@@ -53,8 +54,8 @@ def motion_of(top: Top, start: State, *, method: str, equations: str = 'transpor
     if method == 'exact' or (equations == 'transport' and posture is None and (
             top.gravity_torque == 0.0 or axis_rests(top, start))):
         with suppress(*(() if method == 'exact' else (ImportError, ValueError))):
-            from spinning_top_sim.solvers.exact import ExactSolution  # noqa: PLC0415 - gmpy2
-
+            with needed("method = 'exact'"):
+                from spinning_top_sim.solvers.exact import ExactSolution  # noqa: PLC0415 - gmpy2
             return ExactSolution(top, start)
     try:
         with np.errstate(over='raise', divide='raise', invalid='raise'):
@@ -104,6 +105,8 @@ def solve(top: Top, start: State, t: ArrayLike, *, method: str = 'exact', rtol: 
     ------
     TypeError
         If `top` is no Top or `start` no State.
+    ImportError
+        If 'exact' misses gmpy2.
     ValueError
         Naming the argument, its value and what is allowed.
     IntegrationError

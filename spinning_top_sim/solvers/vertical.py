@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Quaternion
 from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.states import States
@@ -81,14 +82,11 @@ class PreciseState(NamedTuple):
     def posture(self, top: Top) -> Posture:
         """Return the posture about the same vertical."""
         alpha, beta = (z / abs(z) for z in (self.alpha, self.beta))
-        bottom, top_ = self.lz + self.l3, self.lz - self.l3
-        across = 0 * self.lz        # phi' sin(theta)
-        if bottom:
-            across += bottom / (2 * top.lambda1) * self.sin_half / self.cos_half
-        if top_:
-            across += top_ / (2 * top.lambda1) * self.cos_half / self.sin_half
+        cosine, sine = self.cos_half, self.sin_half
+        across = 2 * sine * cosine * attitude.precession_rate(      # phi' sin(theta)
+            top, self.l3, self.lz, cosine * cosine, sine * sine)
         # exp(-i psi)
-        return Posture(self.cos_half * alpha, self.sin_half * beta,
+        return Posture(cosine * alpha, sine * beta,
                        (1j * self.theta_dot - across) * beta * alpha.conjugate(), float(self.l3))
 
     def rounded(self) -> State:

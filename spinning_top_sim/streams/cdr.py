@@ -31,10 +31,10 @@ def stamp_text(time_ns: int) -> str:
 
 
 class Field(NamedTuple):
-    """Numbers that differ from message to message: name in the definition, how many, their type."""
+    """Numbers that differ from message to message: name in the definition, how many, type."""
 
     name: str
-    count: int
+    size: int
     code: str = 'd'         # a format character of `struct`
 
 
@@ -69,20 +69,18 @@ class Template:
         for part in parts:
             if isinstance(part, Header):
                 self._stamps_at.append(_append(buffer, 'I', (0, 0)))
-                part = part.frame_id        # noqa: PLW2901
-            if isinstance(part, str):
-                text = part.encode() + b'\0'
-                _append(buffer, 'I', (len(text),))
-                buffer += text
+                _append_text(buffer, part.frame_id)
+            elif isinstance(part, str):
+                _append_text(buffer, part)
             elif isinstance(part, Field):
-                self._places.append(_append(buffer, part.code, part.count * (0,)))
-            elif part is not None:
+                self._places.append(_append(buffer, part.code, part.size * (0,)))
+            else:
                 _append(buffer, *part)
         # RTPS pads to four bytes; a template does so too, so that logs have what subscribers get.
         self.data = bytes(buffer + bytes(-len(buffer) % 4))
         # A message as a type of NumPy: the fields by number, then the stamps.
         columns: list[tuple[str, Any, int]] = [
-            (f'{i}', (f'<{field.code}', (field.count,)), at)
+            (f'{i}', (f'<{field.code}', (field.size,)), at)
             for i, (field, at) in enumerate(zip(self.fields, self._places, strict=True))]
         for at in self._stamps_at:
             columns += [(f'sec{at}', '<i4', at), (f'nanosec{at}', '<u4', at + 4)]
@@ -126,7 +124,7 @@ class Template:
                     for one in messages]
         for field, offset in zip(self.fields, self._places, strict=True):
             size = struct.calcsize('<' + field.code)
-            if 0 <= at - offset < field.count * size:
+            if 0 <= at - offset < field.size * size:
                 element = (at - offset) // size
                 return f'{field.name}[{element}]', [
                     repr(*struct.unpack_from('<' + field.code, one, offset + element * size))
@@ -141,6 +139,13 @@ def _append(buffer: bytearray, code: str, values: Sequence[float]) -> int:
         buffer += bytes(-(len(buffer) - len(ENCAPSULATION)) % size)
     buffer += struct.pack(f'<{len(values)}{code}', *values)
     return len(buffer) - len(values) * size
+
+
+def _append_text(buffer: bytearray, text: str | None) -> None:
+    if text is not None:
+        data = text.encode() + b'\0'
+        _append(buffer, 'I', (len(data),))
+        buffer += data
 
 
 def fill(rows: Sequence[NDArray[Any]], fields: Sequence[Values]) -> None:

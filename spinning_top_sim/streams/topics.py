@@ -62,7 +62,8 @@ def _invariants(samples: Samples) -> Sequence[Values]:
     return (*now, *drifts, states.norm_error, error),
 
 
-def _magnetic_field(mounting: Mounting, sensor: Magnetometer, samples: Samples) -> Sequence[Values]:
+def _magnetic_field(mounting: Mounting, sensor: Magnetometer,
+                    samples: Samples) -> Sequence[Values]:
     field = sensor.felt(mounting.orientation(samples.states), samples.t_ns)
     return (sensor.read(field, sensor.errors(samples.t_ns)),
             messages.diagonal(*3 * (sensor.variance,)))
@@ -102,10 +103,10 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
         channel('pose', 'pose', 'geometry_msgs/msg/PoseStamped', message(
             Header(world), Field('pose.position', 3), Field('pose.orientation', 4)), _pose),
         channel('tf', '/tf', 'tf2_msgs/msg/TFMessage', message(
-            Numbers('I', (1,)), Header(world), body, Field('transforms[0].transform.translation', 3),
+            Numbers('I', (1,)), Header(world), body,
+            Field('transforms[0].transform.translation', 3),
             Field('transforms[0].transform.rotation', 4)), _pose),
-        channel('joint_states', 'joint_states', 'sensor_msgs/msg/JointState',
-                message(
+        channel('joint_states', 'joint_states', 'sensor_msgs/msg/JointState', message(
             Header(''), Numbers('I', (3,)), *JOINTS, Numbers('I', (3,)), Field('position', 3),
             Numbers('I', (3,)), Field('velocity', 3), Numbers('I', (0,))), _joints),
         timed(of_imu('imu', 'imu/data_raw', encoder=messages.imu(frame, unknown, *noisy[1:]),
@@ -125,10 +126,10 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
                 lambda samples: (magnetometer.true(mounting.orientation(samples.states)),
                                  messages.EXACT)),
         *gnss.channels(values),
-        timed(increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped',
-                        message(Header(frame), Field('quaternion', 4)), lambda samples: samples.imu.increments[:1])),
-        timed(increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', message(Header(frame), Field('vector', 3)),
-                        lambda samples: samples.imu.increments[1:])),
+        timed(increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped', message(
+            Header(frame), Field('quaternion', 4)), lambda samples: samples.imu.increments[:1])),
+        timed(increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', message(
+            Header(frame), Field('vector', 3)), lambda samples: samples.imu.increments[1:])),
         channel('ground_truth_odom', 'ground_truth/odom', ODOMETRY,
                 messages.odometry(world, body), _odometry),
         channel('ground_truth_imu_odom', 'ground_truth/imu_odom', ODOMETRY,

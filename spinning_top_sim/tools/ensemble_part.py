@@ -93,7 +93,7 @@ def samples(specification: Specification, simulation: Simulation) -> Samples:
         if channel.name in specification.kept:
             names[channel.topic] = _column_names(channel)
             tables.append(replace(channel, encoder=_Columns(
-                [field.count for field in channel.template.fields])))
+                [field.size for field in channel.template.fields])))
     times: dict[str, list[Stamps]] = {topic: [] for topic in names}
     numbers: dict[str, list[Rows]] = {topic: [] for topic in names}
     for block in simulation.play(recorded(tables, values),
