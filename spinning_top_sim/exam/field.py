@@ -21,7 +21,7 @@ from spinning_top_sim.exam.scenarios import GRAVITY, Reals, Run
 from spinning_top_sim.exam.scored import ScoredRun, report_of
 from spinning_top_sim.exam.trial import Feed, MakeFilter
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.inertial_sensor import Sensor
+from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.vibration import Vibration
 
@@ -179,8 +179,8 @@ def _readings(values: Mapping[str, Any], turns: Rotation, rates: Reals, force: R
     late = np.maximum(np.arange(1, len(t_ns), 2) - MAG_LATE, 0)
     x, y, z, w = turns[late].as_quat().T
     magnetometer = Magnetometer(values, PERIOD_NS)
-    field = magnetometer.read(magnetometer.disturbed(
-        magnetometer.true((x, y, z, w)), (x, y, z, w), lambda of_body: of_body, t_ns[late]), steps)
-    felt = signals[:3, 1::2], signals[3:, 1::2]
-    return [np.stack(reading, axis=1) for reading in (
-        *Sensor(values, PERIOD_NS).read(felt, steps), field)]
+    field = magnetometer.read(magnetometer.felt((x, y, z, w), t_ns[late]),
+                              magnetometer.errors(np.array(steps)))
+    felt: Any = signals[:3, 1::2], signals[3:, 1::2]
+    return [np.stack(np.broadcast_arrays(*reading), axis=1) for reading in (
+        *Imu(values, PERIOD_NS).read(felt, np.array(steps)), field)]

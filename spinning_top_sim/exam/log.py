@@ -123,8 +123,8 @@ def _places(reader: LogReader) -> dict[int, Mapping[str, Any]]:
             raise ValueError(f'{reader.path}: {error}') from error
         return {0: {}}
     return {0: run.values_at_start, **{
-        event.stamp_ns: event.details['parameters'] for event in run.events
-        if event.name == 'reset'}}
+        stamp_ns: event.details['parameters'] for stamp_ns, event in run.events
+        if event.kind == 'reset'}}
 
 
 def _of_sensor(topic: LogTopic, true: Stamped, places: Mapping[int, Mapping[str, Any]],

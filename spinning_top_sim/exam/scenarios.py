@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.magnetometer import Magnetometer
-from spinning_top_sim.streams.simulation import Simulation
+from spinning_top_sim.streams.play import Simulation
 
 Reals = NDArray[np.float64]
 
@@ -153,25 +153,28 @@ def record(scenario: Scenario, imu: Mapping[str, Any], seed: int) -> Run:
         'mag.field': FIELD, **given, **scenario.values, 'imu.rate': scenario.rate})
     values['mag.field'] = magnetic(values['mag.field'])
     simulation = Simulation(values)
-    device, period_ns = simulation.imu, simulation.imu.length_ns
+    device, period_ns = simulation.imu, simulation.imu.period_ns
     magnetometer = Magnetometer(values, period_ns)
     parts, begin_ns = [], 0
     for end in (*scenario.reversals, scenario.duration):
         end_ns = round(end * scenario.rate) * period_ns
-        steps = range(begin_ns + period_ns, end_ns + 1, period_ns)
-        halves = simulation.segment.states(range(begin_ns, end_ns + 1, period_ns // 2))
+        steps = np.arange(begin_ns + period_ns, end_ns + 1, period_ns)
+        halves = simulation.trajectory.after(begin_ns).states(
+            np.arange(begin_ns, end_ns + 1, period_ns // 2))
         # Three rows of rates, three of force, four of the quaternion.
-        signals: Any = np.stack(np.broadcast_arrays(
-            *itertools.chain(*device.true(halves)), *device.orientation(halves)))
+        signals: Any = np.stack(np.broadcast_arrays(*itertools.chain(
+            *device.mounting.felt(halves)), *device.mounting.orientation(halves)))
         ends = signals[:, 2::2]
         # Simpson's rule.
         mean = (signals[:3, :-2:2] + 4.0 * signals[:3, 1::2] + ends[:3]) / 6.0
         parts.append(np.stack([
-            *itertools.chain(*device.sensor.read((mean, ends[3:6]), steps)),
-            *magnetometer.read(magnetometer.true(ends[6:]), steps), *ends[6:], *ends[:3]]))
+            *itertools.chain(*device.read((mean, ends[3:6]), steps)),
+            *magnetometer.read(magnetometer.true(ends[6:]), magnetometer.errors(steps)),
+            *ends[6:], *ends[:3]]))
         simulation.now_ns = begin_ns = end_ns
         if end < scenario.duration:
-            simulation.command(-simulation.l3, -simulation.lz)
+            motion = simulation.trajectory
+            simulation.apply('command', l3=-motion.l3, lz=-motion.lz)
     gyroscope, accelerometer, field, truth, rates = np.split(
         np.concatenate(parts, axis=1).T, (3, 6, 9, 13), axis=1)
     period = period_ns / NANOSECONDS

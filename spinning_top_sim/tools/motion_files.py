@@ -312,7 +312,7 @@ def _read_log(path: Path, wanted: str | None) -> Recorded:
         with contextlib.suppress(recorded_run.ForeignLogError):
             run = recorded_run.read_run_description(reader)
             recorded.parameters, origin = run.values_in_effect, Decimal(run.epoch_ns) / 10 ** 9
-            end_ns = next((one.stamp_ns for one in run.events if one.name != 'start'), end_ns)
+            end_ns = next((one.stamp_ns for one in run.events if one.event.kind != 'start'), end_ns)
             types = {name: kind for name, kind in types.items()
                      if name == wanted or not name.endswith(NOT_OF_BODY)}
         if not reader.whole:
