@@ -82,7 +82,7 @@ def test_every_channel_sends_what_ros_serializes_with_its_fields_and_frames(numb
                         markers__trace_points=number + 1).channels:
         # Numbers that differ from slot to slot, so that no two can be mixed up.
         fields = [[dice.uniform(-10.0, 10.0) if field.code == 'd' else dice.randrange(100)
-                   for _ in range(field.count)] for field in one.template.fields]
+                   for _ in range(field.size)] for field in one.template.fields]
         data = one.template.encode_one(stamp_ns, *fields)
         message = JAZZY.deserialize_cdr(data, one.type_name)
         theirs = bytes(JAZZY.serialize_cdr(message, one.type_name))
