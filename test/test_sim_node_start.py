@@ -79,7 +79,7 @@ STARTS_REFUSED = {
     'nan': (['-p', 'spin.l3:=.nan'], ('spin.l3', 'nan', 'a number')),
     'pole': (['-p', 'initial.theta:=0.0', '-p', 'spin.lz:=1.0'], ('lz', '1.0', '1.6')),
     'too fast': (['-p', 'spin.l3:=1.0e20'], ('l3', '1e+20')),
-    'missing file': (['--params-file', 'nowhere.yaml'], ('nowhere.yaml', 'there is no such file')),
+    'missing file': (['--params-file', 'nowhere.yaml'], ('nowhere.yaml', 'opening YAML file')),
     'no YAML': (['--params-file', 'bad.yaml'], ('bad.yaml', 'Error at line 1')),
     'use_sim_time': (['-p', 'use_sim_time:=perhaps'], ('use_sim_time', 'perhaps')),
     'no scene': (['--', '--scene', 'nowhere.yaml'], ('nowhere.yaml', 'No such file')),

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
 from itertools import pairwise
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from spinning_top_sim.installation import needed, remedy
 from spinning_top_sim.recording.errors import text_of
@@ -46,8 +46,11 @@ def run_node(name: str, argv: Sequence[str] | None,
     argv = list(sys.argv[1:] if argv is None else argv)
     name = f'spinning-top {name}'
     # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
-    _handle(signal.SIGINT, lambda *_: os._exit(130))
-    _open_standard_streams()
+    _handle(lambda *_: os._exit(130), signal.SIGINT)
+    # Open the streams that the shell has closed (2>&-); otherwise a log gets their number.
+    while os.open(os.devnull, os.O_RDWR) <= 2:
+        pass
+    sys.stderr = sys.stderr or open(2, 'w')     # noqa: SIM115 - rclpy needs it to the end
     try:
         with needed('it'):
             argv, make_node = prepare(argv)
@@ -71,48 +74,32 @@ def run_node(name: str, argv: Sequence[str] | None,
             raise
         return _cannot_start(name, error) if rclpy.ok() else 0
     finally:
-        _ignore_signals()
+        signals = signal.SIGINT, signal.SIGHUP, signal.SIGQUIT
+        _handle(signal.SIG_IGN, *signals)
         if node is not None:
             node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
-        _ignore_signals()       # rclpy has restored the handler that it found
+        _handle(signal.SIG_IGN, *signals)       # rclpy has restored the handlers that it found
 
 
 def _initialize_ros(argv: list[str]) -> list[int]:
     """Initialize rclpy; return the list to which a SIGINT from now on is appended."""
-    for option, path in pairwise(argv):
-        if option == '--params-file' and not os.path.isfile(path):
-            raise ValueError(f'--params-file {path}: there is no such file')
     import rclpy  # noqa: PLC0415
     # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
     # SIGINT twice, from the terminal and from launch.
     interrupts: list[int] = []
-    _handle(signal.SIGINT, lambda number, _: interrupts.append(number))
-    for number in (signal.SIGHUP, signal.SIGQUIT):
-        _handle(number, lambda *_: signal.raise_signal(signal.SIGTERM))
+    _handle(lambda number, _: interrupts.append(number), signal.SIGINT)
+    _handle(lambda *_: signal.raise_signal(signal.SIGTERM), signal.SIGHUP, signal.SIGQUIT)
     rclpy.init(args=argv)
     return interrupts
 
 
-def _open_standard_streams() -> None:
-    """Open the streams that the shell has closed (2>&-); otherwise a log gets their number."""
-    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass
-    os.close(descriptor)
-    if sys.stderr is None:
-        sys.stderr = open(2, 'w')       # noqa: SIM115 - rclpy needs it to the end
-
-
-def _handle(number: signal.Signals, handler: Callable[[int, object], object]) -> None:
-    """Handle a signal unless it is ignored, as nohup ignores SIGHUP."""
-    if signal.getsignal(number) != signal.SIG_IGN:
-        signal.signal(number, handler)
-
-
-def _ignore_signals() -> None:
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
-        signal.signal(number, signal.SIG_IGN)
+def _handle(handler: Any, *signals: signal.Signals) -> None:
+    """Handle these signals unless they are ignored, as nohup ignores SIGHUP."""
+    for number in signals:
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def split_ros_arguments(argv: Iterable[str]) -> tuple[list[str], list[str]]:
@@ -130,23 +117,22 @@ def split_ros_arguments(argv: Iterable[str]) -> tuple[list[str], list[str]]:
     return own, for_ros
 
 
-def node_name(for_ros: Sequence[str], name: str = 'spinning_top') -> str:
+def node_name(for_ros: Sequence[str]) -> str:
     """Return the full name that arguments of ROS give to a node: the first rule holds."""
     found: dict[str, str] = {}
     for option, rule in pairwise(for_ros):
         left, _, right = rule.partition(':=')
-        node, _, what = left.rpartition(':')
-        if option in ('-r', '--remap') and node in ('', name):
-            found.setdefault('__node' if what == '__name' else what, right)
-    return f'/{found.get("__ns", "").strip("/")}/{found.get("__node", name)}'.replace('//', '/')
+        if option in ('-r', '--remap'):
+            found.setdefault(left.removeprefix('spinning_top:').replace('__name', '__node'), right)
+    namespace, name = found.get('__ns', ''), found.get('__node', 'spinning_top')
+    return f'/{namespace.strip("/")}/{name}'.replace('//', '/')
 
 
 def _cannot_start(name: str, error: Exception) -> int:
     kind = type(error).__name__
     if isinstance(error, ImportError) and not find_spec('rclpy'):
-        without = '; `view LOG` works without' if name.endswith('view') else ''
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
-                             f'{remedy("ros")}{without}')
+                             f'{remedy("ros")}')
     expected = (isinstance(error, ValueError | RuntimeError | OSError | ImportError)
                 or kind.startswith('Invalid'))
     print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{short_reason(text_of(error))}',

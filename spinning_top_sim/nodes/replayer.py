@@ -170,7 +170,8 @@ class Replayer(Node):
                 publisher.get_subscription_count() for publisher in senders
                 ) < self._options.wait_for_subscribers:
             yield 20e6
-        for self._round in itertools.count() if self._options.loop else range(1):
+        rounds = itertools.count() if self._options.loop else range(1)
+        for self._round in rounds:
             steps = self._playback.play(self._begin_ns, self._messages(), ROUND_GAP_NS)
             self._publish_clock()       # before the messages, since it may go back
             yield from steps

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Offers simulation_interfaces, the standard of ROS 2 for simulators.
+Offers simulation_interfaces, the standard of ROS 2 for simulators; the top is its one entity.
 
 The handler of GetEntities is `_get_entities`.  A handler takes a request, fills the response, and
 may return a text for `error_message`.  RefusedError has the result code of a refusal; other errors
@@ -14,15 +14,21 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from spinning_top_sim.nodes import entity
-from spinning_top_sim.nodes.entity import RefusedError
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.time import Time
+from std_msgs.msg import Header
+
 from spinning_top_sim.nodes.loop import LoopState
 from spinning_top_sim.nodes.node import Simulator
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
+Message = Any           # message packages have no types
 # Each service, and the values of SimulatorFeatures that announce it.
 FEATURES: Mapping[str, tuple[str, ...]] = {
     'GetSimulatorFeatures': (),
@@ -36,6 +42,17 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     'SetEntityState': ('ENTITY_STATE_SETTING',),
     'GetEntityInfo': ('ENTITY_INFO_GETTING',),
 }
+# Tolerances for the rounding of a client: of the pivot's place [m] and velocity [m/s], and of a
+# quaternion's length.
+NEAR, LENGTH_ERROR = 1e-6, 1e-3
+
+
+class RefusedError(RuntimeError):
+    """A request is refused with a result code."""
+
+    def __init__(self, code: int, reason: object) -> None:
+        super().__init__(str(reason))
+        self.code = code
 
 
 def service_name(type_name: str) -> str:
@@ -59,77 +76,81 @@ class SimulationHandlers:
 
     def __init__(self, node: Simulator, messages: types.ModuleType) -> None:
         self._node, self._loop, self._simulation = node, node.loop, node.simulation
-        self._messages = messages
-        self._results, self._states = messages.Result, messages.SimulationState
+        self._messages, self._results = messages, messages.Result
         self._name = node.get_name()            # of the entity
         self._pause_at_start = -1               # `loop.interruptions` when PAUSED was set at t = 0
         self._quits = False
 
-    def serve(self, name: str, request: object, response: object) -> object:
+    def serve(self, name: str, request: Message, response: Message) -> Message:
         """Handle a request for the service of this type; return the response."""
-        result: Any = getattr(response, 'result', None)
         act = getattr(self, f'_{service_name(name)}')
-        error, text = self._node.outcome(lambda: act(request, response))
-        if result is not None:
-            result.result = self._results.RESULT_OK if error is None else getattr(
+        error, text = self._node.outcome(
+            lambda: self._check_entity(request) or act(request, response))
+        if hasattr(response, 'result'):
+            response.result.result = self._results.RESULT_OK if error is None else getattr(
                 error, 'code', self._results.RESULT_OPERATION_FAILED)
             # A request in YAML can hold text that UTF-8 cannot; sending it would raise an error.
-            result.error_message = text.encode(errors='backslashreplace').decode()
+            response.result.error_message = text.encode(errors='backslashreplace').decode()
         return response
 
-    def _get_simulator_features(self, _: Any, response: Any) -> None:
+    def _check_entity(self, request: Message) -> None:
+        if getattr(request, 'entity', self._name) != self._name:
+            raise RefusedError(self._results.RESULT_NOT_FOUND,
+                               f'entity = {request.entity!r}: there is {self._name!r} only')
+
+    def _check_runs(self) -> None:
+        """Raise RefusedError before the motion begins, and when the process ends."""
+        error, reason = self._node.outcome(self._node.check_started)
+        if error or self._state == 'QUITTING':
+            raise RefusedError(self._results.RESULT_INCORRECT_STATE,
+                               reason or 'the simulator is quitting')
+
+    def _get_simulator_features(self, _: Message, response: Message) -> None:
         known = self._messages.SimulatorFeatures
         response.features.features = sorted({
             getattr(known, name) for row in FEATURES.values() for name in row
             if hasattr(known, name)})
 
-    def _state(self) -> int:
-        """Return the constant of SimulationState."""
-        loop, states = self._loop, self._states
+    @property
+    def _state(self) -> str:
+        """The state as SimulationState names it."""
+        loop = self._loop
         if self._quits or loop.state is LoopState.ENDED:
-            return states.STATE_QUITTING
-        if loop.state is LoopState.WAITING:
-            return states.STATE_STOPPED
+            return 'QUITTING'
         if loop.state is LoopState.RUNNING:
-            return states.STATE_PLAYING
-        # A failed motion is PAUSED, too.
+            return 'PLAYING'
         is_at_start = (loop.state is LoopState.PAUSED and self._simulation.now_ns < 0
                        and loop.interruptions != self._pause_at_start)
-        return states.STATE_STOPPED if is_at_start else states.STATE_PAUSED
+        # A failed motion is PAUSED, too.
+        return 'STOPPED' if is_at_start or loop.state is LoopState.WAITING else 'PAUSED'
 
-    def _get_simulation_state(self, _: Any, response: Any) -> str:
-        response.state.state = self._state()
+    def _get_simulation_state(self, _: Message, response: Message) -> str:
+        response.state.state = getattr(response.state, f'STATE_{self._state}')
         return self._loop.failure or ''
 
-    def _set_simulation_state(self, request: Any, response: Any) -> None:
-        states, target = self._states, request.state.state
-        changes: dict[int, tuple[str, Callable[[], None]]] = {
-            states.STATE_STOPPED: ('STOPPED', partial(self._node.start_again, paused=True)),
-            states.STATE_PLAYING: ('PLAYING', self._play),
-            states.STATE_PAUSED: ('PAUSED', self._pause),
-            states.STATE_QUITTING: ('QUITTING', self._quit)}
-        if target not in changes:
-            raise RefusedError(response.INCORRECT_TRANSITION, f'state = {target}: must be ' + (
-                ', '.join(f'{number} ({name})' for number, (name, _) in changes.items())))
-        name, change = changes[target]
-        present = self._state()
-        if target == present:
+    def _set_simulation_state(self, request: Message, response: Message) -> None:
+        number, present = request.state.state, self._state
+        changes: Mapping[str, Callable[[], None]] = {
+            'STOPPED': partial(self._node.start_again, paused=True), 'PLAYING': self._loop.resume,
+            'PAUSED': self._pause, 'QUITTING': self._quit}
+        names = {getattr(request.state, f'STATE_{name}'): name for name in changes}
+        if number not in names:
+            raise RefusedError(response.INCORRECT_TRANSITION, f'state = {number}: must be ' + (
+                ', '.join(f'{number} ({name})' for number, name in names.items())))
+        if names[number] == present:
             raise RefusedError(response.ALREADY_IN_TARGET_STATE,
-                               f'the simulation is {name} already')
-        if present == states.STATE_QUITTING:
+                               f'the simulation is {present} already')
+        if present == 'QUITTING':
             raise RefusedError(response.INCORRECT_TRANSITION, 'the simulator is quitting')
         try:
-            change()
+            if names[number] != 'QUITTING':
+                self._node.check_started()
+            changes[names[number]]()
         except (ValueError, RuntimeError) as error:
             raise RefusedError(response.STATE_TRANSITION_ERROR, error) from error
 
-    def _play(self) -> None:
-        self._node.check_started()
-        self._loop.resume()
-
     def _pause(self) -> None:
-        self._node.check_started()
-        if self._state() == self._states.STATE_STOPPED:
+        if self._state == 'STOPPED':
             self._pause_at_start = self._loop.interruptions
         else:
             self._loop.pause()
@@ -139,12 +160,12 @@ class SimulationHandlers:
         self._quits = True
         self._node.finish()
 
-    def _step_simulation(self, request: Any, _: Any) -> None:
+    def _step_simulation(self, request: Message, _: Message) -> None:
         loop, steps = self._loop, request.steps
         if steps < 1:
             raise ValueError(f'steps = {steps}: must be >= 1')
         self._node.check_started()
-        if self._state() != self._states.STATE_PAUSED:
+        if self._state != 'PAUSED':
             raise RuntimeError('the simulation is not paused: SetSimulationState must set '
                                'STATE_PAUSED first')
         length_ns = steps * round(self._node.values['step.dt'] * NANOSECONDS)
@@ -153,21 +174,12 @@ class SimulationHandlers:
         if loop.now_ns < target_ns:
             raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
 
-    def _check_runs(self) -> None:
-        """Raise RefusedError before the motion begins, and when the process ends."""
-        quits = self._state() == self._states.STATE_QUITTING
-        error, reason = self._node.outcome(self._node.check_started)
-        if quits or error:
-            raise RefusedError(self._results.RESULT_INCORRECT_STATE,
-                               reason or 'the simulator is quitting')
-
-    def _reset_simulation(self, request: Any, _: Any) -> None:
-        time_and_state = request.SCOPE_TIME | request.SCOPE_STATE
+    def _reset_simulation(self, request: Message, _: Message) -> None:
         self._check_runs()
+        values, time_and_state = self._node.start_values, request.SCOPE_TIME | request.SCOPE_STATE
         if request.scope in (request.SCOPE_DEFAULT, request.SCOPE_ALL, time_and_state):
             self._node.start_again()
         elif request.scope == request.SCOPE_STATE:
-            values = self._node.start_values
             self._set_state(lambda _: parameters.start_state(values))
         else:
             raise RefusedError(
@@ -180,18 +192,7 @@ class SimulationHandlers:
         self._loop.set_state(change)
         self._node.show_spin()
 
-    def _check_entity(self, name: str) -> None:
-        if name != self._name:
-            raise RefusedError(self._results.RESULT_NOT_FOUND,
-                               f'entity = {name!r}: there is {self._name!r} only')
-
-    def _fill_state(self, message: Any) -> None:
-        simulation = self._simulation
-        entity.fill_state(message, simulation.state(),
-                          simulation.epoch_ns + self._loop.now_ns,
-                          self._node.values['world_frame'])
-
-    def _get_entities(self, request: Any, response: Any) -> None:
+    def _get_entities(self, request: Message, response: Message) -> None:
         filters = request.filters
         if (filters.filter or filters.categories or filters.tags.tags
                 or filters.bounds.type != filters.bounds.TYPE_EMPTY):
@@ -199,27 +200,89 @@ class SimulationHandlers:
                                'filters must be empty: there is one entity')
         response.entities = [self._name]
 
-    def _get_entities_states(self, request: Any, response: Any) -> None:
+    def _get_entities_states(self, request: Message, response: Message) -> None:
         self._get_entities(request, response)
         response.states = [self._messages.EntityState()]
-        self._fill_state(response.states[0])
+        self._fill(response.states[0])
 
-    def _get_entity_state(self, request: Any, response: Any) -> None:
-        self._check_entity(request.entity)
-        self._fill_state(response.state)
+    def _get_entity_state(self, _: Message, response: Message) -> None:
+        self._fill(response.state)
 
-    def _set_entity_state(self, request: Any, response: Any) -> None:
-        self._check_entity(request.entity)
-        self._check_runs()
-        frame = self._node.values['world_frame']
-        self._set_state(lambda now: entity.requested_state(request, response, frame, now))
-
-    def _get_entity_info(self, request: Any, response: Any) -> None:
-        self._check_entity(request.entity)
+    def _get_entity_info(self, _: Message, response: Message) -> None:
         response.info.category.category = self._messages.EntityCategory.CATEGORY_ROBOT
         top = self._simulation.trajectory.top
         response.info.description = (
             f'heavy symmetric top on a pivot: mass {top.mass:g} kg, centre of mass '
             f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
             f'{top.lambda3:g} kg m^2')
-        response.info.tags = list(entity.TAGS)
+        response.info.tags = ['spinning_top', 'heavy_symmetric_top', 'imu']
+
+    def _fill(self, message: Message) -> None:
+        """Write the present state into an EntityState, in the world frame."""
+        now, stamp_ns = self._simulation.state(), self._simulation.epoch_ns + self._loop.now_ns
+        message.header = Header(stamp=Time(nanoseconds=stamp_ns).to_msg(),
+                                frame_id=self._node.values['world_frame'])
+        rotation, pivot = now.rows_quaternion, now.pivot
+        for target, rows in (
+                (message.pose.orientation, rotation),
+                (message.twist.angular, attitude.rotated(rotation, now.rows_angular_velocity)),
+                (message.acceleration.angular,
+                 attitude.rotated(rotation, now.rows_angular_acceleration)),
+                (message.pose.position, pivot.position), (message.twist.linear, pivot.velocity),
+                (message.acceleration.linear, pivot.acceleration)):
+            for name, column in zip('xyzw', rows, strict=False):
+                setattr(target, name, float(column[0]))
+
+    def _set_entity_state(self, request: Message, response: Message) -> None:
+        self._check_runs()
+        # Older versions of the message have no flags, and set both.
+        if not (getattr(request, 'set_pose', True) or getattr(request, 'set_twist', True)):
+            raise ValueError('set_pose and set_twist are false: one of them must be true; the '
+                             'acceleration follows from pose and twist')
+        frame, given = self._node.values['world_frame'], request.state.header.frame_id
+        if given not in ('', frame):
+            raise RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED,
+                               f'header.frame_id = {given!r}: must be {frame!r} or empty')
+        self._set_state(partial(requested_state, request, response))
+
+
+def requested_state(request: Message, response: Message, now: States) -> State:
+    """
+    Return the state that a SetEntityState request asks for.
+
+    response : has the codes of refusals
+    now : the present state (n = 1), which holds for what the request does not set, and for the
+        pivot
+
+    Raises RefusedError or ValueError, which name the value and what is allowed.
+    """
+    wanted, turned = request.state, now.rows_quaternion
+    rotation = np.concatenate(turned)
+    rates = np.concatenate(attitude.rotated(turned, now.rows_angular_velocity))
+    if getattr(request, 'set_pose', True):
+        rotation = _numbers(wanted.pose.orientation)
+        length = float(np.linalg.norm(rotation))
+        if not abs(length - 1.0) <= LENGTH_ERROR:
+            raise RefusedError(response.INVALID_POSE, f'pose.orientation = {rotation.tolist()} '
+                               f'has length {length!r}: must be 1 (within {LENGTH_ERROR:g})')
+        _check_near('pose.position', 'm', wanted.pose.position, now.pivot.position,
+                    response.INVALID_POSE)
+    if getattr(request, 'set_twist', True):
+        rates = _numbers(wanted.twist.angular)
+        if not np.all(np.isfinite(rates)):
+            raise ValueError(f'twist.angular = {rates.tolist()} rad/s: must be finite')
+        _check_near('twist.linear', 'm/s', wanted.twist.linear, now.pivot.velocity,
+                    response.result.RESULT_OPERATION_FAILED)
+    return state_of(now.top, rotation, rates)
+
+
+def _check_near(name: str, unit: str, message: Message, of_pivot: NDArray[np.float64],
+                code: int) -> None:
+    found, allowed = _numbers(message), of_pivot[:, 0]
+    if not np.all(np.abs(found - allowed) <= NEAR):
+        raise RefusedError(code, f'{name} = {found.tolist()} {unit}: must be that of the pivot, '
+                           f'{allowed.tolist()} (within {NEAR:g})')
+
+
+def _numbers(message: Message) -> NDArray[np.float64]:
+    return np.array([getattr(message, name) for name in 'xyzw' if hasattr(message, name)], float)

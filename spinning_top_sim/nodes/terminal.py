@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The status line on the terminal."""
 
-import os
 import shutil
 import sys
+
+from spinning_top_sim.tools import cli
 
 
 class Terminal:
@@ -15,26 +16,18 @@ class Terminal:
     def show(self, line: str) -> None:
         """Show a status line as far as it fits on the terminal."""
         if sys.stdout is None or not sys.stdout.isatty():
-            self._write(f'{line}\n')
+            self.tell(line)
             return
-        self._write(f'\r\x1b[K{line[:max(shutil.get_terminal_size().columns - 1, 1)]}')
+        with cli.reader_may_end(OSError):       # or whose disk is full: the node goes on
+            print(f'\r\x1b[K{line[:max(shutil.get_terminal_size().columns - 1, 1)]}', end='')
         self._open = True
 
     def tell(self, line: str) -> None:
         self.end()
-        self._write(f'{line}\n')
+        with cli.reader_may_end(OSError):
+            print(line)
 
     def end(self) -> None:
         if self._open:
             self._open = False
-            self._write('\n')
-
-    @staticmethod
-    def _write(text: str) -> None:
-        try:
-            print(text, end='', flush=True)
-        except OSError:
-            # Nobody reads any more, as in `sim_node | head`; the motion goes on.
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, sys.stdout.fileno())
-            os.close(nowhere)
+            self.tell('')

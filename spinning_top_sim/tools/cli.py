@@ -57,12 +57,12 @@ def run(name: str, help_text: str | None,
 
 
 @contextlib.contextmanager
-def reader_may_end() -> Iterator[None]:
+def reader_may_end(ignored: type[OSError] = BrokenPipeError) -> Iterator[None]:
     """Ignore that the reader of the output, such as a pager, ends before it."""
     try:
         yield
         print(end='', flush=True)
-    except BrokenPipeError:         # Python flushes the output again
+    except ignored:         # Python flushes the output again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
