@@ -170,8 +170,6 @@ def test_late_samples_are_recorded_and_counted_but_not_published(ahead, monkeypa
         assert [name for name, _ in published].count(topic) == 102
         assert (one.sent, one.skipped, one.failed) == (102, 899, 0)
     assert total(encoded)['pose'] == 1001
-    if not ahead:       # nobody takes the samples that are left out
-        assert total(encoded)['joint_states'] == 102
 
 
 @pytest.mark.parametrize(('before', 'after'), [(100.0, 33.0), (10000.0, 10.0)])

@@ -22,16 +22,14 @@ def play(offsets, rate=1.0, plan=None, cost_ns=0, fails=(), paused=False):
 
     def send(data):
         now[0] += cost_ns
-        if int(data) in fails:
+        if data in fails:
             raise RuntimeError('a reader has stalled')
-        sent.append((int(data), now[0] - 77 - cost_ns))
+        sent.append((data, now[0] - 77 - cost_ns))
 
-    player = Playback(lambda: now[0])
-    player.set_rate(rate)
-    player.pause(paused)
-    player.begin(EPOCH_NS, ((EPOCH_NS + offset, send, str(index).encode())
-                            for index, offset in enumerate(offsets)))
-    while (left_ns := player.tick()) is not None:
+    player = Playback(EPOCH_NS, lambda: now[0])
+    player.go_on(rate, paused)
+    for left_ns in player.play(EPOCH_NS, ((EPOCH_NS + offset, send, index)
+                                          for index, offset in enumerate(offsets))):
         until = math.inf if left_ns == math.inf else now[0] + math.ceil(left_ns)
         planned = min(plan, default=math.inf)
         now[0] = min(until, planned)
@@ -66,14 +64,14 @@ def test_a_message_that_cannot_be_published_is_counted_and_the_others_are_played
 
 def test_a_pause_shifts_what_follows_and_catches_nothing_up():
     sent, player = play([0, 100, 200, 300], paused=True, plan={
-        1_000: lambda p: p.pause(False), 1_150: lambda p: p.pause(True),
-        5_000: lambda p: p.pause(True), 1_000_150: lambda p: p.pause(False)})
+        1_000: lambda p: p.go_on(1.0, False), 1_150: lambda p: p.go_on(1.0, True),
+        5_000: lambda p: p.go_on(1.0, True), 1_000_150: lambda p: p.go_on(1.0, False)})
     assert [at for _, at in sent] == [1_000, 1_100, 1_000_200, 1_000_300]
     assert player.late == 0
 
 
 def test_a_new_rate_holds_from_its_moment_on():
-    sent, _ = play([0, 1_000, 3_000], plan={1_500: lambda p: p.set_rate(0.5)})
+    sent, _ = play([0, 1_000, 3_000], plan={1_500: lambda p: p.go_on(0.5, False)})
     assert [at for _, at in sent] == [0, 1_000, 1_500 + 3_000]
 
 
@@ -83,8 +81,7 @@ def test_one_call_sends_for_20_ms_at_most_so_that_services_have_their_turn():
     def send(_):
         now[0] += 1_000_000
 
-    player = Playback(lambda: now[0])
-    player.begin(EPOCH_NS, ((EPOCH_NS, send, b'') for _ in range(1_000)))
-    assert player.tick() == 0.0
+    player = Playback(EPOCH_NS, lambda: now[0])
+    assert next(player.play(EPOCH_NS, ((EPOCH_NS, send, b'') for _ in range(1_000)))) == 0.0
     assert 20 <= player.sent <= 22
-    assert player.now() == EPOCH_NS
+    assert player.now_ns == EPOCH_NS

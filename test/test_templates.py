@@ -81,8 +81,8 @@ def test_every_channel_sends_what_ros_serializes_with_its_fields_and_frames(numb
     for one in simulate(world_frame=frame, body_frame=body, imu__frame_id=imu,
                         markers__trace_points=number + 1).channels:
         # Numbers that differ from slot to slot, so that no two can be mixed up.
-        fields = [[dice.randrange(100) if code != 'd' else dice.uniform(-10.0, 10.0)
-                   for _ in range(count)] for _, code, count, _ in one.template.fields]
+        fields = [[dice.uniform(-10.0, 10.0) if field.code == 'd' else dice.randrange(100)
+                   for _ in range(field.count)] for field in one.template.fields]
         data = one.template.encode_one(stamp_ns, *fields)
         message = JAZZY.deserialize_cdr(data, one.type_name)
         theirs = bytes(JAZZY.serialize_cdr(message, one.type_name))
@@ -90,8 +90,8 @@ def test_every_channel_sends_what_ros_serializes_with_its_fields_and_frames(numb
         if one.topic != '/tf':              # its package is no part of the wheels of ROS
             message = deserialize_message(data, message_class(one.type_name))
             assert_same(data, message)
-        for (name, *_), given in zip(one.template.fields, fields, strict=True):
-            assert numbers_at(message, name) == given, (one.topic, name)
+        for field, given in zip(one.template.fields, fields, strict=True):
+            assert numbers_at(message, field.name) == given, (one.topic, field.name)
         header = getattr((message.transforms if one.topic == '/tf' else [message])[0], 'header',
                          None)
         if header is not None:

@@ -256,9 +256,10 @@ class Loop:
         if self.state is LoopState.ENDED:
             raise RuntimeError(f'{self.state.value}: nothing follows')
         simulation = self._simulation
+        last_stamp_ns = simulation.epoch_ns + simulation.now_ns
         try:
             event = simulation.apply('reset', parameters=values, epoch_ns=self._clock.begin(
-                self._date(), self._source(), simulation.epoch_ns + simulation.now_ns))
+                self._date(), self._source(), last_stamp_ns))
         except ValueError:
             if self.state is LoopState.RUNNING:
                 self._clock.run(self.now_ns, self._source())
@@ -270,6 +271,10 @@ class Loop:
         self.interruptions += 1
         self.set_pace(values)           # a change that failed midway may not have set it
         self._enter(LoopState.PAUSED if self.paused else LoopState.RUNNING)
+        if simulation.epoch_ns < last_stamp_ns and self._recording.is_on:
+            reason = 'stamps have gone back with /clock, and a log keeps them in order'
+            self._recording.end(error=reason)
+            self._warn(f'recording stopped: {reason}; ~/record starts another')
         self._recording.write(event)
 
     def fail(self, reason: str) -> None:

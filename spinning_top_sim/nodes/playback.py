@@ -3,67 +3,73 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain, islice
+from typing import Any
 
-Message = tuple[int, Callable[[bytes], object], bytes]      # time [ns], its publish function, CDR
+from spinning_top_sim.streams.parameter import Effect, Parameter, Range
 
-SLOWEST, FASTEST = 1e-6, 1e9    # rates of a playback: recorded time over real time
-RATES = f'a number in [{SLOWEST:g}, {FASTEST:g}]'
+Message = tuple[int, Callable[[Any], object], Any]      # log time [ns], how to send it, and it
+
+RATE = Parameter('rate', 'Recorded over real time', 1.0, Range(1e-6, 1e9), effect=Effect.NOW)
 LATE_NS = 10_000_000            # a message that is sent later than this is counted
-BUDGET_NS = 20_000_000          # one call sends at most so long
+BUDGET_NS = 20_000_000          # services wait for messages that are due at most so long
 
 
 class Playback:
-    """Sends messages at their times, late ones at once; has a rate and can be paused."""
+    """
+    Log time that runs with steady time, and messages that are sent when it comes to them.
 
-    def __init__(self, steady: Callable[[], int] = time.monotonic_ns) -> None:
+    begin_ns : log time before anything is played
+    steady : returns steady time [ns]
+    sent, late, failed : how many messages were sent, late, and could not be sent
+    """
+
+    def __init__(self, begin_ns: int, steady: Callable[[], int] = time.monotonic_ns) -> None:
         self.sent = self.late = self.failed = 0
         self.rate, self.paused = 1.0, False
         self._steady = steady
-        self._messages: Iterator[Message] = iter(())
-        self._next: Message | None = None
-        self._log_ns = self._from_ns = 0    # time of the log, and steady time of the same moment
+        self._log_ns = self._next_ns = begin_ns     # at `_since_ns`, and of the next message
+        self._since_ns = steady()
 
-    def begin(self, begin_ns: int, messages: Iterator[Message], wait_ns: int = 0) -> None:
-        """Play these messages, in the order of their times; `begin_ns` comes after a wait."""
-        self._messages, self._next = messages, next(messages, None)     # this takes a while
-        self._log_ns, self._from_ns = begin_ns, self._steady() + wait_ns
+    @property
+    def now_ns(self) -> int:
+        """The log time up to which all messages are sent."""
+        passed_ns = 0 if self.paused else max(self._steady() - self._since_ns, 0) * self.rate
+        return self._log_ns + int(min(passed_ns, self._next_ns - self._log_ns))
 
-    def now(self) -> int:
-        """Return the time of the log up to which all messages are sent [ns]."""
-        if self.paused:
-            return self._log_ns
-        passed = max(self._steady() - self._from_ns, 0) * self.rate
-        now_ns = self._log_ns + int(min(passed, 2.0 ** 63))
-        return min(now_ns, self._next[0]) if self._next else now_ns
+    def go_on(self, rate: float, paused: bool) -> None:
+        """Go on from here at another rate, or pause; nothing is caught up."""
+        self._log_ns, self._since_ns = self.now_ns, max(self._steady(), self._since_ns)
+        self.rate, self.paused = rate, paused
 
-    def tick(self) -> float | None:
-        """Send what is due; return the time until more is due [ns], None if all is sent."""
+    def play(self, begin_ns: int, messages: Iterator[Message], wait_ns: int = 0,
+             ) -> Iterator[float]:
+        """
+        Let log time be `begin_ns` after a wait; return an iterator that sends these messages.
+
+        It yields how long to wait before it is asked again [ns].
+
+        messages : in the order of their times, which are not before `begin_ns`
+        """
+        first = [*islice(messages, 1)]      # reading it takes a while
+        self._log_ns = self._next_ns = begin_ns
+        self._since_ns = self._steady() + wait_ns
+        return self._send(chain(first, messages))
+
+    def _send(self, messages: Iterable[Message]) -> Iterator[float]:
         stop_ns = self._steady() + BUDGET_NS
-        while self._next:
-            at_ns, send, data = self._next
-            now_ns = self._steady()
-            left_ns = (math.inf if self.paused else
-                       self._from_ns + (at_ns - self._log_ns) / self.rate - now_ns)
-            if left_ns > 0 or now_ns > stop_ns:
-                return max(left_ns, 0.0)
+        for self._next_ns, send, message in messages:
+            while (left_ns := self._left_ns()) > 0 or self._steady() > stop_ns:
+                yield max(left_ns, 0.0)
+                stop_ns = self._steady() + BUDGET_NS
             try:
-                send(data)
+                send(message)
                 self.sent += 1
             except Exception:       # as with a reader that keeps all and has stopped reading
                 self.failed += 1
             self.late += left_ns < -LATE_NS
-            self._next = next(self._messages, None)
-        return None
 
-    def pause(self, paused: bool) -> None:
-        """Pause, or go on without catching up."""
-        self._go_on_from_sent()
-        self.paused = paused
-
-    def set_rate(self, rate: float) -> None:
-        self._go_on_from_sent()
-        self.rate = rate
-
-    def _go_on_from_sent(self) -> None:
-        self._log_ns, self._from_ns = self.now(), max(self._steady(), self._from_ns)
+    def _left_ns(self) -> float:
+        return math.inf if self.paused else (
+            self._since_ns + (self._next_ns - self._log_ns) / self.rate - self._steady())

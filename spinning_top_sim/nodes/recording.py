@@ -133,6 +133,11 @@ class Recording:
         return self._recorder.warning if self._recorder else None
 
     @property
+    def is_on(self) -> bool:
+        """Whether messages are recorded, if only in memory while the file is being opened."""
+        return self._recorder is not None
+
+    @property
     def path(self) -> Path | None:
         """The log that is open."""
         return self._recorder.path if self._recorder else None

@@ -3,12 +3,12 @@
 
 import argparse
 import contextlib
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
-from spinning_top_sim.nodes.playback import FASTEST, RATES, SLOWEST
+from spinning_top_sim.nodes.playback import RATE
+from spinning_top_sim.streams.parameter import Range
 from spinning_top_sim.tools import cli
 
 DESCRIPTION = """\
@@ -64,32 +64,30 @@ def _parser() -> argparse.ArgumentParser:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    add = parser.add_argument
-    not_negative = _number(0.0, sys.float_info.max, 'a finite number >= 0')
+    add, seconds = parser.add_argument, _number(Range(0.0, 1e9))
     add('file', type=Path, metavar='FILE', help='the log')
-    add('-r', '--rate', metavar='R',
-        type=_number(SLOWEST, FASTEST, f'{RATES}; --start-paused begins with a pause'),
+    add('-r', '--rate', type=_number(RATE.range), metavar='R',
         help='recorded over real time (default: the parameter `rate`, 1)')
     add('-l', '--loop', action='store_true', help='begin again at the end')
-    add('--start', type=not_negative, default=0.0, metavar='S',
+    add('--start', type=seconds, default=0.0, metavar='S',
         help='begin S seconds after the begin of the log')
     add('--topics', nargs='+', default=[], metavar='T',
         help='play these only, by their recorded names')
-    add('--clock', type=not_negative, nargs='?', const=40.0, default=0.0, metavar='HZ',
-        help="publish the log's time on /clock, HZ times a second "
-        '(default 40), instead of a recorded /clock')
+    add('--clock', type=_number(Range(1e-6, 1e4)), nargs='?', const=40.0, metavar='HZ',
+        help="publish the log's time on /clock, HZ times a second (default 40), instead of a "
+        'recorded /clock')
     add('--partial', action='store_true', help='play what is whole of a damaged log')
     add('-p', '--start-paused', action='store_true', help='wait for ~/set_pause false')
-    add('-d', '--delay', type=not_negative, default=0.0, metavar='S',
+    add('-d', '--delay', type=seconds, default=0.0, metavar='S',
         help='wait S seconds before the first message')
     add('--wait-for-subscribers', type=int, default=0, metavar='COUNT',
         help='wait until there are so many, over all topics')
 
 
-def _number(lowest: float, highest: float, allowed: str) -> Callable[[str], float]:
+def _number(allowed: Range) -> Callable[[str], float]:
     def parse(text: str) -> float:
         with contextlib.suppress(ValueError):
-            if lowest <= float(text) <= highest:
+            if float(text) in allowed:
                 return float(text)
-        raise argparse.ArgumentTypeError(f'{text}: must be {allowed}')
+        raise argparse.ArgumentTypeError(f'{text}: must be a number {allowed}')
     return parse

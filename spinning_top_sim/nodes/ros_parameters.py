@@ -51,7 +51,7 @@ def declare(node: Node, given: Mapping[str, Any], overrides: Mapping[str, Any]) 
     shown = {**values, 'spin.lz': parameters.start_state(values).lz}
     node.declare_parameters('', [
         (name, list(value) if isinstance(value, tuple) else value,
-         _descriptor(parameters.BY_NAME[name])) for name, value in shown.items()],
+         descriptor(parameters.BY_NAME[name])) for name, value in shown.items()],
         ignore_override=True)
     return values
 
@@ -66,7 +66,7 @@ def disobeyed_overrides(node: Node, overrides: Iterable[str]) -> Iterator[str]:
                 f'; did you mean qos_overrides.{near[0]}?' if near else '')
 
 
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+def descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows.  Types are dynamic: `Parameter.check` decides."""
     result = ParameterDescriptor(
         name=parameter.name, description=parameter.describe(range_too=False), dynamic_typing=True,

@@ -180,7 +180,7 @@ class LiveSimulation(Simulation):
         """
         while self.now_ns < due_ns:
             if self._ready_ns < due_ns:
-                self._prepare(due_ns, publish_from_ns)
+                self._prepare(due_ns)
             self._send(min(due_ns, self._ready_ns), publish_from_ns)
             if self.now_ns < due_ns and give_way():
                 return False
@@ -191,17 +191,17 @@ class LiveSimulation(Simulation):
         """Time up to which all messages are sent or wait [ns]."""
         return min((group.computed_ns for group in self._groups), default=self._reached_ns)
 
-    def _prepare(self, due_ns: int, publish_from_ns: int) -> None:
+    def _prepare(self, due_ns: int) -> None:
         """Compute what is due, or a part of it; raise where all is sent that the motion has."""
         try:
             self._go_ahead(due_ns, PIECE_SECONDS)
         except IntegrationError:
             if self.now_ns >= self._reached_ns:
                 raise
-        until_ns = min(self._reached_ns, *(
-            group.until_ns(publish_from_ns) for group in self._groups), due_ns)
+        until_ns = min(due_ns, self._reached_ns, *(
+            group.furthest_ns for group in self._groups))
         for group in self._groups:
-            self._compute(group, until_ns, publish_from_ns)
+            self._compute(group, until_ns)
 
     def look_ahead(self, until_ns: int, seconds: float) -> None:
         """
@@ -213,10 +213,10 @@ class LiveSimulation(Simulation):
         if behind is None or behind.computed_ns >= until_ns:
             return
         begin = time.monotonic()
-        goal_ns = min(behind.computed_ns + self._span_ns, behind.until_ns(0))
+        goal_ns = min(behind.computed_ns + self._span_ns, behind.furthest_ns)
         with contextlib.suppress(IntegrationError):     # `send` meets it when the time has come
             self._go_ahead(goal_ns, 0.5 * seconds)
-            self._compute(behind, min(goal_ns, self._reached_ns), 0)
+            self._compute(behind, min(goal_ns, self._reached_ns))
         taken = time.monotonic() - begin
         if taken < 0.5 * seconds:
             self._span_ns = min(2 * self._span_ns, LONGEST_SPAN_NS)
@@ -235,24 +235,14 @@ class LiveSimulation(Simulation):
                 GROWTH, 0.5 * seconds / max(now - called, 1e-6))))
         self.forget()
 
-    def _compute(self, group: '_Group', until_ns: int, publish_from_ns: int) -> None:
+    def _compute(self, group: '_Group', until_ns: int) -> None:
         """Compute the messages of a grid up to a time that the motion has reached."""
-        late_ns = min(until_ns, publish_from_ns - 1)
-        if group.computed_ns < late_ns:     # nobody takes these unless they are recorded
-            for output in group.outputs:
-                if output.log_index is None:
-                    output.skipped += len(output.channel.times(group.computed_ns, late_ns))
-            self._add(group, [output for output in group.outputs
-                              if output.log_index is not None], late_ns)
         if group.computed_ns < until_ns:
-            self._add(group, group.outputs, until_ns)
-
-    def _add(self, group: '_Group', outputs: Sequence[Output], until_ns: int) -> None:
-        by_channel = {output.channel: output for output in outputs}
-        block = self.block([*by_channel], group.computed_ns, until_ns)
-        for channel, t_ns, rows in block.messages:
-            by_channel[channel].add(t_ns, rows)
-        group.computed_ns = block.until_ns
+            by_channel = {output.channel: output for output in group.outputs}
+            block = self.block([*by_channel], group.computed_ns, until_ns)
+            for channel, t_ns, rows in block.messages:
+                by_channel[channel].add(t_ns, rows)
+            group.computed_ns = block.until_ns
 
     def _send(self, until_ns: int, publish_from_ns: int) -> None:
         """Send what waits up to a time, to the log before others."""
@@ -283,9 +273,10 @@ class _Group:
         for output in self.outputs:
             output.clear()
 
-    def until_ns(self, publish_from_ns: int) -> int:
-        """Return how far MOST_SAMPLES behind those that are computed reach."""
+    @property
+    def furthest_ns(self) -> int:
+        """How far MOST_SAMPLES behind those that are computed reach [ns]."""
         channels = [output.channel for output in self.outputs]
         largest = max(len(channel.encoder) for channel in channels)
-        return (max(self.computed_ns, publish_from_ns - 1)
+        return (self.computed_ns
                 + max(1, min(MOST_SAMPLES, MOST_BYTES // largest)) * channels[0].period_ns)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The motion of a run as a function of time: solutions, joined by events and by the pivot."""
 
+import contextlib
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
@@ -97,8 +98,9 @@ class Trajectory:
                 raise IntegrationError(str(error), reached_ns=end_ns) from error
 
     def after(self, t_ns: int) -> Piece:
-        """Return the piece in which the motion goes on after a time."""
-        self._go_on(t_ns + 1)
+        """Return the piece in which the motion goes on after a time; the last if it does not."""
+        with contextlib.suppress(IntegrationError):
+            self._go_on(t_ns + 1)
         return self._pieces[bisect_left(
             self._pieces, t_ns + 1, key=attrgetter('start_ns')) - 1]
 

@@ -88,12 +88,16 @@ class OwnNode(InThisProcess):
         return self._serve(Trigger, name)
 
     def _serve(self, kind, name, **request):
-        act, response = getattr(self.node, f'_{name}'), kind.Response()
-        if name != 'record':
-            return self.node._serve(act, kind.Request(**request), response)
-        future = act(kind.Request(**request), response)
-        self.spin_until('an answer', future.done)
-        return future.result()
+        if name == 'record':
+            future = self.ask_to_record(**request)
+            self.spin_until('an answer', future.done)
+            return future.result()
+        return self.node._serve(getattr(self.node, f'_{name}'), kind.Request(**request),
+                                kind.Response())
+
+    def ask_to_record(self, data):
+        """Return the Future of the answer."""
+        return self.node._record(SetBool.Request(data=data), SetBool.Response())
 
     def spin_until(self, what, condition):
         wait_for(what, lambda: condition() or rclpy.spin_once(self.node, timeout_sec=0.1))

@@ -134,7 +134,7 @@ def replayed(path):
 
     from spinning_top_sim.nodes.replayer import Replayer, open_log
 
-    options = argparse.Namespace(rate=1e9, loop=False, start=0.0, topics=[], clock=0.0,
+    options = argparse.Namespace(rate=1e9, loop=False, start=0.0, topics=[], clock=None,
                                  start_paused=False, delay=0.0, wait_for_subscribers=0)
     rclpy.init()
     try:

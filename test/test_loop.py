@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a tick does, on a clock of its own: late ticks, overload, pause, step, reset."""
+
+from types import SimpleNamespace
+
+import pytest
+from helpers.simulations import SECOND, channel, simulate
+
+from spinning_top_sim.nodes import loop as module
+from spinning_top_sim.nodes.clock import SimulatedClock
+from spinning_top_sim.nodes.loop import Loop, LoopState
+
+TICK_NS, POSE_NS = 5_000_000, 10_000_000        # 200 Hz, 100 Hz
+DATE_NS = 1_700_000_000 * SECOND                # on the grid of the stamps
+
+
+class Run:
+    """
+    A loop that has started, on a steady clock that goes on by `step_ns` whenever it is read.
+
+    times: of the poses recorded since the start or the last reset
+    told: warnings, errors and events
+    """
+
+    def __init__(self, **values):
+        self.now_ns, self.step_ns, self.room, self.told = 77, 0, True, []
+        self.simulation = simulate(**values)
+        self.values, self._taken = self.simulation.values, []
+        recording = SimpleNamespace(has_room=lambda: self.room, wait_for_room=lambda: None,
+                                    is_on=True, write=self.told.append)
+        self.loop = Loop(
+            self.simulation, self.values, recording, SimulatedClock(self.values['time_scale']),
+            date=lambda: DATE_NS + self.now_ns - 77, update_subscribers=lambda: None,
+            warn=self.told.append, error=self.told.append, source=self.read, steady=self.read)
+        self.simulation.log_to(lambda entries: self._taken.extend(
+            stamp_ns for _, stamps_ns, _ in entries for stamp_ns in stamps_ns.tolist()),
+            [channel(self.simulation, 'pose')])
+        self.loop.start()
+
+    def read(self):
+        self.now_ns += self.step_ns
+        return self.now_ns
+
+    @property
+    def times(self):
+        return [stamp_ns - self.simulation.epoch_ns for stamp_ns in self._taken
+                if stamp_ns >= self.simulation.epoch_ns]
+
+    @property
+    def kinds(self):
+        return [event.kind for event in self.told if not isinstance(event, str)]
+
+    def tick(self, after_ns=TICK_NS):
+        self.now_ns += after_ns
+        self.loop.tick()
+
+    def ticks(self, count):
+        for _ in range(count):
+            self.tick()
+        return self
+
+
+def grid(until_ns, period_ns=POSE_NS):
+    return list(range(0, until_ns + 1, period_ns))
+
+
+def test_ticks_send_all_that_is_due_however_late_they_come_and_late_ones_are_counted():
+    run = Run().ticks(20)
+    loop = run.loop
+    assert run.times == grid(20 * TICK_NS) and (loop.late_ticks, loop.skipped_ticks) == (0, 0)
+    run.tick(7_400_000)                             # not yet 1.5 periods
+    assert (loop.late_ticks, loop.skipped_ticks) == (0, 0)
+    run.tick(10_100_000)
+    run.tick(50 * TICK_NS)
+    assert (loop.late_ticks, loop.skipped_ticks) == (2, 1 + 49)
+    assert loop.now_ns == 20 * TICK_NS + 7_400_000 + 10_100_000 + 50 * TICK_NS
+    assert run.times == grid(loop.now_ns)
+
+
+def test_a_pause_sends_what_is_due_holds_catches_nothing_up_and_makes_no_tick_late():
+    run = Run().ticks(4)
+    run.now_ns += 3_000_001
+    run.loop.pause()
+    at_ns = 4 * TICK_NS + 3_000_001
+    for _ in range(3):
+        run.tick(SECOND)
+        run.loop.pause()
+    assert run.loop.state is LoopState.PAUSED and run.loop.now_ns == at_ns
+    run.loop.resume()
+    run.loop.resume()
+    run.ticks(5)
+    assert run.loop.now_ns == at_ns + 5 * TICK_NS
+    assert run.times == grid(run.loop.now_ns)
+    assert run.loop.late_ticks == run.loop.skipped_ticks == 0
+
+
+def test_a_step_is_exact_while_clocks_go_on_or_says_what_is_left(monkeypatch):
+    run = Run(time_scale=50.0).ticks(7)
+    with pytest.raises(RuntimeError, match='while paused'):
+        run.loop.step(SECOND)
+    run.step_ns = 1_333                             # any code takes time
+    run.loop.pause()
+    for length_ns in (210_000_000, 10_000_000, 333_333_333, 1):
+        run.ticks(5)
+        before = run.loop.now_ns
+        run.loop.step(length_ns)
+        assert run.loop.now_ns - before == length_ns
+    monkeypatch.setattr(module, 'STEP_BUDGET_NS', 150_000)
+    run.step_ns, before = 100_000, run.loop.now_ns
+    with pytest.raises(RuntimeError, match=r'takes too long, \d+\.\d+ s are left') as error:
+        run.loop.step(1000 * SECOND)
+    left = float(str(error.value).split()[-4])
+    assert 0.0 < left == pytest.approx(1000.0 - (run.loop.now_ns - before) / SECOND, abs=1e-6)
+    run.step_ns = 0
+    run.loop.resume()
+    run.ticks(3)
+    assert run.times == grid(run.loop.now_ns)
+
+
+def test_the_duration_ends_with_its_last_sample_and_nothing_leads_on():
+    run = Run(duration=0.0723).ticks(100)
+    for act in (run.loop.pause, run.loop.resume, lambda: run.loop.fail('a test')):
+        act()
+        assert run.loop.state is LoopState.ENDED
+    with pytest.raises(RuntimeError, match='`duration` are sent: nothing follows'):
+        run.loop.reset(run.values)
+    assert run.loop.now_ns == 72_300_000 and run.kinds == []
+    assert run.ticks(5).times == grid(72_300_000)
+
+
+@pytest.mark.parametrize('scale', [1.0, 2.0])
+def test_what_a_tick_has_no_time_or_room_for_comes_later_and_a_clock_too_far_ahead_slips(
+        monkeypatch, scale):
+    """By a second of real time."""
+    monkeypatch.setattr(module, 'TICK_BUDGET_NS', 50_000)
+    run = Run(time_scale=scale, pose__rate=1000.0).ticks(4)
+    run.step_ns = 100_000
+    run.tick(900_000_000)
+    assert run.loop.now_ns < scale * 900_000_000
+    run.step_ns = 0
+    run.ticks(10)
+    assert run.loop.now_ns > scale * 900_000_000 and run.loop.slipped_ns == 0
+    run.room, stands_at = False, run.loop.now_ns
+    run.tick(900_000_000)
+    run.tick(200_000_000)
+    assert (run.loop.now_ns, run.loop.slipped_ns) == (stands_at, scale * 1_100_000_000)
+    run.tick(1_200_000_000)
+    assert run.loop.slipped_ns == scale * 2_300_000_000     # all together
+    run.room = True
+    run.ticks(4)
+    assert run.loop.now_ns == stands_at + scale * 4 * TICK_NS
+    assert run.times == grid(run.loop.now_ns, SECOND // 1000)
+
+
+def test_a_reset_begins_again_at_a_later_stamp_and_a_pause_remains():
+    run = Run().ticks(6)
+    assert run.simulation.epoch_ns == DATE_NS
+    run.loop.reset(run.values)
+    assert run.simulation.epoch_ns == DATE_NS + 40_000_000      # behind the sample at 30 ms
+    run.ticks(2)
+    assert run.loop.now_ns == 0, 'its date comes first'
+    run.ticks(2)
+    assert run.loop.now_ns == 2 * TICK_NS and run.times == grid(2 * TICK_NS)
+    run.loop.pause()
+    run.loop.reset(run.values)
+    run.ticks(30)
+    assert (run.loop.now_ns, run.times, run.kinds) == (0, [], ['reset', 'reset'])
+    run.loop.reset(run.values, paused=False)
+    assert run.ticks(4).loop.state is LoopState.RUNNING
+
+
+FAILING = {
+    'pole': {'solver__equations': 'euler', 'initial__theta': 0.5, 'initial__theta_dot': -3.0,
+             'spin__l3': 0.2, 'spin__lz': -0.2},
+    # At the edge of a piece of the path the pivot turns too fast for this top.
+    'no motion from t = 0.05 s on': {
+        'pivot__path': (0.05, 0.0, 0.0, 0.0, 0.001, 1e5, 0.0, 0.0), 'top__lambda1': 1e-9,
+        'top__lambda3': 1e-9, 'spin__l3': 0.0, 'solver__method': 'exact'},
+    'January 2038': {'solver__method': 'exact'}}
+
+
+@pytest.mark.parametrize('reason', FAILING)
+def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
+    run = Run(**FAILING[reason])
+    if '2038' in reason:
+        run.simulation.epoch_ns = (2 ** 31 - 1) * SECOND
+    run.ticks(400)
+    stands_at = run.loop.now_ns
+    assert reason in run.loop.failure and run.loop.state is LoopState.FAILED
+    assert run.times == grid(stands_at)
+    assert sum('until ~/reset' in told for told in run.told) == 1
+    assert run.simulation.state().theta[0] >= 0.0, 'it can be described'
+    for act in (lambda: run.loop.command(1.0, 1.0), lambda: run.loop.step(POSE_NS),
+                run.loop.resume):
+        with pytest.raises((ValueError, RuntimeError), match=f'stands still: .*{reason}'):
+            act()
+    assert run.ticks(5).loop.now_ns == stands_at
+    if '2038' in reason:
+        with pytest.raises(ValueError, match='2038'):
+            run.loop.reset(run.values)
+        assert run.loop.state is LoopState.FAILED
+    else:
+        run.loop.reset(simulate().values)
+        assert run.loop.failure is None and run.ticks(404).loop.now_ns > stands_at
+
+
+def test_events_come_after_what_is_due_and_refused_ones_change_nothing():
+    run = Run().ticks(4)
+    run.now_ns += 3_000_000
+    run.loop.command(2.0, 1.0)
+    (event,) = run.told
+    assert (event.kind, event.t_ns, event.details) == ('command', 23_000_000,
+                                                       {'l3': 2.0, 'lz': 1.0})
+    for act, said in ((lambda: run.loop.command(float('nan'), 1.0), 'nan'),
+                      (lambda: run.loop.drive((0.0, 0.0, 1e9)), r'1000000000\.0')):
+        with pytest.raises(ValueError, match=said):
+            act()
+    assert (run.loop.commands, run.kinds) == (1, ['command'])
+
+
+def test_of_the_velocities_in_twenty_milliseconds_the_last_one_counts():
+    run = Run()
+    for number in range(1, 12):
+        run.loop.drive((number, 0.0, 0.0))
+        run.tick()
+    assert [(event.t_ns, event.details['x']) for event in run.simulation.history] == [
+        (5_000_000, 1.0), (25_000_000, 5.0), (45_000_000, 9.0)]
+
+
+def test_a_time_scale_holds_from_its_moment_on():
+    run = Run().ticks(4)
+    run.loop.set_pace({**run.values, 'time_scale': 10.0})
+    run.tick()
+    assert run.loop.now_ns == 4 * TICK_NS + 10 * TICK_NS

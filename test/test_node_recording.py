@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node records: beside its ticks, whole, and the same as `simulate` computes."""
+
+import errno
+import threading
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from geometry_msgs.msg import Twist
+from helpers.node_harness import PATIENCE_S
+from helpers.node_logs import events_in, log_of, verified
+from helpers.own_node import OwnNode
+from helpers.reference import scene_parameters
+from helpers.simulations import EPOCH_NS, SECOND
+
+from spinning_top_sim.recording import writer
+from spinning_top_sim.tools import simulate
+
+
+@pytest.fixture
+def gate(monkeypatch):
+    """Have files opened and closed only while `gate` is set."""
+    gate = threading.Event()
+    for owner, name in ((writer, 'create_file'), (writer.McapWriter, 'finish')):
+        def slow(*arguments, ordinary=getattr(owner, name), **options):
+            assert gate.wait(PATIENCE_S)
+            return ordinary(*arguments, **options)
+        monkeypatch.setattr(owner, name, slow)
+    return gate
+
+
+def test_ticks_and_commands_go_on_while_a_log_is_being_opened_or_closed(tmp_path, gate):
+    def goes_on():
+        count = len(node.heard['pose'])
+        node.spin_until('samples', lambda: len(node.heard['pose']) > count + 20)
+        assert not answer.done()
+        gate.set()
+        node.spin_until('the answer', answer.done)
+        assert answer.result().success
+        return answer.result().message
+
+    path = tmp_path / 'run.mcap'
+    with OwnNode(tmp_path).listen('pose') as node:
+        node.spin_until('samples', lambda: node.heard['pose'])
+        answer = node.ask_to_record(True)
+        heard = len(node.heard['pose'])
+        node.command(2.0, 1.0)
+        assert node.diagnostics()[2]['recorder'] == 'opening'
+        assert goes_on() == f'recording to {path}'
+        assert node.switch('record', True).message == f'recording already to {path}'
+        gate.clear()
+        answer = node.ask_to_record(False)
+        expected = node.heard['pose'][heard:]
+        assert goes_on().startswith(f'{path}: ')
+        assert node.switch('record', False).message == 'not recording'
+        assert not any(one.log_index for one in node.simulation.outputs)
+    log, _ = log_of(path)
+    assert [event['event'] for event in events_in(log)] == ['start', 'command']
+    assert [data for _, data in log['/pose']] == expected
+    assert verified(path)['identical']
+
+
+def test_a_recording_that_fails_is_told_once_and_gives_way_to_the_next(
+        tmp_path, monkeypatch, capfd):
+    def full(_):
+        raise OSError(errno.ENOSPC, 'No space left on device')
+
+    precious = tmp_path / 'run.mcap'
+    precious.write_bytes(b'precious')
+    with OwnNode(tmp_path, record__enabled=True) as node:
+        node.spin_until('an error', lambda: node.diagnostics()[0] == 2)
+        assert 'exists' in node.diagnostics()[1]
+        answer = node.switch('record', True)
+        assert not answer.success and 'exists' in answer.message
+        assert not any(one.is_used for one in node.simulation.outputs)
+        assert node.set(record__uri=f'{tmp_path}/new/er.mcap/').successful
+        assert node.switch('record', True).success
+        (path,) = (tmp_path / 'new/er.mcap').iterdir()
+        with monkeypatch.context() as patch:
+            patch.setattr(writer.McapWriter, 'flush', full)
+            node.spin_until('an error', lambda: node.diagnostics()[0] == 2)
+        level, message, said = node.diagnostics()
+        assert (level, said['recorder'], said['state']) == (2, 'failed', 'running')
+        assert f'{path}' in message and 'No space left' in message
+        assert node.set(record__uri=f'{tmp_path}/third.mcap').successful
+        assert node.switch('record', True).success
+        assert node.diagnostics()[:2] == (0, 'running')
+    errors = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]
+    assert ['not recording' in errors[0], 'recording stopped' in errors[1]] == [True, True]
+    assert len(errors) == 2 and precious.read_bytes() == b'precious'
+    assert verified(tmp_path / 'third.mcap')['identical']
+
+
+NOISE = {'imu.gyroscope_noise_density': 0.01, 'imu.lever_arm': [0.1, -0.2, 0.3], 'seed': 7}
+
+
+@pytest.mark.parametrize(('scene', 'method'), [
+    ('shuttle', 'exact'), ('near_separatrix', 'exact'), ('looping', 'rk45'), ('braking', 'rk45')])
+def test_a_live_run_is_that_of_simulate_and_verifies_to_the_last_bit(tmp_path, scene, method):
+    """With commands, velocities, resets, changes of rates, and a recording from the middle."""
+    values = {**scene_parameters(scene), **NOISE, 'solver.method': method}
+    with OwnNode(tmp_path, start_paused=True, **values) as node:
+        def drive(x):
+            message = Twist()
+            message.linear.x = x
+            node.node._on_velocity(message)
+
+        l3, lz = node.get('spin.l3', 'spin.lz')
+        node.simulation.epoch_ns = EPOCH_NS
+        assert node.switch('record', True).success
+        node.step(70)
+        node.command(l3 + 0.1, lz + 0.05)
+        node.step(30)
+        assert node.switch('record', False).success
+        assert node.set(record__uri=f'{tmp_path}/part.mcap').successful
+        assert node.set(imu__rate=125.0, pose__rate=33.0).successful
+        drive(0.5)
+        node.step(10)
+        assert node.switch('record', True).success
+        node.step(10)
+        node.command(l3, lz)
+        drive(-0.2)
+        node.step(10)
+        assert node.set(imu__rate=250.0, joint_states__rate=50.0).successful
+        node.step(7)
+        assert node.trigger('reset').success
+        node.step(5)
+        node.command(l3, lz + 0.01)
+        drive(0.0)
+        node.step(20)
+    live, part = tmp_path / 'run.mcap', tmp_path / 'part.mcap'
+    assert verified(live)['identical'] and verified(part)['identical']
+    kinds = {event['event'] for event in events_in(log_of(part)[0])}
+    assert kinds >= {'start', 'command', 'parameters', 'reset', 'drive'}
+    offline = tmp_path / 'offline.mcap'
+    assert simulate.main([
+        '-o', str(offline), '--quiet', '--scene', scene, '--duration', '1', '--epoch',
+        f'{EPOCH_NS // SECOND}', '--command', f'0.7:{l3 + 0.1!r}:{lz + 0.05!r}',
+        *(word for name, value in values.items() for word in ('-p', f'{name}:={value}'))]) == 0
+    (live, _), (offline, _) = log_of(live), log_of(offline)
+    assert {name: rows for name, rows in live.items() if not name.endswith('/events')} == {
+        name: rows for name, rows in offline.items() if not name.endswith('/events')}
