@@ -5,11 +5,13 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from spinning_top_sim.nodes.publishers import THROTTLED, THROTTLED_RATE
-from spinning_top_sim.nodes.tick_loop import LoopState
+from spinning_top_sim.nodes.clock import JUMP_NS
+from spinning_top_sim.nodes.loop import LoopState
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.parameter import Effect
-from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING, all_streams
+from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
+from spinning_top_sim.tools.recorded_run import channels_of
 
 HEAD = """<!-- Written by docs/interface.py from the code. -->
 # Interface and commands
@@ -26,8 +28,7 @@ Publishers are RELIABLE and KEEP_LAST with depth 10. The parameters
 |---|---|---|---|---|
 """
 
-AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | yes | `ground_truth_odom.enabled` |
-| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | yes | |
+AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | yes | |
 
 - `pose`: attitude q(world ← body) in `world_frame`; the position is that of the pivot,
   (0, 0, 0) while it rests in the origin.
@@ -47,8 +48,6 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
 - `ground_truth/imu_timing`: one labelled dimension, {timing}. It has
   the stamp and the true time of each sample of `imu/data_raw`, and how often it was sent.
 - `ground_truth/imu`, `ground_truth/odom`: noise-free. The twist of the odometry is in the body frame.
-- `{throttled}`: messages of `ground_truth/odom` for those who only watch, at most
-  {rate:g} a second of real time, and the last one before a pause. They are not recorded.
 - What is exact has the variance 1e-18 in SI units: in sensor_msgs a covariance of zeros means unknown.
 - `~/invariants`: one labelled dimension, {invariants}. Drifts are relative to the value at the start of
   the motion; the orientation error [rad] is the angle to the exact solution.
@@ -57,8 +56,13 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
   `markers.trace_length`. Every message has the whole trace. The trace is that of the exact solution; its
   last point is the tip according to the solver.
 - `/diagnostics`: level and message are those of the worst problem. Among the values, `state` is one of
-  {states}.
+  {states}. `failed messages` counts what `publish` refused, as it
+  does while a reader with KEEP_ALL has stalled; motion and recording go on.
 - A stamp is the time of its sample, on the grid k × period. A paused node publishes no samples.
+- With `use_sim_time` the node follows the `/clock` of another node. Every sample that becomes due is
+  published, and no stamp is ahead of that `/clock`. If it jumps forward by more than {jump:g} s, so do the
+  stamps, with a warning and an event `epoch`. If it goes back, the node warns, and the stamps go on;
+  `~/reset` brings them back. Of several publishers on `/clock` the latest time counts.
 
 ## Subscribed topics and services
 
@@ -68,21 +72,25 @@ AFTER_TOPICS = """| `{throttled}` | nav_msgs/msg/Odometry | at most {rate:g} | y
 | topic | `~/cmd_vel` | geometry_msgs/Twist | drives the pivot: `linear` is its velocity in the world in m/s, each within 10000, `angular` must be 0; of several in 20 ms, or in the time that a new motion takes, the last one counts |
 | service | `~/set_pause` | std_srvs/SetBool | pauses, resumes; the simulated time stands still meanwhile |
 | service | `~/step` | std_srvs/Trigger | advances by `step.count` × `step.dt`; only while paused |
-| service | `~/reset` | std_srvs/Trigger | starts again with the start state, spin and seed; stamps stay monotonic |
-| service | `~/record` | std_srvs/SetBool | starts, stops a log; the response has its path and counts |
+| service | `~/reset` | std_srvs/Trigger | starts again with the start state, spin and seed; the next stamp is the date |
+| service | `~/record` | std_srvs/SetBool | starts, stops a log; answers when it is open or closed, with path and counts |
 | parameters | `spin.l3`, `spin.lz` | double | the same as a command, with a result; set both atomically |
 | services | `get_entity_state`, `step_simulation`, … | simulation_interfaces | where that package is installed: [simulation_interfaces.md](simulation_interfaces.md) |
 
 The node refuses a command of wrong length, with NaN or infinity, or with Lz ≠ ±L3 while the axis is at a
 pole. It logs the reason and counts the command in `/diagnostics`. The motion continues unchanged.
 
+A command, a state set, a velocity of the pivot, a parameter that acts at once and a reset are *events*.
+A recording has them, with their times ([Logs](log_format.md#events)).
+
 `spin.l3` and `spin.lz` in one request with a parameter of `initial.*` are no command: they are the spin of the
 next start, and take effect with `~/reset` as the others do.
 
 ## Parameters
 
-An integer is accepted as a double. A change takes effect at once, at the next `~/reset`, with the next
-recording, or only at the start of the node (read-only).
+An integer is accepted as a double; a number in quotes only with an exponent, such as '1e-3'. A change
+takes effect at once, at the next `~/reset`, with the next recording, or only at the start of the node
+(read-only).
 
 | parameter | default | unit | allowed values | takes effect | description |
 |---|---|---|---|---|---|
@@ -104,19 +112,19 @@ def page() -> str:
     """Return the page."""
     values = parameters.checked({})
     lines = [HEAD]
-    for stream in all_streams(values):
-        rate, on = values[stream.rate_parameter], values[f'{stream.parameter}.enabled']
-        lines.append(f'| `{stream.topic}` | {stream.type_name} | {rate:g} | '
-                     f'{"yes" if on else "no"} | `{stream.parameter}.enabled`, '
-                     f'`{stream.rate_parameter.removeprefix(stream.parameter)}` |\n')
+    for channel in channels_of(values):
+        own = f'{channel.name}.rate'
+        rate = own if own in values else 'imu.rate'
+        on = 'yes' if parameters.is_enabled(channel.name, values) else 'no'
+        lines.append(f'| `{channel.topic}` | {channel.type_name} | {values[rate]:g} | {on} | '
+                     f'`{channel.name}.enabled`, `{rate.removeprefix(channel.name)}` |\n')
 
     def listed(names: Iterable[str]) -> str:
         return ', '.join(f'`{name}`' for name in names)
 
     lines.append(AFTER_TOPICS.format(
-        throttled=THROTTLED['ground_truth/odom'], rate=THROTTLED_RATE,
         slowest=parameters.LOWEST_RATE_OF_INTERVALS,
-        states=listed(state.name.lower() for state in LoopState), joints=listed(JOINTS),
+        jump=JUMP_NS / NANOSECONDS, states=listed(state.name.lower() for state in LoopState), joints=listed(JOINTS),
         invariants=listed(INVARIANTS), timing=listed(TIMING)))
     for parameter in parameters.TABLE:
         default = parameter.default

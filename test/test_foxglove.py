@@ -9,11 +9,12 @@ from helpers.reference import ROOT
 
 from spinning_top_sim.nodes.endpoints import message_class
 from spinning_top_sim.streams import parameters, topics
+from spinning_top_sim.tools.recorded_run import channels_of
 
 LAYOUT = json.loads((ROOT / 'foxglove/spinning_top_sim.json').read_text())
 PANELS = LAYOUT['configById']
-TYPES = {topics.resolve_topic(stream.topic, ''): stream.type_name
-         for stream in topics.all_streams(parameters.checked({}))}
+TYPES = {topics.resolve_topic(channel.topic, ''): channel.type_name
+         for channel in channels_of(parameters.checked({}))}
 TYPES['/diagnostics'] = 'diagnostic_msgs/msg/DiagnosticArray'
 # Of robot_state_publisher, which the launch files start.
 TYPES['/robot_description'] = 'std_msgs/msg/String'
