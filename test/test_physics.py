@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from helpers.reference import CASES, SCENES, scene_parameters, start_of, top_of
 from scipy.spatial.transform import Rotation
-from spinning_top_sim.streams.simulation import Simulation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.regimes import Description, regime
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.physics.top import LARGEST, SMALLEST, THINNEST, Shape
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.play import Simulation
 
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.80665}
 STATE = {'theta': 0.7, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
@@ -151,7 +151,8 @@ def described(**values):
     simulation = Simulation(parameters.checked(
         {name.replace('__', '.'): value for name, value in values.items()}))
     start = parameters.start_state(simulation.values)
-    return simulation.describe(), simulation.top, start
+    trajectory = simulation.trajectory
+    return trajectory.after(0).describe(), trajectory.top, start
 
 
 def test_the_gyroscopic_ratio_by_hand():
@@ -192,11 +193,12 @@ RESTING = {
 def test_a_resting_axis_is_one_for_the_regime_the_description_and_the_solver(scene, changed,
                                                                              begin):
     simulation = Simulation(parameters.checked({**scene_parameters(scene), **changed}))
-    description = simulation.describe()
+    piece = simulation.trajectory.after(0)
+    description = piece.describe()
     assert description.nutation_period is None
     assert description.theta_min == description.theta_max
     assert str(description).startswith(begin) and ' to ' not in str(description)
-    assert isinstance(simulation.segment.motion, ExactSolution)
+    assert piece.is_exact
 
 
 @pytest.mark.parametrize(('low', 'high', 'text'), [
@@ -205,3 +207,26 @@ def test_a_resting_axis_is_one_for_the_regime_the_description_and_the_solver(sce
 def test_a_description_shows_ranges_with_as_many_digits_as_tell_their_ends_apart(low, high, text):
     motion = Description('waves', 1.0, 0.5, 0.7, 0.0, low, high, 0.0, 0.5, 2.0)
     assert f'precession 0 rad/s ({text}), spin' in str(motion)
+
+
+@pytest.mark.parametrize('scene', SCENES)
+def test_the_body_has_the_mass_and_the_moments_of_the_top(scene):
+    top = parameters.top_of(parameters.checked(scene_parameters(scene)))
+    shape = Shape(top)
+    assert 0.5 * top.mass * shape.radius ** 2 == pytest.approx(top.lambda3, rel=1e-12)
+    if top.is_realizable and shape.height > THINNEST * shape.radius:
+        across = top.mass * (3.0 * shape.radius ** 2 + shape.height ** 2) / 12.0
+        assert across + top.mass * shape.centre ** 2 == pytest.approx(top.lambda1, rel=1e-12)
+    assert shape.centre == top.com_distance
+    assert abs(shape.tip) > abs(shape.centre) + 0.5 * shape.height
+
+
+@pytest.mark.parametrize('changed', [
+    {'mass': 0.0}, {'com_distance': -0.15}, {'com_distance': 0.0}, {'lambda3': 1.0},
+    {'com_distance': 1.0}, {'mass': 5e-324}, {'lambda1': 1e300, 'lambda3': 1e300},
+    {'lambda1': 5e-324, 'lambda3': 5e-324}])
+def test_every_top_can_be_drawn(changed):
+    shape = Shape(Top(**{**TOP, **changed}))
+    assert (shape.tip < 0.0) == (changed.get('com_distance', 0.0) < 0.0)
+    assert SMALLEST <= shape.radius <= LARGEST and SMALLEST <= shape.height <= LARGEST
+    assert math.isfinite(shape.tip)
