@@ -23,11 +23,15 @@ from spinning_top_sim.tools import simulate
 def gate(monkeypatch):
     """Have files opened and closed only while `gate` is set."""
     gate = threading.Event()
-    for owner, name in ((writer, 'create_file'), (writer.McapWriter, 'finish')):
-        def slow(*arguments, ordinary=getattr(owner, name), **options):
+
+    def waiting(ordinary):
+        def slow(*arguments, **options):
             assert gate.wait(PATIENCE_S)
             return ordinary(*arguments, **options)
-        monkeypatch.setattr(owner, name, slow)
+        return slow
+
+    for owner, name in ((writer, 'create_file'), (writer.McapWriter, 'finish')):
+        monkeypatch.setattr(owner, name, waiting(getattr(owner, name)))
     return gate
 
 

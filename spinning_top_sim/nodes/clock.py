@@ -52,10 +52,10 @@ class SimulatedClock:
 
     def begin(self, date_ns: int, source_ns: int, last_stamp_ns: int = 0) -> int:
         """
-        Let t = 0 be due at the next stamp that it may have; return that stamp.
+        Let t = 0 be due when its stamp is the date; return that stamp.
 
         The stamp is the date, rounded up, or the /clock that is followed, rounded down.  It is
-        behind the last one that was sent, unless /clock has gone back meanwhile.
+        after the last one that was sent, unless /clock has gone back meanwhile.
 
         Raises ValueError if it is too late for a stamp of ROS.
         """
@@ -69,9 +69,8 @@ class SimulatedClock:
             epoch_ns = max(epoch_ns, last_stamp_ns + EPOCH_GRID_NS - last_stamp_ns % EPOCH_GRID_NS)
         if epoch_ns > LAST_EPOCH_NS:
             raise ValueError('the seconds of a ROS stamp, an int32, end in January 2038')
-        wait_ns = min(max(epoch_ns - date_ns, 0), EPOCH_GRID_NS)
-        self.run(-int(wait_ns * self._scale), source_ns)
-        self._late_ns = -1 - wait_ns            # t = 0 is not sent yet
+        self.run(int(max(date_ns - epoch_ns, -EPOCH_GRID_NS) * self._scale), source_ns)
+        self._late_ns = -1                      # t = 0 is not sent yet
         return epoch_ns
 
     def run(self, sent_ns: int, source_ns: int) -> None:

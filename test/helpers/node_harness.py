@@ -59,18 +59,25 @@ class SimNode:
     A sim_node in its own process group; it ends with the `with` at the latest.
 
     parameters: by name;  arguments: more of --ros-args;  program: arguments of python instead of
-    the module;  out, err: its output so far
+    the module;  executor: 'single' hides rclpy's EventsExecutor;  out, err: its output so far
     """
 
     _number = itertools.count(1)
 
-    def __init__(self, folder, parameters=None, *, namespace=None, arguments=(), program=None):
+    def __init__(self, folder, parameters=None, *, namespace=None, arguments=(), program=None,
+                 executor='events'):
         if namespace is None:
             namespace = f'/top{next(self._number)}'     # tests share a domain, not names
         self.folder = Path(folder) / (namespace.strip('/') or 'root')
         self.folder.mkdir(parents=True, exist_ok=True)
         self.name = f'{namespace.rstrip("/")}/spinning_top'
         self.namespace = namespace.rstrip('/')
+        self._path = []
+        if executor == 'single':
+            self._path = [str(self.folder / 'hidden')]
+            (self.folder / 'hidden').mkdir()
+            (self.folder / 'hidden/sitecustomize.py').write_text(
+                "import sys; sys.modules['rclpy.experimental'] = None")
         self.command = [
             *DIE_WITH_PARENT, sys.executable,
             *(program or ('-m', 'spinning_top_sim', 'node')),
@@ -78,7 +85,7 @@ class SimNode:
 
     def __enter__(self):
         source = str(Path(spinning_top_sim.__file__).parents[1])
-        paths = [source, *filter(None, [os.environ.get('PYTHONPATH')])]
+        paths = [*self._path, source, *filter(None, [os.environ.get('PYTHONPATH')])]
         environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
         if 'LD_LIBRARY_PATH' not in environment:        # then the wheels must start python anew
             environment.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None)
@@ -335,18 +342,22 @@ class Diagnostics:
 
 
 class DrivenClock:
-    """A clock [ns] on a topic that advances by 5 ms with each check of a condition."""
+    """A publisher of a clock [ns] on a topic."""
 
     def __init__(self, peer, topic, now_ns):
         self._peer, self.now_ns = peer, now_ns
         self._publisher = peer.node.create_publisher(Clock, topic, 10)
 
-    def drive(self, what, until):
+    def set(self, now_ns):
+        self.now_ns = now_ns
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(now_ns, 10 ** 9)
+        self._publisher.publish(message)
+
+    def drive(self, what, until, step_ns=5_000_000):
+        """Advance with each check of a condition."""
         def goes_on():
-            self.now_ns += 5_000_000
-            message = Clock()
-            message.clock.sec, message.clock.nanosec = divmod(self.now_ns, 10 ** 9)
-            self._publisher.publish(message)
+            self.set(self.now_ns + step_ns)
             return until()
         wait_for(what, goes_on)
 
