@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from helpers.reference import CASES, SCENES, scene_parameters, start_of, top_of
 from scipy.spatial.transform import Rotation
-from spinning_top_sim.streams.simulation import Simulation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.regimes import Description, regime
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.play import Simulation
 
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.80665}
 STATE = {'theta': 0.7, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
@@ -150,8 +149,8 @@ def described(**values):
     """Return the description of a motion, its top and its start state."""
     simulation = Simulation(parameters.checked(
         {name.replace('__', '.'): value for name, value in values.items()}))
-    start = parameters.start_state(simulation.values)
-    return simulation.describe(), simulation.top, start
+    piece = simulation.trajectory.after(0)
+    return piece.describe(), piece.top, parameters.start_state(simulation.values)
 
 
 def test_the_gyroscopic_ratio_by_hand():
@@ -191,12 +190,13 @@ RESTING = {
 @pytest.mark.parametrize(('scene', 'changed', 'begin'), [(k, *v) for k, v in RESTING.items()])
 def test_a_resting_axis_is_one_for_the_regime_the_description_and_the_solver(scene, changed,
                                                                              begin):
-    simulation = Simulation(parameters.checked({**scene_parameters(scene), **changed}))
-    description = simulation.describe()
+    piece = Simulation(parameters.checked({**scene_parameters(scene), **changed})
+                       ).trajectory.after(0)
+    description = piece.describe()
     assert description.nutation_period is None
     assert description.theta_min == description.theta_max
     assert str(description).startswith(begin) and ' to ' not in str(description)
-    assert isinstance(simulation.segment.motion, ExactSolution)
+    assert piece.is_exact and not piece.steps
 
 
 @pytest.mark.parametrize(('low', 'high', 'text'), [
