@@ -229,9 +229,7 @@ class Track:
         description = None
         with contextlib.suppress(ArithmeticError, ValueError):
             if not pivot_moves:
-                description = dataclasses.replace(
-                    ExactSolution(self.top, state).describe(),
-                    name=regimes.regime(self.top, state, SNAP))
+                description = ExactSolution(self.top, state).describe(SNAP)
         self.motions = [*self.motions[-MOST_MOTIONS:], DescribedMotion.of(
             int(stamps_ns[-1]), self.top, state, description, pivot_moves=pivot_moves)]
 
