@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
+from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
 Message = Any           # message packages have no types

@@ -207,8 +207,8 @@ def exact_about(top: Top, start: State | Posture,
     """Return the motion while the pivot accelerates so [m/s^2], and the vertical it is about."""
     with precision():
         posture = start if isinstance(start, Posture) else precise(start).posture(top)
-        vertical = Vertical.of(top, posture, acceleration, mpfr)
-        state = vertical.state_of(vertical.to_frame(posture), mpfr)
+        vertical = Vertical.of(top, acceleration, mpfr)
+        state = PreciseState.of_posture(vertical.top, vertical.to_frame(posture), mpfr)
     return ExactSolution(vertical.top, state, vertical.gravity), vertical
 
 
