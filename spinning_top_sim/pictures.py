@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.regimes import swing
 
 Reals = NDArray[np.float64]
 # From the world to the viewer: towards, right, up.  60 deg about z, then 45 deg about y.
@@ -77,15 +76,16 @@ def _outline(motion: Any) -> tuple[Reals, list[float]]:
     for k in np.flatnonzero(~(np.diff(motion.t) > 0.0)).tolist():
         raise ValueError(f't[{k + 1}] = {float(motion.t[k + 1])!r} s: must be later than t[{k}] = '
                          f'{float(motion.t[k])!r} s')
-    return np.stack(motion.rows_axis, axis=1), sorted(
-        float(np.arccos(u)) for u in swing(motion.top, motion.start))
+    path = np.stack(motion.rows_axis, axis=1)
+    tilts = np.arctan2(np.hypot(path[:, 0], path[:, 1]), path[:, 2])
+    return path, [float(tilts.min()), float(tilts.max())]
 
 
 def plot(motion: Any) -> Figure:
     """
     Return a figure of `States`, or of what has its columns; see `States.plot`.
 
-    motion : has t, top, start, rows_axis, theta_folded, phi_dot and energy
+    motion : has t, rows_axis, theta_folded, phi_dot and energy
     """
     (path, bounds), energy = _outline(motion), motion.energy
     with rc_context(STYLE):
@@ -117,7 +117,7 @@ def plot(motion: Any) -> Figure:
 
 
 def animate(motion: Any, fps: float, speed: float) -> FuncAnimation:
-    """Return an animation, for which `motion` has t, top, start, rows_axis and quaternion."""
+    """Return an animation, for which `motion` has t, rows_axis and quaternion."""
     path, bounds = _outline(motion)
     for name, value in (('fps', fps), ('speed', speed)):
         if not 0.0 < value < np.inf:

@@ -5,13 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.inspected import rewritten
 from helpers.simulations import SECOND, run
-
-from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.tools import inspect
-from spinning_top_sim.tools import simulate as simulate_command
-from spinning_top_sim.tools.survey import survey
 
 pymap3d = pytest.importorskip('pymap3d')
 
@@ -101,28 +95,3 @@ def test_a_late_fix_is_where_the_pivot_was_before_it_was_driven():
         for one, true in zip(found[topic][1:], found[exact][1:], strict=True):
             assert np.array_equal(one, true[:count])
     assert found[VELOCITY][2].max() > 0.5
-
-
-def test_a_log_is_verified(tmp_path, capsys):
-    """With an outage longer than a block, in which there is then no velocity."""
-    path = tmp_path / 'gnss.mcap'
-    values = [f'{name}:={list(value) if isinstance(value, tuple) else str(value).lower()}'
-              for name, value in {
-                  **NOISY, 'gnss.outages': (2.8, 5.0), 'imu.drop_rate': 0.05}.items()]
-    assert simulate_command.main([*(part for value in values for part in ('-p', value)), '-o',
-                                  str(path), '--duration', '5', '--quiet']) == 0
-    assert inspect.main([str(path), '--verify']) == 0
-    text = capsys.readouterr().out
-    assert 'gnss/fix' in text and '--verify compares each message' in text
-    # Neither delay, outage nor what the IMU drops is a gap; a message that is lost is one.
-    lossy = rewritten(path, tmp_path / 'lossy.mcap',
-                      lambda topic, number, data: None if number == 10 else data)
-    for log, lost in ((path, 0), (lossy, 1)):
-        with LogReader(log) as reader:
-            topics = survey(reader).topics
-        assert topics['/imu/data_raw'].missing == lost and topics['/imu/data_raw'].count < 990
-        for topic, count, late_ns in ((FIX, 49, 120_000_000), (VELOCITY, 49 - 21, 120_000_000),
-                                      (TRUE_FIX, 51, 0)):
-            report, at_ns = topics[f'/{topic}'], SECOND + 10 * PERIOD_NS + late_ns
-            assert (report.count, report.missing) == (count - lost, lost)
-            assert report.gaps_ns == lost * [(at_ns, at_ns)]

@@ -33,7 +33,7 @@ from rosbags.rosbag2 import Reader
 from spinning_top_sim.recording import recorder as recorder_module
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder, single
-from spinning_top_sim.recording.writer import McapWriter, create_file
+from spinning_top_sim.recording.writer import McapWriter
 
 PATIENCE_S = 20.0  # for what happens at once on an idle machine
 
@@ -131,7 +131,7 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
     synced = []
     monkeypatch.setattr(os, 'fsync', lambda fd: synced.append(os.readlink(f'/proc/self/fd/{fd}')))
     path = tmp_path / 'run.mcap'
-    file = create_file(path, TOPICS, METADATA, compression='zstd')
+    file = McapWriter(path, TOPICS, METADATA, compression='zstd')
     assert synced == [str(path), str(tmp_path)]
     synced.clear()
     file.add(*single(0, 1, pose_cdr(1)))
@@ -142,7 +142,7 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
 def test_a_disk_that_fails_is_told_and_what_was_written_stays(tmp_path, monkeypatch):
     """What is in memory is written, or its loss is an error: also by `finish`."""
     path, pwrite = tmp_path / 'run.mcap', os.pwrite
-    file = create_file(path, TOPICS, METADATA, compression='zstd')
+    file = McapWriter(path, TOPICS, METADATA, compression='zstd')
     file.add(*rows_of(0, 100))
     file.flush()
     file.add(*rows_of(100, 200))
@@ -157,7 +157,7 @@ def test_a_disk_that_fails_is_told_and_what_was_written_stays(tmp_path, monkeypa
     file.finish()
     assert is_indexed(path) and numbers_in(path) == list(range(100))
     path.unlink()
-    file = create_file(path, TOPICS, METADATA, compression='zstd')
+    file = McapWriter(path, TOPICS, METADATA, compression='zstd')
     file.add(*rows_of(0, 100))
     monkeypatch.setattr(os, 'pwrite', refuse)
     with pytest.raises(OSError, match='No space'):
@@ -407,7 +407,7 @@ def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_
 def test_an_interrupted_write_shifts_nothing(tmp_path, monkeypatch):
     """An interrupt in the middle of a chunk; the chunk is written again, and all places hold."""
     path = tmp_path / 'run.mcap'
-    file = create_file(path, TOPICS, METADATA, compression='none')
+    file = McapWriter(path, TOPICS, METADATA, compression='none')
     size = file.size
     pwrite = os.pwrite
 

@@ -37,11 +37,11 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_types_from_msg
 
 from spinning_top_sim.recording import provenance
-from spinning_top_sim.recording.recorder import CHUNK_BYTES, Recorder, single
+from spinning_top_sim.recording.recorder import Recorder, single
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, RecordedTopic, find_definition
-from spinning_top_sim.recording.writer import create_file
-from spinning_top_sim.streams import journal, parameters
-from spinning_top_sim.streams.topics import all_streams
+from spinning_top_sim.recording.writer import CHUNK_BYTES, McapWriter
+from spinning_top_sim.streams import events, parameters
+from spinning_top_sim.streams.play import Simulation
 
 COMPRESSIONS = ('zstd', 'lz4', 'none')
 SUMMARY_OPCODES = (
@@ -191,8 +191,8 @@ def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
 
 def test_the_definitions_of_all_streams_are_those_of_jazzy():
     """By name; those of ROS itself have comments.  Hashes and parsed texts are the same."""
-    types = {stream.type_name for stream in all_streams(parameters.checked({}))}
-    for type_name in sorted(types | set(journal.TOPICS.values())):
+    types = {channel.type_name for channel in Simulation(parameters.checked({}), 0).channels}
+    for type_name in sorted(types | set(events.TOPICS.values())):
         text, type_hash = find_definition(type_name)
         assert type_hash == JAZZY.hash_rihs01(type_name)
         assert get_types_from_msg(text, type_name)[type_name] == JAZZY.fielddefs[type_name]
@@ -232,7 +232,7 @@ def test_messages_of_any_length_are_all_kept_and_the_bytes_are_always_the_same(
         messages.append((topic, time_ns, rng.randbytes(3_000_000 if time_ns == 999 else size)))
     for folder in (tmp_path / 'a', tmp_path / 'b'):
         folder.mkdir()
-        file = create_file(folder / 'run.mcap', TOPICS, METADATA, compression=compression)
+        file = McapWriter(folder / 'run.mcap', TOPICS, METADATA, compression=compression)
         for number, message in enumerate(messages):
             file.add(*single(*message))
             if number % 700 == 0:

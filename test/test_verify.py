@@ -189,6 +189,33 @@ def test_a_log_of_1_is_read_and_verified_by_1(capsys):
         'draws other noise and computes other last bits: verify it with that version\n')
 
 
+@pytest.fixture(scope='module')
+def receiver(tmp_path_factory):
+    """A late receiver on a moving pivot, with an outage longer than a block; an IMU with drops."""
+    pytest.importorskip('pymap3d')
+    values = {'gnss.enabled': 'true', 'gnss.latency': 0.12, 'gnss.outages': '[2.8, 5.0]',
+              'pivot.waypoints': '[0.0, 0.0, 0.0, 4.0, 2.0, 5.0]', 'imu.drop_rate': 0.05}
+    return log_of(tmp_path_factory.mktemp('log') / 'gnss.mcap', '--duration', 5, *(
+        part for name, value in values.items() for part in ('-p', f'{name}:={value}')))
+
+
+def test_what_a_sensor_delays_or_drops_is_no_gap_and_a_message_that_is_lost_is_one(
+        receiver, tmp_path, capsys):
+    assert verified(capsys, receiver)['identical']
+    lossy = rewritten(receiver, tmp_path / 'lossy.mcap', lambda topic, number, data: (
+        None if number == 10 else data))
+    for log, lost in ((receiver, 0), (lossy, 1)):
+        topics = as_json(capsys, log)[1]['topics']
+        assert topics['/imu/data_raw']['missing'] == lost and topics['/imu/data_raw'][
+            'count'] < 990
+        for topic, count, late_ns in (
+                ('/gnss/fix', 49, 120_000_000), ('/gnss/velocity', 49 - 21, 120_000_000),
+                ('/ground_truth/gnss/fix', 51, 0)):
+            found, at_ns = topics[topic], 2 * SECOND + late_ns
+            assert (found['count'], found['missing']) == (count - lost, lost)
+            assert found['gaps_ns'] == lost * [[at_ns, at_ns]]
+
+
 def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):
     torn = tmp_path / 'torn.mcap'
     with open(columns, 'rb') as file:

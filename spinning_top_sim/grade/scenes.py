@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.vertical import state_of
 
 Reals = NDArray[np.float64]
 

@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.scenes import Reals
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.vertical import state_of
 
 # The unknowns: rotation of the reference attitude [rad], angular velocity [rad/s], L3/lambda1
 # [rad/s], P/lambda1 [1/s^2], rotation of the reference mounting [rad], place in the body [m],

@@ -64,50 +64,16 @@ class Description:
     separatrix_distance: float
     gyroscopic_ratio: float
 
-    def __str__(self) -> str:
-        low, high = math.degrees(self.theta_min), math.degrees(self.theta_max)
-        tilt, rates = f'theta = {low:.4g} deg', ''
-        if self.nutation_period is not None:
-            tilt = f'theta from {_span(low, high)} deg every {self.nutation_period:.6g} s'
-            rates = f' ({_span(self.precession_min, self.precession_max)})'
-        return (f'{self.name}: {tilt}; precession {self.mean_precession_rate:.6g} rad/s{rates}, '
-                f'spin {self.mean_spin_rate:.6g} rad/s; spin ratio L3^2/(4 lambda1 |P|) = '
-                f'{self.gyroscopic_ratio:.4g} (upright, it sleeps above 1), distance from the '
-                f'separatrix 1 - m = {self.separatrix_distance:.3g}')
-
-
-def _span(low: float, high: float) -> str:
-    """Return both ends of a range in words, apart; one that is 0 but for rounding is 0."""
-    dust = COINCIDE * min(max(abs(low), abs(high)), 1e300)
-    ends = [0.0 if abs(x) <= dust else x for x in (low, high)]
-    digits = next((n for n in range(4, 14) if len({f'{x:.{n}g}' for x in ends}) == 2), 4)
-    return ' to '.join(f'{x:.{digits}g}' for x in ends)
-
-
-def swing(top: Top, state: State) -> tuple[float, float]:
-    """Return the least and the greatest cos(theta) between which the axis swings."""
-    sin_half, cos_half = math.sin(0.5 * state.theta), math.cos(0.5 * state.theta)
-    cubic = nutation_cubic(top.lambda1, top.gravity_torque, state.l3, state.lz, state.theta_dot,
-                           sin_half, cos_half)
-    scale = max(map(abs, cubic))
-    if not math.isfinite(scale):        # next to a pole that it cannot reach: thrown far away
-        return -1.0, 1.0
-    f0, f1, f2, f3 = (x / (scale or 1.0) for x in cubic)
-    down, up = -2.0 * cos_half ** 2, 2.0 * sin_half ** 2        # to u = -1 and u = 1
-    if f0:
-        low, high = _bisect(f0, f1, f2, f3, down), _bisect(f0, f1, f2, f3, up)
-    elif f1 > 0.0:      # theta' = 0: one end is here, and f1 says on which side the other is
-        low, high = 0.0, _bisect(f1, f2, f3, 0.0, up)
-    else:
-        low, high = _bisect(-f1, -f2, -f3, 0.0, down) if f1 else 0.0, 0.0
-    u0 = math.cos(state.theta)
-    return max(u0 + low, -1.0), min(u0 + high, 1.0)
-
 
 def axis_rests(top: Top, state: State) -> bool:
     """Return whether theta stays as it is: sleeping, hanging at a pole, steady precession."""
-    low, high = swing(top, state)
-    return high - low <= COINCIDE
+    f0, f1, f2, _ = nutation_cubic(
+        top.lambda1, top.gravity_torque, state.l3, state.lz, state.theta_dot,
+        math.sin(0.5 * state.theta), math.cos(0.5 * state.theta))
+    if not (f0 or f1):
+        return True
+    # Of so short a swing the cubic is a parabola: the distance of its roots.
+    return -math.inf < f2 < 0.0 and math.hypot(f1 / f2, 2.0 * math.sqrt(-f0 / f2)) <= COINCIDE
 
 
 def nutation_cubic(lambda1: Real, torque: Real, l3: Real, lz: Real, theta_dot: Real,
@@ -136,25 +102,17 @@ def precession_momentum(l3: Real, lz: Real, sin2_half: Real, cos2_half: Real) ->
     return (lz + l3) - 2 * l3 * cos2_half
 
 
-def _bisect(f0: float, f1: float, f2: float, f3: float, end: float) -> float:
-    """Return the root between 0, where f > 0, and `end`, where f <= 0."""
-    inside, outside = 0.0, end
-    while True:
-        middle = 0.5 * (inside + outside)
-        if middle in (inside, outside):
-            return middle
-        if ((f3 * middle + f2) * middle + f1) * middle + f0 > 0.0:
-            inside = middle
-        else:
-            outside = middle
+def regime(top: Top, state: State, theta_min: float, theta_max: float,
+           coincide: float = COINCIDE) -> str:
+    """
+    Return the name of the motion that swings between these tilts [rad].
 
-
-def regime(top: Top, state: State, coincide: float = COINCIDE) -> str:
-    """Return the motion's name; coincide: relative distance below which roots are one."""
+    coincide : relative distance below which cosines of tilts are equal
+    """
     moves = state.l3 != 0.0 or state.lz != 0.0
     if top.gravity_torque == 0.0:
         return 'free top' if moves or state.theta_dot else 'at rest'
-    low, high = swing(top, state)
+    low, high = math.cos(theta_max), math.cos(theta_min)
     rests = high - low <= coincide
     if rests and 1.0 - abs(low) <= coincide:
         if not moves:
@@ -199,16 +157,11 @@ def precession_extremes(top: Top, state: State, theta_min: float,
                         theta_max: float) -> tuple[float, float]:
     """Return the least and the greatest phi' [rad/s] while theta swings between two tilts."""
     # They lie at the ends, or where d phi'/du = 0: L3 u^2 - 2 Lz u + L3 = 0.
-    tilts = [theta_min, theta_max]
-    l3, lz = state.l3, state.lz
+    tilts, l3, lz = [theta_min, theta_max], state.l3, state.lz
     if abs(lz) > abs(l3):
         inner = math.acos(l3 / (lz + math.copysign(math.sqrt(lz * lz - l3 * l3), lz)))
-        if theta_min < inner < theta_max:
-            tilts.append(inner)
-    rates = []
-    for theta in tilts:
-        cos2, sin2 = math.cos(0.5 * theta) ** 2, math.sin(0.5 * theta) ** 2
-        singular = (theta == math.pi and lz + l3 != 0.0) or (sin2 == 0.0 and lz - l3 != 0.0)
-        rates.append(math.copysign(math.inf, lz - l3 * math.cos(theta)) if singular
-                     else attitude.precession_rate(top, l3, lz, cos2, sin2))
-    return min(rates), max(rates)
+        tilts.append(min(max(inner, theta_min), theta_max))
+    half = 0.5 * np.array(tilts)
+    with np.errstate(divide='ignore'):
+        rates = attitude.precession_rate(top, l3, lz, np.cos(half) ** 2, np.sin(half) ** 2)
+    return float(rates.min()), float(rates.max())

@@ -1,56 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Reads MCAP logs of any writer, also truncated and damaged ones.
+Reads MCAP logs of any writer, also truncated and damaged ones, with mcap's records.
 
-The summary of a whole file leads to its messages; any other file is read from record to record.
+Lengths lead from record to record, so that no index or summary is needed.
 """
 
 import contextlib
+import heapq
 import itertools
 import os
+import struct
 import zlib
-from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
-from io import BytesIO, FileIO
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
-from mcap import records
-from mcap.exceptions import McapError
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.reader import NonSeekingReader
-from mcap.summary import Summary
+from mcap.records import Channel, Chunk, DataEnd, Header, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
-from spinning_top_sim.recording import decoding, rosbag2
-from spinning_top_sim.recording.decoding import HEAD, CompleteReads, LogMessage, Messages
+from spinning_top_sim.recording import rosbag2
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.writer import record_bytes, time_span
 
-MAX_BYTES = 256 << 20       # of one record or one uncompressed chunk in memory
+MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
+MAX_DECLARED = 16 << 20     # of schemas, channels and metadata, which take ten times that
+MOST_INDEX = 1 << 20        # bytes behind the last chunk that may be torn without a loss
+MESSAGE_BYTES = 300         # what a message in memory takes besides its data, about
 MOST_REASONS = 20           # of damage that are told
-BLOCK = 16384               # messages that are read together
-RUN_BYTES = 1 << 20         # of messages outside of chunks that are read together, about
-MAGIC_SIZE = len(MCAP0_MAGIC)
-FOOTER_SIZE, DATA_END_SIZE = HEAD.size + 8 + 8 + 4, HEAD.size + 4
-FIRST_DATE = 10 ** 17       # [ns], in 1973
+BLOCK = 16384               # messages that are grouped together
+HEAD = struct.Struct('<BQ')     # of every record: opcode, length of what follows
+TIMES = struct.Struct('<QQ')    # after the head of a chunk: earliest and latest log time
+MESSAGE = struct.Struct('<HIQ')     # after that of a message: channel, sequence, log time
 UNPACK = {b'\x28\xb5\x2f\xfd': 'zstd -d {} -o {}', b'\x04\x22\x4d\x18': 'lz4 -d {} {}'}
+# What is raised for bytes that are not as they should be.
+UNREADABLE = (McapError, ValueError, OverflowError, struct.error)
 
 
-@dataclass(frozen=True)
-class LogTopic:
+class LogMessage(NamedTuple):
+    """A message of a log."""
+
+    topic: str
+    log_time: int       # [ns]
+    publish_time: int   # [ns]
+    sequence: int       # number in its channel
+    data: bytes         # the serialized message
+    channel_id: int
+
+
+class LogTopic(NamedTuple):
     """A channel of a log."""
 
     name: str
     type_name: str              # such as 'sensor_msgs/msg/Imu', empty without schema
-    schema: str                 # the definition with its dependencies
-    schema_encoding: str        # such as 'ros2msg'
     encoding: str               # of the messages, such as 'cdr'
     qos: tuple[rosbag2.Qos, ...]    # offered profiles, with the keys of `rosbag2.DEFAULT_QOS`
-    metadata: Mapping[str, str]
     channel_id: int
 
 
@@ -62,30 +72,27 @@ class Damage:
     lost_bytes: int = 0         # that cannot be read; indexes do not count
     reasons: list[str] = field(default_factory=list)
 
-    def lose(self, offset: int, end: int, reason: str) -> None:
-        self.lost_bytes += end - offset
-        self.reasons.append(f'found: {end - offset} bytes at byte {offset}: {reason}')
-
     def lines(self) -> list[str]:
         """Return what is lost, and the first reasons."""
         lost = [f'lost: {self.lost_bytes} bytes'] if self.lost_bytes else []
         return lost + self.reasons[:MOST_REASONS]
 
 
-class Part(NamedTuple):
-    """A record, or adjacent messages outside of chunks."""
+class _Place(NamedTuple):
+    """A chunk, or a message outside of one: its log times [ns], where it is, its channels."""
 
-    record: records.McapRecord | None       # None for messages outside of chunks
-    messages: Messages                      # these, or those of a chunk
+    start_ns: int
+    end_ns: int
     offset: int
     end: int
+    channels: set[int]
 
 
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
     An MCAP file, open for reading; a context manager.  Raises LogError if it is none.
 
-    A file with a summary opens at once, any other is read through.  What is damaged is left out.
+    What is damaged is left out.
 
     Parameters
     ----------
@@ -101,7 +108,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     profile, library : str
         What its header says: such as 'ros2', and the program that wrote it.
     whole : bool
-        Whether the file was closed and its summary, if any, is right; see also `damage`.
+        Whether the file was closed; see also `damage`.
     metadata : dict
         The metadata records by name; of several with one name, the last.
     schemas, channels : dict
@@ -113,26 +120,22 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
         self.path, self._max_bytes, self.left_out = _file_of(Path(path)), max_bytes, 0
         self.metadata: dict[str, dict[str, str]] = {}
-        self._small_bytes = 0       # of schemas, channels and metadata
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._declared_bytes = 0
+        self._damage: Damage | None = None
         try:
             if self.path.exists() and not self.path.is_file():     # opening a pipe would block
                 raise LogError(f'cannot read {self.path}: it is no regular file')
-            self._file = CompleteReads(FileIO(self.path))
+            self._file = open(self.path, 'rb', buffering=0)  # noqa: SIM115
         except OSError as error:
             raise LogError(f'cannot read {self.path}: {error.strerror}') from error
-        self.size = self._data_end = self._file.size
         try:
+            self.size = os.fstat(self._file.fileno()).st_size
             header = self._read_header()
             self.profile, self.library = header.profile, header.library
-            self._torn, self._summary, self._problem = True, Summary(), ''
-            try:
-                self._read_summary()
-            except decoding.UNREADABLE as error:
-                self._problem = f'found: no summary: {error or "the file is truncated"}'
-            self.whole = not self._problem
-            self.schemas, self.channels = self._summary.schemas, self._summary.channels
-            self._damage: Damage | None = None
-            self._chunks = self._find_chunks()
+            self.whole = self._at(self.size - len(MCAP0_MAGIC), self.size) == MCAP0_MAGIC
+            self._places = sorted(self._find_places(), key=attrgetter('start_ns'))
         except BaseException:
             self.close()
             raise
@@ -147,14 +150,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     @property
     def topics(self) -> tuple[LogTopic, ...]:
         """The channels of the log, in the order of their ids."""
-        none = records.Schema(id=0, data=b'', encoding='', name='')
         return tuple(LogTopic(
-            name=channel.topic, type_name=schema.name,
-            schema=schema.data.decode(errors='replace'), schema_encoding=schema.encoding,
-            encoding=channel.message_encoding, qos=rosbag2.qos_profiles(channel),
-            metadata=channel.metadata, channel_id=number)
+            channel.topic, schema.name if schema else '', channel.message_encoding,
+            rosbag2.qos_profiles(channel), number)
             for number, channel in sorted(self.channels.items())
-            for schema in [self.schemas.get(channel.schema_id, none)])
+            for schema in [self.schemas.get(channel.schema_id)])
 
     @property
     def compression(self) -> rosbag2.Compression:
@@ -174,19 +174,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         assert self._damage is not None
         return self._damage
 
-    @cached_property
+    @property
     def span(self) -> tuple[int, int]:
-        """
-        The earliest and the latest log time [ns]; both 0 without messages.
-
-        Beside dates, a time of 0 does not count: it says that there was no clock yet.
-        """
-        begin_ns = min((chunk.message_start_time for chunk in self._chunks), default=0)
-        end_ns = max((chunk.message_end_time for chunk in self._chunks), default=0)
-        if begin_ns == 0 and end_ns > FIRST_DATE:
-            first = next(self.messages(start=1), None)
-            begin_ns = first.log_time if first and first.log_time > FIRST_DATE else 0
-        return begin_ns, end_ns
+        """The earliest and the latest log time [ns]; both 0 without messages."""
+        return (min((place.start_ns for place in self._places), default=0),
+                max((place.end_ns for place in self._places), default=0))
 
     def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
                  end: int | None = None) -> Iterator[LogMessage]:
@@ -212,38 +204,34 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         wanted = {number: channel.topic for number, channel in self.channels.items()
                   if names is None or channel.topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
-        mode, compression = self.compression
-        # What is read and not yet passed: log time, chunk, offset there
-        held: list[tuple[int, int, int, Messages]] = []
-        opened: list[tuple[int, int]] = []      # latest log time and size of chunks
-        for chunk in [*sorted(self._chunks, key=attrgetter('message_start_time')), None]:
-            passed = len(held) if chunk is None else bisect_left(
-                held, (chunk.message_start_time,))
-            for time_ns, _, offset, messages in held[:passed]:
-                if time_ns in times:
-                    message = messages.message(wanted, offset)
-                    yield message if mode != 'MESSAGE' else self._decompressed(
-                        message, compression)
-            del held[:passed]
-            if (chunk is None or chunk.message_end_time < times.start
-                    or chunk.message_start_time >= times.stop
-                    or wanted.keys().isdisjoint(chunk.message_index_offsets)):
+        # What is read and not yet passed: log time, place, number there
+        held: list[tuple[int, int, int, Message]] = []
+        held_bytes = 0
+        mode, form = self.compression
+        for place in [*self._places, None]:
+            while held and (place is None or held[0][0] < place.start_ns):
+                *_, message = heapq.heappop(held)
+                held_bytes -= MESSAGE_BYTES + len(message.data)
+                topic, data = wanted[message.channel_id], message.data
+                if mode == 'MESSAGE':
+                    data = self._decompressed(data, form, topic)
+                yield LogMessage(topic, message.log_time, message.publish_time, message.sequence,
+                                 data, message.channel_id)
+            if (place is None or place.end_ns < times.start or place.start_ns >= times.stop
+                    or wanted.keys().isdisjoint(place.channels)):
                 continue
-            place = chunk.chunk_start_offset
             try:
-                messages = self._part(place, place + chunk.chunk_length).messages
-            except decoding.UNREADABLE:
+                records = self._records(self._at(place.offset, place.end))
+            except UNREADABLE:
                 self.left_out += 1
                 continue
-            opened = [one for one in opened if one[0] >= chunk.message_start_time]
-            opened.append((chunk.message_end_time, len(messages.plain)))
-            if sum(size for _, size in opened) > 2 * self._max_bytes:
-                raise LogError(f'cannot read {self.path}: chunks that overlap in time have more '
+            for number, one in enumerate(records):
+                if isinstance(one, Message) and one.channel_id in wanted and one.log_time in times:
+                    heapq.heappush(held, (one.log_time, place.offset, number, one))
+                    held_bytes += MESSAGE_BYTES + len(one.data)
+            if held_bytes > 2 * self._max_bytes:
+                raise LogError(f'cannot read {self.path}: messages that overlap in time take more '
                                f'than {2 * self._max_bytes} bytes')
-            for number in wanted.keys() & messages.entries.keys():
-                held += ((time_ns, place, offset, messages)
-                         for time_ns, offset in messages.entries[number].tolist())
-            held.sort()
 
     def groups(self, topics: Iterable[str] | None = None,
                ) -> Iterator[tuple[str, list[LogMessage]]]:
@@ -253,134 +241,149 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
                 yield topic, list(group)
 
-    def _decompressed(self, message: LogMessage, compression: str) -> LogMessage:
+    def _decompressed(self, data: bytes, form: str, topic: str) -> bytes:
         try:
-            data = decoding.decompress(message.data, compression or 'unknown', self._max_bytes)
+            return _decompress(data, form or 'unknown', self._max_bytes)
         except McapError as error:
-            raise LogError(f'cannot read {self.path}: a message of {message.topic}: {error}'
-                           ) from None
-        return message._replace(data=data)
+            raise LogError(f'cannot read {self.path}: a message of {topic}: {error}') from None
 
-    # ------------------------------------------------------------------------------ the records
+    def parts(self) -> Iterator[tuple[int, list[McapRecord]]]:
+        """
+        Yield (offset, records) of what can be read, in file order: a record, or those of a chunk.
 
-    def parts(self) -> Iterator[Part]:
-        """Yield what can be read, in file order; then `damage` tells what cannot."""
-        damage = Damage(self._torn, reasons=[self._problem] * (not self.whole))
-        offset, index_bytes, self._small_bytes = MAGIC_SIZE, 0, 0
-        while offset < self._data_end:
-            opcode, end = self._end_of(offset)
-            if opcode == 0 or end > self._data_end:
-                # Nothing is lost by a truncated index of the last chunk.
-                if not self._torn or opcode not in (Opcode.MESSAGE_INDEX, Opcode.DATA_END) or (
-                        self.size - offset > index_bytes + DATA_END_SIZE):
-                    damage.lose(offset, self._data_end, 'no whole record')
+        After that, `damage` tells what cannot be read.
+        """
+        damage = Damage(not self.whole)
+        if damage.torn:
+            damage.reasons.append('found: the file does not end as an MCAP file ends')
+        crc = zlib.crc32(MCAP0_MAGIC)
+        for opcode, offset, end in self._heads():
+            # What follows the last chunk is made anew.
+            if damage.torn and end > self.size < offset + MOST_INDEX and opcode in (
+                    Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.DATA_END):
                 break
             try:
-                # Opcodes that are unknown belong to an application.
-                if opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE_INDEX:
-                    part = self._part(offset, end)
-                    self._declare(part.messages)
-                    self._check_data(part, damage)
-                    index_bytes = len(part.messages.plain)      # at most
-                    yield part
-            except decoding.UNREADABLE as error:
-                damage.lose(offset, end, str(error))
-            offset = end
-            if opcode == Opcode.DATA_END:
-                break
-        else:
-            damage.reasons += ['found: the data section has no end'] * (not self._torn)
+                raw = self._at(offset, end)
+                records = self._records(raw)
+            except UNREADABLE as error:
+                lost = min(end, self.size) - offset
+                damage.lost_bytes += lost
+                damage.reasons.append(f'found: {lost} bytes at byte {offset}: '
+                                      f'{error or "a length in it is wrong"}')
+                continue
+            for one in records:
+                if isinstance(one, DataEnd) and one.data_section_crc not in (0, crc) and (
+                        not damage.lost_bytes):
+                    damage.reasons.append('found: the checksum of the data section is wrong')
+            crc = zlib.crc32(raw, crc)
+            yield offset, records
         self._damage = damage
 
-    def _end_of(self, offset: int) -> tuple[int, int]:
-        """Return opcode and end of a record, or the end of adjacent messages, some if many."""
-        opcode, end = self._head(offset)
-        while opcode == Opcode.MESSAGE and end - offset < RUN_BYTES and end < self._data_end:
-            following, its_end = self._head(end)
-            if following != Opcode.MESSAGE or its_end > self._data_end:
-                break
-            end = its_end
-        return opcode, end
+    # -------------------------------------------------------------------------------- the bytes
 
-    def _part(self, offset: int, end: int) -> Part:
-        """Return what is there.  Raises UNREADABLE."""
-        raw = self._raw(offset, end)
-        if raw[:1] == bytes([Opcode.MESSAGE]):
-            return Part(None, decoding.find_messages(raw), offset, end)
-        record = decoding.parse(raw)
-        return Part(record, decoding.open_chunk(record, self._max_bytes)
-                    if isinstance(record, records.Chunk) else Messages(b'', {}, [record]),
-                    offset, end)
-
-    def _head(self, offset: int) -> tuple[int, int]:
-        """Return opcode and end of the record there; a head that is not whole has no end."""
-        head = self._file.at(offset, min(offset + HEAD.size, self.size))
-        opcode, length = HEAD.unpack(head.ljust(HEAD.size, b'\xff'))
-        return opcode, offset + HEAD.size + length
-
-    def _raw(self, offset: int, end: int) -> bytes:
+    def _at(self, offset: int, end: int) -> bytes:
+        """Return the bytes there.  Raises UNREADABLE if there are fewer, or too many."""
+        if not 0 <= offset <= end <= self.size:
+            raise EndOfFile('no whole record')
         if end - offset > self._max_bytes:
             raise McapError(f'more than {self._max_bytes} bytes are not read')
-        return self._file.at(offset, end)
+        try:
+            return os.pread(self._file.fileno(), end - offset, offset)
+        except OSError as error:
+            raise LogError(f'cannot read {self.path}: {error.strerror}') from error
 
-    def _check_data(self, end: Part, damage: Damage) -> None:
-        """Compare the checksum of all data, if that is the data end and has one."""
-        crc = 0
-        if isinstance(end.record, records.DataEnd) and end.record.data_section_crc:
-            for begin in range(0, end.offset, RUN_BYTES):
-                crc = zlib.crc32(self._file.at(begin, min(begin + RUN_BYTES, end.offset)), crc)
-            if crc != end.record.data_section_crc:
-                damage.reasons.append('found: the checksum of the data section is wrong')
+    def _heads(self) -> Iterator[tuple[int, int, int]]:
+        """Yield opcode, begin and end of the records, the last of which may have no whole end."""
+        opcode, end = 0, len(MCAP0_MAGIC)
+        while end < self.size and opcode not in (Opcode.DATA_END, Opcode.FOOTER):
+            offset = end
+            head = self._at(offset, min(offset + HEAD.size, self.size))
+            opcode, length = HEAD.unpack(head.ljust(HEAD.size, b'\xff'))
+            # A file system may leave zeros behind a tear.
+            end = offset + HEAD.size + length if opcode else self.size + 1
+            yield opcode, offset, end
 
-    def is_declared(self, channel_id: int) -> bool:
-        """Return whether a channel and its schema, if it has one, are known."""
-        channel = self.channels.get(channel_id)
-        return channel is not None and channel.schema_id in {0, *self.schemas}
+    def _records(self, raw: bytes) -> list[McapRecord]:
+        """Return a record, or those of a chunk, after noting what they declare; UNREADABLE."""
+        # Opcodes that are unknown belong to an application.
+        if raw[0] > Opcode.DATA_END or raw[0] == Opcode.MESSAGE_INDEX:
+            return []
+        record = _parse(raw)
+        records = self._broken_up(record) if isinstance(record, Chunk) else [record]
+        for one in records:
+            if not isinstance(one, Message):
+                self._declare(one)
+            elif one.channel_id not in self.channels:
+                raise McapError('no whole record declares a channel of its messages')
+        return records
 
-    def _declare(self, messages: Messages) -> None:
-        """Note schemas, channels and metadata.  Raises McapError if messages lack a channel."""
-        for record in messages.declared:
-            known: Any
-            if isinstance(record, records.Metadata):
-                self.metadata[record.name] = record.metadata
-            elif isinstance(record, records.Schema | records.Channel):
-                known = self.schemas if isinstance(record, records.Schema) else self.channels
-                if known.setdefault(record.id, record) != record:
-                    raise McapError(f'it changes {type(record).__name__.lower()} {record.id}')
-            else:
-                continue
-            self._small_bytes += len(record_bytes(record))
-            if self._small_bytes > decoding.MAX_SMALL:
-                raise McapError(f'more than {decoding.MAX_SMALL} bytes of schemas, channels and '
-                                'metadata are not read')
-        if not all(map(self.is_declared, messages.entries)):
-            raise McapError('no whole record declares a channel of its messages')
+    def _broken_up(self, chunk: Chunk) -> list[McapRecord]:
+        size = chunk.uncompressed_size
+        if size > self._max_bytes:
+            raise McapError(f'it unpacks to {size} bytes, more than the {self._max_bytes} that '
+                            'are read')
+        plain = _decompress(chunk.data, chunk.compression, size)    # mcap unpacks to any size
+        if len(plain) != size:
+            raise McapError('it has not the size that it says it has')
+        return breakup_chunk(replace(chunk, compression='', data=plain), validate_crc=True)
 
-    def _find_chunks(self) -> list[records.ChunkIndex]:
-        """Return where messages are; adjacent ones outside of chunks are as a chunk here."""
-        summary = self._summary
-        if not summary.chunk_indexes or not all(
-                one.message_index_offsets and all(map(self.is_declared, one.message_index_offsets))
-                for one in summary.chunk_indexes):
-            return [records.ChunkIndex(
-                chunk_start_offset=part.offset, chunk_length=part.end - part.offset,
-                message_start_time=start_ns, message_end_time=end_ns,
-                message_index_offsets=dict.fromkeys(entries, 0), message_index_length=0,
-                compression='', compressed_size=0, uncompressed_size=0)
-                for part in self.parts() if (entries := part.messages.entries)
-                for start_ns, end_ns in [time_span(entries)]]
-        with contextlib.suppress(*decoding.UNREADABLE):
-            for one in summary.metadata_indexes:
-                record = decoding.parse(self._raw(one.offset, one.offset + one.length))
-                self._declare(Messages(b'', {}, [record]))
-        return sorted(summary.chunk_indexes, key=attrgetter('chunk_start_offset'))
+    def _declare(self, record: McapRecord) -> None:
+        """Note a schema, a channel or metadata.  Raises McapError for too many of them."""
+        if isinstance(record, Metadata):
+            self.metadata[record.name] = record.metadata
+        elif isinstance(record, Schema | Channel):
+            known: dict[int, Any] = (
+                self.schemas if isinstance(record, Schema) else self.channels)
+            if record.id not in known:
+                self._declared_bytes += len(repr(record))
+                if self._declared_bytes > MAX_DECLARED:
+                    raise McapError(f'more than {MAX_DECLARED} bytes of schemas and channels are '
+                                    'not read')
+                known[record.id] = record
 
-    def _read_header(self) -> records.Header:
+    def _find_places(self) -> list[_Place]:
+        """Return where messages are, in file order, after noting what is declared."""
+        if self.whole:      # the summary repeats what a damaged record has declared
+            with contextlib.suppress(*UNREADABLE):
+                start = int.from_bytes(self._at(self.size - 28, self.size - 20), 'little')
+                summary = self._at(start, self.size)
+                if zlib.crc32(summary[:-12]) == int.from_bytes(summary[-12:-8], 'little'):
+                    for record in _stream(summary).records:
+                        self._declare(record)
+        places: list[_Place] = []
+        for opcode, offset, end in self._heads():
+            with contextlib.suppress(*UNREADABLE):
+                content = offset + HEAD.size
+                if end > self.size:
+                    break
+                if opcode == Opcode.CHUNK:
+                    times = TIMES.unpack(self._at(content, content + TIMES.size))
+                    places.append(_Place(*times, offset, end, set()))
+                elif opcode == Opcode.MESSAGE:
+                    channel, _, time_ns = MESSAGE.unpack(
+                        self._at(content, content + MESSAGE.size))
+                    places.append(_Place(time_ns, time_ns, offset, end, {channel}))
+                elif opcode == Opcode.MESSAGE_INDEX and places:
+                    places[-1].channels.add(
+                        int.from_bytes(self._at(content, content + 2), 'little'))
+                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+                    self._records(self._at(offset, end))
+        for place in places:        # those with no index, or with a torn one
+            if not self.channels.keys() >= place.channels != set() or not self.whole and (
+                    place is places[-1]):
+                with contextlib.suppress(*UNREADABLE):
+                    place.channels.update(
+                        one.channel_id for one in self._records(self._at(place.offset, place.end))
+                        if isinstance(one, Message))
+        return places
+
+    def _read_header(self) -> Header:
         """Return the header.  Raises LogError for no MCAP file."""
-        magic = self._file.read(min(MAGIC_SIZE, self.size))
-        with contextlib.suppress(*decoding.UNREADABLE):
-            header = decoding.parse(self._raw(MAGIC_SIZE, self._head(MAGIC_SIZE)[1]))
-            if magic == MCAP0_MAGIC and isinstance(header, records.Header):
+        magic = self._at(0, min(len(MCAP0_MAGIC), self.size))
+        with contextlib.suppress(*UNREADABLE):
+            _, offset, end = next(self._heads(), (0, 0, 0))
+            header = _parse(self._at(offset, end))
+            if magic == MCAP0_MAGIC and isinstance(header, Header):
                 return header
         reason = 'it is no MCAP file' if magic else 'it is empty'
         if magic[:4] in UNPACK:
@@ -388,20 +391,39 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 self.path, self.path.with_suffix(''))
         raise LogError(f'cannot read {self.path}: {reason}')
 
-    def _read_summary(self) -> None:
-        """Read the summary, if there is one.  UNREADABLE if it is damaged or the file is torn."""
-        footer_at = self.size - MAGIC_SIZE - FOOTER_SIZE
-        footer = decoding.parse(self._file.at(footer_at, self.size - MAGIC_SIZE))
-        if self._file.read(MAGIC_SIZE) != MCAP0_MAGIC or not isinstance(footer, records.Footer):
-            raise McapError('the file does not end as an MCAP file ends')
-        self._torn, start = False, footer.summary_start or footer_at
-        section = self._file.at(start, self.size)
-        if footer.summary_crc not in (0, zlib.crc32(section[:-MAGIC_SIZE - 4])):
-            raise McapError('its checksum is wrong')
-        self._data_end = start
-        if len(section) <= decoding.MAX_SMALL:      # else it is read from record to record
-            self._summary = NonSeekingReader(
-                CompleteReads(BytesIO(MCAP0_MAGIC + section))).get_summary() or Summary()
+
+class _Whole(BytesIO):
+    """Bytes; a read of them is complete or EndOfFile: mcap takes truncated fields for shorter."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = super().read(size)
+        if size is not None and len(data) < size:
+            raise EndOfFile
+        return data
+
+
+def _stream(raw: bytes) -> StreamReader:
+    return StreamReader(_Whole(raw), skip_magic=True, emit_chunks=True)
+
+
+def _parse(raw: bytes) -> McapRecord:
+    """Return a record of a known kind from all of its bytes; UNREADABLE."""
+    return next(_stream(raw).records)
+
+
+def _decompress(data: bytes, compression: str, most: int) -> bytes:
+    """Return the uncompressed bytes of all frames, or the first `most` + 1; UNREADABLE."""
+    stream: BinaryIO = BytesIO(data)
+    if compression == 'zstd':
+        stream = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)
+    elif compression == 'lz4':
+        stream = lz4.frame.open(stream)
+    elif compression:
+        raise McapError(f'its compression {compression[:20]!r} is none of zstd, lz4')
+    try:
+        return stream.read(most + 1)
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
+        raise McapError('it cannot be decompressed') from None
 
 
 def _file_of(path: Path) -> Path:

@@ -123,7 +123,7 @@ class Recorder:
         """What the recording has come to so far."""
         running = self.state in ('opening', 'recording')    # read first: nothing is written after
         file = self._file
-        numbers = file.message_counts.values() if file else itertools.repeat(0)
+        numbers = file.message_counts if file else itertools.repeat(0)
         counts = {topic.name: number for topic, number in zip(self._topics, numbers, strict=False)}
         missing = self._offered - sum(counts.values())
         return RecordingSummary(
@@ -198,8 +198,8 @@ class Recorder:
 
     def _open(self) -> McapWriter:
         """Return the file that `uri` names; in a folder, under the first free name."""
-        with needed('a recording'):
-            from spinning_top_sim.recording.writer import create_file  # noqa: PLC0415
+        with needed('a recording', 'mcap'):
+            from spinning_top_sim.recording.writer import McapWriter  # noqa: PLC0415
 
         folder = path = Path(self._uri).expanduser().absolute()
         if self._uri.endswith('/'):
@@ -210,7 +210,7 @@ class Recorder:
             if not named:
                 path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
             try:
-                file = create_file(path, self._topics, self._metadata,
+                file = McapWriter(path, self._topics, self._metadata,
                                    compression=self._compression,
                                    min_free_bytes=self._min_free_bytes)
                 self.path = path

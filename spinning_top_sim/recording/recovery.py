@@ -1,68 +1,85 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes what can be read of a damaged log into a new, indexed one."""
+"""Writes what can be read of a damaged log into a new, indexed one, by mcap's writer."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+import os
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
-from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
+from mcap.records import Attachment, Message, Metadata
+from mcap.writer import Writer
 
 from spinning_top_sim.recording.errors import LogError, why_not_written
-from spinning_top_sim.recording.reader import LogReader, Part
-from spinning_top_sim.recording.rosbag2 import BAG_METADATA
-from spinning_top_sim.recording.writer import McapWriter, time_span
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata
 
 
 def recover(reader: LogReader, output: Path,
-            progress: Callable[[float], object] = lambda done: None) -> McapWriter:
+            progress: Callable[[float], object] = lambda done: None) -> int:
     """
-    Write everything that can be read of a log into a new file; return what has written it.
+    Write everything that can be read of a log into a new file; return the number of messages.
 
     output : must not exist; is removed again where the recovery fails
     progress : is called with the bytes that are done, of `reader.size`
 
-    Chunks of messages are copied as they are, other messages are put into new chunks; message
-    indexes, statistics, summary and the `rosbag2` record are made anew.
+    Chunks, indexes, statistics, summary and the `rosbag2` record are made anew.
     Raises LogError, also if a file that was not closed holds no whole message.
     """
     try:
-        writer = McapWriter(output, header=Header(reader.profile, reader.library),
-                            compression='zstd')
-        with writer.discarded_on_failure():
-            for part in reader.parts():
-                progress(part.offset)
-                _copy(part, reader, writer)
-            _declare(filter(reader.is_declared, reader.channels), reader, writer)
-            if not writer.messages and not reader.whole:
-                raise LogError(f'nothing to save in {reader.path}: there is no whole message in '
-                               'it')
-            is_bag = reader.profile == 'ros2' or BAG_METADATA in reader.metadata
-            writer.finish(reader.compression if is_bag else None)
+        with open(output, 'xb') as file:
+            try:
+                messages = _copy(reader, Writer(file, enable_data_crcs=True), output.name,
+                                 progress)
+                file.flush()
+                os.fsync(file.fileno())
+            except BaseException:
+                output.unlink()
+                raise
     except OSError as error:
         raise LogError(f'cannot write {output}: {why_not_written(output, error)}') from error
+    return messages
+
+
+def _copy(reader: LogReader, writer: Writer, name: str,
+          progress: Callable[[float], object]) -> int:
+    schemas, channels = {0: 0}, dict[int, int]()        # new ids by old ones
+
+    def declare() -> None:
+        for number, schema in reader.schemas.items():
+            if number not in schemas:
+                schemas[number] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        for number, channel in reader.channels.items():
+            if number not in channels:
+                channels[number] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0),
+                    channel.metadata)
+
+    writer.start(reader.profile, reader.library)
+    counts: Counter[int] = Counter()
+    times_ns: list[int] = []
+    for offset, records in reader.parts():
+        progress(offset)
+        declare()
+        for one in records:
+            if isinstance(one, Message):
+                writer.add_message(channels[one.channel_id], one.log_time, one.data,
+                                   one.publish_time, one.sequence)
+                counts[one.channel_id] += 1
+                times_ns = [min([*times_ns, one.log_time]), max([*times_ns, one.log_time])]
+            elif isinstance(one, Attachment):
+                writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type,
+                                      one.data)
+            elif isinstance(one, Metadata) and one.name != BAG_METADATA:
+                writer.add_metadata(one.name, one.metadata)
+    messages = counts.total()
+    if not messages and not reader.whole:
+        raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
+    if reader.profile == 'ros2' or BAG_METADATA in reader.metadata:
+        types = {topic.channel_id: topic.type_name for topic in reader.topics}
+        writer.add_metadata(BAG_METADATA, bag_metadata(
+            [(channel, types[number], counts[number])
+             for number, channel in reader.channels.items()], name,
+            min(times_ns, default=0), max(times_ns, default=0), reader.compression))
+    writer.finish()
     progress(reader.size)
-    return writer
-
-
-def _copy(part: Part, reader: LogReader, writer: McapWriter) -> None:
-    chunk, messages = part.record, part.messages
-    for record in messages.declared:
-        if isinstance(record, Schema | Channel | Attachment) or (
-                isinstance(record, Metadata) and record.name != BAG_METADATA):
-            writer.write(record)
-    _declare(messages.entries, reader, writer)
-    if messages.entries and isinstance(chunk, Chunk):
-        start_ns, end_ns = time_span(messages.entries)
-        writer.write_chunk(replace(
-            chunk, message_start_time=start_ns, message_end_time=end_ns), messages.entries)
-    elif messages.entries:
-        writer.write_messages(messages.plain, messages.entries)
-
-
-def _declare(channel_ids: Iterable[int], reader: LogReader, writer: McapWriter) -> None:
-    """Write these channels; a summary tells those whose records are damaged."""
-    for number in channel_ids:
-        channel = reader.channels[number]
-        if channel.schema_id:
-            writer.write(reader.schemas[channel.schema_id])
-        writer.write(channel)
+    return messages

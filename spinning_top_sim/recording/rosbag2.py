@@ -134,15 +134,15 @@ def compression_of(text: str) -> Compression:
     return NOT_COMPRESSED if found.mode in ('', 'NONE') else found
 
 
-def bag_metadata_yaml(topics: Sequence[tuple[Channel, str, int]], file_name: str, start_ns: int,
-                      end_ns: int, compression: Compression) -> str:
-    """Return the text of the `rosbag2` record; `topics` are channels, types and message counts."""
+def bag_metadata(topics: Sequence[tuple[Channel, str, int]], file_name: str, start_ns: int,
+                 end_ns: int, compression: Compression = NOT_COMPRESSED) -> dict[str, str]:
+    """Return the `rosbag2` record; `topics` are channels, types and message counts."""
     # A file name may hold bytes that are no text: they must not spoil the closing of a log.
     file_name = file_name.encode(errors='replace').decode()
     start = {'nanoseconds_since_epoch': start_ns}
     duration = {'nanoseconds': end_ns - start_ns}
     total = sum(messages for _, _, messages in topics)
-    return _dump({
+    return {'serialized_metadata': _dump({
         'version': 9,   # of rosbag2_storage::BagMetadata in jazzy
         'storage_identifier': 'mcap',
         'duration': duration,
@@ -164,7 +164,7 @@ def bag_metadata_yaml(topics: Sequence[tuple[Channel, str, int]], file_name: str
         'files': [{'path': file_name, 'starting_time': start, 'duration': duration,
                    'message_count': total}],
         'custom_data': None,
-        'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy'})
+        'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy'})}
 
 
 class _Dumper(yaml.SafeDumper):

@@ -12,11 +12,11 @@ import contextlib
 import itertools
 import os
 import struct
-import threading
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
+from operator import itemgetter
 from pathlib import Path
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -33,47 +33,78 @@ from spinning_top_sim.recording import rosbag2
 from spinning_top_sim.recording.errors import RecordingError, why_not_written
 from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
 
+CHUNK_BYTES = 1_000_000     # of messages that make a chunk, about
 # The fastest level that compresses nearly as well as zstd's own default, 3, with a window of a
 # whole chunk: its default, half of one, costs up to 20 %.
 ZSTD = zstandard.ZstdCompressionParameters.from_level(-1, window_log=20)
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
 
-# Message index entries of a chunk by channel id: (n, 2) log times and offsets in the chunk.
-Entries = Mapping[int, NDArray[np.uint64]]
-
 
 class McapWriter:
     """
-    A new MCAP file, which must not exist (FileExistsError), used by one thread at a time.
+    A new log, used by one thread at a time; its head is on the disk at once.
 
-    `add` collects messages of a topic for a chunk, `flush` writes the chunk.  A topic is an index
-    here, its channel has the id index + 1, and its messages are numbered.
+    `add` collects messages for a chunk and writes it when it is full; `flush` writes it now.  The
+    topic with index i has the channel i + 1.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 
+    path : must not exist
+    topics : all stand before the first chunk, so that a truncated file tells them in any case
+    metadata : the `spinning_top_sim` record at the head of the file
     compression : of the chunks, 'zstd', 'lz4' or 'none'
+
+    Raises ValueError for a topic that is listed twice, RecordingError naming path or type.
     """
 
-    def __init__(self, path: Path, *, header: records.Header, compression: str) -> None:
-        self._path = path
+    def __init__(self, path: Path, topics: Sequence[rosbag2.RecordedTopic],
+                 metadata: Mapping[str, str], *, compression: str,
+                 min_free_bytes: int = 0) -> None:
+        names = [topic.name for topic in topics]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f'topic {name!r} is listed twice: once is allowed')
+        self._path, self._topics = path, topics
         self._compression = '' if compression == 'none' else compression
         self._zstd = zstandard.ZstdCompressor(compression_params=ZSTD)
-        self._chunk, self._spare = _ChunkMemory(), _ChunkMemory()
-        self._beside: threading.Thread | None = None    # writes the chunk before
-        self._beside_error: Exception | None = None
-        self._next_sequence: dict[int, int] = {}    # by channel id
-        self.message_counts: dict[int, int] = {}    # messages in the file by channel id
-        self.chunk_count = 0
+        # What `add` was given for the next chunk, and its size there
+        self._rows: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
+        self._chunk_bytes = 0
+        self.message_counts = [0] * len(topics)     # messages in the file
         self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
-        self._type_names = {0: ''}                  # by schema id
-        self._channels: dict[int, records.Channel] = {}
+        types = list(dict.fromkeys(topic.type_name for topic in topics))
+        definitions = {name: rosbag2.find_definition(name) for name in types}
+        schemas = [records.Schema(number, definitions[name][0].encode(), 'ros2msg', name)
+                   for number, name in enumerate(types, start=1)]
+        self._channels = [records.Channel(
+            id=number, topic=topic.name, message_encoding='cdr',
+            schema_id=1 + types.index(topic.type_name),
+            metadata={'offered_qos_profiles': rosbag2.offered_qos_yaml(topic),
+                      'topic_type_hash': definitions[topic.type_name][1]})
+            for number, topic in enumerate(topics, start=1)]
         # Records of the summary by opcode.  Serialized: thousands of objects would take memory.
-        self._summary: defaultdict[int, list[bytes]] = defaultdict(list)
-        self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
-        with self.discarded_on_failure():
-            self._write([MCAP0_MAGIC, record_bytes(header)])
+        self._summary = defaultdict(list, {
+            Opcode.SCHEMA: [*map(record_bytes, schemas)],
+            Opcode.CHANNEL: [*map(record_bytes, self._channels)]})
+        header = records.Header(profile='ros2', library=OUR_LIBRARY + version())
+        try:
+            self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
+            try:
+                self.check_disk(min_free_bytes)
+                self._write([MCAP0_MAGIC, record_bytes(header)])
+                self._write_metadata(METADATA_NAME, dict(metadata))
+                self._write([*self._summary[Opcode.SCHEMA], *self._summary[Opcode.CHANNEL]])
+                self.sync()
+                _sync_directory(path.parent)
+            except BaseException:
+                self._file.close()
+                path.unlink(missing_ok=True)
+                raise
+        except (OSError, ValueError) as error:
+            raise RecordingError(
+                f'cannot record to {path}: {why_not_written(path, error)}') from error
 
     @property
     def size(self) -> int:
@@ -81,126 +112,89 @@ class McapWriter:
 
     @property
     def messages(self) -> int:
-        return sum(self.message_counts.values())
-
-    @contextlib.contextmanager
-    def discarded_on_failure(self) -> Iterator[None]:
-        """Close and remove the file if the body of the `with` statement raises."""
-        try:
-            yield
-        except BaseException:
-            self._file.close()
-            with contextlib.suppress(OSError):
-                self._path.unlink()
-            raise
-
-    def write(self, record: records.McapRecord) -> None:
-        """Write metadata, an attachment, or a schema or channel that is not there already."""
-        if isinstance(record, records.Schema):
-            if record.id in self._type_names:
-                return
-            self._type_names[record.id] = record.name
-        elif isinstance(record, records.Channel):
-            if record.id in self._channels:
-                return
-            self._channels[record.id] = record
-            self.message_counts[record.id] = self._next_sequence[record.id] = 0
-        offset, raw = self.size, record_bytes(record)
-        self._write([raw])
-        if isinstance(record, records.Metadata):
-            record = records.MetadataIndex(offset, len(raw), record.name)
-        elif isinstance(record, records.Attachment):
-            record = records.AttachmentIndex(
-                offset, len(raw), record.log_time, record.create_time, len(record.data),
-                record.name, record.media_type)
-        self._summarize(record)
-
-    def _summarize(self, record: records.McapRecord) -> None:
-        raw = record_bytes(record)
-        self._summary[raw[0]].append(raw)
+        return sum(self.message_counts)
 
     def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
             rows: NDArray[np.uint8]) -> None:
         """
-        Add messages of a topic to the chunk in memory.
+        Add messages of a topic, which must not change before the chunk is written.
 
         log_times_ns : log and publish times (n,), n >= 1, in any order
         rows : serialized messages (n, size)
         """
-        channel_id = topic_index + 1
-        self._chunk.add(channel_id, self._next_sequence[channel_id], log_times_ns, rows)
-        self._next_sequence[channel_id] += len(rows)
+        self._rows.append((topic_index, log_times_ns, rows))
+        self._chunk_bytes += len(rows) * _message_type(rows.shape[1]).itemsize
+        if self._chunk_bytes >= CHUNK_BYTES:
+            self.flush()
 
-    def flush(self, *, beside: bool = False) -> None:
+    def flush(self) -> None:
         """
         Write the chunk in memory, if it holds anything.
 
-        beside : in another thread, while the next chunk is filled: a seventh of the time of a
-            run of `simulate` is compression
-
-        An OSError, also that of the chunk written beside, loses its chunk, so that the file can
-        be finished; an interrupt does not.
+        An exception loses it, so that the file can be finished; an interrupt does not.
         """
-        if self._beside is not None:
-            self._beside.join()
-            self._beside, error, self._beside_error = None, self._beside_error, None
-            if error is not None:
-                raise error
-        if beside:
-            self._beside = threading.Thread(target=self._write_beside, args=(self._chunk,))
-            self._beside.start()
-            self._chunk, self._spare = self._spare, self._chunk
-        else:
-            self._write_out(self._chunk)
-
-    def _write_beside(self, chunk: '_ChunkMemory') -> None:
         try:
-            self._write_out(chunk)
-        except Exception as error:
-            self._beside_error = error
-
-    def _write_out(self, chunk: '_ChunkMemory') -> None:
-        try:
-            if chunk.size:
-                self.write_messages(chunk.plain, {
-                    number: np.concatenate(parts) for number, parts in chunk.entries.items()})
-        except OSError:
-            chunk.clear()
+            if self._rows:
+                self._write_chunk()
+        except Exception:
+            self._rows, self._chunk_bytes = [], 0
             raise
-        chunk.clear()
+        self._rows, self._chunk_bytes = [], 0
 
-    def write_messages(self, plain: bytes | memoryview, entries: Entries) -> None:
-        """Write a chunk of these message records.  Raises OSError."""
+    def _write_chunk(self) -> None:
+        plain, offset = np.empty(self._chunk_bytes, np.uint8), 0
+        # By topic, log times and offsets in the chunk (n, 2), as they stand in message indexes
+        entries: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
+        counts = [*self.message_counts]
+        for (topic, size), alike in itertools.groupby(
+                sorted(self._rows, key=itemgetter(0)), lambda rows: (rows[0], rows[2].shape[1])):
+            _, times_ns, data = map(np.concatenate, zip(*(
+                ((), *rows[1:]) for rows in alike), strict=True))
+            record = _message_type(size)
+            numbers, end = np.arange(len(times_ns)), offset + len(times_ns) * record.itemsize
+            messages = plain[offset:end].view(record)
+            messages['opcode'], messages['length'] = Opcode.MESSAGE, record.itemsize - 9
+            messages['channel'], messages['sequence'] = topic + 1, numbers + counts[topic]
+            messages['log_time'] = messages['publish_time'] = times_ns
+            messages['data'] = data
+            entries[topic].append(np.stack(
+                [times_ns, numbers * record.itemsize + offset], axis=1).astype(np.uint64))
+            counts[topic] += len(times_ns)
+            offset = end
+        indexes = {topic: np.concatenate(parts) for topic, parts in entries.items()}
+        start_ns = min(int(index[:, 0].min()) for index in indexes.values())
+        end_ns = max(int(index[:, 0].max()) for index in indexes.values())
         data = (self._zstd.compress(plain) if self._compression == 'zstd'
-                else lz4.frame.compress(plain) if self._compression else bytes(plain))
-        start_ns, end_ns = time_span(entries)
-        self.write_chunk(records.Chunk(
+                else lz4.frame.compress(plain) if self._compression else plain.tobytes())
+        chunk = record_bytes(records.Chunk(
             compression=self._compression, data=data, message_start_time=start_ns,
             message_end_time=end_ns, uncompressed_crc=zlib.crc32(plain),
-            uncompressed_size=len(plain)), entries)
-
-    def write_chunk(self, chunk: records.Chunk, entries: Entries) -> None:
-        """Write a chunk with the indexes of its messages.  Raises OSError."""
-        raw = record_bytes(chunk)
+            uncompressed_size=len(plain)))
         # mcap's class would make Python objects of all entries.
-        indexes = [INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + numbers.nbytes, channel_id,
-                                   numbers.nbytes) + numbers.tobytes()
-                   for channel_id, numbers in sorted(entries.items())]
-        offsets = list(itertools.accumulate(map(len, indexes), initial=self.size + len(raw)))
-        index = records.ChunkIndex(
-            chunk_start_offset=self.size, chunk_length=len(raw),
-            message_index_offsets=dict(zip(sorted(entries), offsets, strict=False)),
-            message_index_length=offsets[-1] - offsets[0],
-            compression=chunk.compression, compressed_size=len(chunk.data),
-            uncompressed_size=chunk.uncompressed_size,
-            message_start_time=chunk.message_start_time, message_end_time=chunk.message_end_time)
-        self._write([raw, *indexes])
-        self._summarize(index)
-        self.chunk_count += 1
-        if entries:
-            self._times_ns += chunk.message_start_time, chunk.message_end_time
-            for channel_id, numbers in entries.items():
-                self.message_counts[channel_id] += len(numbers)
+        blocks = [chunk, *(
+            INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + index.nbytes, topic + 1, index.nbytes)
+            + index.tobytes() for topic, index in indexes.items())]
+        offsets = list(itertools.accumulate(map(len, blocks), initial=self.size))
+        summary = records.ChunkIndex(
+            chunk_start_offset=self.size, chunk_length=len(chunk),
+            message_index_offsets={
+                topic + 1: at for topic, at in zip(indexes, offsets[1:], strict=False)},
+            message_index_length=offsets[-1] - offsets[1],
+            compression=self._compression, compressed_size=len(data),
+            uncompressed_size=len(plain), message_start_time=start_ns, message_end_time=end_ns)
+        self._write(blocks)
+        self._summarize(summary)
+        self._times_ns += start_ns, end_ns
+        self.message_counts = counts
+
+    def _write_metadata(self, name: str, content: dict[str, str]) -> None:
+        offset, raw = self.size, record_bytes(records.Metadata(name, content))
+        self._write([raw])
+        self._summarize(records.MetadataIndex(offset, len(raw), name))
+
+    def _summarize(self, record: records.McapRecord) -> None:
+        raw = record_bytes(record)
+        self._summary[raw[0]].append(raw)
 
     def sync(self) -> None:
         os.fsync(self._file.fileno())
@@ -216,36 +210,30 @@ class McapWriter:
             raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
                           f'{min_free_bytes}')
 
-    def finish(self, bag: rosbag2.Compression | None = rosbag2.NOT_COMPRESSED) -> None:
-        """
-        Write the chunk in memory and the summary, bring all to the disk, close the file.
-
-        bag : how the messages are compressed, for a `rosbag2` record; None: there is none
-        """
+    def finish(self) -> None:
+        """Write the chunk in memory and the summary, bring all to the disk, close the file."""
         try:
             self.flush()
-            span = min(self._times_ns, default=0), max(self._times_ns, default=0)
-            if bag is not None:
-                topics = [(channel, self._type_names[channel.schema_id], count) for channel, count
-                          in zip(self._channels.values(), self.message_counts.values(),
-                                 strict=True)]
-                self.write(records.Metadata(rosbag2.BAG_METADATA, {
-                    'serialized_metadata': rosbag2.bag_metadata_yaml(
-                        topics, self._path.name, *span, bag)}))
+            start_ns, end_ns = min(self._times_ns, default=0), max(self._times_ns, default=0)
+            self._write_metadata(rosbag2.BAG_METADATA, rosbag2.bag_metadata(
+                [(channel, topic.type_name, count) for channel, topic, count in zip(
+                    self._channels, self._topics, self.message_counts, strict=True)],
+                self._path.name, start_ns, end_ns))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
-            self._write([self._summary_section(*span)])
+            counts = {f'{name}_count': len(self._summary[kind]) for name, kind in (
+                ('schema', Opcode.SCHEMA), ('channel', Opcode.CHANNEL),
+                ('chunk', Opcode.CHUNK_INDEX), ('metadata', Opcode.METADATA_INDEX))}
+            self._summarize(records.Statistics(
+                message_count=self.messages, message_start_time=start_ns, message_end_time=end_ns,
+                channel_message_counts=dict(enumerate(self.message_counts, start=1)),
+                attachment_count=0, **counts))
+            self._write([self._summary_section()])
             self.sync()
-            sync_directory(self._path.parent)
+            _sync_directory(self._path.parent)
         finally:
             self._file.close()
 
-    def _summary_section(self, start_ns: int, end_ns: int) -> bytes:
-        counts = {f'{name}_count': len(self._summary[kind]) for name, kind in (
-            ('schema', Opcode.SCHEMA), ('channel', Opcode.CHANNEL), ('chunk', Opcode.CHUNK_INDEX),
-            ('attachment', Opcode.ATTACHMENT_INDEX), ('metadata', Opcode.METADATA_INDEX))}
-        self._summarize(records.Statistics(
-            message_count=self.messages, message_start_time=start_ns, message_end_time=end_ns,
-            channel_message_counts=self.message_counts, **counts))
+    def _summary_section(self) -> bytes:
         summary, offsets = bytearray(), bytearray()
         for opcode, group in sorted(self._summary.items()):
             if group:
@@ -277,96 +265,11 @@ class McapWriter:
         self._end = offset, crc
 
 
-class _ChunkMemory:
-    """
-    Message records of a chunk, uncompressed.
-
-    The memory is used again: new pages for each chunk cost a tenth of the time of `simulate`.
-    """
-
-    def __init__(self) -> None:
-        self._memory = bytearray(1 << 21)
-        self.size = 0
-        # By channel id arrays of log times and offsets
-        self.entries: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
-
-    @property
-    def plain(self) -> memoryview:
-        """The records, valid until the chunk changes."""
-        return memoryview(self._memory)[:self.size]
-
-    def clear(self) -> None:
-        self.size = 0
-        self.entries.clear()
-
-    def add(self, channel_id: int, sequence: int, log_times_ns: NDArray[np.int64],
-            rows: NDArray[np.uint8]) -> None:
-        """Add messages, the first of which has this sequence number."""
-        numbers, record = np.arange(len(rows)), _message_type(rows.shape[1])
-        size = self.size + len(rows) * record.itemsize
-        if size > len(self._memory):
-            self._memory = self._memory[:self.size] + bytearray(size)
-        messages = np.frombuffer(self._memory, record, len(rows), self.size)
-        messages['opcode'], messages['length'] = Opcode.MESSAGE, record.itemsize - 9
-        messages['channel'], messages['sequence'] = channel_id, numbers + sequence
-        messages['log_time'] = messages['publish_time'] = log_times_ns
-        messages['data'] = rows
-        entries = np.empty((len(rows), 2), np.uint64)
-        entries[:, 0], entries[:, 1] = log_times_ns, numbers * record.itemsize + self.size
-        self.entries[channel_id].append(entries)
-        self.size = size
-
-
-def create_file(path: Path, topics: Sequence[rosbag2.RecordedTopic], metadata: Mapping[str, str],
-                *, compression: str, min_free_bytes: int = 0) -> McapWriter:
-    """
-    Create a log, which must not exist, and bring its head to the disk.
-
-    topics : all stand before the first chunk, so that a truncated file tells them in any case
-    metadata : the `spinning_top_sim` record at the head of the file
-
-    Raises ValueError for a topic that is listed twice, RecordingError naming path or type.
-    """
-    names = [topic.name for topic in topics]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f'topic {name!r} is listed twice: once is allowed')
-    types = list(dict.fromkeys(topic.type_name for topic in topics))
-    definitions = {name: rosbag2.find_definition(name) for name in types}
-    try:
-        header = records.Header(profile='ros2', library=OUR_LIBRARY + version())
-        file = McapWriter(path, header=header, compression=compression)
-        with file.discarded_on_failure():
-            file.check_disk(min_free_bytes)
-            file.write(records.Metadata(METADATA_NAME, dict(metadata)))
-            for number, (name, (text, _)) in enumerate(definitions.items(), start=1):
-                file.write(records.Schema(number, text.encode(), 'ros2msg', name))
-            for number, topic in enumerate(topics, start=1):
-                file.write(records.Channel(
-                    id=number, topic=topic.name, message_encoding='cdr',
-                    schema_id=1 + types.index(topic.type_name),
-                    metadata={'offered_qos_profiles': rosbag2.offered_qos_yaml(topic),
-                              'topic_type_hash': definitions[topic.type_name][1]}))
-            file.sync()
-            sync_directory(path.parent)
-    except (OSError, ValueError) as error:
-        raise RecordingError(f'cannot record to {path}: {why_not_written(path, error)}') from error
-    return file
-
-
 def record_bytes(record: records.McapRecord) -> bytes:
     """Return a record as it stands in a file."""
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()
-
-
-def time_span(entries: Entries) -> tuple[int, int]:
-    """Return the earliest and the latest stamp in the entries of a chunk; (0, 0) in none."""
-    if not entries:
-        return 0, 0
-    times = np.concatenate([numbers[:, 0] for numbers in entries.values()])
-    return int(times.min()), int(times.max())
 
 
 @lru_cache
@@ -376,7 +279,7 @@ def _message_type(size: int) -> np.dtype[np.void]:
                      ('log_time', '<u8'), ('publish_time', '<u8'), ('data', 'u1', (size,))])
 
 
-def sync_directory(directory: Path) -> None:
+def _sync_directory(directory: Path) -> None:
     """Bring the names in a directory to the disk, if the file system can and lets us."""
     with contextlib.suppress(OSError):
         descriptor = os.open(directory, os.O_RDONLY)

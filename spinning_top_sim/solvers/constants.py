@@ -55,7 +55,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from gmpy2 import asinh, const_pi, mpfr, sin_cos, sqrt
+import gmpy2
+from gmpy2 import asinh, const_pi, mpfr, sqrt
 from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
@@ -77,7 +78,6 @@ from spinning_top_sim.solvers.multiprecision import (
     argument,
     atan2,
     cubic_roots,
-    phase,
     precision,
 )
 from spinning_top_sim.solvers.vertical import PreciseState
@@ -140,10 +140,7 @@ class ThetaMotion(NamedTuple):
 
 def precise(state: State) -> PreciseState:
     """Return a state in multiprecision."""
-    half_phi, half_psi = (phase(mpfr(angle) / 2) for angle in (state.phi, state.psi))
-    sine, cosine = sin_cos(mpfr(state.theta) / 2)
-    return PreciseState(sine, cosine, mpfr(state.theta_dot), half_phi * half_psi,
-                        half_phi * half_psi.conjugate(), mpfr(state.l3), mpfr(state.lz))
+    return PreciseState.of(state, mpfr, gmpy2)
 
 
 def set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:

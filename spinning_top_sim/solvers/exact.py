@@ -18,6 +18,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion
 from spinning_top_sim.physics.pivot import NANOSECONDS, Fractions
 from spinning_top_sim.physics.regimes import (
+    COINCIDE,
     Description,
     axis_rests,
     precession_extremes,
@@ -140,15 +141,20 @@ class ExactSolution:
     def theta_max(self) -> float:
         return self.arrays.bounds[1]
 
-    def describe(self) -> Description:
-        """Return the motion in numbers."""
+    def describe(self, coincide: float = COINCIDE) -> Description:
+        """
+        Return the motion in numbers.
+
+        coincide : relative distance below which two turning points are one
+        """
         top, start = self.top, self.start
         rests = axis_rests(top, start)
         low, high = 2 * (start.theta,) if rests else (self.theta_min, self.theta_max)
         slowest, fastest = precession_extremes(top, start, low, high)
         weight = 4.0 * top.lambda1 * abs(top.gravity_torque)
         return Description(
-            name=regime(top, start), nutation_period=None if rests else self.nutation_period,
+            name=regime(top, start, low, high, coincide),
+            nutation_period=None if rests else self.nutation_period,
             theta_min=low, theta_max=high, mean_precession_rate=self.mean_precession_rate,
             precession_min=slowest, precession_max=fastest, mean_spin_rate=self.mean_spin_rate,
             separatrix_distance=self.m1,
@@ -201,8 +207,8 @@ def exact_about(top: Top, start: State | Posture,
     """Return the motion while the pivot accelerates so [m/s^2], and the vertical it is about."""
     with precision():
         posture = start if isinstance(start, Posture) else precise(start).posture(top)
-        vertical = Vertical.of(top, posture, acceleration, mpfr)
-        state = vertical.state_of(vertical.to_frame(posture), mpfr)
+        vertical = Vertical.of(top, acceleration, mpfr)
+        state = PreciseState.of_posture(vertical.top, vertical.to_frame(posture), mpfr)
     return ExactSolution(vertical.top, state, vertical.gravity), vertical
 
 

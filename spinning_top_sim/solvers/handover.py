@@ -99,9 +99,9 @@ class Piece:
             return exact_about(top, start, self.ride.acceleration)
         posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
                    else start.in_doubles())
-        vertical = Vertical.of(top, posture, self.ride.acceleration, float)
+        vertical = Vertical.of(top, self.ride.acceleration, float)
         posture = vertical.to_frame(posture)
-        state = vertical.state_of(posture, float).rounded()
+        state = PreciseState.of_posture(vertical.top, posture).rounded()
         return motion_of(vertical.top, state, method=method, posture=posture,
                          **settings), vertical
 

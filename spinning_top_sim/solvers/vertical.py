@@ -11,29 +11,31 @@ Steps hand them over in doubles.
 
 from __future__ import annotations
 
-import cmath
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Quaternion
 from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import State, Top, pole_momentum
 
 # Numbers of Python or of gmpy2.
 Real = Any
 Complex = Any
-# An axis nearer to the vertical than this [rad] is vertical.  Lz - L3 keeps as many digits there
-# as this has zeros.
-POLE_IN_BITS = 1e-30
-# If the distance by which a motion misses a pole is less than this share of the largest possible,
-# it passes exactly: the set-up squares the share, and keeps some 40 digits.
-THROUGH = 1e-19
+# An axis nearer to the vertical than this [rad] is vertical.  In multiprecision, Lz - L3 keeps as
+# many digits there as this has zeros; in doubles, the rounding of Lz changes the angular velocity
+# of a tilted axis by as much as the tilt that is left out does, relative to L3/lambda1.
+POLE_IN_BITS, POLE_IN_DOUBLES = 1e-30, 1.5e-8
+# A motion that misses a pole by less than this share of the largest possible passes it exactly:
+# this is what rounding leaves of Lz - L3 in multiprecision.
+THROUGH = 1e-40
 
 
 class Posture(NamedTuple):
@@ -56,12 +58,10 @@ class Posture(NamedTuple):
 
 class PreciseState(NamedTuple):
     """
-    A state about some vertical.
+    A state about some vertical, in any numbers.
 
     sin_half, cos_half : of theta/2, with theta in [0, pi]
-    theta_dot : [rad/s]
     alpha, beta : complex numbers of any modulus with the arguments (phi + psi)/2, (phi - psi)/2
-    l3, lz : [kg m^2/s]
     """
 
     sin_half: Real
@@ -73,11 +73,46 @@ class PreciseState(NamedTuple):
     lz: Real
 
     @classmethod
-    def of(cls, state: State) -> PreciseState:
-        """Return a state in doubles; theta may be any number."""
-        return cls(math.sin(0.5 * state.theta), math.cos(0.5 * state.theta), state.theta_dot,
-                   cmath.rect(1.0, 0.5 * state.phi + 0.5 * state.psi),
-                   cmath.rect(1.0, 0.5 * state.phi - 0.5 * state.psi), state.l3, state.lz)
+    def of(cls, state: State, real: Callable[[Any], Real] = float,
+           functions: ModuleType = math) -> PreciseState:
+        """Return a state in other numbers, which have these sines and cosines."""
+        theta, phi, psi = (real(angle) / 2 for angle in (state.theta, state.phi, state.psi))
+        sin, cos = functions.sin, functions.cos
+        alpha, beta = (cos(angle) + 1j * sin(angle) for angle in (phi + psi, phi - psi))
+        return cls(sin(theta), cos(theta), real(state.theta_dot), alpha, beta, real(state.l3),
+                   real(state.lz))
+
+    @classmethod
+    def of_posture(cls, top: Top, posture: Posture, real: Callable[[Any], Real] = float,
+                   pole: float = POLE_IN_BITS) -> PreciseState:
+        """
+        Return the state of a posture about the same vertical.
+
+        A vertical axis has no precession angle of its own: there the angle is that of the line
+        about which the axis turns, so that all of this motion is nutation.
+
+        pole : within which tilt the axis is vertical [rad]
+        """
+        alpha, beta, transverse, _ = posture
+        cosine2, sine2, l3 = _norm(alpha), _norm(beta), real(posture.l3)
+        size2 = cosine2 + sine2
+        cosine, sine = (cosine2 / size2) ** 0.5, (sine2 / size2) ** 0.5
+        if 2 * min(sine, cosine) < pole:
+            rate, none = abs(transverse), 0 * sine
+            turn = -1j * transverse if rate else 1 + 0j         # exp(-i psi) theta'
+            if sine < cosine:
+                return cls(none, 1 + none, rate, alpha, alpha * turn, l3, l3)
+            return cls(1 + none, none, rate, beta * turn.conjugate(), beta, l3, -l3)
+        # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
+        # + i theta') exp(-i psi)
+        rates = transverse * (alpha * beta.conjugate()) / (cosine * sine * size2)
+        lambda1 = real(top.lambda1)
+        lz = (cosine - sine) * (cosine + sine) * l3 - (
+            2 * lambda1 * rates.real * cosine * sine)
+        most2 = THROUGH ** 2 * (l3 * l3 + lambda1 * (
+            lambda1 * _norm(transverse) + abs(top.gravity_torque)))
+        lz = next((pole for pole in (l3, -l3) if (lz - pole) ** 2 <= most2), lz)
+        return cls(sine, cosine, rates.imag, alpha, beta, l3, lz)
 
     def posture(self, top: Top) -> Posture:
         """Return the posture about the same vertical."""
@@ -92,20 +127,18 @@ class PreciseState(NamedTuple):
     def rounded(self) -> State:
         """Return the state in doubles."""
         alpha, beta = (math.atan2(float(x.imag), float(x.real)) for x in (self.alpha, self.beta))
-        l3 = float(self.l3)
-        return State(
-            theta=2.0 * math.atan2(float(self.sin_half), float(self.cos_half)),
-            theta_dot=float(self.theta_dot), phi=alpha + beta, psi=alpha - beta, l3=l3,
-            lz=float(self.lz) if self.sin_half else l3)
+        theta = 2.0 * math.atan2(float(self.sin_half), float(self.cos_half))
+        pole = pole_momentum(theta, float(self.l3))
+        return State(theta=theta, theta_dot=float(self.theta_dot), phi=alpha + beta,
+                     psi=alpha - beta, l3=float(self.l3),
+                     lz=float(self.lz) if pole is None else pole)
 
 
 class Vertical(NamedTuple):
     """
     The line of effective gravity, and a frame with its z axis along it.
 
-    Of the two directions z is the one on the side of the axis, and gravity has a sign: the axis
-    can only meet the pole theta = 0, where floating-point numbers are dense.  Without effective
-    gravity z stays the line of the world's vertical.
+    z is the direction that is up in the world, too: gravity has a sign.
 
     gravity : downwards along z positive [m/s^2]
     top : in this gravity
@@ -118,23 +151,19 @@ class Vertical(NamedTuple):
     beta: Complex
 
     @classmethod
-    def of(cls, top: Top, posture: Posture, acceleration: Fractions,
-           real: Callable[[Any], Real]) -> Vertical:
+    def of(cls, top: Top, acceleration: Fractions, real: Callable[[Any], Real]) -> Vertical:
         """
-        Return the vertical of a posture while the pivot accelerates so [m/s^2].
+        Return the vertical while the pivot accelerates so [m/s^2].
 
         real : makes a number of a fraction, or of a float
         """
         x, y, z = map(real, acceleration)
         z += real(top.gravity)
-        size = (x * x + y * y + z * z) ** 0.5
+        size = (x * x + y * y + z * z) ** 0.5 * (-1 if z < 0 else 1)
         x, y, z = (x / size, y / size, z / size) if size else (0 * x, 0 * y, 1 + 0 * z)
-        # The axis is (2 alpha beta, |alpha|^2 - |beta|^2).
-        level = 2 * posture.alpha * posture.beta
-        height = _norm(posture.alpha) - _norm(posture.beta)
-        if x * level.real + y * level.imag + z * height < 0:
-            x, y, z, size = -x, -y, -z, -size
-        return cls(size, replace(top, gravity=float(size)), *_least_rotation(x, y, z))
+        cosine = ((1 + z) / 2) ** 0.5
+        return cls(size, replace(top, gravity=float(size)), cosine + 0j,
+                   (x + 1j * y) / (2 * cosine))
 
     @property
     def rotation(self) -> Quaternion:
@@ -145,37 +174,11 @@ class Vertical(NamedTuple):
 
     def to_frame(self, posture: Posture) -> Posture:
         """Return a posture in the world as one in this frame."""
-        alpha, beta = _product(self.alpha.conjugate(), -self.beta, posture.alpha, posture.beta)
-        return posture._replace(alpha=alpha, beta=beta)
+        return _turned(posture, self.alpha.conjugate(), -self.beta)
 
     def to_world(self, posture: Posture) -> Posture:
         """Return a posture in this frame as one in the world."""
-        alpha, beta = _product(self.alpha, self.beta, posture.alpha, posture.beta)
-        return posture._replace(alpha=alpha, beta=beta)
-
-    def state_of(self, posture: Posture, real: Callable[[Any], Real]) -> PreciseState:
-        """Return a posture in this frame as a state; real as in `of`."""
-        top, (alpha, beta, transverse, _) = self.top, posture
-        cosine2, sine2, l3 = _norm(alpha), _norm(beta), real(posture.l3)
-        size2 = cosine2 + sine2
-        cosine, sine = (cosine2 / size2) ** 0.5, (sine2 / size2) ** 0.5
-        if 2 * sine < POLE_IN_BITS:     # all the motion of the axis is nutation: psi from omega
-            theta_dot = abs(transverse)
-            beta = alpha * (-1j * transverse) if theta_dot else alpha
-            return PreciseState(0 * sine, 1 + 0 * sine, theta_dot, alpha, beta, l3, l3)
-        # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
-        # + i theta') exp(-i psi)
-        rates = transverse * (alpha * beta.conjugate())
-        half_tilt = cosine * sine
-        tilt, unit, lambda1 = 2 * half_tilt, half_tilt * size2, real(top.lambda1)
-        lz = (1 - 2 * sine * sine) * l3 - lambda1 * rates.real / unit * tilt
-        most2 = THROUGH ** 2 * tilt * tilt * (l3 * l3 * tilt * tilt + lambda1 * (
-            lambda1 * _norm(transverse)
-            + abs(self.gravity * real(top.mass) * real(top.com_distance))))
-        for pole in (l3, -l3):
-            if (lz - pole) ** 2 <= most2:
-                lz = pole or 0 * pole
-        return PreciseState(sine, cosine, rates.imag / unit, alpha, beta, l3, lz)
+        return _turned(posture, self.alpha, self.beta)
 
 
 def posture_at(states: States) -> Posture:
@@ -185,24 +188,27 @@ def posture_at(states: States) -> Posture:
     return Posture(complex(w, z), complex(y, -x), complex(o1, o2), states.start.l3)
 
 
+def state_of(top: Top, quaternion: NDArray[np.float64],
+             angular_velocity: NDArray[np.float64]) -> State:
+    """
+    Return the state of a top with this attitude and angular velocity.
+
+    quaternion : (4,) q(world <- body) as x, y, z, w, of any length but 0; the sum and the
+        difference of phi and psi belong to its sign
+    angular_velocity : (3,) in the world frame [rad/s]
+    """
+    x, y, z, w = unit = (quaternion / np.linalg.norm(quaternion)).tolist()
+    w1, w2, w3 = (float(part) for part in attitude.rotated_back(
+        unit, angular_velocity.tolist()))
+    posture = Posture(complex(w, z), complex(y, -x), complex(w1, w2), top.lambda3 * w3)
+    return PreciseState.of_posture(top, posture, pole=POLE_IN_DOUBLES).rounded()
+
+
 def _norm(z: Complex) -> Real:
     return (z * z.conjugate()).real
 
 
-def _least_rotation(x: Real, y: Real, z: Real) -> tuple[Complex, Complex]:
-    """Return the Cayley-Klein parameters of the least rotation of (0, 0, 1) to a unit vector."""
-    level = (x * x + y * y) ** 0.5
-    if not level:                   # perhaps a half turn, about the x axis
-        return (z + 0j, 0j * z) if z > 0 else (0j * z, 1j * z)
-    if z > 0:
-        cosine = ((1 + z) / 2) ** 0.5
-        sine = level / (2 * cosine)
-    else:
-        sine = ((1 - z) / 2) ** 0.5
-        cosine = level / (2 * sine)
-    return cosine + 0j, sine / level * (x + 1j * y)
-
-
-def _product(a: Complex, b: Complex, c: Complex, d: Complex) -> tuple[Complex, Complex]:
-    """Return the Cayley-Klein parameters of two rotations: (a, b) after (c, d)."""
-    return a * c - b * d.conjugate(), a * d + b * c.conjugate()
+def _turned(posture: Posture, a: Complex, b: Complex) -> Posture:
+    """Return a posture after a rotation with the Cayley-Klein parameters a and b."""
+    alpha, beta, *rest = posture
+    return Posture(a * alpha - b * beta.conjugate(), a * beta + b * alpha.conjugate(), *rest)

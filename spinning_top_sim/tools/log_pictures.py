@@ -37,7 +37,7 @@ def _columns(motion: MotionReport, data: Attitudes, seconds: float) -> SimpleNam
     unknown = np.full(len(data.time), np.nan)       # such as the rates in a log of poses alone
     constants = data.constants(top)
     return SimpleNamespace(
-        t=data.time, top=top, start=motion.piece.start,
+        t=data.time,
         quaternion=np.stack(data.quaternion, axis=-1),
         rows_axis=(data.tip.real, data.tip.imag, data.height),
         theta_folded=np.arccos(np.clip(data.height, -1.0, 1.0)),

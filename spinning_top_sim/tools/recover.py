@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Write everything that is whole in a truncated or damaged MCAP log into a new
-log that every reader takes: chunks as they are, index and summary made anew.
+log that every reader takes; chunks, index and summary are made anew.
 Damaged chunks are left out; where a record has no end, the rest of the file is.
 The old file is only read.
 
@@ -39,13 +39,12 @@ def _run(arguments: argparse.Namespace) -> int:
     with LogReader(log) as reader, cli.progress('recovered', reader.size, 'bytes') as show:
         log = reader.path
         output: Path = arguments.output or log.parent / f'{log.stem}_recovered.mcap'
-        recovered = recover(reader, output, show)
+        messages = recover(reader, output, show)
         damage = reader.damage
     for line in damage.lines():
         cli.print_line(line)
     kept = 'kept' if damage.lost_bytes else 'kept all'
-    cli.print_line(f'{kept}: {recovered.messages} messages in {recovered.chunk_count} chunks, '
-                   f'{recovered.size} bytes in {output}')
+    cli.print_line(f'{kept}: {messages} messages, {output.stat().st_size} bytes in {output}')
     return SOME_LOST if damage.lost_bytes else cli.OK
 
 

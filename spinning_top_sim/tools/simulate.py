@@ -21,7 +21,7 @@ from spinning_top_sim.recording.provenance import run_metadata
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import create_file
+from spinning_top_sim.recording.writer import McapWriter
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
@@ -168,7 +168,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     channels = recorded(simulation.channels, values)
     types = {channel.topic: channel.type_name for channel in channels} | events.TOPICS
     topics = list(types)
-    file = create_file(
+    file = McapWriter(
         path, [RecordedTopic(resolve_topic(name, namespace), type_name)
                for name, type_name in types.items()],
         run_metadata(values, epoch_ns, -1, (), values), compression=values['record.compression'])
@@ -183,7 +183,6 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
             if isinstance(done, Block):
                 for channel, t_ns, rows in done.messages:
                     file.add(channels.index(channel), epoch_ns + t_ns, rows)
-                file.flush(beside=True)
             else:
                 add(done)
     except KeyboardInterrupt as interrupt:

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.recording.decoding import LogMessage
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
-from spinning_top_sim.recording.reader import Damage, LogReader
+from spinning_top_sim.recording.reader import Damage, LogMessage, LogReader
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, stamp_text
 from spinning_top_sim.streams.channel import Channel

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics import attitude, placement, regimes
+from spinning_top_sim.physics import attitude, regimes
 from spinning_top_sim.physics.regimes import Description, natural_momentum
 from spinning_top_sim.physics.top import Shape, State, Top
 from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import period_ns
 from spinning_top_sim.streams.imu import Imu
@@ -229,9 +230,7 @@ class Track:
         description = None
         with contextlib.suppress(ArithmeticError, ValueError):
             if not pivot_moves:
-                description = dataclasses.replace(
-                    ExactSolution(self.top, state).describe(),
-                    name=regimes.regime(self.top, state, SNAP))
+                description = ExactSolution(self.top, state).describe(SNAP)
         self.motions = [*self.motions[-MOST_MOTIONS:], DescribedMotion.of(
             int(stamps_ns[-1]), self.top, state, description, pivot_moves=pivot_moves)]
 
@@ -243,7 +242,7 @@ def constants_and_state(top: Top, row: Rows) -> tuple[tuple[float, float, float]
     A state within rounding errors of a special motion becomes that motion.
     """
     quaternion, omega = row[QUATERNION], row[RATES]
-    state = placement.state_of(top, quaternion, np.array(
+    state = state_of(top, quaternion, np.array(
         attitude.rotated(tuple(quaternion), tuple(omega))))
     energy = float(np.sum(energies(top, row[np.newaxis])))
     dust = SNAP * max(abs(state.l3), abs(state.lz), natural_momentum(top))
