@@ -12,8 +12,9 @@ import os
 
 import numpy as np
 import pytest
-from helpers.reference import scene_parameters
+from helpers.reference import ROOT, scene_parameters
 from helpers.wrong_filters import TABLE
+from stress import runner
 from stress.tops import blocks, check_block
 
 from spinning_top_sim.physics.top import ContinuedState
@@ -87,3 +88,8 @@ def test_a_seed_of_a_part_of_make_stress(tmp_path, monkeypatch, request, part, s
         peer = request.getfixturevalue('peer')
         monkeypatch.setattr(module, 'shared_peer', lambda: peer)
     assert module.check(seed, tmp_path)
+
+
+def test_make_stress_runs_every_part():
+    text = (ROOT / 'test/stress/all').read_text()
+    assert {part for part in runner.PARTS if f'$python {part} --seconds' not in text} <= {'fit'}

@@ -39,17 +39,16 @@ def parameter_set(random_: random.Random) -> dict[str, object]:
 
 def _number(random_: random.Random, row: Parameter) -> float | int:
     """Return an allowed number: an end of the range, the default, or of any magnitude."""
-    low = row.minimum if row.minimum is not None else (
-        -LARGEST if row.above is None else math.nextafter(row.above, 1.0))
-    high = LARGEST if row.maximum is None else row.maximum
-    size = row.smallest or 0.0
-    default = row.default if isinstance(row.default, int | float) else 1.0
+    low, high, default = row.range.lowest, row.range.highest, row.default
+    if row.range.is_open:
+        low = math.nextafter(low, math.inf)
     wanted = random_.choice((low, high, default, _double(random_), _double(random_),
                              random_.uniform(-10.0, 10.0)))
+    wanted = float(wanted if isinstance(wanted, int | float) else 1.0)
     if low >= 0.0:
         wanted = abs(wanted)
-    chosen = min(max(wanted if abs(wanted) >= size else 0.0, low), high)
-    return int(chosen) if isinstance(row.default, int) else chosen
+    chosen = 0.0 if row.range.has_zero and wanted < low else min(max(wanted, low), high)
+    return int(chosen) if isinstance(default, int) else chosen
 
 
 def actions(random_: random.Random) -> list[tuple[str, object]]:
