@@ -25,9 +25,8 @@ ALREADY, TRANSITION_ERROR, INCORRECT_TRANSITION = 101, 102, 103
 
 
 @pytest.fixture
-def top(node):
-    node.renew()
-    return node
+def top(stopped):
+    return stopped
 
 
 def test_features_are_those_of_the_services(top):

@@ -20,9 +20,8 @@ NAME = 'spinning_top'
 
 
 @pytest.fixture
-def top(node):
-    node.renew()
-    return node.pause()
+def top(stopped):
+    return stopped.pause()
 
 
 def numbers(state):
