@@ -70,7 +70,8 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
         later = np.array([1, 50, 200]) * MILLISECOND
         assert np.abs(simulation.trajectory.evaluate(now + later).quaternion
                       - truth.states(later).quaternion).max() < 1e-7
-        assert simulation.send(now := now + int(later[-1]))
+        now += int(later[-1])
+        assert simulation.send(now)
 
 
 @pytest.mark.parametrize('which', [0, 4])
