@@ -22,9 +22,9 @@ from std_msgs.msg import Header
 from spinning_top_sim.nodes.loop import LoopState
 from spinning_top_sim.nodes.node import Simulator
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
+from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
@@ -83,9 +83,12 @@ class SimulationHandlers:
 
     def serve(self, name: str, request: Message, response: Message) -> Message:
         """Handle a request for the service of this type; return the response."""
-        act = getattr(self, f'_{service_name(name)}')
-        error, text = self._node.outcome(
-            lambda: self._check_entity(request) or act(request, response))
+        def act() -> str | None:
+            self._check_entity(request)
+            said: str | None = getattr(self, f'_{service_name(name)}')(request, response)
+            return said
+
+        error, text = self._node.outcome(act)
         if hasattr(response, 'result'):
             response.result.result = self._results.RESULT_OK if error is None else getattr(
                 error, 'code', self._results.RESULT_OPERATION_FAILED)

@@ -39,16 +39,15 @@ def parameter_set(random_: random.Random) -> dict[str, object]:
 
 def _number(random_: random.Random, row: Parameter) -> float | int:
     """Return an allowed number: an end of the range, the default, or of any magnitude."""
-    low = row.minimum if row.minimum is not None else (
-        -LARGEST if row.above is None else math.nextafter(row.above, 1.0))
-    high = LARGEST if row.maximum is None else row.maximum
-    size = row.smallest or 0.0
+    low, high = row.range.lowest, row.range.highest
     default = row.default if isinstance(row.default, int | float) else 1.0
     wanted = random_.choice((low, high, default, _double(random_), _double(random_),
                              random_.uniform(-10.0, 10.0)))
     if low >= 0.0:
         wanted = abs(wanted)
-    chosen = min(max(wanted if abs(wanted) >= size else 0.0, low), high)
+    if row.range.has_zero and wanted < low:
+        return 0 if isinstance(row.default, int) else 0.0
+    chosen = min(max(wanted, math.nextafter(low, high) if row.range.is_open else low), high)
     return int(chosen) if isinstance(row.default, int) else chosen
 
 
