@@ -6,13 +6,16 @@ Truths come from outside the code under test: differences of what was published,
 formulas, readers of other people; or from the pipeline run in this process without ROS.
 """
 
+import math
 import signal
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
+from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.node_logs import (
     KINDS,
@@ -21,7 +24,9 @@ from helpers.node_logs import (
     assert_clean_end,
     assert_received_from,
     log_of,
+    settled,
     stamp_of,
+    stamps_of,
     the_log,
     verified,
 )
@@ -40,7 +45,7 @@ RUNS = {
 
 @pytest.fixture(scope='module')
 def both_runs(peer, diagnostics, tmp_path_factory):
-    """Two nodes side by side in namespaces of their own, recorded, watched, told, and ended."""
+    """Two nodes side by side on either executor, recorded, watched, told, and ended."""
     folder = tmp_path_factory.mktemp('runs')
     runs = {}
     # With the default depth of 10, a subscriber that stands still for 50 ms misses samples.
@@ -48,7 +53,7 @@ def both_runs(peer, diagnostics, tmp_path_factory):
         f'qos_overrides./{name}/{topic}.publisher.depth': 1000 for topic in (*KINDS, 'markers')}}
         for name, values in RUNS.items())
     with (SimNode(folder, one, namespace='/plain') as one,
-          SimNode(folder, two, namespace='/mounted') as two):
+          SimNode(folder, two, namespace='/mounted', executor='single') as two):
         for node in (one, two):
             topics = {name: peer.listen(node.topic(name), kind) for name, kind in KINDS.items()}
             runs[node.namespace[1:]] = SimpleNamespace(node=node, topics=topics)
@@ -111,3 +116,27 @@ def test_two_nodes_in_two_namespaces_do_not_disturb_each_other(both_runs):
 
 def test_sigint_and_sigterm_end_a_node_properly(run):
     assert_clean_end(run.node, run.code)
+
+
+def test_services_answer_and_act(peer, tmp_path):
+    with SimNode(tmp_path) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped).wait(3)
+        assert 'paused' in peer.trigger(node, 'step').message
+        paused_at = peer.switch(node, 'set_pause', True).message
+        assert peer.switch(node, 'set_pause', True).message == paused_at        # idempotent
+        count = settled(pose)
+        assert peer.set_together(node, step__count=7, step__dt=0.03).successful
+        assert peer.trigger(node, 'step').success
+        pose.wait(count + 21)
+        assert settled(pose) == count + 21
+        assert peer.switch(node, 'set_pause', False).success
+        pose.wait(count + 50)
+        assert (np.diff(stamps_of(pose)) % PERIODS_NS['pose'] == 0).all(), 'one grid'
+        assert peer.set_together(node, spin__l3=0.9, spin__lz=0.2).successful
+        answer = peer.trigger(node, 'reset')
+        epoch = int(answer.message.split()[-2])
+        wait_for('samples after it', lambda: stamp_of(pose.raw[-1]) > epoch)
+        stamps = stamps_of(pose)
+        assert epoch in stamps and (np.diff(stamps) > 0).all()
+        assert peer.get(node, 'spin.l3', 'spin.lz') == [1.6, 1.6 * math.cos(math.radians(30.0))]
+        pose.muted = True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the node ends, what it imports, how it bears overload, faults and full disks."""
+"""How the node ends, and how it bears overload, readers that stall, and errors."""
 
 import os
 import re
@@ -20,53 +20,67 @@ from helpers.node_logs import (
     assert_received_from,
     decoded,
     log_of,
-    stamp_of,
     the_log,
+    verified,
 )
 from helpers.own_node import OwnNode
-from helpers.simulations import play, simulate, stream
 
 from spinning_top_sim.nodes import terminal
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 
+# A node whose log is opened when there is a file `go`
+SLOW = """
+import pathlib, sys, time
+from spinning_top_sim.recording import writer
+from spinning_top_sim.__main__ import main
+ordinary = writer.create_file
+def create_file(*arguments, **options):
+    while not pathlib.Path('go').exists():
+        time.sleep(0.01)
+    return ordinary(*arguments, **options)
+writer.create_file = create_file
+sys.exit(main())
+"""
+INT, TERM = signal.SIGINT, signal.SIGTERM
+ENDINGS = [     # executor, signals, other parameters, state of the recorder and of the motion then
+    ('events', (INT, INT), {}, 'recording', 'running'),
+    ('single', (INT, INT), {}, 'recording', 'running'),
+    ('events', (signal.SIGHUP, signal.SIGQUIT), {}, 'recording', 'running'),
+    ('single', (TERM, TERM), {'start_paused': True}, 'recording', 'paused'),
+    ('events', (INT, INT), {}, 'opening', 'running'),
+    ('single', (INT, TERM), {'use_sim_time': True}, 'off', 'waiting')]
 
-def test_the_published_orientation_error_is_that_of_the_published_pose():
-    """Column 7 of ~/invariants against the pose of the same instant and the exact solution."""
-    run = simulate(invariants__rate=100.0)
-    taken = play(run, SECOND // 2, 'pose', '~/invariants')
-    invariants, poses = (np.vstack([stream(run, topic).template.decode(data)[place]
-                                    for name, _, data in taken if name == topic])
-                         for topic, place in (('~/invariants', 0), ('pose', 1)))
-    exact = ExactSolution(run.top, parameters.start_state(run.values))
-    truth = exact.states(range(0, SECOND // 2 + 1, SECOND // 100)).quaternion
-    computed = 4.0 * np.arctan2(*(np.linalg.norm(part, axis=1)
-                                  for part in (poses - truth, poses + truth)))
-    assert 1e-14 < invariants[:, 7].max() < 1e-9
-    assert invariants[:, 7] == pytest.approx(computed, rel=1e-6, abs=2e-15)
 
-
-@pytest.mark.parametrize('numbers', [
-    (signal.SIGINT, signal.SIGINT), (signal.SIGHUP, signal.SIGQUIT)], ids=['int', 'hup'])
-def test_however_it_is_ended_the_log_is_whole(peer, tmp_path, numbers):
-    with SimNode(tmp_path, {'record.enabled': True}) as node:
-        pose = peer.listen(node.topic('pose'), PoseStamped).wait(20)
+@pytest.mark.parametrize(('executor', 'numbers', 'values', 'recorder', 'state'), ENDINGS)
+def test_however_it_is_ended_the_log_is_whole(
+        peer, diagnostics, tmp_path, executor, numbers, values, recorder, state):
+    with SimNode(tmp_path, {'record.enabled': True, **values}, executor=executor,
+                 program=('-c', SLOW, 'node') if recorder == 'opening' else None) as node:
+        pose = peer.listen(node.topic('pose'), PoseStamped)
+        if state == 'running':
+            pose.wait(10)
+        wait_for('its state', lambda: (diagnostics.text(node, 'recorder'), diagnostics.text(
+            node, 'state')) == (recorder, state))
         os.killpg(node.process.pid, numbers[0])
         time.sleep(0.05)
+        (node.folder / 'go').touch()
         code = node.end(numbers[1])
         pose.muted = True
     assert_clean_end(node, code)
+    if recorder == 'off':
+        assert not list(node.folder.glob('*.mcap'))
+        return
     path = the_log(node.folder)
-    log, _ = log_of(path)
-    logged = [data for _, data in log[node.topic('pose')]]
-    assert_received_from(pose.raw, logged)
-    assert decoded(path)[node.topic('pose')] == len(logged)
-    assert path.name in node.out, 'it says what it has recorded'
     assert f'next: spinning-top inspect {path}\n      spinning-top view {path}\n' in node.out
+    assert verified(path)['identical'] and path.name in node.out
+    if state == 'running':
+        logged = [data for _, data in log_of(path)[0][node.topic('pose')]]
+        assert_received_from(pose.raw, logged)
+        assert decoded(path)[node.topic('pose')] == len(logged)
 
 
-@pytest.mark.parametrize(('number', 'delay'), [(signal.SIGINT, 0.35), (signal.SIGTERM, 0.5)])
+@pytest.mark.parametrize(('number', 'delay'), [(INT, 0.35), (TERM, 0.5)])
 def test_a_signal_while_it_starts_ends_it_quietly(monkeypatch, tmp_path, number, delay):
     # Python ignores what interrupts the module that starts coverage before the program.
     monkeypatch.delenv('COVERAGE_PROCESS_CONFIG', raising=False)
@@ -74,7 +88,7 @@ def test_a_signal_while_it_starts_ends_it_quietly(monkeypatch, tmp_path, number,
         time.sleep(delay)
         code = node.end(number)
     assert code != -signal.SIGKILL, ('it had to be killed', node.err)
-    allowed = {0, 130} if number == signal.SIGINT else {0, -signal.SIGTERM}
+    allowed = {0, 130} if number == INT else {0, -TERM}
     # Before our main() runs, Python itself answers; its `site` has a main(), too.
     if re.search(r'sim_node\.py", line \d+, in main', node.err) or code in (0, 130, 2):
         assert code in allowed, (code, node.err)
@@ -95,14 +109,47 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(monkeypa
         shown.show('two')
 
 
+READER = """
+import rclpy, sys
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import HistoryPolicy, QoSProfile
+rclpy.init()
+node = rclpy.create_node('reader')
+node.create_subscription(PoseStamped, sys.argv[1], lambda _: print('.', end='', flush=True),
+                         QoSProfile(history=HistoryPolicy.KEEP_ALL))
+rclpy.spin(node)
+"""
+
+
+def test_readers_that_stall_are_counted_and_motion_and_recording_go_on(
+        peer, diagnostics, tmp_path):
+    values = {'record.enabled': True, 'pose.rate': 5000.0,
+              'qos_overrides./keep/pose.publisher.history': 'keep_all'}
+    with (SimNode(tmp_path, values, namespace='/keep') as node,
+          SimNode(tmp_path, namespace='/reader', program=('-c', READER, '/keep/pose')) as reader):
+        wait_for('messages', lambda: len(reader.out) > 100)
+        os.kill(reader.process.pid, signal.SIGSTOP)
+        wait_for('failures', lambda: diagnostics.number(node, 'failed messages') > 1000)
+        said = diagnostics.next(node)
+        later = diagnostics.next(node)
+        assert float(later['simulated time [s]']) > float(said['simulated time [s]'])
+        assert (later['state'], later['recorder']) == ('running', 'recording')
+        count = len(reader.out)
+        os.kill(reader.process.pid, signal.SIGCONT)
+        wait_for('more messages', lambda: len(reader.out) > count + 6000)
+        assert_clean_end(node, node.end())
+    path = the_log(node.folder)
+    assert verified(path)['identical']
+    assert set(np.diff([stamp for stamp, _ in log_of(path)[0]['/keep/pose']])) == {SECOND // 5000}
+
+
 def test_overload_skips_what_is_live_records_everything_and_stays_reachable(tmp_path, capfd):
     streams = ('pose', 'joint_states', 'ground_truth_odom')
     rates = {f'{name}__rate': 10000.0 for name in streams}
-    others = {f'{row[0]}__enabled': row[0] in streams for row in parameters.STREAM_DEFAULTS}
+    others = {f'{name}__enabled': name in streams for name in parameters.STREAMS}
     with OwnNode(tmp_path, **rates, **others, tick_rate=10000.0, time_scale=100.0,
-                 record__enabled=True) as node:
-        node.listen('pose')
-        wait_for('a clock that slips, and samples that are skipped', lambda: (
+                 record__enabled=True).listen('pose') as node:
+        node.spin_until('a clock that slips, and samples that are skipped', lambda: (
             node.loop.slipped_ns and any(one.skipped for one in node.simulation.outputs)))
         level, message, said = node.diagnostics()
         node.diagnostics()
@@ -121,9 +168,8 @@ def test_overload_skips_what_is_live_records_everything_and_stays_reachable(tmp_
 
 
 # In a tick, in reports, in a parameter's change.
-BREAKABLE = {
-    'loop.tick': None, '_report.diagnostics': None,
-    'loop.set_pace': lambda node: node.set(pose__rate=50.0)}
+BREAKABLE = {'loop.tick': None, '_report.diagnostics': None,
+             'loop.set_pace': lambda node: node.set(pose__rate=50.0)}
 
 
 @pytest.mark.parametrize('path', BREAKABLE)
@@ -132,35 +178,25 @@ def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
     def broken(*_, **__):
         raise ZeroDivisionError('nobody expected this')
 
-    with OwnNode(tmp_path, status_period=0.05, record__enabled=True) as node:
-        node.listen('pose')
-        wait_for('samples', lambda: len(node.heard['pose']) > 5)
-        wait_for('a recording', lambda: node.node._session._recorder)
+    reason = 'unexpected ZeroDivisionError: nobody expected this'
+    with OwnNode(tmp_path, record__enabled=True).listen('pose') as node:
+        node.spin_until('samples', lambda: len(node.heard['pose']) > 5)
         owner, name = path.split('.')
         with monkeypatch.context() as patch:
             patch.setattr(getattr(node.node, owner), name, broken)
             if BREAKABLE[path]:
-                answer = BREAKABLE[path](node)
-                if answer is not None:
-                    assert 'nobody expected this' in str(answer)
-            elif owner == '_report':
-                for timer in node.node.timers:
-                    timer.callback()
-            wait_for('an error', lambda: node.loop.failure)
-        wait_for('the end of the recording', lambda: node.node._session.error)
-        node.node._session.stop()           # waits until the log is closed
-        level, message, _ = node.diagnostics()
-        reason = 'unexpected ZeroDivisionError: nobody expected this'
-        assert (level, message) == (2, f'recording: {reason}')
+                assert 'nobody expected this' in BREAKABLE[path](node).reason
+            node.spin_until('an error', lambda: node.loop.failure)
+        node.spin_until('the end of the recording', lambda: node.node._recording.error)
+        assert node.diagnostics()[:2] == (2, f'recording: {reason}')
         assert node.loop.failure == reason
         said = capfd.readouterr().err
         assert 'until ~/reset' in said and TRACEBACK in said
         node.node._show_status()
         assert ' FAILED |' in capfd.readouterr().out.splitlines()[-1]
-        logged = [data for _, data in log_of(tmp_path / 'run.mcap')[0]['/pose']]
-        assert_received_from([data for data in node.heard['pose']
-                              if stamp_of(data) >= stamp_of(logged[0])], logged)
         answer = node.switch('set_pause', False)
         assert not answer.success and f'stands still: {reason}' in answer.message
+        heard = list(node.heard['pose'])
         assert node.trigger('reset').success
         node.wait_until(100_000_000)
+    assert_received_from(heard, [data for _, data in log_of(tmp_path / 'run.mcap')[0]['/pose']])

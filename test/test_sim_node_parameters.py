@@ -12,8 +12,9 @@ from helpers.node_harness import wait_for
 from helpers.node_logs import commands_in, log_of, verified
 from helpers.own_node import OwnNode
 
+from spinning_top_sim.nodes import publishers
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.parameter import Effect
+from spinning_top_sim.streams.parameter import ANY, Effect
 from spinning_top_sim.streams.topics import INVARIANTS
 
 
@@ -97,6 +98,25 @@ def test_refused_commands_and_parameters_change_nothing(node, capfd):
     assert commands_in(recorded(node)) == []
 
 
+def test_a_stream_whose_messages_cannot_be_used_is_refused_before_anything_changes(
+        node, monkeypatch):
+    def broken(type_name):
+        raise LookupError(f'{type_name} cannot be used: no type support')
+
+    node.step(3)
+    before = node.node.values
+    rates = [one.period_ns for one in node.simulation.channels]
+    with monkeypatch.context() as patch:
+        patch.setattr(publishers, 'message_class', broken)
+        result = node.set(pose__rate=50.0, markers__enabled=True)
+    assert not result.successful
+    assert result.reason.endswith('cannot be used: no type support')
+    assert node.node.values == before and not node.get('markers.enabled')[0]
+    assert [one.period_ns for one in node.simulation.channels] == rates
+    node.step(3)
+    assert node.loop.failure is None
+
+
 def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
     """YAML 1.1 takes 1e-9 for a text, and so do `ros2 param set` and `ros2 param load`."""
     assert node.set(solver__rtol='1e-9', imu__gyroscope_noise_density='5e-5', duration=0,
@@ -134,10 +154,10 @@ def test_parameters_are_described(node):
         assert parameter.effect.value in descriptor.description
         assert 'must' not in descriptor.description, 'what is allowed is a constraint'
         assert descriptor.read_only == (parameter.effect is Effect.START)
-        bounded = [bound for bound in (parameter.minimum, parameter.above, parameter.maximum)
-                   if bound is not None]
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
-        assert len(ranges) == (len(bounded) == 2), parameter.name
+        assert len(ranges) == (parameter.range is not ANY), parameter.name
         for limits in ranges:
-            assert [limits.from_value, limits.to_value] == bounded, parameter.name
+            bounds = [limits.from_value, limits.to_value]
+            assert bounds[0] in parameter.range or parameter.range.is_open, parameter.name
+            assert bounds[1] == parameter.range.highest, parameter.name
         assert descriptor.additional_constraints == parameter.allowed

@@ -3,41 +3,22 @@
 
 import os
 import signal
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
-from helpers.simulations import record
+from helpers.simulations import play
 
-from spinning_top_sim.nodes import publishers
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.view.track import Track
 
 VIEW = ('-m', 'spinning_top_sim', 'view', '--no-browser', '--port', '0')
 PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
-
-
-@pytest.mark.parametrize(('period', 'count'), [(0.001, 300), (0.1, 101)])
-def test_a_throttle_lets_few_messages_through_and_the_last_one(monkeypatch, period, count):
-    now, sent = 0.0, []
-    monkeypatch.setattr(publishers.time, 'monotonic', lambda: now)
-    publisher = SimpleNamespace(publish=sent.append, get_subscription_count=lambda: 1)
-    one = publishers.Throttle(publisher)
-    number = 0
-    while now < 10.0:
-        number += 1
-        one.sink(None)(number)
-        now = number * period
-    assert len(sent) == pytest.approx(count, abs=1)
-    one.flush(at_once=True)
-    assert sent[-1] == number
-    assert len(set(sent)) == len(sent)
 
 
 @pytest.fixture
@@ -63,10 +44,8 @@ def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypa
         epoch_ns = seconds * NANOSECONDS
         monkeypatch.setattr(live, 'count_publishers', lambda _, number=count: number)
         live._listen_as_needed()
-        run = LiveSimulation(values, epoch_ns)
-        taken = record(run, 'ground_truth/odom', 'pose', 'joint_states')
-        run.advance(NANOSECONDS // 2)
-        live._inbox.extend((topic, data) for topic, _, data in taken if topic in live._listeners)
+        taken = play(Simulation(values, epoch_ns), NANOSECONDS // 2, *live._listeners)
+        live._inbox.extend((topic, data) for topic, _, data in taken)
         live._draw_once()
         assert live._track.span[1] == epoch_ns + NANOSECONDS // 2
         assert live._page._tops[0]._picture[0] == epoch_ns + NANOSECONDS // 2
@@ -84,7 +63,7 @@ def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):
         poses = peer.listen(node.topic('pose'), PoseStamped)
         with SimNode(tmp_path / 'view', namespace=node.namespace, program=VIEW) as view:
             wait_for('the page to listen', lambda: peer.node.count_subscribers(
-                node.topic('ground_truth/odom_throttle')))
+                node.topic('ground_truth/odom')))
             before = diagnostics.next(node)
             # It hangs for a second of simulated time, which is the real time.
             os.killpg(view.process.pid, signal.SIGSTOP)

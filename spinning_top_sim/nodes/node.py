@@ -134,11 +134,8 @@ class Simulator(Node):
     def stop(self) -> None:
         """End the motion and close the recording, whether the context is valid or not."""
         self._terminal.end()
-        path = self._recording.path
-        summary = self._recording.close()
-        if summary:
-            self._terminal.tell(f'{summary}\nnext: spinning-top inspect {path}\n'
-                                f'      spinning-top view {path}')
+        if summary := self._recording.close():
+            self._terminal.tell(summary)
 
     def finish(self) -> None:
         """End the process after the response that is being prepared."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.streams.channel import Channel
@@ -101,13 +100,16 @@ class Recording:
         return reason
 
     def close(self) -> str | None:
-        """Wait until all logs are closed; return a text about the one that was open."""
+        """Wait until all logs are closed; return a text for the user about the last one."""
         recorder = self._recorder
         self.end()
         for request in self._requests:
             request.recorder.close()
         self.check()
-        return _summary(recorder) if recorder else None
+        if recorder is None or recorder.path is None:
+            return None
+        return (f'{_summary(recorder)}\nnext: spinning-top inspect {recorder.path}\n'
+                f'      spinning-top view {recorder.path}')
 
     def write(self, event: Event) -> None:
         """Record an event, if a recording goes on."""
@@ -136,11 +138,6 @@ class Recording:
     def is_on(self) -> bool:
         """Whether messages are recorded, if only in memory while the file is being opened."""
         return self._recorder is not None
-
-    @property
-    def path(self) -> Path | None:
-        """The log that is open."""
-        return self._recorder.path if self._recorder else None
 
     def numbers(self) -> dict[str, object]:
         """Return what /diagnostics say of the recorder, by their keys."""

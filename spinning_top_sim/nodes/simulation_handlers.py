@@ -22,9 +22,9 @@ from std_msgs.msg import Header
 from spinning_top_sim.nodes.loop import LoopState
 from spinning_top_sim.nodes.node import Simulator
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
+from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 

@@ -39,16 +39,16 @@ def parameter_set(random_: random.Random) -> dict[str, object]:
 
 def _number(random_: random.Random, row: Parameter) -> float | int:
     """Return an allowed number: an end of the range, the default, or of any magnitude."""
-    low, high = row.range.lowest, row.range.highest
-    default = row.default if isinstance(row.default, int | float) else 1.0
+    low, high, default = row.range.lowest, row.range.highest, row.default
+    if row.range.is_open:
+        low = math.nextafter(low, math.inf)
     wanted = random_.choice((low, high, default, _double(random_), _double(random_),
                              random_.uniform(-10.0, 10.0)))
+    wanted = float(wanted if isinstance(wanted, int | float) else 1.0)
     if low >= 0.0:
         wanted = abs(wanted)
-    if row.range.has_zero and wanted < low:
-        return 0 if isinstance(row.default, int) else 0.0
-    chosen = min(max(wanted, math.nextafter(low, high) if row.range.is_open else low), high)
-    return int(chosen) if isinstance(row.default, int) else chosen
+    chosen = 0.0 if row.range.has_zero and wanted < low else min(max(wanted, low), high)
+    return int(chosen) if isinstance(default, int) else chosen
 
 
 def actions(random_: random.Random) -> list[tuple[str, object]]:

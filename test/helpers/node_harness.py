@@ -336,9 +336,12 @@ class Diagnostics:
         wait_for('two /diagnostics', lambda: len(self.statuses(node)) >= count + 2)
         return numbers(self.statuses(node)[-1])
 
+    def text(self, node, key):
+        """Return the newest value of this name."""
+        return numbers(self.wait_for(node, key, lambda _: True))[key]
+
     def number(self, node, key):
-        """Return the newest number of this name."""
-        return float(numbers(self.wait_for(node, key, lambda _: True))[key])
+        return float(self.text(node, key))
 
 
 class DrivenClock:
