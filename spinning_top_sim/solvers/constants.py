@@ -55,8 +55,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import gmpy2
-from gmpy2 import asinh, const_pi, mpfr, sqrt
+from gmpy2 import asinh, const_pi, mpfr, sin_cos, sqrt
 from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
@@ -140,7 +139,7 @@ class ThetaMotion(NamedTuple):
 
 def precise(state: State) -> PreciseState:
     """Return a state in multiprecision."""
-    return PreciseState.of(state, mpfr, gmpy2)
+    return PreciseState.of(state, mpfr, sin_cos)
 
 
 def set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
