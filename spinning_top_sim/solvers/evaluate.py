@@ -87,27 +87,13 @@ def halves(x: Number) -> tuple[Number, Number]:
 
 
 class ThetaArrays:
-    """
-    The constants of a motion in doubles; columns are (k, 1).
-
-    Raises ValueError if doubles cannot hold an amplitude or a rate.
-
-    start_wholes, start_offsets, start_rests : of the three phases at t = 0: their sum
-    drifts : kappa/2 of alpha and beta
-    stretch : K/K' times a quarter turn, 0 in the real form
-    prefactors : at even and at odd N, of the rows R of alpha and beta, s J of alpha and beta
-    coefficients : of the polynomials of these rows in xi, highest power first, (k, 4, 2)
-    on_line : the numbers, 0 for alpha and 1 for beta, of those that have s = 0
-    zeros : by the same number, of those that pass their pole exactly: whether R = 0 at y = 0 is
-        at even N (0) or at odd N (1)
-    u_dot, u_dot_coefficients : of u'
-    bottom_rate, top_rate : (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
-    precession, swing : p and q at even and at odd N, of (Lz - L3 u)/lambda1
-    """
+    """The constants of a motion in doubles.  Raises ValueError if these cannot hold one."""
 
     def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
+        # (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
         self.bottom_rate, self.top_rate = (float(x.pole_rate) for x in factors)
+        # The three phases at t = 0 are the sum of whole, offset and rest.
         self._rates = [motion.quarter_rate, *(x.rate / const_pi() for x in factors)]
         turns = [2 * x.phase_turns for x in factors]
         wholes = [motion.start_whole, *map(int, map(rint, turns))]
@@ -116,6 +102,8 @@ class ThetaArrays:
             [motion.start_offset, *map(sub, turns, wholes[1:])])
         self.drifts = np.array([[0.5 * float(factor.drift)] for factor in factors])
         self.stretch = QUARTER * float(motion.stretch) if motion.stretch else 0.0
+        # At even and at odd N, of the rows R of alpha and beta, s J of alpha and beta; the
+        # polynomials in xi have their highest power first, (k, 4, 2).
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
         self.coefficients = _highest_first(
@@ -129,6 +117,8 @@ class ThetaArrays:
                 raise ValueError(
                     f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
                     f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
+        # 0 for alpha and 1 for beta: those with s = 0, and of those that pass their pole exactly,
+        # whether R = 0 at y = 0 is at even N (0) or at odd N (1).
         self.on_line = [k for k, factor in enumerate(factors) if not factor.pole_rate]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
                       if SIN_ODD in pair}

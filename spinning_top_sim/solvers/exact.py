@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sinh, sqrt
@@ -59,8 +60,8 @@ class ExactSolution:
         Means over a nutation [rad/s].
     theta_min, theta_max : float
         Bounds of theta folded into [0, pi] [rad].
-    m, m1 : float
-        Parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix.
+    m1 : float
+        1 - m, m the parameter of the elliptic functions: 0 on the separatrix.
     time_limit : float
         The farthest time either way [s]: there a phase has made 2^52 turns.
 
@@ -90,8 +91,7 @@ class ExactSolution:
         with precision():
             self._motion = motion = set_up(
                 top, mpfr(top.gravity) if gravity is None else gravity, start)
-            alpha, beta, self.m, self.m1 = (
-                motion.alpha, motion.beta, float(motion.m), float(motion.m1))
+            alpha, beta, self.m1 = motion.alpha, motion.beta, float(motion.m1)
             # 2 K/w, two quarter periods
             self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
             self.mean_precession_rate = float(alpha.rate + beta.rate)
@@ -110,9 +110,11 @@ class ExactSolution:
 
     def _check_start(self) -> None:
         """Refuse constants so large, or so far apart, that doubles lose the start among them."""
-        start, first = self.start, self.at_start
-        (alpha, beta), theta_dot, across = (np.ravel(x).tolist() for x in (
-            first.moduli, first.theta_dot, first.across))
+        start = self.start
+        with np.errstate(all='ignore'):
+            first = ThetaValues(self.arrays, Times.from_ns(range(1)))
+            (alpha, beta), theta_dot, across = (np.ravel(x).tolist() for x in (
+                first.moduli, first.theta_dot, first.across))
         cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
         # Relative to the distance from either pole, and to a small velocity of the axis.
         for name, error, size in (
@@ -127,11 +129,6 @@ class ExactSolution:
     @cached_property
     def _precise_start(self) -> PreciseState:
         return precise(self.start)
-
-    @cached_property
-    def at_start(self) -> ThetaValues:
-        with np.errstate(all='ignore'):
-            return ThetaValues(self.arrays, Times.from_ns(range(1)))
 
     @property
     def theta_min(self) -> float:
@@ -251,18 +248,17 @@ class _ExactStates(States):
         return self._times.seconds
 
     @cached_property
-    def _block(self) -> ThetaValues:
-        if len(self) == 1 and not self._times.high[0]:
-            return self._solution.at_start
+    def _values(self) -> ThetaValues:
         return ThetaValues(self._solution.arrays, self._times)
 
-    def _rows(self, name: str) -> NDArray[np.float64]:
-        """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
-        blocks = (self._block,) if len(self) <= TIMES_TOGETHER else (
-            ThetaValues(self._solution.arrays, self._times.part(slice(k, k + TIMES_TOGETHER)))
-            for k in range(0, len(self), TIMES_TOGETHER))
-        rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
-        return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
+    def _rows(self, name: str) -> Any:
+        """Return an attribute (k, n) of `ThetaValues`; of many times, a block after the other."""
+        if len(self) <= TIMES_TOGETHER:
+            return getattr(self._values, name)
+        parts = (self._times.part(slice(k, k + TIMES_TOGETHER))
+                 for k in range(0, len(self), TIMES_TOGETHER))
+        return np.concatenate([
+            getattr(ThetaValues(self._solution.arrays, part), name) for part in parts], axis=1)
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
