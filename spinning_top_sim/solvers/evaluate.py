@@ -31,8 +31,8 @@ Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
 SIGNS = np.array((1.0, -1.0))   # of an even and of an odd number of half turns
 HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the three phases' units
-# Smaller amplitudes leave no room for their squares in doubles, larger numbers none for halves.
-LEAST_AMPLITUDE, LARGEST_NUMBER = 1e-145, 1e290
+# Smaller amplitudes leave no room for their squares in doubles.
+LEAST_AMPLITUDE = 1e-145
 # 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).
 SPLITTER = 134217729.0
 # Once glibc has freed a block of this size, it keeps freed memory for large arrays instead of
@@ -41,16 +41,11 @@ np.empty(2 ** 22, np.uint8)
 
 
 class Times(NamedTuple):
-    """
-    Times since the start of a motion, as sums of two doubles.
+    """Times since the start of a motion, as sums of two doubles."""
 
-    per_second : 1 for times in s, 10^9 in ns
-    high, low : (n,) nearest doubles, and what they leave out, which may be one 0
-    """
-
-    per_second: int
-    high: Column
-    low: Column | float = 0.0
+    per_second: int                 # 1 for times in s, 10^9 in ns
+    high: Column                    # (n,) nearest doubles
+    low: Column | float = 0.0       # what they leave out, perhaps nothing
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
@@ -130,11 +125,7 @@ class ThetaArrays:
         self._scaled: dict[int, list[Matrix]] = {}
 
     def turned(self, times: Times) -> tuple[Matrix, Matrix]:
-        """
-        Return what the three phases have grown by, rate * t, (3, n).
-
-        As nearest doubles and what they leave out: no error grows.
-        """
+        """Return rate * t of the three phases, (3, n), as doubles and what they leave out."""
         unit = times.per_second
         if unit not in self._scaled:
             with precision():
@@ -156,16 +147,15 @@ class ThetaArrays:
         return high, rest
 
     @cached_property
-    def _middles(self) -> Matrix:
-        """The rows where y = 0, at N = 0 and N = 1, (4, 2)."""
-        return np.where(np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
+    def _middles(self) -> list[list[float]]:
+        """The rows where y = 0, at N = 0 and at N = 1."""
+        return np.where(np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0).T.tolist()
 
     @cached_property
     def bounds(self) -> tuple[float, float]:
         """The least and the greatest theta in [0, pi] [rad]."""
-        alpha, beta, alpha_imag, beta_imag = self._middles
-        low, high = sorted((2.0 * np.arctan2(np.hypot(beta, beta_imag),
-                                             np.hypot(alpha, alpha_imag))).tolist())
+        low, high = sorted(2.0 * math.atan2(math.hypot(b, b_imag), math.hypot(a, a_imag))
+                           for a, b, a_imag, b_imag in self._middles)
         return low, high
 
     @cached_property
@@ -179,7 +169,7 @@ class ThetaArrays:
             return False
         low, high = (0.5 * theta for theta in self.bounds)
         least = min(math.sin(2.0 * low), math.sin(2.0 * high))
-        return 2.0 * float(np.abs(self.precession).max()) < least * (
+        return 2.0 * max(map(abs, self.precession.tolist())) < least * (
             abs(self.bottom_rate) * math.tan(high) + abs(self.top_rate) / math.tan(low))
 
     @cached_property
@@ -187,8 +177,7 @@ class ThetaArrays:
         """(i, j) if both poles are passed: theta/2 is within a quarter turn of pi/2 (i + j N)."""
         if len(self.zeros) < 2:
             return None
-        alpha, beta, *_ = self._middles
-        first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
+        first, second = (math.atan2(b, a) / QUARTER for a, b, *_ in self._middles)
         slope = (second - first + 2.0) % 4.0 - 2.0
         start_whole = float(self.start_wholes[0, 0])
         start = (first + slope * start_whole + 1.0) % 4.0 - 1.0
@@ -271,8 +260,7 @@ class ThetaValues:
         """
         phi, theta and psi, continued through the poles [rad], (5, n).
 
-        phi and psi are given in two parts each, as what grows with time and the rest, less their
-        values at t = 0.
+        phi and psi in two parts each, what grows with time and the rest, less a constant.
         """
         (_, alpha, beta), (_, alpha_rest, beta_rest) = self._turned, self._turned_rest
         arguments = np.arctan2(self._imag, self._real)
@@ -309,8 +297,7 @@ class ThetaValues:
         """
         Phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) [rad/s].
 
-        Nothing cancels near a pole in half angles, and at one that can be reached the singular
-        term is absent.
+        In half angles nothing cancels near a pole, and of a fast top nothing in the series.
         """
         arrays, (alpha, beta) = self._arrays, self.moduli
         if arrays.precesses_slowly:
@@ -342,13 +329,7 @@ class ThetaValues:
 
 def _reduced(turned: Matrix, turned_rest: Matrix,
              arrays: ThetaArrays) -> tuple[NDArray[np.int64], Matrix]:
-    """
-    Return the nearest integers of three phases, and what is left of them, (3, n) each.
-
-    turned, turned_rest : what they have grown by, as two doubles each
-
-    whole + part = turned + turned_rest + the phases at t = 0
-    """
+    """Return the nearest integers of the three phases, and what is left of them, (3, n) each."""
     whole = np.rint(turned)
     part = turned - whole
     shift = part + arrays.start_offsets
