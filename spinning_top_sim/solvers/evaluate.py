@@ -124,8 +124,13 @@ class ThetaArrays:
             [[*map(float, motion.precession)], [*map(float, motion.swing)]])
         self._scaled: dict[int, list[Matrix]] = {}
 
-    def turned(self, times: Times) -> tuple[Matrix, Matrix]:
-        """Return rate * t of the three phases, (3, n), as doubles and what they leave out."""
+    def phases(self, times: Times) -> tuple[Matrix, Matrix, NDArray[np.int64], Matrix]:
+        """
+        Return the three phases, (3, n) each.
+
+        As what they have grown by, rate * t, in doubles and what these leave out; and from their
+        values at t = 0 on, as the nearest integers and what is left.
+        """
         unit = times.per_second
         if unit not in self._scaled:
             with precision():
@@ -144,7 +149,20 @@ class ThetaArrays:
         if not isinstance(times.low, float):
             small += rate * times.low
         rest += small
-        return high, rest
+        whole = np.rint(high)
+        part = high - whole
+        shift = part + self.start_offsets
+        shift += rest
+        np.rint(shift, out=shift)
+        # No difference rounds where the result is small: its terms are within a factor of two of
+        # each other then (Sterbenz).
+        half = 0.5 * shift
+        part -= half
+        half -= self.start_offsets
+        part -= half
+        part += rest + self.start_rests
+        shift += self.start_wholes
+        return high, rest, whole.astype(np.int64) + shift.astype(np.int64), part
 
     @cached_property
     def _middles(self) -> list[list[float]]:
@@ -189,8 +207,7 @@ class ThetaValues:
 
     def __init__(self, arrays: ThetaArrays, times: Times) -> None:
         self._arrays = arrays
-        self._turned, self._turned_rest = arrays.turned(times)
-        self._whole, part = _reduced(self._turned, self._turned_rest, arrays)
+        self._turned, self._turned_rest, self._whole, part = arrays.phases(times)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
@@ -325,27 +342,6 @@ class ThetaValues:
             cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
         return np.stack((self.theta_dot, self.across, cos[0] * cos[1] + sin[0] * sin[1],
                          sin[0] * cos[1] - cos[0] * sin[1]))
-
-
-def _reduced(turned: Matrix, turned_rest: Matrix,
-             arrays: ThetaArrays) -> tuple[NDArray[np.int64], Matrix]:
-    """Return the nearest integers of the three phases, and what is left of them, (3, n) each."""
-    whole = np.rint(turned)
-    part = turned - whole
-    shift = part + arrays.start_offsets
-    shift += turned_rest
-    np.rint(shift, out=shift)
-    # No difference rounds where the result is small: its terms are within a factor of two of each
-    # other then (Sterbenz).
-    half = 0.5 * shift
-    part -= half
-    half -= arrays.start_offsets
-    part -= half
-    part += turned_rest + arrays.start_rests
-    wholes = whole.astype(np.int64)
-    shift += arrays.start_wholes
-    wholes += shift.astype(np.int64)
-    return wholes, part
 
 
 def _columns(numbers: Sequence[mpfr]) -> Matrix:
