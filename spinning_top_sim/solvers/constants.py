@@ -100,16 +100,17 @@ class ThetaMotion(NamedTuple):
     size: int = MOST_TERMS          # coefficients of each polynomial that doubles need
 
 
-def precise(state: State) -> PreciseState:
+def precise(start: State | PreciseState) -> PreciseState:
     """Return a state in multiprecision."""
-    return PreciseState.of(state, mpfr, sin_cos)
+    return (start if isinstance(start, PreciseState)
+            else PreciseState.of(start, mpfr, sin_cos))
 
 
-def set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
+def set_up(top: Top, start: State | PreciseState, gravity: mpfr | None = None) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the numbers as they are.
 
-    gravity : instead of that of the top
+    gravity : in multiprecision, instead of that of the top
 
     Raises ValueError if none of BITS_TO_TRY tell the roots of the cubic apart.  They are never
     equal: on the separatrix, or in steady precession with theta' != 0, cos(theta0) would be
@@ -118,7 +119,7 @@ def set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
     for tried in BITS_TO_TRY:
         with precision(tried):
             try:
-                return _set_up(top, gravity, start)
+                return _set_up(top, mpfr(top.gravity) if gravity is None else gravity, start)
             except RootsTooCloseError:
                 continue
             except ArithmeticError as error:
@@ -141,8 +142,7 @@ class _Side(NamedTuple):
 def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
     torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
     lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
-    sin_half, cos_half, theta_dot, alpha, beta, l3, lz = (
-        start if isinstance(start, PreciseState) else precise(start))
+    sin_half, cos_half, theta_dot, alpha, beta, l3, lz = precise(start)
     spin = l3 * (1 / lambda3 - 1 / lambda1)
     sides = (_Side(lz + l3, spin, argument(alpha), cos_half, -sin_half * theta_dot),
              _Side(lz - l3, -spin, argument(beta), sin_half, cos_half * theta_dot))

@@ -78,11 +78,15 @@ class PreciseState(NamedTuple):
     @classmethod
     def of(cls, state: State, real: Callable[[Any], Real] = float,
            sin_cos: Callable[[Real], tuple[Real, Real]] = _sin_cos) -> PreciseState:
-        """Return a state in other numbers, which have this sine and cosine."""
+        """Return a state, perhaps a continued one, in numbers with this sine and cosine."""
         theta, phi, psi = (real(angle) / 2 for angle in (state.theta, state.phi, state.psi))
         alpha, beta = (cos + 1j * sin for sin, cos in map(sin_cos, (phi + psi, phi - psi)))
-        return cls(*sin_cos(theta), real(state.theta_dot), alpha, beta, real(state.l3),
-                   real(state.lz))
+        (sine, cosine), theta_dot = sin_cos(theta), real(state.theta_dot)
+        if sine < 0:
+            sine, beta, theta_dot = -sine, -beta, -theta_dot
+        if cosine < 0:
+            cosine, alpha, theta_dot = -cosine, -alpha, -theta_dot
+        return cls(sine, cosine, theta_dot, alpha, beta, real(state.l3), real(state.lz))
 
     @classmethod
     def of_posture(cls, top: Top, posture: Posture, real: Callable[[Any], Real] = float,
