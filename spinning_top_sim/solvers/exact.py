@@ -102,7 +102,7 @@ class ExactSolution:
         """Refuse constants so large, or so far apart, that doubles lose the start among them."""
         start = self.start
         with np.errstate(all='ignore'):
-            first = ThetaValues(self.arrays, Times.from_ns(range(1)))
+            first = ThetaValues(self.arrays, Times(1, np.zeros(1)))
             (alpha, beta), theta_dot, across = (np.ravel(x).tolist() for x in (
                 first.moduli, first.theta_dot, first.across))
         cosine, sine = abs(math.cos(0.5 * start.theta)), abs(math.sin(0.5 * start.theta))
