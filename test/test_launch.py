@@ -19,7 +19,7 @@ import pytest
 from helpers.reference import ROOT
 
 from spinning_top_sim import nodes
-from spinning_top_sim.nodes import sim_node
+from spinning_top_sim.nodes import replay_node, sim_node
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import scene_file, simulate
 from spinning_top_sim.tools.scene_file import read_scene
@@ -211,9 +211,9 @@ def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(installed, 
                   rviz='true')
     node = run.nodes['spinning_top_sim/replay_node']
     assert node.executable in EXECUTABLES
-    from spinning_top_sim.nodes.replay_node import _parser
-
-    options = _parser().parse_args(node.arguments)
+    parser = ArgumentParser()
+    replay_node.add_arguments(parser)
+    options = parser.parse_args(node.arguments)
     assert (options.file, options.rate, options.start, options.loop, options.clock,
             options.partial) == (log, 2.0, 0.5, True, 50.0, False)
     tf = run.nodes[f'{RSP}/{RSP}']

@@ -1,27 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What a node does for simulation_interfaces: states, steps, resets, features.
+What a node does for simulation_interfaces: states, steps, resets, features, and its entity.
 
 The handlers are called as the executor calls them, with stand-ins for the messages, and with the
 installed ones where there are some.
 """
 
 import json
+import math
 import re
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
-from helpers.node_logs import xyz, xyzw
+from helpers.node_logs import log_of, xyz, xyzw
 from helpers.standard_node import standard_node  # noqa: F401, a fixture
+from nav_msgs.msg import Odometry
+from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.nodes.simulation_handlers import FEATURES
 from spinning_top_sim.tools import inspect
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 STOPPED, PLAYING, PAUSED, QUITTING, NO_WORLD = range(5)
-ALREADY, TRANSITION_ERROR, INCORRECT_TRANSITION = 101, 102, 103
+ALREADY = INVALID_POSE = 101
+TRANSITION_ERROR, INCORRECT_TRANSITION = 102, 103
+NAME = 'spinning_top'
 
 
 @pytest.fixture
@@ -35,45 +42,57 @@ def test_features_are_those_of_the_services(top):
     names = {name for name in dir(known) if name.isupper()
              and getattr(known, name) in list(features.features)}
     assert names == {name for row in FEATURES.values() for name in row}
-    assert not {'ENTITY_TAGS', 'ENTITY_CATEGORIES', 'ENTITY_BOUNDS', 'SPAWNING', 'DELETING',
-                'SIMULATION_RESET_TIME', 'WORLD_TAGS', 'ENTITY_INFO_SETTING'} & names
     assert not features.spawn_formats
 
 
 def test_a_node_that_starts_paused_is_stopped_until_something_moves(top):
-    assert top.state == STOPPED
-    assert top.set_state('STOPPED') == ALREADY
-    assert top.set_state('PAUSED') == OK
-    assert top.state == PAUSED
-    assert top.simulation.now_ns == -1, 'no sample of the motion is sent'
-    assert top.set_state('PAUSED') == ALREADY
-    assert top.set_state('STOPPED') == OK
-    assert top.state == STOPPED
+    for name, code, state in (('STOPPED', ALREADY, STOPPED), ('PAUSED', OK, PAUSED),
+                              ('PAUSED', ALREADY, PAUSED), ('STOPPED', OK, STOPPED)):
+        assert (top.set_state(name), top.state) == (code, state)
+        assert top.simulation.now_ns == -1, 'no sample of the motion is sent'
 
 
 def test_play_pause_stop(top):
-    assert top.set_state('PLAYING') == OK
-    assert top.state == PLAYING
-    assert top.set_state('PLAYING') == ALREADY
+    assert (top.set_state('PLAYING'), top.state, top.set_state('PLAYING')) == (
+        OK, PLAYING, ALREADY)
     top.wait_until(50_000_000)
-    assert top.set_state('PAUSED') == OK
+    assert (top.set_state('PAUSED'), top.state) == (OK, PAUSED)
     paused_ns = top.simulation.now_ns
-    assert top.state == PAUSED
     assert top.set_state('PLAYING') == OK
     top.wait_until(paused_ns + 50_000_000)
     epoch_ns, now_ns = top.simulation.epoch_ns, top.simulation.now_ns
-    assert top.set_state('STOPPED') == OK
-    assert top.state == STOPPED
-    assert top.simulation.now_ns == -1
+    assert (top.set_state('STOPPED'), top.state, top.simulation.now_ns) == (OK, STOPPED, -1)
     assert top.simulation.epoch_ns > epoch_ns + now_ns, 'stamps do not go back'
     assert top.set_state('PLAYING') == OK
 
 
-def test_other_states_are_refused_by_name(top):
-    code, text = top.refused('SetSimulationState',
-                             state=top.messages.SimulationState(state=NO_WORLD))
-    assert code == INCORRECT_TRANSITION
-    assert text == 'state = 4: must be 0 (STOPPED), 1 (PLAYING), 2 (PAUSED), 3 (QUITTING)'
+def test_what_cannot_be_is_refused_with_its_values(top):
+    assert top.refused('SetSimulationState', state=top.messages.SimulationState(state=4)) == (
+        INCORRECT_TRANSITION,
+        'state = 4: must be 0 (STOPPED), 1 (PLAYING), 2 (PAUSED), 3 (QUITTING)')
+    code, text = top.refused('StepSimulation', steps=1)
+    assert code == FAILED and 'STATE_PAUSED first' in text
+    top.set_state('PLAYING')
+    assert top.refused('StepSimulation', steps=1)[0] == FAILED
+    top.pause()
+    assert top.refused('StepSimulation', steps=0) == (FAILED, 'steps = 0: must be >= 1')
+    now_ns = top.simulation.now_ns
+    code, text = top.refused('ResetSimulation', scope=1)
+    assert code == UNSUPPORTED
+    assert text.startswith('scope = 1: must be 0 or 255 (all), 2 (state) or 3')
+    for service, name in (('GetEntityState', ''), ('SetEntityState', 'Spinning_top'),
+                          ('GetEntityInfo', '/spinning_top')):
+        assert top.refused(service, entity=name) == (
+            NOT_FOUND, f"entity = {name!r}: there is 'spinning_top' only")
+    category = top.messages.EntityCategory(category=1)
+    for service in ('GetEntities', 'GetEntitiesStates'):
+        assert top.done(service).entities == [NAME]
+        for filters in ({'filter': 'top'}, {'categories': [category]},
+                        {'tags': top.messages.TagsFilter(tags=['imu'])},
+                        {'bounds': top.messages.Bounds(type=1)}):
+            assert top.refused(service, filters=top.messages.EntityFilters(**filters)) == (
+                UNSUPPORTED, 'filters must be empty: there is one entity')
+    assert top.simulation.now_ns == now_ns
 
 
 def test_quitting_ends_the_node(top):
@@ -104,16 +123,6 @@ def test_a_failed_motion_is_paused_until_it_is_stopped(top):
     assert (top.state, top.loop.failure) == (STOPPED, None)
 
 
-def test_steps_only_while_paused(top):
-    code, text = top.refused('StepSimulation', steps=1)
-    assert code == FAILED
-    assert 'STATE_PAUSED first' in text
-    top.set_state('PLAYING')
-    assert top.refused('StepSimulation', steps=1)[0] == FAILED
-    top.pause()
-    assert top.refused('StepSimulation', steps=0) == (FAILED, 'steps = 0: must be >= 1')
-
-
 def test_steps_are_whole_nanoseconds_however_they_are_divided(top):
     assert top.set(step__dt=1.0 / 3.0).successful
     top.pause().done('StepSimulation', steps=6)
@@ -124,41 +133,36 @@ def test_steps_are_whole_nanoseconds_however_they_are_divided(top):
     assert top.state == PAUSED
 
 
-def motion(top):
-    """Return attitude and angular velocity."""
-    state = top.done('GetEntityState', entity='spinning_top').state
-    return xyzw(state.pose.orientation), xyz(state.twist.angular)
+def numbers(state):
+    """Return attitude, angular velocity and acceleration of an EntityState, as one array."""
+    assert xyz(state.pose.position) == xyz(state.twist.linear) == (0.0, 0.0, 0.0)
+    assert xyz(state.acceleration.linear) == (0.0, 0.0, 0.0)
+    return np.array([*xyzw(state.pose.orientation), *xyz(state.twist.angular),
+                     *xyz(state.acceleration.angular)])
+
+
+def state_of(top):
+    return top.done('GetEntityState', entity=NAME).state
 
 
 @pytest.mark.parametrize('scope', [0, 3])
 def test_a_reset_of_time_and_state_is_that_of_the_node(top, scope):
-    start = motion(top)
+    start = numbers(state_of(top))
     top.pause().done('StepSimulation', steps=5)
     assert top.set(spin__l3=2.5).successful
-    assert top.get('spin.l3') == [2.5]
     top.done('ResetSimulation', scope=scope)
-    assert top.simulation.now_ns == -1
-    assert motion(top) == start
-    assert top.get('spin.l3') == [1.6]
+    assert (top.simulation.now_ns, top.get('spin.l3')) == (-1, [1.6])
+    assert (numbers(state_of(top)) == start).all()
     assert top.state == STOPPED, 'a pause stays'
 
 
 def test_a_reset_of_the_state_lets_time_go_on(top):
-    start = motion(top)
+    start = numbers(state_of(top))
     top.pause().done('StepSimulation', steps=5)
     top.done('ResetSimulation', scope=2)
-    assert top.simulation.now_ns == 50_000_000
-    assert motion(top) == start
-    assert top.state == PAUSED
+    assert (top.simulation.now_ns, top.state) == (50_000_000, PAUSED)
+    assert (numbers(state_of(top)) == start).all()
     top.done('StepSimulation', steps=1)
-
-
-def test_other_scopes_are_not_supported(top):
-    top.pause().done('StepSimulation', steps=2)
-    code, text = top.refused('ResetSimulation', scope=1)
-    assert code == UNSUPPORTED
-    assert text.startswith('scope = 1: must be 0 or 255 (all), 2 (state) or 3')
-    assert top.simulation.now_ns == 20_000_000
 
 
 @pytest.mark.parametrize('method', ['rk45', 'exact'])
@@ -171,20 +175,26 @@ def test_a_log_of_all_this_verifies(top, tmp_path, capsys, method):
         imu__gyroscope_bias_stddev=0.1, record__uri=path).successful
     top.done('ResetSimulation', scope=0)
     state = top.messages.EntityState()
-    state.twist.angular.x, state.pose.orientation.w = 0.5, 1.0
-    state.twist.angular.z = 11.0
-    top.pause().done('StepSimulation', steps=3)
-    top.done('SetEntityState', entity='spinning_top', state=state, set_twist=True)
-    top.done('StepSimulation', steps=3)
+    state.twist.angular.x, state.pose.orientation.w, state.twist.angular.z = 0.5, 1.0, 11.0
+
+    def put(**parts):
+        top.done('SetEntityState', entity='spinning_top', state=state, **parts)
+
+    def step(count):
+        top.done('StepSimulation', steps=count)
+
+    top.pause()
+    step(3)
+    put(set_twist=True)
+    step(3)
     assert top.switch('record', True).success
-    top.done('StepSimulation', steps=7)
-    top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True, set_twist=True)
-    top.done('StepSimulation', steps=11)
+    step(7)
+    put(set_pose=True, set_twist=True)
+    step(11)
     top.done('ResetSimulation', scope=2)
-    top.done('StepSimulation', steps=5)
-    top.done('StepSimulation', steps=20)
-    top.done('SetEntityState', entity='spinning_top', state=state, set_pose=True)
-    top.done('StepSimulation', steps=13)
+    step(25)
+    put(set_pose=True)
+    step(13)
     assert top.switch('record', False).success
     code = inspect.main([path, '--verify', '--json'])
     content = json.loads(capsys.readouterr().out)
@@ -193,3 +203,125 @@ def test_a_log_of_all_this_verifies(top, tmp_path, capsys, method):
         'start', 'state', 'state', 'state']
     assert inspect.main([path]) == 0
     assert re.search('.*, 3 states set', capsys.readouterr().out)
+
+
+def test_the_state_is_what_is_published_at_its_stamp(top, tmp_path):
+    """Bit by bit against the log: the attitude of ground_truth/odom, and its rates turned."""
+    assert top.set(record__uri=str(tmp_path / 'run.mcap')).successful
+    assert top.switch('record', True).success
+    found = []
+    top.pause()
+    for _ in range(12):
+        top.done('StepSimulation', steps=3)
+        found.append(state_of(top))
+        (other,) = top.done('GetEntitiesStates').states
+        assert (numbers(other) == numbers(found[-1])).all()
+    assert top.switch('record', False).success
+    published = [deserialize_message(data, Odometry)
+                 for _, data in log_of(tmp_path / 'run.mcap')[0]['/ground_truth/odom']]
+    by_stamp = {(one.header.stamp.sec, one.header.stamp.nanosec): one for one in published}
+    for state in found:
+        odom = by_stamp[state.header.stamp.sec, state.header.stamp.nanosec]
+        assert state.header.frame_id == 'world'
+        assert xyzw(state.pose.orientation) == xyzw(odom.pose.pose.orientation)
+        # The twist of an odometry is in the frame of the body.
+        turned = Rotation.from_quat(xyzw(odom.pose.pose.orientation)).apply(
+            xyz(odom.twist.twist.angular))
+        assert np.allclose(numbers(state)[4:7], turned, rtol=1e-14, atol=1e-14)
+
+
+def upright(top, **changes):
+    """Return a state with these numbers, by paths such as twist__linear__x."""
+    state = top.messages.EntityState()
+    state.pose.orientation.w = 1.0
+    for path, value in changes.items():
+        *way, name = path.split('__')
+        target = state
+        for part in way:
+            target = getattr(target, part)
+        setattr(target, name, value)
+    return state
+
+
+@pytest.mark.parametrize('which', ['pose', 'twist', 'both'])
+def test_a_state_that_is_set_is_the_state(top, which):
+    top.pause().done('StepSimulation', steps=20)
+    before, q = numbers(state_of(top)), np.array([0.2, -0.5, 0.4, 0.7])
+    q /= np.linalg.norm(q)
+    rates = (1.0, -2.0, 9.0)
+    wanted = upright(top, **{f'pose__orientation__{axis}': value for axis, value in zip(
+        'xyzw', q.tolist(), strict=True)}, **{
+            f'twist__angular__{axis}': value for axis, value in zip('xyz', rates, strict=True)})
+    top.done('SetEntityState', entity=NAME, state=wanted, set_pose=which != 'twist',
+             set_twist=which != 'pose')
+    after = numbers(state_of(top))
+    expected = [*(before[:4] if which == 'twist' else q),
+                *(before[4:7] if which == 'pose' else rates)]
+    assert np.allclose(after[:7], expected, rtol=0.0, atol=1e-12)
+    assert (top.state, top.simulation.now_ns) == (PAUSED, 200_000_000)
+    # The parameters show the spin, and the motion goes on from there until a reset.
+    now = top.simulation.state()
+    assert top.get('spin.l3', 'spin.lz') == pytest.approx(
+        [float(now.l3[0]), float(now.lz[0])], rel=1e-12)
+    top.done('StepSimulation', steps=1)
+    assert np.allclose(numbers(state_of(top))[4:7], after[4:7] + 0.01 * after[7:], rtol=0.0,
+                       atol=0.05)
+    top.done('ResetSimulation', scope=0)
+    assert top.get('spin.l3') == [1.6]
+
+
+BAD_STATES = [
+    ({'pose__position__x': 0.1}, INVALID_POSE, 'pose.position = [0.1, 0.0, 0.0] m: must be'),
+    ({'pose__position__z': math.nan}, INVALID_POSE, 'pose.position = [0.0, 0.0, nan] m: must be'),
+    ({'pose__orientation__w': 0.9}, INVALID_POSE, 'has length 0.9: must be 1'),
+    ({'pose__orientation__x': math.nan}, INVALID_POSE, 'has length nan: must be 1'),
+    ({'twist__linear__y': 0.5}, FAILED, 'twist.linear = [0.0, 0.5, 0.0] m/s: must be that of'),
+    ({'twist__angular__z': math.inf}, FAILED, 'twist.angular = [0.0, 0.0, inf] rad/s: must be'),
+    ({'twist__angular__z': 1e200}, FAILED, 'no motion from'),
+    ({'header__frame_id': 'map'}, UNSUPPORTED, "header.frame_id = 'map': must be 'world'"),
+]
+
+
+@pytest.mark.parametrize(('changes', 'code', 'text'), BAD_STATES)
+def test_a_bad_state_changes_nothing(top, changes, code, text):
+    top.pause().done('StepSimulation', steps=5)
+    before = state_of(top)
+    found, reason = top.refused('SetEntityState', entity=NAME, state=upright(top, **changes),
+                                set_pose=True, set_twist=True)
+    assert (found, text in reason) == (code, True), (found, reason)
+    assert (numbers(state_of(top)) == numbers(before)).all()
+
+
+@pytest.mark.parametrize(('x', 'w', 'theta'), [(3e-9, 1.0, 0.0), (1.0, 3e-9, math.pi)])
+def test_next_to_a_pole_what_is_not_spin_is_nutation(top, x, w, theta):
+    state = upright(top, pose__orientation__x=x, pose__orientation__w=w, twist__angular__x=0.3,
+                    twist__angular__z=2.0)
+    top.done('SetEntityState', entity=NAME, state=state, set_pose=True, set_twist=True)
+    start = top.simulation.state()
+    assert start.theta == theta and abs(start.lz) == abs(start.l3)
+    assert start.theta_dot == pytest.approx(0.3)
+
+
+def test_a_state_can_be_set_where_the_pivot_is(top):
+    """What the node says of a moving pivot can be sent back to it, and nothing else."""
+    top.loop.drive((0.5, 0.0, 0.0))
+    top.pause().done('StepSimulation', steps=30)
+    state = state_of(top)
+    assert state.pose.position.x > 0.01 and state.twist.linear.x > 0.1
+    assert top.refused('SetEntityState', entity=NAME, state=upright(top), set_pose=True,
+                       set_twist=False)[0] == INVALID_POSE
+    top.done('SetEntityState', entity=NAME, state=state, set_pose=True, set_twist=True)
+    after = state_of(top)
+    assert xyz(after.pose.position) == xyz(state.pose.position)
+    assert xyz(after.twist.linear) == xyz(state.twist.linear)
+    assert xyzw(after.pose.orientation) == pytest.approx(xyzw(state.pose.orientation), abs=1e-12)
+    assert xyz(after.twist.angular) == pytest.approx(xyz(state.twist.angular), abs=1e-12)
+    top.done('StepSimulation', steps=1)
+    assert state_of(top).pose.position.x > after.pose.position.x
+
+
+def test_what_the_entity_is(top):
+    info = top.done('GetEntityInfo', entity=NAME).info
+    assert info.category.category == top.messages.EntityCategory.CATEGORY_ROBOT
+    assert 'mass 2 kg' in info.description
+    assert list(info.tags) == ['spinning_top', 'heavy_symmetric_top', 'imu']

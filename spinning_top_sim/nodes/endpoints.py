@@ -25,19 +25,18 @@ def message_class(type_name: str) -> type:
     """
     # REP-144 and the ROS 2 interface names.
     match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
-    if match:
-        package, name = match.groups()
-        prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
-        # Other Python packages must not be imported because a log names them.
-        if any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
+    package, name = match.groups() if match else ('', '')
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    # Other Python packages must not be imported because a log names them.
+    if not any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
                for prefix in prefixes):
-            try:
-                kind: type = getattr(importlib.import_module(f'{package}.msg'), name)
-                check_for_type_support(kind)
-                return kind
-            except Exception as error:      # importing a broken package may raise anything
-                raise LookupError(f'{type_name} cannot be used: {error}') from error
-    raise LookupError(f'{type_name} is not installed')
+        raise LookupError(f'{type_name} is not installed')
+    try:
+        kind: type = getattr(importlib.import_module(f'{package}.msg'), name)
+        check_for_type_support(kind)
+    except Exception as error:      # importing a broken package may raise anything
+        raise LookupError(f'{type_name} cannot be used: {error}') from error
+    return kind
 
 
 def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float) -> bool:

@@ -33,8 +33,9 @@ from spinning_top_sim.nodes.terminal import Terminal
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.streams.parameter import Range
 
-ROUND_GAP_NS = 10_000_000       # real time before the first message of a round
+ROUND_GAP_NS = 10_000_000       # real time before the first message of a round, after the last
 SHORTEST_WAIT_NS = 300_000      # denser messages are sent together: each wait takes 0.1 ms
 LAST_ANSWERS_NS = 300_000_000   # best-effort subscribers read shared memory, which ends with us
 PATIENCE_S = 5.0                # Fast DDS asks every 3 s for acknowledgements
@@ -59,10 +60,12 @@ class Replayer(Node):
         self._log, self._options, self._terminal = log, options, Terminal()
         first = next(log.messages(start=1), None)       # a time of 0 says: no clock yet
         log_begin_ns, self._end_ns = first.log_time if first else 0, log.span[1]
-        self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
         self._length_s = (self._end_ns - log_begin_ns) / NANOSECONDS
-        if self._begin_ns > self._end_ns:
-            raise ValueError(f'--start {options.start:g}: the log lasts {self._length_s:.3f} s')
+        for name, value, allowed in (('start', options.start, Range(0.0, self._length_s)),
+                                     ('clock', options.clock or 1.0, Range(1e-6, 1e4))):
+            if value not in allowed:
+                raise ValueError(f'--{name} {value:g}: must be {allowed}')
+        self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
         self.outputs = self._open_publishers()
         for warning in ros_parameters.disobeyed_overrides(self, overrides):
             self.get_logger().warning(warning)
@@ -175,6 +178,7 @@ class Replayer(Node):
             steps = self._playback.play(self._begin_ns, self._messages(), ROUND_GAP_NS)
             self._publish_clock()       # before the messages, since it may go back
             yield from steps
+            yield ROUND_GAP_NS          # the last messages arrive before the clock goes back
         yield LAST_ANSWERS_NS
         wait_for_all_acked(senders, PATIENCE_S)
         self._terminal.tell(f'played {self._counts()}')

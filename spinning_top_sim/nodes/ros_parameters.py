@@ -13,6 +13,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameter import ANY, Effect, Parameter
 from spinning_top_sim.tools.scene_file import likely_name, with_doubles
 
+OF_RCLPY = ('use_sim_time', 'start_type_description_service')     # which it declares itself
 SPIN = ('spin.l3', 'spin.lz')
 
 
@@ -26,11 +27,10 @@ def take_overrides(node: Node) -> dict[str, Any]:
     found = {name: node.get_parameter(name).value for name in node.get_parameters_by_prefix('')}
     if not isinstance(found['use_sim_time'], bool):
         raise ValueError(f'use_sim_time = {found["use_sim_time"]!r}: must be true or false')
-    for name in ('use_sim_time', 'start_type_description_service'):     # of rclpy itself
-        found.pop(name, None)
-    for name in found:
+    given = {name: value for name, value in found.items() if name not in OF_RCLPY}
+    for name in given:
         node.undeclare_parameter(name)
-    return found
+    return given
 
 
 def declare(node: Node, given: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -68,20 +68,18 @@ def disobeyed_overrides(node: Node, overrides: Iterable[str]) -> Iterator[str]:
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows.  Types are dynamic: `Parameter.check` decides."""
-    result = ParameterDescriptor(
+    numbers, ranges = parameter.range, {}
+    if numbers is not ANY and isinstance(parameter.default, int):
+        ranges['integer_range'] = [IntegerRange(
+            from_value=int(numbers.lowest), to_value=int(numbers.highest))]
+    elif numbers is not ANY:        # in a list, the range of each number
+        lowest = 0.0 if numbers.has_zero else float(numbers.lowest)
+        ranges['floating_point_range'] = [FloatingPointRange(
+            from_value=lowest, to_value=float(numbers.highest))]
+    return ParameterDescriptor(
         name=parameter.name, description=parameter.describe(range_too=False), dynamic_typing=True,
-        read_only=parameter.effect is Effect.START,
-        additional_constraints=parameter.allowed)
-    if parameter.range is ANY:
-        return result
-    if isinstance(parameter.default, int):
-        result.integer_range = [IntegerRange(
-            from_value=int(parameter.range.lowest), to_value=int(parameter.range.highest))]
-    else:               # in a list, the range of each number
-        lowest = 0.0 if parameter.range.has_zero else float(parameter.range.lowest)
-        result.floating_point_range = [FloatingPointRange(
-            from_value=lowest, to_value=float(parameter.range.highest))]
-    return result
+        read_only=parameter.effect is Effect.START, additional_constraints=parameter.allowed,
+        **ranges)
 
 
 def all_with_doubles(given: Sequence[RosParameter]) -> list[RosParameter]:

@@ -22,9 +22,9 @@ from std_msgs.msg import Header
 from spinning_top_sim.nodes.loop import LoopState
 from spinning_top_sim.nodes.node import Simulator
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
+from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 
@@ -83,9 +83,7 @@ class SimulationHandlers:
 
     def serve(self, name: str, request: Message, response: Message) -> Message:
         """Handle a request for the service of this type; return the response."""
-        act = getattr(self, f'_{service_name(name)}')
-        error, text = self._node.outcome(
-            lambda: self._check_entity(request) or act(request, response))
+        error, text = self._node.outcome(lambda: self._handle(name, request, response))
         if hasattr(response, 'result'):
             response.result.result = self._results.RESULT_OK if error is None else getattr(
                 error, 'code', self._results.RESULT_OPERATION_FAILED)
@@ -93,10 +91,12 @@ class SimulationHandlers:
             response.result.error_message = text.encode(errors='backslashreplace').decode()
         return response
 
-    def _check_entity(self, request: Message) -> None:
+    def _handle(self, name: str, request: Message, response: Message) -> str | None:
         if getattr(request, 'entity', self._name) != self._name:
             raise RefusedError(self._results.RESULT_NOT_FOUND,
                                f'entity = {request.entity!r}: there is {self._name!r} only')
+        text: str | None = getattr(self, f'_{service_name(name)}')(request, response)
+        return text
 
     def _check_runs(self) -> None:
         """Raise RefusedError before the motion begins, and when the process ends."""

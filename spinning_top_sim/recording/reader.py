@@ -369,8 +369,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
                     self._records(self._at(offset, end))
         for place in places:        # those with no index, or with a torn one
-            if not self.channels.keys() >= place.channels != set() or not self.whole and (
-                    place is places[-1]):
+            if not self.channels.keys() >= place.channels != set() or (not self.whole and (
+                    place is places[-1])):
                 with contextlib.suppress(*UNREADABLE):
                     place.channels.update(
                         one.channel_id for one in self._records(self._at(place.offset, place.end))

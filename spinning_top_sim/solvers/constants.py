@@ -2,10 +2,9 @@
 """
 The heavy symmetric top in theta functions: what is computed once for a motion, in multiprecision.
 
-The solution is Klein's.  F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI;
-E. T. Whittaker, *Analytical Dynamics*, 4th ed., sect. 71 and 72; theta functions: Whittaker and
-Watson, *Modern Analysis*, ch. XXI; D. F. Lawden, *Elliptic Functions and Applications*; DLMF,
-https://dlmf.nist.gov, ch. 19, 20 and 22.
+The solution is Klein's: F. Klein, A. Sommerfeld, *Ueber die Theorie des Kreisels*, ch. VI;
+E. T. Whittaker, *Analytical Dynamics*, 4th ed., sect. 71 and 72.  docs/theta_functions.md derives
+it, with r+- for r - s pi w/(2K).  DLMF: https://dlmf.nist.gov, ch. 19, 20 and 22.
 
 The last four lines of the symbols are of alpha; beta has its own.
 
@@ -20,32 +19,15 @@ The last four lines of the symbols are of alpha; beta has its own.
     X, R, J, D      numerator R + i s J and denominator of its quotient of theta functions
     r, c, kappa     its phase is r t + c + kappa y besides that of X; r is a mean rate
 
-docs/theta_functions.md derives steps 1, 2 and 4; r is r+- + s+- pi w/(2K) there.
+    u = u1 + (u2 - u1) sn^2(chi),  w^2 = P (u3 - u1)/(2 lambda1)    [DLMF 22.13(i)]
+    alpha = X(y)/D(y) exp i(r t + c + kappa y),  beta likewise
 
-1. *Nutation.*  u = u1 + (u2 - u1) sn^2(chi) [DLMF 22.13(i)], w^2 = P (u3 - u1)/(2 lambda1).
-
-2. *Attitude.*  alpha vanishes where u = -1, at chi = i (2K/pi) a; beta where u = 1, at
-   chi = K + i (2K/pi) b, with real a and b [DLMF 22.6(iv)].  A quotient of theta functions with
-   these zeros and the poles of u differs from alpha or beta by a factor
-   exp(constant + constant * t).
-
-3. *Phase.*  Z counts quarter periods, and |y| <= pi/4.  By step 2
-
-       alpha = X(y)/D(y) exp i(r t + c + kappa y),   X = R + i s J,   beta likewise.
-
-   D is theta4(y) at even N (u near u1) and theta3(y) at odd N (u near u2).  X is
-   i s theta1(y - i s a) at even and theta2(y - i s a) at odd N for alpha; for beta, with b for a,
-   it is the other way round [DLMF 20.2(i), 20.2(iii)].
-
-4. *Rates.*  The argument of alpha has the rate Omega/2 + (Lz + L3)/(2 lambda1 (1 + u)), that of
-   beta -Omega/2 + (Lz - L3)/(2 lambda1 (1 - u)).  r follows where X is theta2 and y = 0, at u2 for
-   alpha and at u1 for beta.  X(y) turns by a quarter turn from one N to the next, which r t
-   contains already: kappa = -s takes it out again.  The imaginary form has
-   kappa = s (2 K a/(pi K') - 1) [DLMF 20.7(viii)].
-
-5. *Poles.*  s = 0 means that the axis passes a pole exactly.  Then X is real and changes its sign
-   there.  If Lz = L3 and u3 = 1, beta has no zero: it is proportional to dn(chi), with theta4 and
-   theta3 for X.
+D is theta4(y) at even N (u near u1) and theta3(y) at odd N (u near u2).  X is i s theta1(y - isa)
+at even and theta2(y - isa) at odd N for alpha; for beta, with b for a, it is the other way round
+[DLMF 20.2(i), 20.2(iii)].  X turns by a quarter turn from one N to the next, which r t contains
+already: kappa = -s takes it out again.  The imaginary form has kappa = s (2 K a/(pi K') - 1)
+[DLMF 20.7(viii)].  If s = 0 the axis passes a pole exactly: X is real and changes its sign.  If
+Lz = L3 and u3 = 1, beta has no zero: it is proportional to dn(chi), with theta4 and theta3 as X.
 
 Everything that cancels, cancels here: next to a pole, to the separatrix, to steady precession.  So
 there are 57 digits, and more if two roots are close; some 40 are left.
@@ -55,8 +37,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import gmpy2
-from gmpy2 import asinh, const_pi, mpfr, sqrt
+from gmpy2 import asinh, const_pi, mpfr, sin_cos, sqrt
 from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
@@ -88,66 +69,48 @@ with precision():
 
 
 class Factor(NamedTuple):
-    """
-    Alpha or beta: (R + i s J)/D exp i(r t + c + kappa y); the symbols are explained above.
+    """Alpha or beta, (R + i s J)/D exp i(r t + c + kappa y)."""
 
-    rate : r [rad/s]
-    phase_turns : c [turns]
-    drift : kappa
-    parts : R and s J at even and at odd N, less their common factors.  If it changes its sign at
-        a pole, R is a sine series at one of them, and has the factor (-1)^floor(N/2).
-    scales : these factors
-    pole_rate : (Lz +- L3)/(2 lambda1) [rad/s]; its sign is s
-    start_argument : of (R + i s J) exp(i kappa y) at t = 0 [rad]
-    """
-
-    rate: mpfr
-    phase_turns: mpfr
-    drift: mpfr
+    rate: mpfr                      # r [rad/s]
+    phase_turns: mpfr               # c [turns]
+    drift: mpfr                     # kappa
+    # R and s J at even and at odd N, less common factors.  If X changes its sign at a pole, R is a
+    # sine series at one of them, and has the factor (-1)^floor(N/2).
     parts: tuple[Parts, Parts]
-    scales: tuple[mpfr, mpfr]
-    pole_rate: mpfr
-    start_argument: mpfr
+    scales: tuple[mpfr, mpfr]       # these factors
+    pole_rate: mpfr                 # (Lz +- L3)/(2 lambda1) [rad/s]; its sign is s
+    start_argument: mpfr            # of X exp(i kappa y) at t = 0 [rad]
 
 
 class ThetaMotion(NamedTuple):
-    """
-    A motion in theta functions; the symbols are explained above.
-
-    stretch : K/K', if the series are in the imaginary form, of x = stretch y
-    quarter_rate : quarter periods per second, w/K
-    start_whole, start_offset : N and 2y/pi at t = 0, start_offset accurate relative to itself
-    size : coefficients of each polynomial that doubles need
-    u_dot, u_dot_series : c at even and at odd N, and theta1, of u' = c theta1(2y)/D^4
-    precession, swing : p and q at even and at odd N, of
-        (Lz - L3 u)/lambda1 = p + q theta1(y)^2/D^2
-    """
+    """A motion in theta functions.  Pairs are at even and at odd N."""
 
     alpha: Factor
     beta: Factor
-    stretch: mpfr | None = None
-    quarter_rate: mpfr = ZERO
-    start_whole: int = 0
-    start_offset: mpfr = ZERO
-    u_dot: tuple[mpfr, mpfr] = (ZERO, ZERO)
-    u_dot_series: Series = NOTHING
+    stretch: mpfr | None = None     # K/K' if the series are in the imaginary form, of stretch y
+    quarter_rate: mpfr = ZERO       # quarter periods per second, w/K
+    start_whole: int = 0            # N at t = 0
+    start_offset: mpfr = ZERO       # 2y/pi at t = 0, accurate relative to itself
+    u_dot: tuple[mpfr, mpfr] = (ZERO, ZERO)     # c of u' = c theta1(2y)/D^4
+    u_dot_series: Series = NOTHING              # theta1
+    # p and q of (Lz - L3 u)/lambda1 = p + q theta1(y)^2/D^2
     precession: tuple[mpfr, mpfr] = (ZERO, ZERO)
     swing: tuple[mpfr, mpfr] = (ZERO, ZERO)
-    m: mpfr = ZERO
     m1: mpfr = ONE
-    size: int = MOST_TERMS
+    size: int = MOST_TERMS          # coefficients of each polynomial that doubles need
 
 
-def precise(state: State) -> PreciseState:
+def precise(start: State | PreciseState) -> PreciseState:
     """Return a state in multiprecision."""
-    return PreciseState.of(state, mpfr, gmpy2)
+    return (start if isinstance(start, PreciseState)
+            else PreciseState.of(start, mpfr, sin_cos))
 
 
-def set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
+def set_up(top: Top, start: State | PreciseState, gravity: mpfr | None = None) -> ThetaMotion:
     """
     Return alpha and beta of the motion through `start` at t = 0, for the numbers as they are.
 
-    gravity : instead of that of the top
+    gravity : in multiprecision, instead of that of the top
 
     Raises ValueError if none of BITS_TO_TRY tell the roots of the cubic apart.  They are never
     equal: on the separatrix, or in steady precession with theta' != 0, cos(theta0) would be
@@ -156,7 +119,7 @@ def set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
     for tried in BITS_TO_TRY:
         with precision(tried):
             try:
-                return _set_up(top, gravity, start)
+                return _set_up(top, mpfr(top.gravity) if gravity is None else gravity, start)
             except RootsTooCloseError:
                 continue
             except ArithmeticError as error:
@@ -167,27 +130,19 @@ def set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
 
 
 class _Side(NamedTuple):
-    """
-    Alpha or beta at the start.
+    """Alpha or beta at the start; x is 1 + u for alpha and 1 - u for beta."""
 
-    momentum, spin : its argument has the rate (spin + momentum/(lambda1 x))/2; x is 1 + u for
-        alpha and 1 - u for beta
-    argument : its argument [rad]
-    modulus, slope : its modulus, and twice the derivative of that
-    """
-
-    momentum: mpfr
+    momentum: mpfr          # its argument has the rate (spin + momentum/(lambda1 x))/2
     spin: mpfr
-    argument: mpfr
+    argument: mpfr          # [rad]
     modulus: mpfr
-    slope: mpfr
+    slope: mpfr             # twice the derivative of the modulus
 
 
 def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
     torque = mpfr(top.mass) * gravity * mpfr(top.com_distance)
     lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
-    sin_half, cos_half, theta_dot, alpha, beta, l3, lz = (
-        start if isinstance(start, PreciseState) else precise(start))
+    sin_half, cos_half, theta_dot, alpha, beta, l3, lz = precise(start)
     spin = l3 * (1 / lambda3 - 1 / lambda1)
     sides = (_Side(lz + l3, spin, argument(alpha), cos_half, -sin_half * theta_dot),
              _Side(lz - l3, -spin, argument(beta), sin_half, cos_half * theta_dot))
@@ -215,9 +170,8 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
               momentum: mpfr, cubic: tuple[mpfr, mpfr, mpfr, mpfr], falling: bool,
               ) -> ThetaMotion:
     """
-    Return a motion with P >= 0, or that of which this is the mirror image.
+    Return a motion with P >= 0, or with mirror = -1 that of which this is the mirror image.
 
-    mirror : 1, or -1 for the latter
     momentum : Lz - L3 u at the start of the motion itself
     """
     roots, f3 = cubic_roots(*cubic), cubic[3]
@@ -250,22 +204,17 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
         precession=(momentum / lambda1 - turn * roots.y1, momentum / lambda1 - turn * roots.y2),
         swing=(-swing * form.middle4 ** 2,
                swing * form.middle3 ** 2 * roots.gap32 / roots.gap31),
-        m=roots.gap21 / roots.gap31, m1=roots.gap32 / roots.gap31, size=form.size)
+        m1=roots.gap32 / roots.gap31, size=form.size)
 
 
 class _Pole(NamedTuple):
-    """
-    The pole where alpha or beta vanishes.
-
-    is_beta : whether it is the one at u = 1
-    x1, x2 : its distances from u1 and u2, as x of `_Side`
-    zero : sn^2(c, m1) in the imaginary form, -sn^2(ic, m) in the real one, with c = (2K/pi) a or
-        (2K/pi) b; None if there is no zero
-    """
+    """The pole where alpha or beta vanishes."""
 
     is_beta: bool
-    x1: mpfr
+    x1: mpfr                # x of `_Side` at u1 and at u2
     x2: mpfr
+    # sn^2(c, m1) in the imaginary form, -sn^2(ic, m) in the real one, with c = (2K/pi) a or
+    # (2K/pi) b [DLMF 22.6(iv)]; None if there is no zero
     zero: mpfr | None
 
 
@@ -274,7 +223,7 @@ def _poles(sides: tuple[_Side, ...], roots: Roots, two_p_lambda1: mpfr,
     """
     Return the poles of alpha and beta.
 
-    No subtraction cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2.  So the product of
+    Nothing cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2.  So the product of
     three distances is known, and the smallest of them needs no difference.
     """
     c0, s0 = (2 * side.modulus ** 2 for side in sides)              # 1 + u0 and 1 - u0
@@ -299,9 +248,8 @@ def _nearest_quarter(roots: Roots, complement: mpfr, falling: bool,
     """
     Return N at t = 0, the sign of y, and sn^2 or sn^2/cn^2 of the distance of chi from N K.
 
-    The latter is -sn^2 of the distance times i, of the parameter m1 [DLMF 22.6(iv)].
-
-    complement : sqrt(m1)
+    The latter, in the imaginary form, is -sn^2 of the distance times i, of the parameter m1
+    [DLMF 22.6(iv)].  complement : sqrt(m1)
     """
     sign = -1 if falling else 1
     low, high = -roots.y1, roots.y2         # u0 - u1 and u2 - u0
@@ -324,7 +272,7 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: mpfr, x_rate: 
     sense, drift, rate = sign_of(side.momentum), ZERO, side.spin / 2
     farthest, real, imag = max(pole.x1, pole.x2), ONE, ZERO
     scale = sqrt(farthest / 2)
-    starts_in_first = quarters % 2 == pole.is_beta       # the theta1 of step 3
+    starts_in_first = quarters % 2 == pole.is_beta       # where X is theta1
     if pole.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
     elif not sense:

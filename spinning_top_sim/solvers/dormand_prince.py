@@ -45,8 +45,6 @@ UnknownRows = NDArray[np.float64]
 # Hairer et al. eq. (4.13): aim a little below the tolerance and change the step within limits.
 SAFETY = 0.9
 SHRINK, GROW = 0.2, 5.0
-# Doubles do not hold the powers of faster rates or longer steps.
-FASTEST_RATE, LONGEST_STEP = 1e100, 1e100       # [rad/s], [s]
 # A step of fewer units in the last place of t is a collapse, not progress.
 SMALLEST_STEP_ULPS = 16
 # A time that so many steps of the present size do not reach is refused: minutes of work.
@@ -139,8 +137,6 @@ class SteppedMotion(ABC):
         derivative = self.derivative(*y)
         # The steps that can still be read, in order; the first one has no length.
         self._kept = [Step(0.0, y, derivative, 0.0, y, derivative)]
-        if not fastest_rate <= FASTEST_RATE:
-            raise OverflowError(f'{fastest_rate:.3g} rad/s')
         # A careful first step: the control finds the right one within a few.
         self._next_step = 0.1 * math.pow(tolerance, 0.2) / (fastest_rate or 1.0)
         self.steps, self.evaluations = 0, 1
@@ -167,7 +163,7 @@ class SteppedMotion(ABC):
         t, y, derivative = newest.t1, newest.y1, newest.derivative1
         grow, step = GROW, unrolled_step(len(y), isinstance(y[0], complex))
         while True:
-            end = t + min(self._next_step, LONGEST_STEP)
+            end = t + self._next_step
             h = end - t                         # what the sum really made of it
             if not h > SMALLEST_STEP_ULPS * math.ulp(t):
                 raise IntegrationError(
@@ -199,12 +195,12 @@ class SteppedMotion(ABC):
         """Forget the steps that only states before this time [ns] need."""
         self._forget(self._number(before_ns / NANOSECONDS))
 
+    def _forget(self, count: int) -> None:
+        del self._kept[:count]
+
     def _number(self, t: float) -> int:
         """Return which of the steps that are kept a time [s] lies in, or comes after."""
         return bisect_left(self._kept, t, hi=len(self._kept) - 1, key=attrgetter('t1'))
-
-    def _forget(self, count: int) -> None:
-        del self._kept[:count]
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """Return the states at ascending times (n,) [ns]; see `states_at_seconds`."""

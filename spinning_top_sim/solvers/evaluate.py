@@ -31,8 +31,8 @@ Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
 SIGNS = np.array((1.0, -1.0))   # of an even and of an odd number of half turns
 HALF_ANGLES = 0.5 * math.pi * np.array([[0.5], [1.0], [1.0]])       # of the three phases' units
-# Smaller amplitudes leave no room for their squares in doubles, larger numbers none for halves.
-LEAST_AMPLITUDE, LARGEST_NUMBER = 1e-145, 1e290
+# Smaller amplitudes leave no room for their squares in doubles.
+LEAST_AMPLITUDE = 1e-145
 # 2^27 + 1: the factor that splits a double into two halves (Dekker, Numer. Math. 18, 1971, 224).
 SPLITTER = 134217729.0
 # Once glibc has freed a block of this size, it keeps freed memory for large arrays instead of
@@ -41,16 +41,11 @@ np.empty(2 ** 22, np.uint8)
 
 
 class Times(NamedTuple):
-    """
-    Times since the start of a motion, as sums of two doubles.
+    """Times since the start of a motion, as sums of two doubles."""
 
-    per_second : 1 for times in s, 10^9 in ns
-    high, low : (n,) nearest doubles, and what they leave out, which may be one 0
-    """
-
-    per_second: int
-    high: Column
-    low: Column | float = 0.0
+    per_second: int                 # 1 for times in s, 10^9 in ns
+    high: Column                    # (n,) nearest doubles
+    low: Column | float = 0.0       # what they leave out, perhaps nothing
 
     @classmethod
     def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
@@ -87,27 +82,13 @@ def halves(x: Number) -> tuple[Number, Number]:
 
 
 class ThetaArrays:
-    """
-    The constants of a motion in doubles; columns are (k, 1).
-
-    Raises ValueError if doubles cannot hold an amplitude or a rate.
-
-    start_wholes, start_offsets, start_rests : of the three phases at t = 0: their sum
-    drifts : kappa/2 of alpha and beta
-    stretch : K/K' times a quarter turn, 0 in the real form
-    prefactors : at even and at odd N, of the rows R of alpha and beta, s J of alpha and beta
-    coefficients : of the polynomials of these rows in xi, highest power first, (k, 4, 2)
-    on_line : the numbers, 0 for alpha and 1 for beta, of those that have s = 0
-    zeros : by the same number, of those that pass their pole exactly: whether R = 0 at y = 0 is
-        at even N (0) or at odd N (1)
-    u_dot, u_dot_coefficients : of u'
-    bottom_rate, top_rate : (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
-    precession, swing : p and q at even and at odd N, of (Lz - L3 u)/lambda1
-    """
+    """The constants of a motion in doubles.  Raises ValueError if these cannot hold one."""
 
     def __init__(self, motion: ThetaMotion) -> None:
         factors = motion.alpha, motion.beta
+        # (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
         self.bottom_rate, self.top_rate = (float(x.pole_rate) for x in factors)
+        # The three phases at t = 0 are the sum of whole, offset and rest.
         self._rates = [motion.quarter_rate, *(x.rate / const_pi() for x in factors)]
         turns = [2 * x.phase_turns for x in factors]
         wholes = [motion.start_whole, *map(int, map(rint, turns))]
@@ -116,6 +97,8 @@ class ThetaArrays:
             [motion.start_offset, *map(sub, turns, wholes[1:])])
         self.drifts = np.array([[0.5 * float(factor.drift)] for factor in factors])
         self.stretch = QUARTER * float(motion.stretch) if motion.stretch else 0.0
+        # At even and at odd N, of the rows R of alpha and beta, s J of alpha and beta; the
+        # polynomials in xi have their highest power first, (k, 4, 2).
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
         self.coefficients = _highest_first(
@@ -129,6 +112,8 @@ class ThetaArrays:
                 raise ValueError(
                     f'the amplitude of {name} is {size:.3e}: the start is too close to a pole '
                     f'or to rest there; must be 0 or at least {LEAST_AMPLITUDE}')
+        # 0 for alpha and 1 for beta: those with s = 0, and of those that pass their pole exactly,
+        # whether R = 0 at y = 0 is at even N (0) or at odd N (1).
         self.on_line = [k for k, factor in enumerate(factors) if not factor.pole_rate]
         self.zeros = {k: pair.index(SIN_ODD) for k, pair in enumerate(self.prefactors[:2])
                       if SIN_ODD in pair}
@@ -139,11 +124,12 @@ class ThetaArrays:
             [[*map(float, motion.precession)], [*map(float, motion.swing)]])
         self._scaled: dict[int, list[Matrix]] = {}
 
-    def turned(self, times: Times) -> tuple[Matrix, Matrix]:
+    def phases(self, times: Times) -> tuple[Matrix, Matrix, NDArray[np.int64], Matrix]:
         """
-        Return what the three phases have grown by, rate * t, (3, n).
+        Return the three phases, (3, n) each.
 
-        As nearest doubles and what they leave out: no error grows.
+        As what they have grown by, rate * t, in doubles and what these leave out; and from their
+        values at t = 0 on, as the nearest integers and what is left.
         """
         unit = times.per_second
         if unit not in self._scaled:
@@ -163,19 +149,31 @@ class ThetaArrays:
         if not isinstance(times.low, float):
             small += rate * times.low
         rest += small
-        return high, rest
+        whole = np.rint(high)
+        part = high - whole
+        shift = part + self.start_offsets
+        shift += rest
+        np.rint(shift, out=shift)
+        # No difference rounds where the result is small: its terms are within a factor of two of
+        # each other then (Sterbenz).
+        half = 0.5 * shift
+        part -= half
+        half -= self.start_offsets
+        part -= half
+        part += rest + self.start_rests
+        shift += self.start_wholes
+        return high, rest, whole.astype(np.int64) + shift.astype(np.int64), part
 
     @cached_property
-    def _middles(self) -> Matrix:
-        """The rows where y = 0, at N = 0 and N = 1, (4, 2)."""
-        return np.where(np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0)
+    def _middles(self) -> list[list[float]]:
+        """The rows where y = 0, at N = 0 and at N = 1."""
+        return np.where(np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0).T.tolist()
 
     @cached_property
     def bounds(self) -> tuple[float, float]:
         """The least and the greatest theta in [0, pi] [rad]."""
-        alpha, beta, alpha_imag, beta_imag = self._middles
-        low, high = sorted((2.0 * np.arctan2(np.hypot(beta, beta_imag),
-                                             np.hypot(alpha, alpha_imag))).tolist())
+        low, high = sorted(2.0 * math.atan2(math.hypot(b, b_imag), math.hypot(a, a_imag))
+                           for a, b, a_imag, b_imag in self._middles)
         return low, high
 
     @cached_property
@@ -189,7 +187,7 @@ class ThetaArrays:
             return False
         low, high = (0.5 * theta for theta in self.bounds)
         least = min(math.sin(2.0 * low), math.sin(2.0 * high))
-        return 2.0 * float(np.abs(self.precession).max()) < least * (
+        return 2.0 * max(map(abs, self.precession.tolist())) < least * (
             abs(self.bottom_rate) * math.tan(high) + abs(self.top_rate) / math.tan(low))
 
     @cached_property
@@ -197,8 +195,7 @@ class ThetaArrays:
         """(i, j) if both poles are passed: theta/2 is within a quarter turn of pi/2 (i + j N)."""
         if len(self.zeros) < 2:
             return None
-        alpha, beta, *_ = self._middles
-        first, second = (np.arctan2(beta, alpha) / QUARTER).tolist()
+        first, second = (math.atan2(b, a) / QUARTER for a, b, *_ in self._middles)
         slope = (second - first + 2.0) % 4.0 - 2.0
         start_whole = float(self.start_wholes[0, 0])
         start = (first + slope * start_whole + 1.0) % 4.0 - 1.0
@@ -210,8 +207,7 @@ class ThetaValues:
 
     def __init__(self, arrays: ThetaArrays, times: Times) -> None:
         self._arrays = arrays
-        self._turned, self._turned_rest = arrays.turned(times)
-        self._whole, part = _reduced(self._turned, self._turned_rest, arrays)
+        self._turned, self._turned_rest, self._whole, part = arrays.phases(times)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
@@ -281,8 +277,7 @@ class ThetaValues:
         """
         phi, theta and psi, continued through the poles [rad], (5, n).
 
-        phi and psi are given in two parts each, as what grows with time and the rest, less their
-        values at t = 0.
+        phi and psi in two parts each, what grows with time and the rest, less a constant.
         """
         (_, alpha, beta), (_, alpha_rest, beta_rest) = self._turned, self._turned_rest
         arguments = np.arctan2(self._imag, self._real)
@@ -319,8 +314,7 @@ class ThetaValues:
         """
         Phi' sin(theta) = (Lz - L3 cos(theta))/(lambda1 sin(theta)) [rad/s].
 
-        Nothing cancels near a pole in half angles, and at one that can be reached the singular
-        term is absent.
+        In half angles nothing cancels near a pole, and of a fast top nothing in the series.
         """
         arrays, (alpha, beta) = self._arrays, self.moduli
         if arrays.precesses_slowly:
@@ -348,33 +342,6 @@ class ThetaValues:
             cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
         return np.stack((self.theta_dot, self.across, cos[0] * cos[1] + sin[0] * sin[1],
                          sin[0] * cos[1] - cos[0] * sin[1]))
-
-
-def _reduced(turned: Matrix, turned_rest: Matrix,
-             arrays: ThetaArrays) -> tuple[NDArray[np.int64], Matrix]:
-    """
-    Return the nearest integers of three phases, and what is left of them, (3, n) each.
-
-    turned, turned_rest : what they have grown by, as two doubles each
-
-    whole + part = turned + turned_rest + the phases at t = 0
-    """
-    whole = np.rint(turned)
-    part = turned - whole
-    shift = part + arrays.start_offsets
-    shift += turned_rest
-    np.rint(shift, out=shift)
-    # No difference rounds where the result is small: its terms are within a factor of two of each
-    # other then (Sterbenz).
-    half = 0.5 * shift
-    part -= half
-    half -= arrays.start_offsets
-    part -= half
-    part += turned_rest + arrays.start_rests
-    wholes = whole.astype(np.int64)
-    shift += arrays.start_wholes
-    wholes += shift.astype(np.int64)
-    return wholes, part
 
 
 def _columns(numbers: Sequence[mpfr]) -> Matrix:

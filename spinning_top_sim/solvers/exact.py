@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sinh, sqrt
@@ -59,8 +60,8 @@ class ExactSolution:
         Means over a nutation [rad/s].
     theta_min, theta_max : float
         Bounds of theta folded into [0, pi] [rad].
-    m, m1 : float
-        Parameter of the elliptic functions and m1 = 1 - m, which is 0 on the separatrix.
+    m1 : float
+        1 - m, m the parameter of the elliptic functions: 0 on the separatrix.
     time_limit : float
         The farthest time either way [s]: there a phase has made 2^52 turns.
 
@@ -75,63 +76,45 @@ class ExactSolution:
     def __init__(self, top: Top, start: State | PreciseState,
                  gravity: mpfr | None = None) -> None:
         # A motion about another vertical has its start and its `gravity` in multiprecision.
-        self.top, self.turns, self.sign, half_turn = top, 0, 1.0, 0.0
-        if isinstance(start, PreciseState):
-            self.start, self._precise_start = start.rounded(), start
-        else:
-            # A state continued through a pole is solved from the same attitude in [0, pi].
-            self.turns = round(start.theta / math.tau)
-            theta = start.theta - self.turns * math.tau
-            if theta < 0.0:
-                self.sign, half_turn = -1.0, math.pi
-            self.start = start = State(
-                theta=min(abs(theta), math.pi), theta_dot=self.sign * start.theta_dot,
-                phi=start.phi + half_turn, psi=start.psi - half_turn, l3=start.l3, lz=start.lz)
+        self.top, self._given = top, start
+        self.start = start = start if isinstance(start, State) else start.rounded()
+        # theta = sign * (theta in [0, pi]) + turn, for a start that goes on beyond a pole
+        self.turn = math.tau * round(start.theta / math.tau)
+        self.sign = -1.0 if start.theta < self.turn else 1.0
         with precision():
-            self._motion = motion = set_up(
-                top, mpfr(top.gravity) if gravity is None else gravity, start)
-            alpha, beta, self.m, self.m1 = (
-                motion.alpha, motion.beta, float(motion.m), float(motion.m1))
+            self._motion = motion = set_up(top, self._given, gravity)
+            alpha, beta, self.m1 = motion.alpha, motion.beta, float(motion.m1)
             # 2 K/w, two quarter periods
             self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
             self.mean_precession_rate = float(alpha.rate + beta.rate)
             self.mean_spin_rate = float(alpha.rate - beta.rate)
             # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
-            self.phi_phase = float(
-                self.start.phi - alpha.start_argument - beta.start_argument) - half_turn
-            self.psi_phase = float(
-                self.start.psi - alpha.start_argument + beta.start_argument) + half_turn
-            self.time_limit = MOST_TURNS / float(max(
-                abs(motion.quarter_rate), abs(alpha.rate) / (2 * const_pi()),
-                abs(beta.rate) / (2 * const_pi()), 1e-290))
+            self.phi_phase = float(start.phi - alpha.start_argument - beta.start_argument)
+            self.psi_phase = float(start.psi - alpha.start_argument + beta.start_argument)
+            self.time_limit = MOST_TURNS / max(
+                abs(float(motion.quarter_rate)), 1e-290,
+                (abs(self.mean_precession_rate) + abs(self.mean_spin_rate)) / (4.0 * math.pi))
             self.arrays = ThetaArrays(motion)
         if gravity is None:
             self._check_start()
 
     def _check_start(self) -> None:
         """Refuse constants so large, or so far apart, that doubles lose the start among them."""
-        start, first = self.start, self.at_start
-        (alpha, beta), theta_dot, across = (np.ravel(x).tolist() for x in (
-            first.moduli, first.theta_dot, first.across))
-        cosine, sine = math.cos(0.5 * start.theta), math.sin(0.5 * start.theta)
+        start = self.start
+        with np.errstate(all='ignore'):
+            first = ThetaValues(self.arrays, Times(1, np.zeros(1)))
+            (alpha, beta), theta_dot, across = (np.ravel(x).tolist() for x in (
+                first.moduli, first.theta_dot, first.across))
+        cosine, sine = abs(math.cos(0.5 * start.theta)), abs(math.sin(0.5 * start.theta))
         # Relative to the distance from either pole, and to a small velocity of the axis.
         for name, error, size in (
                 ('theta', beta * cosine - alpha * sine, alpha * sine),
-                ('theta_dot', theta_dot[0] - start.theta_dot,
+                ('theta_dot', self.sign * theta_dot[0] - start.theta_dot,
                  min(math.hypot(start.theta_dot, across[0]), max(1.0, abs(start.theta_dot))))):
             if not abs(error) <= 1e-14 * abs(size):
                 raise ValueError(f'{name} = {getattr(start, name)!r} cannot be held in doubles: '
                                  f'the constants of {self.top} and {start} are too far apart in '
                                  'size')
-
-    @cached_property
-    def _precise_start(self) -> PreciseState:
-        return precise(self.start)
-
-    @cached_property
-    def at_start(self) -> ThetaValues:
-        with np.errstate(all='ignore'):
-            return ThetaValues(self.arrays, Times.from_ns(range(1)))
 
     @property
     def theta_min(self) -> float:
@@ -148,8 +131,8 @@ class ExactSolution:
         coincide : relative distance below which two turning points are one
         """
         top, start = self.top, self.start
-        rests = axis_rests(top, start)
-        low, high = 2 * (start.theta,) if rests else (self.theta_min, self.theta_max)
+        rests, (low, high) = axis_rests(top, start), self.arrays.bounds
+        high = low if rests else high
         slowest, fastest = precession_extremes(top, start, low, high)
         weight = 4.0 * top.lambda1 * abs(top.gravity_torque)
         return Description(
@@ -185,7 +168,7 @@ class ExactSolution:
         vertical : that of the motion, if it is not the world's
         """
         with precision():
-            start = self._precise_start
+            start = precise(self._given)
             found = start.posture(self.top)
             if t_ns:                # perhaps at a pole, where the axis does not tell its rates
                 alpha, beta, u_dot = _at(self._motion, mpfr(t_ns) / NANOSECONDS)
@@ -197,8 +180,6 @@ class ExactSolution:
                                                    abs(alpha) ** 2)
                     transverse = -(momentum / mpfr(self.top.lambda1) + 1j * u_dot) / product
                 found = Posture(alpha, beta, transverse, found.l3)
-            if self.turns % 2:
-                found = found._replace(alpha=-found.alpha, beta=-found.beta)
             return vertical.to_world(found) if vertical else found
 
 
@@ -251,30 +232,29 @@ class _ExactStates(States):
         return self._times.seconds
 
     @cached_property
-    def _block(self) -> ThetaValues:
-        if len(self) == 1 and not self._times.high[0]:
-            return self._solution.at_start
+    def _values(self) -> ThetaValues:
         return ThetaValues(self._solution.arrays, self._times)
 
-    def _rows(self, name: str) -> NDArray[np.float64]:
-        """Return an attribute (k, n) of `ThetaValues`, computed a block at a time."""
-        blocks = (self._block,) if len(self) <= TIMES_TOGETHER else (
-            ThetaValues(self._solution.arrays, self._times.part(slice(k, k + TIMES_TOGETHER)))
-            for k in range(0, len(self), TIMES_TOGETHER))
-        rows: list[NDArray[np.float64]] = [getattr(block, name) for block in blocks]
-        return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
+    def _rows(self, name: str) -> Any:
+        """Return an attribute (k, n) of `ThetaValues`; of many times, a block after the other."""
+        if len(self) <= TIMES_TOGETHER:
+            return getattr(self._values, name)
+        parts = (self._times.part(slice(k, k + TIMES_TOGETHER))
+                 for k in range(0, len(self), TIMES_TOGETHER))
+        return np.concatenate([
+            getattr(ThetaValues(self._solution.arrays, part), name) for part in parts], axis=1)
 
     @cached_property
     def rows_quaternion(self) -> Quaternion:
         x, y, z, w = self._rows('quaternion')
-        return (-x, -y, -z, -w) if self._solution.turns % 2 else (x, y, z, w)
+        return x, y, z, w
 
     @cached_property
     def angles(self) -> tuple[Column, Column, Column]:
         solution = self._solution
         precession, phi, theta, spin, psi = self._rows('angles')
         return (precession + (phi + solution.phi_phase),
-                solution.sign * theta + solution.turns * math.tau,
+                solution.sign * theta + solution.turn,
                 spin + (psi + solution.psi_phase))
 
     @cached_property

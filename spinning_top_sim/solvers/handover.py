@@ -40,32 +40,17 @@ class Piece:
     Times are simulated times [ns].  While the pivot has always rested, phi and psi are unwrapped
     and theta goes on through the poles; else theta is in [0, pi], phi and psi in [-2 pi, 2 pi].
 
-    Parameters
-    ----------
-    top : Top
-        In the gravity of the world.
-    start : State or Posture
-        About the vertical of the world, at `start_ns`.
-    start_ns : int
-        When the piece begins [ns].
-    ride : pivot.Piece
-        What the pivot does; REST where it has always rested at the origin.
-    method, equations, rtol, atol
-        As of `solve`.
+    top : in the gravity of the world
+    start : about the vertical of the world, at `start_ns`
+    ride : what the pivot does; REST where it has always rested at the origin
+    method, equations, rtol, atol : as of `solve`
 
-    Attributes
-    ----------
-    l3, lz, energy : float
-        Constants of the motion in the frame of the pivot; Lz about the line of effective gravity.
-    fastest_rate : float
-        Bound on how fast the attitude and the body's rates change [rad/s].
-    steps, evaluations : int
-        Counts; 0 for the exact solution.
+    l3, lz, energy : constants of the motion in the frame of the pivot; Lz about the line of
+        effective gravity, which is positive upwards
+    fastest_rate : bound on how fast the attitude and the body's rates change [rad/s]
+    steps, evaluations : counts; 0 for the exact solution
 
-    Raises
-    ------
-    ValueError
-        Naming what is off, where no motion begins.
+    Raises ValueError, naming what is off, where no motion begins.
     """
 
     def __init__(self, top: Top, start: State | Posture, start_ns: int,
@@ -74,12 +59,16 @@ class Piece:
         self.top, self.start_ns, self.ride, self._start = top, start_ns, ride, start
         try:
             with np.errstate(over='ignore', invalid='ignore'):
+                self._posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
+                                 else start.in_doubles())
                 self._solution = self._begun(method, equations=equations, rtol=rtol, atol=atol)
                 self._motion, self._vertical = self._solution
-                self.l3, self.lz = self._motion.start.l3, self._motion.start.lz
-                self.energy = self._energy()
-                self.fastest_rate = integrals.fastest_rate(
-                    self._motion.top, self.l3, self.energy)
+                about, begun, across = (
+                    self._motion.top, self._motion.start, abs(self._posture.transverse))
+                self.l3, self.lz = begun.l3, begun.lz
+                self.energy = 0.5 * (top.lambda1 * across * across + begun.l3 / top.lambda3
+                                     * begun.l3) + about.gravity_torque * math.cos(begun.theta)
+                self.fastest_rate = integrals.fastest_rate(about, self.l3, self.energy)
             if not self.fastest_rate <= FASTEST_RATE:
                 raise ValueError(f'it turns at up to {self.fastest_rate:.3g} rad/s: must be at '
                                  f'most {FASTEST_RATE:.2g}')
@@ -97,21 +86,11 @@ class Piece:
             with needed("method = 'exact'"):
                 from spinning_top_sim.solvers.exact import exact_about  # noqa: PLC0415 - gmpy2
             return exact_about(top, start, self.ride.acceleration)
-        posture = (PreciseState.of(start).posture(top) if isinstance(start, State)
-                   else start.in_doubles())
         vertical = Vertical.of(top, self.ride.acceleration, float)
-        posture = vertical.to_frame(posture)
+        posture = vertical.to_frame(self._posture)
         state = PreciseState.of_posture(vertical.top, posture).rounded()
         return motion_of(vertical.top, state, method=method, posture=posture,
                          **settings), vertical
-
-    def _energy(self) -> float:
-        if isinstance(self._start, State):
-            return float(self._motion.states(range(1)).energy[0])
-        # A posture tells it at a third of the time; there may be many pieces a second.
-        top, state, across = self._motion.top, self._motion.start, abs(self._start.transverse)
-        return (0.5 * (top.lambda1 * float(across) ** 2 + state.l3 / top.lambda3 * state.l3)
-                + top.gravity_torque * math.cos(state.theta))
 
     @property
     def start(self) -> State:

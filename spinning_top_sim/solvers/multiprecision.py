@@ -5,15 +5,13 @@ Multiprecision numbers, `mpfr` and `mpc` of gmpy2, and what the closed form comp
 `precision` sets the precision of results.  L. Fousse et al., "MPFR: A multiple-precision binary
 floating-point library with correct rounding", ACM Trans. Math. Softw. 33 (2007), 13.
 
-`GaussMean`: elliptic integrals by Gauss' arithmetic-geometric mean.  One sequence of means of a_0
-and g_0 gives the complete integral of the first kind and the nome, and, with one more square root
-a step, an incomplete integral.  No step subtracts numbers of one size, and all converge
-quadratically.
+`GaussMean`: elliptic integrals by Gauss' arithmetic-geometric mean of a_0 and g_0 [DLMF 19.8(i)].
+No step subtracts numbers of one size, and all converge quadratically.
 
-    a_(n+1) = (a_n + g_n)/2,  g_(n+1) = sqrt(a_n g_n),  c_n = sqrt(a_n^2 - g_n^2)    [DLMF 19.8(i)]
+    a_(n+1) = (a_n + g_n)/2,  g_(n+1) = sqrt(a_n g_n),  c_n = sqrt(a_n^2 - g_n^2)
 
-The modulus is k = c_0/a_0, its complement k' = g_0/a_0.  The arguments a_0, g_0, c_0 need no
-common scale: the functions depend on their ratios only, but for the mean itself.
+The modulus is k = c_0/a_0, its complement k' = g_0/a_0: only the ratios of a_0, g_0 and c_0 count,
+but for the mean itself.
 
 `cubic_roots`: the roots of the nutation's cubic and their distances, without cancellation.
 
@@ -33,7 +31,7 @@ from operator import add, mul
 from typing import NamedTuple
 
 import gmpy2
-from gmpy2 import frexp, get_context, mpc, mpfr, sqrt
+from gmpy2 import agm, const_pi, exp, frexp, get_context, mpc, mpfr, sqrt
 
 # Three words of 64 bits, or 57 decimal digits.
 BITS = 192
@@ -75,9 +73,6 @@ def double_double(x: mpfr) -> tuple[float, float]:
     return high, float(x - high)
 
 
-# Coefficients of lambda, lambda^5, lambda^9 ... in the nome [DLMF 19.5.6; A002103 of oeis.org].
-# The first one that is left out contributes less than 1e-44 for k^2 <= 1/2.
-NOME_COEFFICIENTS = 1, 2, 15, 150, 1707, 20910, 268616, 3567400, 48555069, 673458874
 NEGLIGIBLE = 1e-21      # a ratio whose square does not count
 
 
@@ -89,13 +84,11 @@ class GaussMean:
     """
 
     def __init__(self, a: mpfr, g: mpfr, c: mpfr) -> None:
-        self._start, self._squares = a, [c * c]
-        self._means: list[tuple[mpfr, mpfr]] = []     # g_n and c_n
-        while not self._means or c > a * NEGLIGIBLE:
+        self._start, self._complement, self._squares = a, c, [c * c]
+        while len(self._squares) == 1 or c > a * NEGLIGIBLE:
             product, a = a * g, (a + g) / 2
             c = self._squares[-1] / (4 * a)         # [DLMF 19.8.3]
             g = sqrt(product) if c > a * NEGLIGIBLE else a
-            self._means.append((g, c))
             self._squares.append(c * c)
         self.mean = a
 
@@ -105,13 +98,8 @@ class GaussMean:
         return self._start / self.mean
 
     def nome(self) -> mpfr:
-        """Return q = exp(-pi K'/K) to 40 digits, for k^2 <= 1/2."""
-        a, (g, c) = self._start, self._means[0]
-        small = a * c / (a + g) ** 2                # (1 - sqrt(k'))/(1 + sqrt(k'))/2
-        power, total = small ** 4, ZERO
-        for coefficient in reversed(NOME_COEFFICIENTS):
-            total = total * power + coefficient
-        return small * total
+        """Return q = exp(-pi K'/K)."""
+        return exp(-const_pi() * self.mean / agm(self._start, self._complement))
 
     def amplitude(self, square: mpfr, sign: int) -> mpfr:
         """

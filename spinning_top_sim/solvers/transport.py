@@ -82,7 +82,10 @@ class TransportMotion(SteppedMotion):
         self._turn_beta = 0.5j * (lz + carried) / lambda1
         self._fall = complex(-torque / lambda1)
         # What 2 lambda1 |m|^2 + P cos(theta) must stay; the rest of the energy is constant.
-        alpha, beta, m = _vector(top, posture or PreciseState.of(start).posture(top))
+        alpha, beta, across, _ = posture or PreciseState.of(start).posture(top)
+        # Of L in the body: lambda1 (omega_1 + i omega_2), L3.  e3 is (2 alpha beta, ...).
+        m = 0.5j * (alpha * alpha * across - beta * beta * across.conjugate()
+                    + 2.0 * alpha * beta * (l3 / lambda1))
         self._energy = 2.0 * lambda1 * abs(m) ** 2 + torque * (abs(alpha) ** 2 - abs(beta) ** 2)
         # |m| never exceeds this: the scale of its error, as 1 is that of alpha and beta.  Close to
         # hanging the sum is what its rounding leaves.
@@ -129,12 +132,11 @@ class TransportMotion(SteppedMotion):
     def accepted(self, y: Unknowns, y_new: Unknowns) -> Unknowns:
         """Return y_new moved back onto the invariants; see `project`."""
         alpha, beta, m = y_new
-        projected = self.project((alpha.real, alpha.imag, beta.real, beta.imag, m.real, m.imag),
-                                 POLE_SHARE, ONE_STATE)
+        projected = self.project(
+            (alpha.real, alpha.imag, beta.real, beta.imag, m.real, m.imag), ONE_STATE)
         return complex(*projected[:2]), complex(*projected[2:4]), complex(*projected[4:])
 
-    def project(self, y: Sequence[Any], pole_share: float,
-                functions: Functions = COLUMNS) -> tuple[Any, ...]:
+    def project(self, y: Sequence[Any], functions: Functions = COLUMNS) -> tuple[Any, ...]:
         """Return y with |q| = 1, then L.e3 = L3, then the energy restored along theta'."""
         # m conj(alpha beta) = u + i v, where v carries L.e3 and u the nutation rate: v follows
         # from L3 and Lz, and u^2 from |u + i v|^2, which the energy tells.
@@ -148,7 +150,9 @@ class TransportMotion(SteppedMotion):
         inverse_square = inverse_norm * inverse_norm
         cos2, sin2 = cos2 * inverse_square, sin2 * inverse_square
         size = cos2 * sin2
-        axis_real, axis_imag = half_axis(alpha_real, alpha_imag, beta_real, beta_imag)
+        # alpha beta = (e3_x + i e3_y)/2
+        axis_real = alpha_real * beta_real - alpha_imag * beta_imag
+        axis_imag = alpha_real * beta_imag + alpha_imag * beta_real
         lambda1, l3, lz = self.top.lambda1, self._l3, self._lz
         # L3 - Lz cos(theta), without cancellation at the poles
         v = 0.25 / lambda1 * where(sin2 < cos2, (l3 - lz) + 2.0 * lz * sin2,
@@ -159,7 +163,7 @@ class TransportMotion(SteppedMotion):
         # What rounding leaves of the energy does not tell u.
         is_known = (u * u > self._large_enough * size) & (u_squared > 0.0)
         u = where(is_known, copysign(sqrt(where(is_known, u_squared, 0.0)), u), u)
-        at_pole = size <= pole_share
+        at_pole = size <= POLE_SHARE
         divisor = where(at_pole, 1.0, size)
         return (
             alpha_real, alpha_imag, beta_real, beta_imag,
@@ -168,12 +172,9 @@ class TransportMotion(SteppedMotion):
 
     def phases(self, y: Sequence[Column], uniform: Column) -> list[Column]:
         """
-        Return the phases of alpha and beta less the uniform parts, and theta/2.
+        Return the phases of alpha and beta less the uniform parts, and theta/2, but for turns.
 
-        The phases are known but for whole turns.
-
-        y : real and imaginary parts of alpha and beta, and more
-        uniform : the uniform part of alpha's phase in the same frame [rad]
+        uniform : the uniform part of alpha's phase in the frame of y [rad]
         """
         moduli, phases = [], []
         for k, part in enumerate((uniform, -uniform)):
@@ -214,20 +215,6 @@ class TransportMotion(SteppedMotion):
         return _TransportStates(self, t, unknowns)
 
 
-def _vector(top: Top, posture: Posture) -> Unknowns:
-    """Return alpha, beta and m of a posture."""
-    alpha, beta, transverse, l3 = posture
-    # Of L in the body: lambda1 (omega_1 + i omega_2), L3.  e3 is (2 alpha beta, ...).
-    momentum = (alpha * alpha * transverse - beta * beta * transverse.conjugate()
-                + 2.0 * alpha * beta * (l3 / top.lambda1))
-    return alpha, beta, 0.5j * momentum
-
-
-def half_axis(a: Any, a_imag: Any, b: Any, b_imag: Any) -> tuple[Any, Any]:
-    """Return alpha beta = (e3_x + i e3_y)/2, of length sin(theta)/2."""
-    return a * b - a_imag * b_imag, a * b_imag + a_imag * b
-
-
 def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
     """
     Return the whole turns to add to `phase` so that it follows `before` [rad].
@@ -253,7 +240,7 @@ class _TransportStates(States):
     @cached_property
     def _projected(self) -> Components:
         """The unknowns on the invariants, in the body's own frame."""
-        a, b, c, d, m_real, m_imag = self._motion.project(self._stepped, POLE_SHARE)
+        a, b, c, d, m_real, m_imag = self._motion.project(self._stepped)
         spin = 0.5 * self._motion.spin_rate * self.t
         cosine, sine = np.cos(spin), np.sin(spin)
         return (a * cosine - b * sine, b * cosine + a * sine,

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,6 +55,10 @@ class Posture(NamedTuple):
         return Posture(complex(self.alpha), complex(self.beta), complex(self.transverse), self.l3)
 
 
+def _sin_cos(angle: float) -> tuple[float, float]:
+    return math.sin(angle), math.cos(angle)
+
+
 class PreciseState(NamedTuple):
     """
     A state about some vertical, in any numbers.
@@ -74,13 +77,16 @@ class PreciseState(NamedTuple):
 
     @classmethod
     def of(cls, state: State, real: Callable[[Any], Real] = float,
-           functions: ModuleType = math) -> PreciseState:
-        """Return a state in other numbers, which have these sines and cosines."""
+           sin_cos: Callable[[Real], tuple[Real, Real]] = _sin_cos) -> PreciseState:
+        """Return a state, perhaps a continued one, in numbers with this sine and cosine."""
         theta, phi, psi = (real(angle) / 2 for angle in (state.theta, state.phi, state.psi))
-        sin, cos = functions.sin, functions.cos
-        alpha, beta = (cos(angle) + 1j * sin(angle) for angle in (phi + psi, phi - psi))
-        return cls(sin(theta), cos(theta), real(state.theta_dot), alpha, beta, real(state.l3),
-                   real(state.lz))
+        alpha, beta = (cos + 1j * sin for sin, cos in map(sin_cos, (phi + psi, phi - psi)))
+        (sine, cosine), theta_dot = sin_cos(theta), real(state.theta_dot)
+        if sine < 0:
+            sine, beta, theta_dot = -sine, -beta, -theta_dot
+        if cosine < 0:
+            cosine, alpha, theta_dot = -cosine, -alpha, -theta_dot
+        return cls(sine, cosine, theta_dot, alpha, beta, real(state.l3), real(state.lz))
 
     @classmethod
     def of_posture(cls, top: Top, posture: Posture, real: Callable[[Any], Real] = float,

@@ -7,6 +7,7 @@ import contextlib
 import difflib
 import re
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +22,9 @@ NODE = '/spinning_top'      # the full name of the node where no other is asked 
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 
-_WITH_EXPONENT = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+')
-
 
 class _Loader(yaml.SafeLoader):
     """Resolves plain scalars as rcl does: 1e5 is a double, 1_000 and ~ are strings."""
-
-    def compose_node(self, *place: object) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError('rcl supports no aliases')
-        return super().compose_node(*place)
 
 
 _Loader.bool_values = yaml.SafeLoader.bool_values | {'y': True, 'n': False}
@@ -45,29 +39,27 @@ for _type, _pattern in (
     _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_type}', re.compile(f'({_pattern})$'), None)
 
 
-class _Name(argparse.Action):
-    """The name of an installed file; "help" prints the names and exits, as --help does."""
-
-    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
-                 value: Any, option: str | None = None) -> None:
-        if value == 'help':
-            with cli.reader_may_end():
-                for stem, path in parameter_files(self.dest).items():
-                    # The first sentence of the comment at the head, behind the licence.
-                    text = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
-                                    if line.startswith('# '))
-                    print(f'{stem:20} {text.partition(". ")[0].rstrip(".")}')
-            parser.exit()
-        setattr(namespace, self.dest, value)
-
-
 def add_arguments(parser: argparse.ArgumentParser, *kinds: str) -> None:
     """Add the options --scene and --imu, or one of them."""
     for kind, what in (('scene', 'top and start of a scene'), ('imu', 'errors of an IMU')):
         if kind in (kinds or ('scene', 'imu')):
             parser.add_argument(
-                f'--{kind}', metavar='NAME', action=_Name, help=f'{what}: the name of one that is '
-                'installed, or the path of a parameter file; "help" lists the names')
+                f'--{kind}', metavar='NAME', type=partial(_name, kind), help=f'{what}: the '
+                'name of one that is installed, or the path of a parameter file; "help" lists '
+                'the names')
+
+
+def _name(kind: str, text: str) -> str:
+    """Return the text; "help" prints the names of the installed files and exits, as --help."""
+    if text != 'help':
+        return text
+    with cli.reader_may_end():
+        for stem, path in parameter_files(kind).items():
+            # The first sentence of the comment at the head, behind the licence.
+            head = ' '.join(line[2:] for line in path.read_text('utf-8').splitlines()[1:5]
+                            if line.startswith('# '))
+            print(f'{stem:20} {head.partition(". ")[0].rstrip(".")}')
+    raise SystemExit(cli.OK)
 
 
 def add_parameters(parser: argparse.ArgumentParser) -> None:
@@ -91,9 +83,9 @@ def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = Fal
     """
     values: dict[str, object] = {}
     for path in chosen_files(arguments):
-        values |= _read(path, node)
-    values |= map(parse_assignment, arguments.param)
-    return {name: value for name, value in values.items() if is_of_ros(name) == to_ros}
+        values |= read_scene(path, node, to_ros=to_ros)
+    return values | {name: value for name, value in map(parse_assignment, arguments.param)
+                     if is_of_ros(name) == to_ros}
 
 
 def chosen_files(arguments: argparse.Namespace) -> list[Path]:
@@ -112,31 +104,24 @@ def file_of(kind: str, name: str) -> Path:
     return files.get(name, Path(name))
 
 
-def read_scene(path: str | Path, node: str = NODE) -> dict[str, object]:
+def read_scene(path: str | Path, node: str = NODE, *, to_ros: bool = False) -> dict[str, object]:
     """
     Return the parameters of a node in a ROS 2 parameter file, not checked.
 
     Sections are matched as by rcl: `/**`, `/left/*`, `left: spinning_top:`.  A section
     `spinning_top` or with the last part of the node's name applies in any namespace.
 
-    node : its full name
+    node, to_ros : as for `given`
 
     Raises OSError, or ValueError, which names the file.
     """
-    return {name: value for name, value in _read(path, node).items() if not is_of_ros(name)}
-
-
-def _read(path: str | Path, node: str) -> dict[str, object]:
-    source = str(path)
-    sections = list(_sections(parse_yaml(Path(path).read_bytes(), source)))
-    fitting = [section for name, section in sections if _fits(name, node)]
-    if not fitting:
-        there = ', '.join(name for name, _ in sections) or 'none'
-        raise ValueError(f'{source} has no parameters for the node {node}: it must have '
-                         "'/**:' or 'spinning_top:', and 'ros__parameters:' in it; its nodes: "
-                         f'{there}')
-    return {name: value for section in fitting
-            for name, value in _known(dict(_flatten(section)), source).items()}
+    sections = list(_sections(parse_yaml(Path(path).read_bytes(), str(path))))
+    if not any(_fits(name, node) for name, _ in sections):
+        raise ValueError(f"{path} has no parameters for the node {node}: it must have '/**:' or "
+                         "'spinning_top:', and 'ros__parameters:' in it; its nodes: "
+                         f'{", ".join(name for name, _ in sections) or "none"}')
+    return {parameter: value for name, section in sections if _fits(name, node)
+            for parameter, value in parse_section(section, str(path), to_ros=to_ros).items()}
 
 
 def _sections(content: object, name: str = '') -> Iterator[tuple[str, Mapping[object, object]]]:
@@ -156,10 +141,11 @@ def _fits(section: str, node: str) -> bool:
             or section in (NODE, f'/{node.rpartition("/")[2]}'))
 
 
-def parse_section(section: Mapping[object, object], source: str) -> dict[str, object]:
+def parse_section(section: Mapping[object, object], source: str, *, to_ros: bool = False,
+                  ) -> dict[str, object]:
     """Return the parameters in a mapping, not checked.  Raises ValueError, as `read_scene`."""
-    return {name: value for name, value in _known(dict(_flatten(section)), source).items()
-            if not is_of_ros(name)}
+    return {name: value if to_ros else _known(name, value, source)
+            for name, value in _flatten(section) if is_of_ros(name) == to_ros}
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
@@ -167,12 +153,15 @@ def parse_assignment(text: str) -> tuple[str, object]:
     name, separator, yaml_text = text.partition(':=')
     if not separator:
         raise ValueError(f'{text!r}: must be NAME:=VALUE')
-    return name, _known({name: parse_yaml(yaml_text, text)}, text)[name]
+    value = parse_yaml(yaml_text, text)
+    return name, value if is_of_ros(name) else _known(name, value, text)
 
 
 def parse_yaml(text: str | bytes, source: str) -> object:
     """Return the content of YAML with the types of rcl.  Raises ValueError, as `read_scene`."""
     try:
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise ValueError('rcl supports no aliases')
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f'{source} is not YAML: {" ".join(str(error).split())}') from error
@@ -197,33 +186,29 @@ def likely_name(name: str) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
-def _known(values: Mapping[str, object], source: str) -> dict[str, object]:
-    """Return the values, with doubles.  Raises ValueError for unknown parameters."""
-    for name, value in values.items():
-        if is_of_ros(name):
-            continue
-        if name not in parameters.BY_NAME:
-            raise ValueError(f'{source}: there is no parameter {name}{likely_name(name)}')
-        if value is None:
-            raise ValueError(f'{source}: {name} has no value')
-        if isinstance(value, list) and len(set(map(type, value))) > 1:
-            raise ValueError(f'{source}: {name} = {shown(value)}: the items of a list must have '
-                             'one type, such as [0.0, 1.5]')
-    return {name: with_doubles(name, value) for name, value in values.items()}
+def _known(name: str, value: object, source: str) -> object:
+    """Return the value of a parameter, with doubles.  Raises ValueError for an unknown one."""
+    if name not in parameters.BY_NAME:
+        raise ValueError(f'{source}: there is no parameter {name}{likely_name(name)}')
+    if value is None:
+        raise ValueError(f'{source}: {name} has no value')
+    if isinstance(value, list) and len(set(map(type, value))) > 1:
+        raise ValueError(f'{source}: {name} = {shown(value)}: the items of a list must have one '
+                         'type, such as [0.0, 1.5]')
+    return with_doubles(name, value)
 
 
 def with_doubles(name: str, value: Any) -> Any:
     """
-    Return the value of a parameter with doubles for integers where it has doubles.
+    Return the value of a parameter with doubles for integers and texts where it has doubles.
 
-    A text such as '1e-9' is a double, too: YAML 1.1, as in `ros2 param set`, takes it for a text.
+    YAML 1.1, as in `ros2 param set`, takes 1e-9 for a text.  What is no number stays.
     """
-    parameter = parameters.BY_NAME.get(name)
-    if isinstance(value, list | array.array):
-        items = [with_doubles(name, item) for item in value]
-        return items if len(set(map(type, items))) == 1 else value
-    if parameter is not None and parameter.has_doubles and (
-            type(value) is int or (isinstance(value, str) and _WITH_EXPONENT.fullmatch(value))):
-        with contextlib.suppress(OverflowError):
-            return float(value)
+    if name in parameters.BY_NAME and parameters.BY_NAME[name].has_doubles:
+        if isinstance(value, list | array.array):
+            items = [with_doubles(name, item) for item in value]
+            return items if len(set(map(type, items))) == 1 else value
+        if type(value) in (int, str):
+            with contextlib.suppress(ValueError, OverflowError):
+                return float(value)
     return value

@@ -26,7 +26,7 @@ from spinning_top_sim.tools import inspect, recover, simulate
 
 PATIENCE_S = 120.0
 MEMORY_MB = 1000
-PLAY_S = 0.05               # what is wrong with a log shows when it is loaded
+PLAY_S = 10.0               # most are played in 0.3 s; times of one may lie anywhere
 TERMINAL_CODES = re.compile(r'[\x00-\x08\x0b-\x1f\x7f-\x9f]')
 
 
@@ -128,32 +128,34 @@ def recovered(path, folder):
 
 
 def replayed(path):
-    """Load and begin to play a log as replay_node does, in this process."""
+    """Play a log as replay_node does, in this process, to its end or for PLAY_S."""
     import helpers.own_domain  # noqa: F401
     import rclpy
 
+    from spinning_top_sim.nodes import replay_node
     from spinning_top_sim.nodes.replayer import Replayer, open_log
 
-    options = argparse.Namespace(rate=1e9, loop=False, start=0.0, topics=[], clock=None, partial=True,
-                                 start_paused=False, delay=0.0, wait_for_subscribers=0)
+    parser = argparse.ArgumentParser()
+    replay_node.add_arguments(parser)
+    options = parser.parse_args([str(path), '--rate', '1e9', '--partial'])
     rclpy.init()
+    said = io.StringIO()
     try:
-        log = open_log(path, True)
-        try:
+        with (contextlib.redirect_stdout(said), contextlib.redirect_stderr(said),
+              open_log(path, True) as log):
             node = Replayer(log, options)
-        except Exception:
-            log.close()
-            raise
-        node.start()
-        end = time.monotonic() + PLAY_S
-        while time.monotonic() < end and not node.finished.done():
-            rclpy.spin_once(node, timeout_sec=0.01)
-        node.stop()
-        code = node.finished.result() if node.finished.done() else 'going on'
-        node.destroy_node()
-        return f'replay {code}'
+            node.start()
+            end = time.monotonic() + PLAY_S
+            while time.monotonic() < end and not node.finished.done():
+                rclpy.spin_once(node, timeout_sec=0.01)
+            node.stop()
+            code = node.finished.result() if node.finished.done() else 'going on'
+            node.destroy_node()
     except (LogError, ValueError) as error:
         assert '\n' not in str(error), error
         return 'replay refused'
     finally:
         rclpy.shutdown()
+    played = re.search(r'played (\d+ messages)', said.getvalue())
+    assert (played is not None) == (code == 0), said.getvalue()
+    return f'replay {code}, {played[1]}' if played else f'replay {code}'

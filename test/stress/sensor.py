@@ -143,7 +143,8 @@ def nees(seed, duration_ns):
 
 def covariances(simulation, topic):
     """Return the variances in a sensor_msgs/Imu: of orientation, rates and force, (9,)."""
-    message = channel(simulation, topic).template.data
+    template = channel(simulation, topic).template
+    message = template.encode_one(0, *(np.zeros((1, one.size)) for one in template.fields))
     # Quaternion, rates and force come before nine numbers each.
     numbers = np.frombuffer(message, '<f8', 37, len(message) - 296)
     return np.concatenate([numbers[begin:begin + 9:4] for begin in (4, 16, 28)])
