@@ -92,9 +92,9 @@ def test_giving_way_in_a_long_integration_loses_nothing_and_leaves_a_state_to_re
 def test_a_clock_far_ahead_leaves_a_state_to_read(monkeypatch):
     """The solver goes no further than the samples do, and keeps the steps that they need."""
     monkeypatch.setattr(dormand_prince, 'MOST_KEPT', 2000)
-    simulation = simulate()
+    simulation = simulate(pose__rate=5000.0)
     record(simulation, 'pose')
-    while simulation.trajectory.steps < 6000:
+    while simulation.trajectory.steps < 4000:
         simulation.send(10 ** 6 * SECOND, give_way=lambda: True)
         assert simulation.state().theta[0] > 0.5
 
