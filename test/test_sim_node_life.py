@@ -32,14 +32,14 @@ from spinning_top_sim.streams import parameters
 # A node whose log is opened when there is a file `go`
 SLOW = """
 import pathlib, sys, time
-from spinning_top_sim.recording import writer
+from spinning_top_sim.recording.writer import McapWriter
 from spinning_top_sim.__main__ import main
-ordinary = writer.create_file
-def create_file(*arguments, **options):
+ordinary = McapWriter.__init__
+def opened(*arguments, **options):
     while not pathlib.Path('go').exists():
         time.sleep(0.01)
-    return ordinary(*arguments, **options)
-writer.create_file = create_file
+    ordinary(*arguments, **options)
+McapWriter.__init__ = opened
 sys.exit(main())
 """
 INT, TERM = signal.SIGINT, signal.SIGTERM

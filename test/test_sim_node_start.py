@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The start of a node: arguments, values given twice, refusals, and what a run of it says."""
 
+import os
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import yaml
 from helpers.node_harness import SimNode
 from helpers.node_logs import TRACEBACK, log_of, the_log
 from helpers.own_node import OwnNode, as_a_process, run_main
+from helpers.reference import ROOT
 from helpers.standard_node import StandardNode
 from rclpy.executors import SingleThreadedExecutor
 from test_scene_file import scene
@@ -133,8 +135,8 @@ def test_a_run_tells_where_its_log_is(main, monkeypatch, tmp_path):
 def test_a_node_without_standard_streams_leaves_a_whole_log(tmp_path):
     command = (f'exec "{sys.executable}" -m spinning_top_sim node -p duration:=0.3 '
                '-p record.enabled:=true <&- >&- 2>&-')
-    assert subprocess.run(['sh', '-c', command], cwd=tmp_path, timeout=60,
-                          check=False).returncode == 0
+    assert subprocess.run(['sh', '-c', command], cwd=tmp_path, timeout=60, check=False, env={
+        **os.environ, 'PYTHONPATH': str(ROOT)}).returncode == 0
     assert len(log_of(the_log(tmp_path))[0]['/pose']) == 31
 
 
