@@ -21,6 +21,7 @@ from helpers.simulations import (
 )
 
 from spinning_top_sim import solve
+from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams import live, parameters
@@ -86,6 +87,16 @@ def test_giving_way_in_a_long_integration_loses_nothing_and_leaves_a_state_to_re
     assert np.transpose(angles) == pytest.approx(
         np.column_stack((there.theta, there.phi, there.psi)), abs=1e-8)
     assert taken == expected
+
+
+def test_a_clock_far_ahead_leaves_a_state_to_read(monkeypatch):
+    """The solver goes no further than the samples do, and keeps the steps that they need."""
+    monkeypatch.setattr(dormand_prince, 'MOST_KEPT', 2000)
+    simulation = simulate(pose__rate=5000.0)
+    record(simulation, 'pose')
+    while simulation.trajectory.steps < 4000:
+        simulation.send(10 ** 6 * SECOND, give_way=lambda: True)
+        assert simulation.state().theta[0] > 0.5
 
 
 def test_ticks_leave_nothing_behind():

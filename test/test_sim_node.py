@@ -30,6 +30,7 @@ from helpers.node_logs import (
     the_log,
     verified,
 )
+from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import MarkerArray
 
 WATCHED_S = 1
@@ -65,9 +66,9 @@ def both_runs(peer, diagnostics, tmp_path_factory):
                 topic.muted = True
             run.said = diagnostics.next(run.node)
         # What is said to one, after what is watched, and does not reach the other.
-        peer.introduce(one, diagnostics)
-        peer.send_command(one, 2.0, 1.5)
-        wait_for('the command', lambda: peer.get(one, 'spin.l3', 'spin.lz') == [2.0, 1.5])
+        commands = peer.node.create_publisher(Float64MultiArray, one.topic('~/commands'), 10)
+        wait_for('the command', lambda: commands.publish(Float64MultiArray(
+            data=[2.0, 1.5])) or peer.get(one, 'spin.l3', 'spin.lz') == [2.0, 1.5])
         assert peer.set_together(one, seed=99, pose__rate=50.0).successful
         assert peer.switch(one, 'set_pause', True).success
         said = diagnostics.next(two)

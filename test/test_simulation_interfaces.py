@@ -32,9 +32,8 @@ NAME = 'spinning_top'
 
 
 @pytest.fixture
-def top(node):
-    node.renew()
-    return node
+def top(stopped):
+    return stopped
 
 
 def test_features_are_those_of_the_services(top):

@@ -193,13 +193,14 @@ class LiveSimulation(Simulation):
 
     def _prepare(self, due_ns: int) -> None:
         """Compute what is due, or a part of it; raise where all is sent that the motion has."""
+        # No further than what is computed next: a solver keeps a limited number of steps.
+        goal_ns = min([due_ns, *(group.furthest_ns for group in self._groups)])
         try:
-            self._go_ahead(due_ns, PIECE_SECONDS)
+            self._go_ahead(goal_ns, PIECE_SECONDS)
         except IntegrationError:
             if self.now_ns >= self._reached_ns:
                 raise
-        until_ns = min(due_ns, self._reached_ns, *(
-            group.furthest_ns for group in self._groups))
+        until_ns = min(goal_ns, self._reached_ns)
         for group in self._groups:
             self._compute(group, until_ns)
 

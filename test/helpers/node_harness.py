@@ -31,7 +31,6 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 import helpers.own_domain  # noqa: F401, for programs without conftest.py
@@ -218,7 +217,6 @@ class Peer:
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
         self._clients = {}
-        self._publishers = {}
 
     def _spin(self):
         # Not spin(): shutdown() may destroy its guard condition before it waits for it.
@@ -288,21 +286,6 @@ class Peer:
         answer = self.call(GetParameters, node.topic('~/get_parameters'),
                            GetParameters.Request(names=list(names)), again=True)
         return [parameter_value_to_python(value) for value in answer.values]
-
-    def send_command(self, node, *data):
-        """Publish on ~/commands, where `introduce` was called before."""
-        self._publishers[node.name].publish(Float64MultiArray(data=[float(d) for d in data]))
-
-    def introduce(self, node, diagnostics):
-        """Publish commands that are refused until one has arrived."""
-        publisher = self.node.create_publisher(Float64MultiArray, node.topic('~/commands'), 10)
-        self._publishers[node.name] = publisher
-        before = diagnostics.number(node, 'rejected commands')
-        end = time.monotonic() + PATIENCE_S
-        while diagnostics.number(node, 'rejected commands') == before:
-            assert time.monotonic() < end, 'no command has arrived'
-            publisher.publish(Float64MultiArray())
-            time.sleep(0.05)
 
 
 def _parameters(values):

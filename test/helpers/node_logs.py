@@ -73,11 +73,6 @@ def events_in(log):
     return [json.loads(data[8:].rstrip(b'\0')) for _, data in rows]
 
 
-def commands_in(log):
-    return [(event['t_ns'], event['l3'], event['lz']) for event in events_in(log)
-            if event['event'] == 'command']
-
-
 def assert_clean_end(node, code):
     assert code == 0, node.err
     assert TRACEBACK not in node.err, node.err

@@ -15,7 +15,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from helpers.node_harness import numbers, options, wait_for
 from spinning_top_sim.nodes.node import Simulator
-from spinning_top_sim.nodes.ros_parameters import SPIN
 
 
 class InThisProcess:
@@ -55,20 +54,6 @@ class OwnNode(InThisProcess):
             setattr(one, 'publish', self.heard[one.channel.topic].append)
             for one in outputs if one.channel.topic in self.heard and one.publish is None]
         return self
-
-    def begin_again(self, values):
-        """Let the node be as after a start with these values, and paused."""
-        node = self.node
-        node._recording.close()
-        before, node.values = node.values, dict(values)
-        node._start_spin = {name: values[name] for name in SPIN}
-        node._open_topics(values)
-        node.remove_on_set_parameters_callback(node._on_set_parameters)
-        node.set_parameters([
-            Parameter(name, value=list(value) if isinstance(value, tuple) else value)
-            for name, value in values.items() if value != before[name] and name not in SPIN])
-        node.add_on_set_parameters_callback(node._on_set_parameters)
-        node.start_again(paused=True)
 
     def set(self, **values):
         """Set parameters all or none; return the result."""

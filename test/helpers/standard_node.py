@@ -28,16 +28,7 @@ class StandardNode(OwnNode):
     def __init__(self, folder, kind='stand-in', **values):
         super().__init__(folder, start_paused=True, **values)
         self.messages, self.services = types_of(kind)
-        self._first_values = dict(self.node.start_values)
-        self._forget()
-
-    def _forget(self):
         self.handlers = SimulationHandlers(self.node, self.messages)
-
-    def renew(self):
-        """Go back to the state after the start."""
-        self.begin_again(self._first_values)
-        self._forget()
 
     def call(self, name, **request):
         """Return the response to a request with these fields."""
@@ -74,7 +65,7 @@ class StandardNode(OwnNode):
         return self
 
 
-@pytest.fixture(scope='module', params=KINDS, name='node')
-def standard_node(request, tmp_path_factory):
-    with StandardNode(tmp_path_factory.mktemp('node'), request.param) as node:
-        yield node
+@pytest.fixture(params=KINDS, name='stopped')
+def standard_node(request, tmp_path):
+    with StandardNode(tmp_path, request.param) as top:
+        yield top
