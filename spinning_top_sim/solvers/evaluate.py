@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import Column, Number
 from spinning_top_sim.physics.pivot import NANOSECONDS, ns_array
 from spinning_top_sim.solvers.constants import ThetaMotion
-from spinning_top_sim.solvers.multiprecision import SIN_ODD, double_double, precision
+from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
 
 Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
@@ -346,7 +346,8 @@ class ThetaValues:
 
 def _columns(numbers: Sequence[mpfr]) -> Matrix:
     """Return nearest doubles and what they leave out, (2, k, 1)."""
-    return np.array([*map(double_double, numbers)]).T[:, :, np.newaxis]
+    high = [*map(float, numbers)]
+    return np.array([high, [*map(float, map(sub, numbers, high))]])[:, :, np.newaxis]
 
 
 def _highest_first(polynomials: Iterable[list[float]]) -> Matrix:
