@@ -37,8 +37,8 @@ class Piece:
     """
     A piece of a run: one solution, between two events or changes of the pivot's acceleration.
 
-    Times are simulated times [ns].  While the pivot has always rested, phi and psi are unwrapped
-    and theta goes on through the poles; else theta is in [0, pi], phi and psi in [-2 pi, 2 pi].
+    Times are simulated times [ns].  While the pivot has always rested, angles are unwrapped; else
+    they are those of `WorldStates`.
 
     top : in the gravity of the world
     start : about the vertical of the world, at `start_ns`
@@ -126,9 +126,7 @@ class Piece:
         """
         Return the states in the world, the pivot included, at ascending times from the start on.
 
-        The steps that are missing are taken here, and the newest are kept until `forget`.
-        Raises IntegrationError where the equations cannot go on; its `reached_ns` says up to when
-        there are states.
+        Raises IntegrationError where steps cannot go on; `reached_ns` says how far they do.
         """
         try:
             return self._in_world(self._solution, t_ns)
