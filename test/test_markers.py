@@ -9,7 +9,7 @@ from helpers.reference import SCENES, scene_parameters
 from helpers.simulations import SECOND, play, run, simulate
 
 from spinning_top_sim import Top, solve
-from spinning_top_sim.physics.top import LARGEST, SMALLEST, THINNEST, Shape
+from spinning_top_sim.shape import LARGEST, SMALLEST, THINNEST, Shape
 from spinning_top_sim.streams import messages, parameters
 
 PERIOD_NS = 50_000_000

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude, regimes
 from spinning_top_sim.physics.regimes import Description, natural_momentum
-from spinning_top_sim.physics.top import Shape, State, Top
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.shape import Shape
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
