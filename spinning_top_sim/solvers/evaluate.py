@@ -60,10 +60,9 @@ class Times(NamedTuple):
         high = count.astype(np.float64)
         if np.abs(high).max(initial=0.0) < 2.0 ** 53:
             return cls(NANOSECONDS, high)
-        upper = (count >> 20).astype(np.float64) * 2.0 ** 20
-        lower = (count & (2 ** 20 - 1)).astype(np.float64)
-        high = upper + lower
-        return cls(NANOSECONDS, high, lower - (high - upper))
+        # Half of it, as `high` may be 2^63.
+        rest = count - 2 * (0.5 * high).astype(np.int64)
+        return cls(NANOSECONDS, high, rest.astype(np.float64))
 
     @property
     def seconds(self) -> Column:
@@ -102,7 +101,7 @@ class ThetaArrays:
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
         self.coefficients = _highest_first(
-            [float(scale * x) for x in one.polynomial(motion.size)]
+            [float(scale * x) for x in one.polynomial[:motion.size]]
             for row, factor in zip(rows, 2 * factors, strict=True)
             for one, scale in zip(row, factor.scales, strict=True)).reshape(-1, 4, 2)
         for name, factor in (('alpha', motion.alpha), ('beta', motion.beta)):
@@ -119,7 +118,7 @@ class ThetaArrays:
                       if SIN_ODD in pair}
         self.u_dot = np.array([*map(float, motion.u_dot)])
         self.u_dot_coefficients = _highest_first(
-            [[*map(float, motion.u_dot_series.polynomial(motion.size))]])
+            [[*map(float, motion.u_dot_series.polynomial[:motion.size])]])
         self.precession, self.swing = np.array(
             [[*map(float, motion.precession)], [*map(float, motion.swing)]])
         self._scaled: dict[int, list[Matrix]] = {}

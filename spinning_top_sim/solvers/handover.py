@@ -7,7 +7,7 @@ import math
 from contextlib import suppress
 from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,10 +109,7 @@ class Piece:
 
     def describe(self) -> Description | None:
         """Return the motion in numbers; None if it has no closed form or the pivot moves."""
-        exact = self._exact
-        if not self.rests or exact is None or isinstance(exact[0], SteppedMotion):
-            return None
-        return exact[0].describe()
+        return self._exact[0].describe() if self.rests and self._exact else None
 
     @property
     def steps(self) -> int:
@@ -139,11 +136,12 @@ class Piece:
         return None if self._exact is None else self._in_world(self._exact, t_ns)
 
     @cached_property
-    def _exact(self) -> Solution | None:
+    def _exact(self) -> tuple[ExactSolution, Vertical | None] | None:
         if not isinstance(self._motion, SteppedMotion):
-            return self._solution
+            return self._motion, self._vertical
         with suppress(ImportError, ValueError):
-            return self._begun('exact')
+            motion, vertical = self._begun('exact')
+            return cast('ExactSolution', motion), vertical
         return None
 
     def posture(self, t_ns: int) -> Posture:

@@ -25,7 +25,7 @@ Positive constants that all series of a form share are left out.
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import reduce
+from functools import cached_property, reduce
 from itertools import count, zip_longest
 from operator import add, mul
 from typing import NamedTuple
@@ -207,38 +207,33 @@ MULTIPLE_ANGLES = [
     for rows in (_polynomials(*pair) for pair in FIRST_POLYNOMIALS)]
 
 
-class Series(NamedTuple):
+class Series:
     """
     The sum of weights[k] times cos(n y) or sin(n y): a prefactor times a polynomial in sin^2 y.
 
     In the imaginary form y stands for ix: cosh x for cos y, sinh x for sin y, xi = -sinh^2 x.
     """
 
-    prefactor: int
-    weights: Sequence[mpfr]
+    def __init__(self, prefactor: int, weights: Sequence[mpfr]) -> None:
+        self.prefactor, self.weights = prefactor, weights
 
-    def polynomial(self, most: int) -> list[mpfr]:
-        """Return the coefficients of xi^0, xi^1 ... of so many terms."""
-        weights, shapes = self.weights[:most], MULTIPLE_ANGLES[self.prefactor]
+    @cached_property
+    def polynomial(self) -> list[mpfr]:
+        """The coefficients of xi^0, xi^1 ..."""
         # A sum of -0 is -0.
-        return [reduce(add, map(mul, weights[power:], shapes[power]))
-                for power in range(len(weights))]
+        return [reduce(add, map(mul, self.weights[power:], shapes)) for power, shapes in zip(
+            range(len(self.weights)), MULTIPLE_ANGLES[self.prefactor], strict=False)]
 
     def at(self, sin: mpfr, cos: mpfr, xi: mpfr) -> mpfr:
-        """Return the sum by Clenshaw's recurrence."""
-        twice, value, before = 2 - 4 * xi, ZERO, ZERO
-        for weight in reversed(self.weights):
-            value, before = weight + twice * value - before, value
-        if self.prefactor == COS_EVEN:
-            return value - before * twice / 2
-        if self.prefactor == COS_ODD:
-            return (value - before) * cos
-        return (value + before) * sin if self.prefactor == SIN_ODD else 2 * before * sin * cos
+        """Return the sum."""
+        value = reduce(lambda value, coefficient: value * xi + coefficient,
+                       reversed(self.polynomial))
+        return value * (ONE, cos, sin, sin * cos)[self.prefactor]
 
     @property
     def leading(self) -> mpfr:
         """At y = 0, the value of a cosine series, or the derivative of a sine series."""
-        return sum(map(mul, self.weights, MULTIPLE_ANGLES[self.prefactor][0]), ZERO)
+        return self.polynomial[0]
 
 
 NOTHING = Series(COS_EVEN, [ZERO])
