@@ -139,7 +139,7 @@ def test_the_manifest_requires_what_ubuntu_has_of_what_pip_installs(project):
     declared = {keys[dependency.name] for dependency in
                 parse_package(str(ROOT / 'package.xml')).exec_depends if dependency.name in keys}
     required = {re.split('[<>]', line)[0] for line in project['dependencies']}
-    assert declared == set(keys.values()) == required - {'gmpy2', 'mcap', 'rosbags'}    # no keys
+    assert declared == set(keys.values()) == required - {'gmpy2', 'mcap', 'rosbags'}    # have no key
 
 
 def make(*arguments):
