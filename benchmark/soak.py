@@ -85,9 +85,9 @@ class Client:
 
 
 CHANGES = itertools.cycle((
-    ('spin.l3', 1.61), ('ground_truth_imu.rate', 50.0), ('max_error', 0.0),
+    ('spin.l3', 1.61), ('ground_truth_imu.rate', 50.0), ('invariants.rate', 50.0),
     ('ground_truth_odom.enabled', False), ('spin.l3', 1.6), ('ground_truth_imu.rate', 200.0),
-    ('max_error', 1e-6), ('ground_truth_odom.enabled', True)))
+    ('invariants.rate', 10.0), ('ground_truth_odom.enabled', True)))
 
 
 def missing_in(path: Path) -> dict[str, tuple[int, int]]:

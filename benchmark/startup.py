@@ -27,6 +27,7 @@ from processes import Process, children_cpu, load, median, ros_arguments, script
 from report import preamble, table, write_section
 
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.parameter import ANY
 
 OURS, RECORDING, LIKE, BARE = 'sim_node', 'sim_node, recording', 'bare, same interface', 'bare'
 KINDS = (OURS, RECORDING, LIKE, BARE)
@@ -37,12 +38,9 @@ def parameter_file(path: Path) -> None:
     rows = []
     for parameter in parameters.TABLE:
         value = parameter.default
-        lowest = parameter.minimum if parameter.above is None else parameter.above
-        largest = sys.float_info.max if parameter.is_double else 2 ** 62
-        bounds = None
-        if lowest is not None or parameter.maximum is not None:
-            bounds = [-largest if lowest is None else lowest,
-                      largest if parameter.maximum is None else parameter.maximum]
+        reach = parameter.range
+        bounds = None if reach is ANY else [0.0 if reach.has_zero else reach.lowest,
+                                            reach.highest]
         rows.append([parameter.name, 1.0 if value is None else value, parameter.describe(),
                      bounds])
     path.write_text(json.dumps(rows))

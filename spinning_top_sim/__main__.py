@@ -19,7 +19,7 @@ COMMANDS = {
     'simulate': ('tools.simulate', 'simulate a top as fast as possible and write a log or table'),
     'inspect': ('tools.inspect', 'say what is in a log; verify, plot or export it'),
     'recover': ('tools.recover', 'copy what is left of a damaged log'),
-    'export': ('tools.export', 'write models for physics engines, or reference trajectories'),
+    'export': ('tools.export', 'write the top as a model for physics engines'),
     'ensemble': ('tools.ensemble', 'simulate many tops with sampled parameters'),
     'examine': ('exam.command', 'examine an attitude filter'),
     'grade': ('grade.command', 'grade the trajectory of a simulator'),

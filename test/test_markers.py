@@ -8,7 +8,7 @@ from helpers.reference import SCENES, scene_parameters
 from helpers.simulations import SECOND, play, run, simulate
 
 from spinning_top_sim import solve
-from spinning_top_sim.physics.top import Shape
+from spinning_top_sim.shape import Shape
 from spinning_top_sim.streams import messages, parameters
 
 PERIOD_NS = 50_000_000

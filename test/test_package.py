@@ -23,6 +23,7 @@ from spinning_top_sim.installation import remedy
 NAME = 'spinning_top_sim'
 SCRIPTS = sorted(path for path in (ROOT / 'scripts').iterdir() if path.is_file())
 SCENES = sorted((ROOT / 'config').glob('*.yaml'))
+NO_KEY = {'gmpy2', 'mcap', 'rosbags'}        # of rosdep, or one of PyPI only
 SOURCES = ('.ci', 'benchmark', 'docs', 'examples', 'launch', 'scripts', NAME, 'test')
 
 
@@ -139,7 +140,7 @@ def test_the_manifest_requires_what_ubuntu_has_of_what_pip_installs(project):
     declared = {keys[dependency.name] for dependency in
                 parse_package(str(ROOT / 'package.xml')).exec_depends if dependency.name in keys}
     required = {re.split('[<>]', line)[0] for line in project['dependencies']}
-    assert declared == set(keys.values()) == required - {'gmpy2', 'mcap', 'rosbags'}    # no keys
+    assert declared == set(keys.values()) == required - NO_KEY
 
 
 def make(*arguments):

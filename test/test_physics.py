@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.physics.top import LARGEST, SMALLEST, THINNEST, Shape
+from spinning_top_sim.shape import LARGEST, SMALLEST, THINNEST, Shape
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.play import Simulation

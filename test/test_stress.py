@@ -12,15 +12,13 @@ import os
 
 import numpy as np
 import pytest
-from helpers.reference import ROOT, scene_parameters
-from helpers.wrong_filters import TABLE
-from stress import runner
+from helpers.reference import scene_parameters
+from helpers.simulations import MILLISECOND, simulate
 from stress.tops import blocks, check_block
 
 from spinning_top_sim.physics.top import ContinuedState
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.live import LiveSimulation
 
 TOPS = int(os.environ.get('STRESS_TOPS', '30'))
 
@@ -47,39 +45,48 @@ def momenta(random, scale, theta):
 def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
     """And what follows is the exact motion from there, on the same branch."""
     random = np.random.default_rng(len(scene))
-    values = parameters.checked({**scene_parameters(scene), 'solver.method': method})
-    simulation = LiveSimulation(values)
-    scale = abs(values['spin.l3']) or 1.0
+    simulation = simulate({**scene_parameters(scene), 'solver.method': method})
+    top, scale = simulation.trajectory.top, abs(simulation.values['spin.l3']) or 1.0
     now = 0
     for _ in range(12):
-        now += int(random.integers(1, 700_000_000))
-        assert simulation.advance(now)
+        now += int(random.integers(1, 700 * MILLISECOND))
+        assert simulation.send(now)
         before = simulation.state()
         l3, lz = momenta(random, scale, before.theta[0])
-        simulation.command(l3, lz)
+        simulation.apply('command', l3=l3, lz=lz)
         after = simulation.state()
-        assert (simulation.l3, simulation.lz) == (l3, lz)
-        assert after.lz[0] == lz
+        assert (simulation.trajectory.l3, simulation.trajectory.lz, after.lz[0]) == (l3, lz, lz)
         omega1, omega2, omega3 = after.angular_velocity[0]
-        assert omega3 == l3 / simulation.top.lambda3
-        total = math.hypot(simulation.top.lambda1 * math.hypot(omega1, omega2), l3)
+        assert omega3 == l3 / top.lambda3
+        total = math.hypot(top.lambda1 * math.hypot(omega1, omega2), l3)
         assert after.l3[0] == pytest.approx(l3, rel=0.0, abs=1e-14 * total)
         # Where a pole is crossed the angles are of the ideal line, and steps of 1e-11 beside it.
         assert math.dist(after.quaternion[0], before.quaternion[0]) < 1e-9
         for name in ('theta', 'theta_dot', 'phi', 'psi'):
             assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-9)
-        truth = ExactSolution(simulation.top, ContinuedState(l3=l3, lz=lz, **{
+        truth = ExactSolution(top, ContinuedState(l3=l3, lz=lz, **{
             name: float(getattr(after, name)[0])
             for name in ('theta', 'theta_dot', 'phi', 'psi')}))
-        for later in (1_000_000, 50_000_000, 200_000_000):
-            simulation.advance(now + later)
-            exact = truth.states(range(later, later + 1))
-            assert math.dist(simulation.state().quaternion[0], exact.quaternion[0]) < 1e-7
-        now += 200_000_000
+        later = np.array([1, 50, 200]) * MILLISECOND
+        assert np.abs(simulation.trajectory.evaluate(now + later).quaternion
+                      - truth.states(later).quaternion).max() < 1e-7
+        now += int(later[-1])
+        assert simulation.send(now)
 
 
-@pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0), *(('wrong', [*TABLE]
-    .index(f'mahony, {one}')) for one in (
+@pytest.mark.parametrize('which', [0, 4])
+def test_whole_logs_are_replayed_whole(tmp_path, which):
+    logs = importlib.import_module('stress.logs')
+    pytest.importorskip('rclpy')
+    path = tmp_path / 'whole.mcap'
+    path.write_bytes(logs.original_logs()[which])
+    with LogReader(path) as reader:
+        count = sum(1 for _ in reader.messages())
+    assert count > 200 and logs.replayed(path) == f'replay 0, {count} messages'
+
+
+@pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0), *(
+    ('wrong', f'mahony, {one}') for one in (
         'dt rounded', 'slow heading', 'heading by atan', 'no tilt about y', 'vector y x z'))])
 def test_a_seed_of_a_part_of_make_stress(tmp_path, monkeypatch, request, part, seed):
     pytest.importorskip('rclpy')
@@ -87,9 +94,6 @@ def test_a_seed_of_a_part_of_make_stress(tmp_path, monkeypatch, request, part, s
     if part == 'nodes':
         peer = request.getfixturevalue('peer')
         monkeypatch.setattr(module, 'shared_peer', lambda: peer)
+    if part == 'wrong':
+        seed = [*module.TABLE].index(seed)
     assert module.check(seed, tmp_path)
-
-
-def test_make_stress_runs_every_part():
-    text = (ROOT / 'test/stress/all').read_text()
-    assert {part for part in runner.PARTS if f'$python {part} --seconds' not in text} <= {'fit'}

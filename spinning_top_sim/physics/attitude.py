@@ -8,9 +8,8 @@ Klein & Sommerfeld, *Theorie des Kreisels*, ch. I:
     alpha = w + i z = cos(theta/2) exp(i (phi + psi)/2),
     beta  = y - i x = sin(theta/2) exp(i (phi - psi)/2).
 
-Functions take and return columns: arrays of shape (n,), and tuples of such arrays for vectors and
-quaternions.  They use elementwise real arithmetic only, so that a value does not depend on the
-other values in its column.
+Functions take and return columns (n,), and tuples of such for vectors and quaternions.  They use
+elementwise real arithmetic only: a value does not depend on the other values in its column.
 """
 
 from typing import TypeVar

@@ -2,10 +2,9 @@
 """
 Rotation and velocity increments of a body, exact to rounding however short the interval is.
 
-Increments are the differences of the states at both ends.  The rounding errors of these do not add
-up in a sum of increments, but over a short time, such as 0.1 ms, they are large beside the
-difference: there the increments are integrals of the body's rates, whose rounding shrinks with
-the interval.  Means are integrals, too, by a Gauss-Legendre rule at whole nanoseconds.
+Increments are differences of the states at both ends, whose rounding does not add up in a sum.
+Over a short time, such as 0.1 ms, it is large beside the difference: there they are integrals of
+the body's rates, as means are, by a Gauss-Legendre rule at whole nanoseconds.
 """
 
 import math
@@ -32,18 +31,11 @@ Matrix = NDArray[np.float64]
 
 
 class Increments(NamedTuple):
-    """
-    What a body did in an interval [a, b), for n intervals at a time.
+    """What a body did in an interval [a, b), for n intervals at a time."""
 
-    rotation : (4, n) q(body at a <- body at b) as x, y, z, w
-    velocity : (3, n) integral of the specific force of a point of the body, in the body frame at a
-        [m/s]: R(a)^T (v(b) - v(a) + (g z + a) (b - a)), in the axes of the world with the
-        velocity v of the point relative to the pivot and the acceleration a of the pivot
-    angles : (3, n) integral of the angular velocity in the body frame of each moment [rad]
-    forces : (3, n) integral of the specific force in the body frame of each moment [m/s]
-    """
-
-    rotation: Matrix
+    rotation: Matrix        # (4, n) q(body at a <- body at b) as x, y, z, w
+    # (3, n) integrals of the specific force f of a point of the body [m/s] and of the angular
+    # velocity [rad/s]: of f in the body frame at a; of both in the body frame of each moment
     velocity: Matrix
     angles: Matrix
     forces: Matrix
@@ -87,8 +79,7 @@ def increments(states: Callable[[NDArray[np.int64]], States], begins: range, len
     """
     Return the increments over panels of one length that begin at these times [ns].
 
-    states : gives the states in the world at ascending times [ns], in which the acceleration of
-        the pivot is the same throughout
+    states : gives the states at times [ns], throughout which the pivot accelerates uniformly
     point : of which the specific force is taken, in the body [m]
     rate : `fastest_rate` of the motion
     """
@@ -148,8 +139,10 @@ def _differences(quaternions: Matrix, velocities: Matrix, fall: Matrix) -> Matri
     """
     Return rotation and velocity (7, n) of `Increments` from the states at both ends.
 
+    The latter is R(a)^T (v(b) - v(a) + fall), with velocities v relative to the pivot.
+
     quaternions, velocities : (components, 2, n); velocities in the body [m/s]
-    fall : (3, 1) what supports the pivot adds to a velocity meanwhile, in the world [m/s]
+    fall : (3, 1) g z and the acceleration of the pivot times b - a, in the world [m/s]
     """
     now, last = ((x, y, z, w) for x, y, z, w in quaternions.swapaxes(0, 1))
     (x, y, z, w), (a, b, c, d) = now, last

@@ -66,15 +66,12 @@ def kinematics(piece: Piece, times_ns: NDArray[np.int64]) -> Kinematics:
 
 class PivotPath:
     """
-    The path of a pivot that accelerates piecewise uniformly.
-
-    After the last piece the pivot keeps its velocity, or the first one follows.
+    The path of a pivot that accelerates piecewise uniformly, and then keeps its velocity.
 
     pieces : durations > 0 [ns], and accelerations (3,) [m/s^2]
     repeat : whether they are repeated for ever.  Then they must leave the velocity as it was, but
         for rounding, which the last acceleration takes; and last SHORTEST_S each on average
     position, velocity : (3,) at the start, in the world [m], [m/s]
-    start_ns : when the path starts [ns]
 
     Raises ValueError for a path that cannot be repeated, and for a piece of 9e9 s or more.
     """
@@ -113,9 +110,7 @@ class PivotPath:
     def through(cls, waypoints: Sequence[Given], *, speed: float, acceleration: float,
                 repeat: bool = False, start_ns: int = 0) -> PivotPath:
         """
-        Return the path along straight lines that stops at each waypoint.
-
-        On each line the pivot accelerates, cruises and brakes.
+        Return the path along straight lines; on each the pivot accelerates, cruises and brakes.
 
         waypoints : two or more (3,) [m]; points that repeat their predecessor are passed over
         speed, acceleration : the greatest, > 0 [m/s], [m/s^2]; slightly smaller where a duration
@@ -140,9 +135,7 @@ class PivotPath:
         """
         Return the path that changes the velocity into `target` uniformly, keeps it, and stops.
 
-        target : (3,) in the world [m/s]
         most_acceleration : > 0 [m/s^2]; the acceleration is slightly smaller: whole nanoseconds
-        position, velocity : (3,) at the start [m], [m/s]
         stop_ns : when the pivot begins to brake, even if it has not reached the target [ns]
         """
         goal, now = _fractions(target), _fractions(velocity)

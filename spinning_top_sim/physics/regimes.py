@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.top import State, Top
 
 Real = Any              # float, or a multiprecision number
@@ -139,18 +138,6 @@ def _precessing_regime(state: State, low: float, high: float, coincide: float) -
     if min(abs(reversal - low), abs(reversal - high)) <= coincide * max(1.0, abs(reversal)):
         return 'cusps'
     return 'loops' if low < reversal < high else 'waves'
-
-
-def effective_potential(top: Top, l3: float, lz: float, theta: Column) -> Column:
-    """
-    Return V(theta) [J] of lambda1 theta'^2/2 + V(theta) = E - L3^2/(2 lambda3).
-
-    It is (Lz - L3 cos theta)^2/(2 lambda1 sin^2 theta) + P cos(theta); theta: (n,) [rad].
-    """
-    phi_dot = attitude.precession_rate(top, l3, lz, np.cos(0.5 * theta) ** 2,
-                                       np.sin(0.5 * theta) ** 2)
-    return (0.5 * top.lambda1 * (phi_dot * np.sin(theta)) ** 2
-            + top.gravity_torque * np.cos(theta))
 
 
 def precession_extremes(top: Top, state: State, theta_min: float,

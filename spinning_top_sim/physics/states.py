@@ -40,11 +40,11 @@ def relative_drift(values: NDArray[np.float64], start: Column | float) -> Column
 
 class States:
     """
-    States of a top at n times.
+    States of a top at n times, in columns that are computed when they are first asked for.
 
-    Who asks for the attitude does not pay for Euler angles.  A value depends on its own time only,
-    never on the other times.  A solver has a subclass with its name, `method`, and the columns t,
-    angles, theta_dot, rows_quaternion and transverse_velocity; all others follow.
+    A value depends on its own time only, never on the other times.  A solver has a subclass with
+    its name, `method`, and the columns t, angles, theta_dot, rows_quaternion and
+    transverse_velocity; all others follow.
 
     Attributes
     ----------
@@ -223,7 +223,7 @@ class States:
         """
         Return the velocity omega x r of a point of the body relative to the pivot.
 
-        As three (n,) arrays in the body frame [m/s], in which `point` is r, from the pivot [m].
+        As three (n,) arrays in the body frame [m/s], in which `point` is r [m].
         """
         (w1, w2, w3), (r1, r2, r3) = self.rows_angular_velocity, point
         return w2 * r3 - w3 * r2, w3 * r1 - w1 * r3, w1 * r2 - w2 * r1
@@ -232,9 +232,9 @@ class States:
         """
         Return what an ideal accelerometer at a point of the body measures.
 
-        It is f = omega' x r + omega x (omega x r) + g z + a with the upward vertical z and the
-        acceleration a of the pivot: at rest +g upwards, as REP-145 has it.  As three (n,) arrays
-        in the body frame [m/s^2], in which `point` is r, from the pivot [m].
+        It is omega' x r + omega x (omega x r) + g z + a with the acceleration a of the pivot: at
+        rest +g upwards, as REP-145 has it.  As three (n,) arrays in the body frame [m/s^2], in
+        which `point` is r, from the pivot [m].
         """
         f1, f2, f3 = self._support
         if not any(point):          # the point is the pivot: no rate is needed
@@ -279,11 +279,9 @@ class WorldStates(States):
     [-2 pi, 2 pi].  Energy, Lz and `start` are those in the frame of the pivot about the vertical
     there; energy and Lz are constants of the motion.
 
-    top : in the gravity of the world
     moved : states in the frame of the vertical
-    rotation : (4, 1) q(world <- frame) as x, y, z, w
-    ride : what the pivot does
-    times_ns : (n,) simulated times [ns], on which the pivot depends
+    rotation : q(world <- frame)
+    ride, times_ns : what the pivot does, at simulated times (n,) [ns]
     """
 
     t, l3, transverse_velocity, _support = (

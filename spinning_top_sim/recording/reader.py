@@ -2,7 +2,7 @@
 """
 Reads MCAP logs of any writer, also truncated and damaged ones, with mcap's records.
 
-Lengths lead from record to record, so that no index or summary is needed.
+Lengths lead from record to record, so that no index is needed.
 """
 
 import contextlib
@@ -11,8 +11,9 @@ import itertools
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
@@ -22,7 +23,7 @@ import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, DataEnd, Header, McapRecord, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
@@ -30,14 +31,14 @@ from spinning_top_sim.recording import rosbag2
 from spinning_top_sim.recording.errors import LogError
 
 MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
-MAX_DECLARED = 16 << 20     # of schemas, channels and metadata, which take ten times that
+MAX_DECLARED = 16 << 20     # of schemas and channels, which may be compressed well
 MOST_INDEX = 1 << 20        # bytes behind the last chunk that may be torn without a loss
 MESSAGE_BYTES = 300         # what a message in memory takes besides its data, about
 MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are grouped together
 HEAD = struct.Struct('<BQ')     # of every record: opcode, length of what follows
-TIMES = struct.Struct('<QQ')    # after the head of a chunk: earliest and latest log time
-MESSAGE = struct.Struct('<HIQ')     # after that of a message: channel, sequence, log time
+# Where log times stand: the earliest and the latest in a chunk, and that of a message
+TIMES = {Opcode.CHUNK: struct.Struct('<9xQQ'), Opcode.MESSAGE: struct.Struct('<15xQ')}
 UNPACK = {b'\x28\xb5\x2f\xfd': 'zstd -d {} -o {}', b'\x04\x22\x4d\x18': 'lz4 -d {} {}'}
 # What is raised for bytes that are not as they should be.
 UNREADABLE = (McapError, ValueError, OverflowError, struct.error)
@@ -78,21 +79,11 @@ class Damage:
         return lost + self.reasons[:MOST_REASONS]
 
 
-class _Place(NamedTuple):
-    """A chunk, or a message outside of one: its log times [ns], where it is, its channels."""
-
-    start_ns: int
-    end_ns: int
-    offset: int
-    end: int
-    channels: set[int]
-
-
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
     An MCAP file, open for reading; a context manager.  Raises LogError if it is none.
 
-    What is damaged is left out.
+    What is damaged is left out.  A file that was not closed is read through at once.
 
     Parameters
     ----------
@@ -104,15 +95,13 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     Attributes
     ----------
     path, size : Path, int
-        The file, of a folder the one in it, and its size when it was opened [bytes].
+        The file, and its size when it was opened [bytes].
     profile, library : str
         What its header says: such as 'ros2', and the program that wrote it.
     whole : bool
-        Whether the file was closed; see also `damage`.
-    metadata : dict
-        The metadata records by name; of several with one name, the last.
-    schemas, channels : dict
-        mcap's records by id.
+        Whether the file was closed and its summary, if any, is right; see also `damage`.
+    metadata, schemas, channels : dict
+        The last metadata of a name, and mcap's records by id.
     left_out : int
         Damaged chunks that `messages` has skipped so far.
     """
@@ -123,7 +112,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self._declared_bytes = 0
-        self._damage: Damage | None = None
         try:
             if self.path.exists() and not self.path.is_file():     # opening a pipe would block
                 raise LogError(f'cannot read {self.path}: it is no regular file')
@@ -134,8 +122,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             self.size = os.fstat(self._file.fileno()).st_size
             header = self._read_header()
             self.profile, self.library = header.profile, header.library
-            self.whole = self._at(self.size - len(MCAP0_MAGIC), self.size) == MCAP0_MAGIC
-            self._places = sorted(self._find_places(), key=attrgetter('start_ns'))
+            self.whole = True
+            try:
+                self._read_summary()
+            except UNREADABLE:
+                self.whole = False
+            self._places = sorted(self._find_places())
+            if not self.whole or not self.channels:
+                _ = self.damage     # notes what is declared in chunks
         except BaseException:
             self.close()
             raise
@@ -165,20 +159,19 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             text = beside.read_text(errors='replace')
         return rosbag2.compression_of(text)
 
-    @property
+    @cached_property
     def damage(self) -> Damage:
-        """What is wrong with the file; reads all of it at the first use."""
-        if self._damage is None:
-            for _ in self.parts():
-                pass
-        assert self._damage is not None
-        return self._damage
+        """What is wrong with the file; reads all of it."""
+        damage = Damage(False)
+        for _ in self.parts(damage):
+            pass
+        return damage
 
     @property
     def span(self) -> tuple[int, int]:
         """The earliest and the latest log time [ns]; both 0 without messages."""
-        return (min((place.start_ns for place in self._places), default=0),
-                max((place.end_ns for place in self._places), default=0))
+        return (min((start_ns for start_ns, *_ in self._places), default=0),
+                max((end_ns for _, end_ns, *_ in self._places), default=0))
 
     def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
                  end: int | None = None) -> Iterator[LogMessage]:
@@ -208,8 +201,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         held: list[tuple[int, int, int, Message]] = []
         held_bytes = 0
         mode, form = self.compression
-        for place in [*self._places, None]:
-            while held and (place is None or held[0][0] < place.start_ns):
+        for start_ns, end_ns, offset, its_end in [*self._places, (1 << 64, 1 << 64, 0, 0)]:
+            while held and held[0][0] < start_ns:
                 *_, message = heapq.heappop(held)
                 held_bytes -= MESSAGE_BYTES + len(message.data)
                 topic, data = wanted[message.channel_id], message.data
@@ -217,21 +210,31 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                     data = self._decompressed(data, form, topic)
                 yield LogMessage(topic, message.log_time, message.publish_time, message.sequence,
                                  data, message.channel_id)
-            if (place is None or place.end_ns < times.start or place.start_ns >= times.stop
-                    or wanted.keys().isdisjoint(place.channels)):
+            if end_ns < times.start or start_ns >= times.stop or (
+                    names is not None and not self._may_hold(wanted, its_end)):
                 continue
             try:
-                records = self._records(self._at(place.offset, place.end))
+                records = self._records(self._at(offset, its_end))
             except UNREADABLE:
                 self.left_out += 1
                 continue
             for number, one in enumerate(records):
                 if isinstance(one, Message) and one.channel_id in wanted and one.log_time in times:
-                    heapq.heappush(held, (one.log_time, place.offset, number, one))
+                    heapq.heappush(held, (one.log_time, offset, number, one))
                     held_bytes += MESSAGE_BYTES + len(one.data)
             if held_bytes > 2 * self._max_bytes:
                 raise LogError(f'cannot read {self.path}: messages that overlap in time take more '
                                f'than {2 * self._max_bytes} bytes')
+
+    def _may_hold(self, channels: Container[int], offset: int) -> bool:
+        """Return whether a chunk has messages of channels, by its indexes, which begin there."""
+        begin = offset
+        for opcode, begin, _ in self._heads(offset):
+            if opcode != Opcode.MESSAGE_INDEX:
+                break
+            if int.from_bytes(self._at(begin + 9, begin + 11), 'little') in channels:
+                return True
+        return not self.whole or begin == offset        # there is no index, or a torn one
 
     def groups(self, topics: Iterable[str] | None = None,
                ) -> Iterator[tuple[str, list[LogMessage]]]:
@@ -247,13 +250,13 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         except McapError as error:
             raise LogError(f'cannot read {self.path}: a message of {topic}: {error}') from None
 
-    def parts(self) -> Iterator[tuple[int, list[McapRecord]]]:
+    def parts(self, damage: Damage) -> Iterator[tuple[int, list[McapRecord]]]:
         """
         Yield (offset, records) of what can be read, in file order: a record, or those of a chunk.
 
-        After that, `damage` tells what cannot be read.
+        damage : is set to what cannot be read
         """
-        damage = Damage(not self.whole)
+        damage.torn = not self.whole
         if damage.torn:
             damage.reasons.append('found: the file does not end as an MCAP file ends')
         crc = zlib.crc32(MCAP0_MAGIC)
@@ -269,15 +272,13 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 lost = min(end, self.size) - offset
                 damage.lost_bytes += lost
                 damage.reasons.append(f'found: {lost} bytes at byte {offset}: '
-                                      f'{error or "a length in it is wrong"}')
+                                      f'{str(error) or "a length in it is wrong"}')
                 continue
-            for one in records:
-                if isinstance(one, DataEnd) and one.data_section_crc not in (0, crc) and (
-                        not damage.lost_bytes):
-                    damage.reasons.append('found: the checksum of the data section is wrong')
+            if opcode == Opcode.DATA_END and not damage.lost_bytes and (
+                    int.from_bytes(raw[9:13], 'little') not in (0, crc)):
+                damage.reasons.append('found: the checksum of the data section is wrong')
             crc = zlib.crc32(raw, crc)
             yield offset, records
-        self._damage = damage
 
     # -------------------------------------------------------------------------------- the bytes
 
@@ -292,9 +293,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         except OSError as error:
             raise LogError(f'cannot read {self.path}: {error.strerror}') from error
 
-    def _heads(self) -> Iterator[tuple[int, int, int]]:
-        """Yield opcode, begin and end of the records, the last of which may have no whole end."""
-        opcode, end = 0, len(MCAP0_MAGIC)
+    def _heads(self, end: int = len(MCAP0_MAGIC)) -> Iterator[tuple[int, int, int]]:
+        """Yield opcode, begin and end of records, of which the last may end behind the file."""
+        opcode = 0
         while end < self.size and opcode not in (Opcode.DATA_END, Opcode.FOOTER):
             offset = end
             head = self._at(offset, min(offset + HEAD.size, self.size))
@@ -341,41 +342,30 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                                     'not read')
                 known[record.id] = record
 
-    def _find_places(self) -> list[_Place]:
-        """Return where messages are, in file order, after noting what is declared."""
-        if self.whole:      # the summary repeats what a damaged record has declared
-            with contextlib.suppress(*UNREADABLE):
-                start = int.from_bytes(self._at(self.size - 28, self.size - 20), 'little')
-                summary = self._at(start, self.size)
-                if zlib.crc32(summary[:-12]) == int.from_bytes(summary[-12:-8], 'little'):
-                    for record in _stream(summary).records:
-                        self._declare(record)
-        places: list[_Place] = []
+    def _find_places(self) -> Iterator[tuple[int, int, int, int]]:
+        """
+        Yield where messages are: earliest and latest log time, begin and end of a record.
+
+        Notes what is declared outside of chunks.
+        """
         for opcode, offset, end in self._heads():
             with contextlib.suppress(*UNREADABLE):
-                content = offset + HEAD.size
-                if end > self.size:
-                    break
-                if opcode == Opcode.CHUNK:
-                    times = TIMES.unpack(self._at(content, content + TIMES.size))
-                    places.append(_Place(*times, offset, end, set()))
-                elif opcode == Opcode.MESSAGE:
-                    channel, _, time_ns = MESSAGE.unpack(
-                        self._at(content, content + MESSAGE.size))
-                    places.append(_Place(time_ns, time_ns, offset, end, {channel}))
-                elif opcode == Opcode.MESSAGE_INDEX and places:
-                    places[-1].channels.add(
-                        int.from_bytes(self._at(content, content + 2), 'little'))
+                if opcode in TIMES and end <= self.size:
+                    times = TIMES[opcode].unpack(self._at(offset, offset + TIMES[opcode].size))
+                    yield times[0], times[-1], offset, end
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
                     self._records(self._at(offset, end))
-        for place in places:        # those with no index, or with a torn one
-            if not self.channels.keys() >= place.channels != set() or (not self.whole and (
-                    place is places[-1])):
-                with contextlib.suppress(*UNREADABLE):
-                    place.channels.update(
-                        one.channel_id for one in self._records(self._at(place.offset, place.end))
-                        if isinstance(one, Message))
-        return places
+
+    def _read_summary(self) -> None:
+        """Note what the summary declares.  UNREADABLE if it is damaged or the file is torn."""
+        footer = _parse(self._at(self.size - 37, self.size - 8))
+        if not isinstance(footer, Footer):
+            raise McapError
+        summary = self._at(footer.summary_start or self.size - 37, self.size)
+        if footer.summary_crc not in (0, zlib.crc32(summary[:-12])):
+            raise McapError
+        for record in _stream(summary).records:     # up to the magic
+            self._declare(record)
 
     def _read_header(self) -> Header:
         """Return the header.  Raises LogError for no MCAP file."""

@@ -14,7 +14,7 @@ import contextlib
 import itertools
 import threading
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,7 +31,6 @@ if TYPE_CHECKING:       # the recorder's thread imports it, which takes 0.1 s
     from spinning_top_sim.recording.writer import McapWriter
 
 QUEUE_BYTES = 32_000_000    # of a full queue; a burst that began with room may go on
-CHUNK_BYTES = 1_000_000     # of messages that make a chunk, about
 ENTRY_BYTES = 300           # what queued rows cost besides their data, about
 
 # The next messages of a topic: its index, log times (n,) [ns], serialized messages (n, size).
@@ -228,7 +227,13 @@ class Recorder:
             self._wake.clear()
             closing = not self._accepting  # read before the queue: once set, nothing more comes
             now = time.monotonic()
-            self._write_queued(file)
+            for _ in range(len(self._queue)):
+                rows, size = self._queue.popleft()
+                for one in rows:
+                    file.add(*one)
+                self._bytes_out += size
+            if self.room:
+                self._taken.set()
             if closing or now >= next_flush:
                 next_flush = now + interval
                 file.flush()
@@ -242,22 +247,6 @@ class Recorder:
                     return
                 self._begin_sync(file, now)
             self._wake.wait(max(0.0, next_flush - time.monotonic()))
-
-    def _write_queued(self, file: McapWriter) -> None:
-        batch: list[Rows] = []
-        batch_bytes = 0
-        for _ in range(len(self._queue)):
-            rows, size = self._queue.popleft()
-            batch += rows
-            batch_bytes += size
-            self._bytes_out += size
-            if batch_bytes >= CHUNK_BYTES:
-                _add(file, batch)
-                file.flush()
-                batch, batch_bytes = [], 0
-        _add(file, batch)
-        if self.room:
-            self._taken.set()
 
     def _begin_sync(self, file: McapWriter, now: float) -> None:
         if self._syncing is not None and self._syncing.is_alive():
@@ -283,14 +272,3 @@ class Recorder:
 def single(topic_index: int, log_time_ns: int, data: bytes) -> Rows:
     """Return one message as rows."""
     return topic_index, np.array([log_time_ns]), np.frombuffer(data, np.uint8)[np.newaxis]
-
-
-def _add(file: McapWriter, batch: Sequence[Rows]) -> None:
-    """Add messages, neighbours of one topic and size together."""
-    by_topic: defaultdict[int, list[Rows]] = defaultdict(list)
-    for rows in batch:
-        by_topic[rows[0]].append(rows)
-    for topic_index, group in by_topic.items():
-        for _, alike in itertools.groupby(group, key=lambda rows: rows[2].shape[1]):
-            _, times_ns, messages = zip(*alike, strict=True)
-            file.add(topic_index, np.concatenate(times_ns), np.concatenate(messages))

@@ -10,7 +10,7 @@ from mcap.records import Attachment, Message, Metadata
 from mcap.writer import Writer
 
 from spinning_top_sim.recording.errors import LogError, why_not_written
-from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.reader import Damage, LogReader
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata
 
 
@@ -57,7 +57,7 @@ def _copy(reader: LogReader, writer: Writer, name: str,
     writer.start(reader.profile, reader.library)
     counts: Counter[int] = Counter()
     times_ns: list[int] = []
-    for offset, records in reader.parts():
+    for offset, records in reader.parts(Damage(False)):
         progress(offset)
         declare()
         for one in records:

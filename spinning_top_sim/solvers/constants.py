@@ -137,6 +137,13 @@ class _Side(NamedTuple):
     argument: mpfr          # [rad]
     modulus: mpfr
     slope: mpfr             # twice the derivative of the modulus
+    # The pole where it vanishes: whether it is the one at u = 1, x at u1 and at u2, and, with
+    # c = (2K/pi) a or (2K/pi) b, sn^2(c, m1) in the imaginary form, -sn^2(ic, m) in the real one
+    # [DLMF 22.6(iv)], or None if there is no zero
+    is_beta: bool = False
+    x1: mpfr = ZERO
+    x2: mpfr = ZERO
+    zero: mpfr | None = None
 
 
 def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion:
@@ -176,7 +183,6 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
     """
     roots, f3 = cubic_roots(*cubic), cubic[3]
     imaginary = roots.gap21 > roots.gap32
-    poles = _poles(sides, roots, lambda1 ** 2 * f3, imaginary)
     a, g, c = sqrt(roots.gap31), sqrt(roots.gap32), sqrt(roots.gap21)
     mean = GaussMean(a, g, c)
     form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary)
@@ -189,9 +195,9 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
     root_f3 = sqrt(f3)
     # w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
     y_rate = root_f3 * mean.mean / 2
-    factors = [_quotient(form, side, pole, lambda1, y_rate * (stretch or 1), y_rate, start_whole,
-                         y0, (direction * sin, cos, xi))
-               for side, pole in zip(sides, poles, strict=True)]
+    factors = [_quotient(form, side, lambda1, y_rate * (stretch or 1), y_rate, start_whole, y0,
+                         (direction * sin, cos, xi))
+               for side in _with_poles(*sides, roots, lambda1 ** 2 * f3, imaginary)]
     swing_rate = root_f3 * (mirror * a / 2 * roots.gap21)       # w (u2 - u1)
     even, odd = form.slopes_of_sn2()
     turn = mirror * l3 / lambda1
@@ -207,40 +213,28 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
         m1=roots.gap32 / roots.gap31, size=form.size)
 
 
-class _Pole(NamedTuple):
-    """The pole where alpha or beta vanishes."""
-
-    is_beta: bool
-    x1: mpfr                # x of `_Side` at u1 and at u2
-    x2: mpfr
-    # sn^2(c, m1) in the imaginary form, -sn^2(ic, m) in the real one, with c = (2K/pi) a or
-    # (2K/pi) b [DLMF 22.6(iv)]; None if there is no zero
-    zero: mpfr | None
-
-
-def _poles(sides: tuple[_Side, ...], roots: Roots, two_p_lambda1: mpfr,
-           imaginary: bool) -> tuple[_Pole, _Pole]:
+def _with_poles(alpha: _Side, beta: _Side, roots: Roots, two_p_lambda1: mpfr,
+                imaginary: bool) -> tuple[_Side, _Side]:
     """
-    Return the poles of alpha and beta.
+    Return alpha and beta with their poles.
 
     Nothing cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2.  So the product of
     three distances is known, and the smallest of them needs no difference.
     """
-    c0, s0 = (2 * side.modulus ** 2 for side in sides)              # 1 + u0 and 1 - u0
+    c0, s0 = 2 * alpha.modulus ** 2, 2 * beta.modulus ** 2          # 1 + u0 and 1 - u0
     below1, above2 = s0 - roots.y1, c0 + roots.y2
-    above1 = sides[0].momentum ** 2 / (two_p_lambda1 * above2 * (roots.y3 + c0))
+    above1 = alpha.momentum ** 2 / (two_p_lambda1 * above2 * (roots.y3 + c0))
     below2, u3_minus_one = s0 - roots.y2, roots.y3 - s0
-    product = sides[1].momentum ** 2 / (two_p_lambda1 * below1)
+    product = beta.momentum ** 2 / (two_p_lambda1 * below1)
     if below2 <= u3_minus_one:
         below2 = product / u3_minus_one
     else:
         u3_minus_one = product / below2
-    beta_zero = None
-    if u3_minus_one:
-        beta_zero = below2 * roots.gap31 / (
-            below1 * roots.gap32 if imaginary else u3_minus_one * roots.gap21)
-    return (_Pole(False, above1, above2, above1 / (above2 if imaginary else roots.gap21)),
-            _Pole(True, below1, below2, beta_zero))
+    scale = below1 * roots.gap32 if imaginary else u3_minus_one * roots.gap21
+    zero = below2 * roots.gap31 / scale if u3_minus_one else None
+    return (alpha._replace(x1=above1, x2=above2,
+                           zero=above1 / (above2 if imaginary else roots.gap21)),
+            beta._replace(is_beta=True, x1=below1, x2=below2, zero=zero))
 
 
 def _nearest_quarter(roots: Roots, complement: mpfr, falling: bool,
@@ -260,9 +254,8 @@ def _nearest_quarter(roots: Roots, complement: mpfr, falling: bool,
         low * roots.gap32 if imaginary else roots.gap21 * roots.y3))
 
 
-def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: mpfr, x_rate: mpfr,
-              y_rate: mpfr, quarters: int, y: mpfr,
-              point: tuple[mpfr, mpfr, mpfr]) -> Factor:
+def _quotient(form: ThetaForm, side: _Side, lambda1: mpfr, x_rate: mpfr, y_rate: mpfr,
+              quarters: int, y: mpfr, point: tuple[mpfr, mpfr, mpfr]) -> Factor:
     """
     Return alpha or beta as a quotient of theta functions.
 
@@ -270,13 +263,13 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: mpfr, x_rate: 
     quarters, y, point : N, y and the arguments of `Series.at` at t = 0
     """
     sense, drift, rate = sign_of(side.momentum), ZERO, side.spin / 2
-    farthest, real, imag = max(pole.x1, pole.x2), ONE, ZERO
+    farthest, real, imag = max(side.x1, side.x2), ONE, ZERO
     scale = sqrt(farthest / 2)
-    starts_in_first = quarters % 2 == pole.is_beta       # where X is theta1
-    if pole.zero is None:           # proportional to dn
+    starts_in_first = quarters % 2 == side.is_beta       # where X is theta1
+    if side.zero is None:           # proportional to dn
         first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
     elif not sense:
-        sign = -1 if pole.is_beta else 1
+        sign = -1 if side.is_beta else 1
         first = Series(SIN_ODD, [sign * x for x in form.theta1.weights]), NOTHING
         second = form.theta2, NOTHING
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
@@ -286,7 +279,7 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: mpfr, x_rate: 
         if flip * (series.at(*point) or series.leading * side.slope) < 0:
             scale = -scale
     else:
-        amplitude = form.mean.amplitude(pole.zero, -1 if form.imaginary else 1)
+        amplitude = form.mean.amplitude(side.zero, -1 if form.imaginary else 1)
         first, second = form.shifted(amplitude, sense)
         drift = -sense * ONE
         if form.imaginary:
@@ -295,8 +288,8 @@ def _quotient(form: ThetaForm, side: _Side, pole: _Pole, lambda1: mpfr, x_rate: 
                  - second[1].leading / second[0].leading * x_rate)
         real, imag = (part.at(*point) for part in (first if starts_in_first else second))
     # alpha is largest at u2, where N is odd, and beta at u1: both at the centre of theta2.
-    scale *= (form.middle4 if pole.is_beta else form.middle3) / second[0].leading
-    parts, scales = (((second, first), (scale, scale * form.odd_over_even)) if pole.is_beta
+    scale *= (form.middle4 if side.is_beta else form.middle3) / second[0].leading
+    parts, scales = (((second, first), (scale, scale * form.odd_over_even)) if side.is_beta
                      else ((first, second), (scale, scale)))
     start_argument = drift * y + atan2(imag, real)
     return Factor(rate, (side.argument - start_argument) / (2 * const_pi()), drift, parts, scales,

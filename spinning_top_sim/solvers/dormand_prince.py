@@ -73,8 +73,7 @@ def unrolled_step(size: int, is_complex: bool) -> StepFunction:
     """
     Return step(f, h, y, k1) -> (y_new, k7, error estimate) for vectors of `size` numbers.
 
-    The loops over stages and components are written out once from the tableau, as source text:
-    with loops over lists a motion takes 1.4 times the time.
+    As source text without loops: with loops over lists a motion takes 1.4 times the time.
     """
     literal = (lambda x: f'({x!r}+0j)') if is_complex else repr
 
@@ -120,10 +119,8 @@ class SteppedMotion(ABC):
     """
     A motion from its start at t = 0, by steps of equations y' = f(y).
 
-    A subclass has the equations: f, its derivative, the error that is tolerated, and the states.
-    It sets what `derivative` needs before it calls `__init__`, which calls `derivative`.
+    A subclass sets what its `derivative`, f, needs before it calls `__init__`.
 
-    top, start : what moves, and from where
     y : the unknowns at t = 0, all complex or all real
     tolerance, fastest_rate : relative error of a step, and a bound on |y'|/|y| [1/s], from which
         the first step's length comes
@@ -208,10 +205,9 @@ class SteppedMotion(ABC):
 
     def states_at_seconds(self, t: Column) -> States:
         """
-        Return the states at ascending times t (n,) [s].
+        Return the states at ascending times t (n,) [s]; missing steps are taken here.
 
-        Missing steps are taken here, and the newest MOST_KEPT are kept.  Raises IntegrationError
-        if a time lies before them, or the last time cannot be reached, or is too far away.
+        Raises IntegrationError for a time before the steps that are kept, or out of reach.
         """
         if len(t) and t[0] < self._kept[0].t0:
             raise IntegrationError(f't = {float(t[0])!r} s: steps go forward, and the oldest one '

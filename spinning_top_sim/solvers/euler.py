@@ -28,10 +28,9 @@ class EulerMotion(SteppedMotion):
     """
     Equations (29)-(32) of "Analysis of Symmetric Spinning Top" (2023), to the letter, for study.
 
-    They are singular where the axis is vertical, and near there wrong without a sign of it:
-    cos(theta) rounds towards 1, Lz - L3 cos(theta) loses its digits, or a step leaps over the
-    pole, and phi and psi drift off while every error estimate is small.  So these equations stop
-    with an error there, and do not begin with a disc whose lambda3/lambda1 loses digits.
+    They are singular where the axis is vertical, and near there wrong without a sign of it: see
+    docs/theta_functions.md.  So they stop with an error there, and do not begin with a disc whose
+    lambda3/lambda1 loses digits.
     """
 
     def __init__(self, top: Top, start: State, rtol: float, atol: float) -> None:

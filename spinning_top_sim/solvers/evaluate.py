@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import Column, Number
 from spinning_top_sim.physics.pivot import NANOSECONDS, ns_array
 from spinning_top_sim.solvers.constants import ThetaMotion
-from spinning_top_sim.solvers.multiprecision import SIN_ODD, double_double, precision
+from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
 
 Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
@@ -60,10 +60,9 @@ class Times(NamedTuple):
         high = count.astype(np.float64)
         if np.abs(high).max(initial=0.0) < 2.0 ** 53:
             return cls(NANOSECONDS, high)
-        upper = (count >> 20).astype(np.float64) * 2.0 ** 20
-        lower = (count & (2 ** 20 - 1)).astype(np.float64)
-        high = upper + lower
-        return cls(NANOSECONDS, high, lower - (high - upper))
+        # Half of it, as `high` may be 2^63.
+        rest = count - 2 * (0.5 * high).astype(np.int64)
+        return cls(NANOSECONDS, high, rest.astype(np.float64))
 
     @property
     def seconds(self) -> Column:
@@ -102,7 +101,7 @@ class ThetaArrays:
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
         self.coefficients = _highest_first(
-            [float(scale * x) for x in one.polynomial(motion.size)]
+            [float(scale * x) for x in one.polynomial[:motion.size]]
             for row, factor in zip(rows, 2 * factors, strict=True)
             for one, scale in zip(row, factor.scales, strict=True)).reshape(-1, 4, 2)
         for name, factor in (('alpha', motion.alpha), ('beta', motion.beta)):
@@ -119,7 +118,7 @@ class ThetaArrays:
                       if SIN_ODD in pair}
         self.u_dot = np.array([*map(float, motion.u_dot)])
         self.u_dot_coefficients = _highest_first(
-            [[*map(float, motion.u_dot_series.polynomial(motion.size))]])
+            [[*map(float, motion.u_dot_series.polynomial[:motion.size])]])
         self.precession, self.swing = np.array(
             [[*map(float, motion.precession)], [*map(float, motion.swing)]])
         self._scaled: dict[int, list[Matrix]] = {}
@@ -346,7 +345,8 @@ class ThetaValues:
 
 def _columns(numbers: Sequence[mpfr]) -> Matrix:
     """Return nearest doubles and what they leave out, (2, k, 1)."""
-    return np.array([*map(double_double, numbers)]).T[:, :, np.newaxis]
+    high = [*map(float, numbers)]
+    return np.array([high, [*map(float, map(sub, numbers, high))]])[:, :, np.newaxis]
 
 
 def _highest_first(polynomials: Iterable[list[float]]) -> Matrix:

@@ -30,7 +30,7 @@ from spinning_top_sim.physics.states import TIMES_TOGETHER, States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set_up
 from spinning_top_sim.solvers.evaluate import ThetaArrays, ThetaValues, Times
-from spinning_top_sim.solvers.multiprecision import SIN_ODD, phase, precision
+from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
@@ -209,8 +209,9 @@ def _at(motion: ThetaMotion, t: mpfr) -> tuple[mpc, mpc, mpfr]:
                       for part in factor.parts[whole % 2])
         if whole & 2 and any(one.prefactor == SIN_ODD for one, _ in factor.parts):
             real = -real                # it passes a pole
-        turn = factor.rate * t + 2 * const_pi() * factor.phase_turns + factor.drift * y
-        return (real + 1j * imag) * phase(turn)
+        sin, cos = sin_cos(
+            factor.rate * t + 2 * const_pi() * factor.phase_turns + factor.drift * y)
+        return (real + 1j * imag) * (cos + 1j * sin)
 
     alpha, beta = value(motion.alpha), value(motion.beta)
     size = sqrt(abs(alpha) ** 2 + abs(beta) ** 2)

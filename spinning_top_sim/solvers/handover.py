@@ -7,7 +7,7 @@ import math
 from contextlib import suppress
 from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +37,8 @@ class Piece:
     """
     A piece of a run: one solution, between two events or changes of the pivot's acceleration.
 
-    Times are simulated times [ns].  While the pivot has always rested, phi and psi are unwrapped
-    and theta goes on through the poles; else theta is in [0, pi], phi and psi in [-2 pi, 2 pi].
+    Times are simulated times [ns].  While the pivot has always rested, angles are unwrapped; else
+    they are those of `WorldStates`.
 
     top : in the gravity of the world
     start : about the vertical of the world, at `start_ns`
@@ -109,10 +109,7 @@ class Piece:
 
     def describe(self) -> Description | None:
         """Return the motion in numbers; None if it has no closed form or the pivot moves."""
-        exact = self._exact
-        if not self.rests or exact is None or isinstance(exact[0], SteppedMotion):
-            return None
-        return exact[0].describe()
+        return self._exact[0].describe() if self.rests and self._exact else None
 
     @property
     def steps(self) -> int:
@@ -126,9 +123,7 @@ class Piece:
         """
         Return the states in the world, the pivot included, at ascending times from the start on.
 
-        The steps that are missing are taken here, and the newest are kept until `forget`.
-        Raises IntegrationError where the equations cannot go on; its `reached_ns` says up to when
-        there are states.
+        Raises IntegrationError where steps cannot go on; `reached_ns` says how far they do.
         """
         try:
             return self._in_world(self._solution, t_ns)
@@ -141,11 +136,12 @@ class Piece:
         return None if self._exact is None else self._in_world(self._exact, t_ns)
 
     @cached_property
-    def _exact(self) -> Solution | None:
+    def _exact(self) -> tuple[ExactSolution, Vertical | None] | None:
         if not isinstance(self._motion, SteppedMotion):
-            return self._solution
+            return self._motion, self._vertical
         with suppress(ImportError, ValueError):
-            return self._begun('exact')
+            motion, vertical = self._begun('exact')
+            return cast('ExactSolution', motion), vertical
         return None
 
     def posture(self, t_ns: int) -> Posture:

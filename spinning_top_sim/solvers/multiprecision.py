@@ -25,7 +25,7 @@ Positive constants that all series of a form share are left out.
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import reduce
+from functools import cached_property, reduce
 from itertools import count, zip_longest
 from operator import add, mul
 from typing import NamedTuple
@@ -37,7 +37,7 @@ from gmpy2 import agm, const_pi, exp, frexp, get_context, mpc, mpfr, sqrt
 BITS = 192
 # An infinity or a NaN raises ArithmeticError.
 TRAPS = {f'trap_{name}': True for name in ('divzero', 'invalid', 'overflow')}
-ZERO, ONE, IMAGINARY = mpfr(0), mpfr(1), mpc(1j)
+ZERO, ONE = mpfr(0), mpfr(1)
 
 
 @contextmanager
@@ -61,19 +61,7 @@ def argument(z: mpc) -> mpfr:
     return atan2(z.imag, z.real)
 
 
-def phase(angle: mpfr) -> mpc:
-    """Return exp(i angle)."""
-    sine, cosine = gmpy2.sin_cos(angle)
-    return cosine + IMAGINARY * sine
-
-
-def double_double(x: mpfr) -> tuple[float, float]:
-    """Return the nearest double, and the nearest double to what it leaves out."""
-    high = float(x)
-    return high, float(x - high)
-
-
-NEGLIGIBLE = 1e-21      # a ratio whose square does not count
+NEGLIGIBLE = 1e-21      # a ratio whose fourth power does not count
 
 
 class GaussMean:
@@ -86,9 +74,8 @@ class GaussMean:
     def __init__(self, a: mpfr, g: mpfr, c: mpfr) -> None:
         self._start, self._complement, self._squares = a, c, [c * c]
         while len(self._squares) == 1 or c > a * NEGLIGIBLE:
-            product, a = a * g, (a + g) / 2
+            a, g = (a + g) / 2, sqrt(a * g)
             c = self._squares[-1] / (4 * a)         # [DLMF 19.8.3]
-            g = sqrt(product) if c > a * NEGLIGIBLE else a
             self._squares.append(c * c)
         self.mean = a
 
@@ -114,10 +101,7 @@ class GaussMean:
             return ZERO
         h = self._start / sqrt(square)
         for c2 in self._squares:
-            # Two terms of the root are enough where c is small.
-            h2 = h * h
-            h = (h + sign * c2 / (4 * h) if c2 < h2 * NEGLIGIBLE
-                 else (h + sqrt(h2 + sign * c2)) / 2)
+            h = (h + sqrt(h * h + sign * c2)) / 2
         amplitude = self.mean / h
         # The square may be 1 but for rounding: the sine is then 1.
         return min(amplitude, ONE) if sign < 0 else amplitude
@@ -223,38 +207,33 @@ MULTIPLE_ANGLES = [
     for rows in (_polynomials(*pair) for pair in FIRST_POLYNOMIALS)]
 
 
-class Series(NamedTuple):
+class Series:
     """
     The sum of weights[k] times cos(n y) or sin(n y): a prefactor times a polynomial in sin^2 y.
 
     In the imaginary form y stands for ix: cosh x for cos y, sinh x for sin y, xi = -sinh^2 x.
     """
 
-    prefactor: int
-    weights: Sequence[mpfr]
+    def __init__(self, prefactor: int, weights: Sequence[mpfr]) -> None:
+        self.prefactor, self.weights = prefactor, weights
 
-    def polynomial(self, most: int) -> list[mpfr]:
-        """Return the coefficients of xi^0, xi^1 ... of so many terms."""
-        weights, shapes = self.weights[:most], MULTIPLE_ANGLES[self.prefactor]
+    @cached_property
+    def polynomial(self) -> list[mpfr]:
+        """The coefficients of xi^0, xi^1 ..."""
         # A sum of -0 is -0.
-        return [reduce(add, map(mul, weights[power:], shapes[power]))
-                for power in range(len(weights))]
+        return [reduce(add, map(mul, self.weights[power:], shapes)) for power, shapes in zip(
+            range(len(self.weights)), MULTIPLE_ANGLES[self.prefactor], strict=False)]
 
     def at(self, sin: mpfr, cos: mpfr, xi: mpfr) -> mpfr:
-        """Return the sum by Clenshaw's recurrence."""
-        twice, value, before = 2 - 4 * xi, ZERO, ZERO
-        for weight in reversed(self.weights):
-            value, before = weight + twice * value - before, value
-        if self.prefactor == COS_EVEN:
-            return value - before * twice / 2
-        if self.prefactor == COS_ODD:
-            return (value - before) * cos
-        return (value + before) * sin if self.prefactor == SIN_ODD else 2 * before * sin * cos
+        """Return the sum."""
+        value = reduce(lambda value, coefficient: value * xi + coefficient,
+                       reversed(self.polynomial))
+        return value * (ONE, cos, sin, sin * cos)[self.prefactor]
 
     @property
     def leading(self) -> mpfr:
         """At y = 0, the value of a cosine series, or the derivative of a sine series."""
-        return sum(map(mul, self.weights, MULTIPLE_ANGLES[self.prefactor][0]), ZERO)
+        return self.polynomial[0]
 
 
 NOTHING = Series(COS_EVEN, [ZERO])
@@ -264,15 +243,12 @@ Parts = tuple[Series, Series]
 
 class ThetaForm:
     """
-    The theta functions in the real or in the imaginary form.
+    The theta functions theta1 .. theta4 of y, or what Jacobi's transformation makes of them.
 
-    mean : of which k is the modulus of the form: k^2 is m in the real and 1 - m in the imaginary
-        form, and at most 1/2
+    mean : its k^2 is m in the real and 1 - m in the imaginary form, and at most 1/2
     size : coefficients of a polynomial that doubles need
-    theta1 .. theta4 : the functions of y, or what the transformation makes of them
     slope1, middle3, middle4 : the derivative of theta1, and theta3 and theta4, at y = 0
-    odd_over_even : the factor that the transforms of theta1 and theta4 have lost, squared; those
-        of theta2 and theta3 have not
+    odd_over_even : the square of the factor that theta1 and theta4 lack beside theta2 and theta3
     """
 
     def __init__(self, mean: GaussMean, imaginary: bool) -> None:
@@ -319,25 +295,20 @@ class ThetaForm:
         sines = _weighted(self._odd, -amplitude, amplitude, twice)
         cosines = _weighted(self._odd, other, other, twice)
         theta1 = (Series(COS_ODD, _alternating(sines)),
-                  Series(SIN_ODD, _alternating(_signed(sense, cosines))))
+                  Series(SIN_ODD, _alternating([sense * x for x in cosines])))
         if self.imaginary:
             sines = _weighted(self._even, -2 * amplitude * other, ZERO, twice)
             cosines = _weighted(self._even, twice / 2, ONE, twice)
             return theta1, (Series(COS_EVEN, _alternating(cosines)),
-                            Series(SIN_EVEN, _alternating(_signed(-sense, sines))))
-        return theta1, (Series(COS_ODD, cosines), Series(SIN_ODD, _signed(sense, sines)))
+                            Series(SIN_EVEN, _alternating([-sense * x for x in sines])))
+        return theta1, (Series(COS_ODD, cosines), Series(SIN_ODD, [sense * x for x in sines]))
 
 
 def _alternating(weights: Sequence[mpfr]) -> list[mpfr]:
     return [-x if k % 2 else x for k, x in enumerate(weights)]
 
 
-def _signed(sign: int, weights: Sequence[mpfr]) -> Sequence[mpfr]:
-    return weights if sign > 0 else [-x for x in weights]
-
-
-def _weighted(weights: Sequence[mpfr], before: mpfr, value: mpfr,
-              twice: mpfr) -> list[mpfr]:
+def _weighted(weights: Sequence[mpfr], before: mpfr, value: mpfr, twice: mpfr) -> list[mpfr]:
     """Return weights times sines or cosines of a, 3a ..., or of 0, 2a ..., from two of them."""
     products = []
     for weight in weights:

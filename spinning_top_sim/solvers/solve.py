@@ -35,8 +35,7 @@ def motion_of(top: Top, start: State, *, method: str, equations: str = 'transpor
     Return the motion that begins at `start`; `solve` explains the settings.
 
     Motions without torque or nutation take no steps: 'rk45' leaves them to the closed form, where
-    that can hold them and gmpy2 is installed.  The transport equations scale their unknowns to 1
-    and tolerate atol + rtol; the Euler equations tolerate atol + rtol |angle|.
+    that can hold them and gmpy2 is installed.
 
     posture : of `start` in the same frame, in doubles that know more of it
 

@@ -36,19 +36,14 @@ ONE_STATE: Functions = math.sqrt, math.copysign, lambda condition, x, y: x if co
 
 class TransportMotion(SteppedMotion):
     """
-    Regular at every attitude.
-
-    Unknowns are the Cayley-Klein parameters and the horizontal angular momentum in the world,
-    m = i (L_x + i L_y)/(2 lambda1).  From q' = (1/2) omega q and L' = torque,
+    Regular at every attitude; docs/theta_functions.md derives these equations.
 
         alpha' =  i (Lz - c)/(2 lambda1) alpha + m conj(beta)
         beta'  =  i (Lz + c)/(2 lambda1) beta  - m conj(alpha)
-        m'     = -(P/lambda1) alpha beta
+        m'     = -(P/lambda1) alpha beta,       m = i (L_x + i L_y)/(2 lambda1)
 
-    with c the part of L3 that these equations carry.  They are those of a frame that turns about
-    e3 with the body, less a known uniform rate chi = L3/lambda3 - (L3 - c)/lambda1.  The factor
-    exp(+-i chi t/2) is put on when a state is read, so the step size follows the nutation and not
-    the spin.  With c = L3/2 the spectrum of alpha and beta is centred about zero.
+    They are those of a frame that turns with the body less chi = L3/lambda3 - (L3 - c)/lambda1:
+    the factor exp(+-i chi t/2) is put on when a state is read, and steps need not follow the spin.
 
     The invariants |q| = 1, L.e3 = L3 and the energy are restored after each step and in each
     sample (projection, Hairer, Lubich & Wanner, *Geometric Numerical Integration*, sect. IV.4).
@@ -58,13 +53,10 @@ class TransportMotion(SteppedMotion):
         alpha:   Omega/2 + (Lz + L3)/(4 lambda1 cos^2(theta/2)),   Omega = L3/lambda3 - L3/lambda1,
         beta:   -Omega/2 + (Lz - L3)/(4 lambda1 sin^2(theta/2)).
 
-    The first term is the uniform part.  The second never changes its sign, and turns the phase by
-    little more than half a turn in a step, however near a pole the step passes.  So the phase of
-    a sample is, of all arctan2(..) + 2 pi k, the first one ahead of the phase at the begin of its
-    step.  If Lz + L3 or Lz - L3 is 0, alpha or beta has the uniform part alone.  It then moves on
-    a line through zero, and its modulus changes sign where the axis passes that pole.
-
-    The unknowns are scaled to 1, so the tolerated errors `rtol` and `atol` of a step add up.
+    The second term never changes its sign, and turns the phase by little more than half a turn in
+    a step, however near a pole.  So the phase of a sample is, of all arctan2(..) + 2 pi k, the
+    first one ahead of that at the begin of its step.  Without a second term the number moves on a
+    line through zero, and its modulus changes sign where the axis passes that pole.
 
     posture : of `start`, in doubles that know more of it
     """
@@ -73,10 +65,9 @@ class TransportMotion(SteppedMotion):
                  posture: Posture | None = None) -> None:
         lambda1, l3, lz, torque = top.lambda1, start.l3, start.lz, top.gravity_torque
         self.top, self._l3, self._lz = top, l3, lz
-        carried = 0.5 * l3                                              # c
+        carried = 0.5 * l3          # c: so the spectrum of alpha and beta is centred about zero
         self.spin_rate = l3 / top.lambda3 - (l3 - carried) / lambda1
-        # Of the uniform part of alpha's phase, in the frame that is stepped and in the body: they
-        # differ by chi/2.  Those of beta have the other sign.
+        # Of the uniform part of alpha's phase, in the frame that is stepped and in the body.
         self.uniform_rates = -0.5 * carried / lambda1, 0.5 * (l3 / top.lambda3 - l3 / lambda1)
         self._turn_alpha = 0.5j * (lz - carried) / lambda1
         self._turn_beta = 0.5j * (lz + carried) / lambda1
@@ -91,7 +82,7 @@ class TransportMotion(SteppedMotion):
         # hanging the sum is what its rounding leaves.
         above_lowest = max(self._energy + abs(torque), 4.0 * math.ulp(1.0) * abs(torque))
         self._scale = math.sqrt(0.5 * above_lowest / lambda1) or 1.0
-        self._tolerance = rtol + atol
+        self._tolerance = rtol + atol               # the unknowns are scaled to 1
         self._large_enough = NUTATION_SHARE * self._scale ** 2
         # Their signs are the senses in which the phases and theta turn.
         self.momenta = lz + l3, lz - l3, 0.0
@@ -219,8 +210,7 @@ def turns_to_follow(phase: Column, before: Column, momentum: float) -> Column:
     """
     Return the whole turns to add to `phase` so that it follows `before` [rad].
 
-    In the sense of `momentum` it then lies within (-pi/2, 3 pi/2) from there: backwards by
-    rounding at most.  Without a sense (momentum 0) it is the nearest.
+    In the sense of `momentum`, but for rounding; without one (momentum 0) it is the nearest.
     """
     ahead = 0.5 * math.pi * ((momentum > 0.0) - (momentum < 0.0))
     return 0.0 - np.rint((phase - before - ahead) / math.tau)

@@ -4,9 +4,8 @@ How a motion is handed over to another vertical, in whatever numbers it is given
 
 In the frame of a pivot with the acceleration a, gravity is g - a: the top is the same top about
 another vertical.  A change of a leaves attitude and angular velocity as they are.  The exact
-solution hands them over in multiprecision: in doubles every change would move the constants of
-the motion by a rounding, and the phase would drift by that much times the angle that follows.
-Steps hand them over in doubles.
+solution hands them over in multiprecision: rounded to doubles, the constants of the motion would
+change, and its phase drift.
 """
 
 from __future__ import annotations

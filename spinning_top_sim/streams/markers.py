@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.states import Point
-from spinning_top_sim.physics.top import Shape
+from spinning_top_sim.shape import Shape
 from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS, Values
 from spinning_top_sim.streams.channel import Channel, Samples, period_ns

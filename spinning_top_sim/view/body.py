@@ -9,7 +9,7 @@ import trimesh
 from trimesh import creation
 from trimesh.transformations import rotation_matrix
 
-from spinning_top_sim.physics.top import Shape
+from spinning_top_sim.shape import Shape
 
 Colour = tuple[int, int, int]
 BLUE, WHITE, GOLD, STEEL, GREY = (

@@ -8,12 +8,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.regimes import effective_potential
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.topics import INVARIANTS
 from spinning_top_sim.view import shapes
 from spinning_top_sim.view.svg import Line, Plot
-from spinning_top_sim.view.track import PRECESSION, Series, Track, energies
+from spinning_top_sim.view.track import (
+    PRECESSION,
+    Series,
+    Track,
+    effective_potential,
+    energies,
+)
 
 Reals = NDArray[np.float64]
 POINTS = 400                    # in a line at most

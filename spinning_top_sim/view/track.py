@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics import attitude, regimes
+from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import Description, natural_momentum
-from spinning_top_sim.physics.top import Shape, State, Top
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.shape import Shape
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
@@ -103,7 +104,7 @@ class DescribedMotion:
     def of(cls, begin_ns: int, top: Top, state: State,
            description: Description | None, *, pivot_moves: bool = False) -> 'DescribedMotion':
         """Return the motion that begins in a state."""
-        height = regimes.effective_potential(top, state.l3, state.lz, np.array([state.theta]))
+        height = effective_potential(top, state.l3, state.lz, np.array([state.theta]))
         energy = 0.5 * top.lambda1 * state.theta_dot ** 2 + float(height[0])
         return cls(begin_ns, state.l3, state.lz, energy, description, pivot_moves)
 
@@ -251,6 +252,18 @@ def constants_and_state(top: Top, row: Rows) -> tuple[tuple[float, float, float]
     theta_dot = state.theta_dot if top.lambda1 * abs(state.theta_dot) > dust else 0.0
     return (energy, state.l3, state.lz), State(theta=state.theta, theta_dot=theta_dot, l3=l3,
                                                lz=lz)
+
+
+def effective_potential(top: Top, l3: float, lz: float, theta: Rows) -> Rows:
+    """
+    Return V(theta) [J] of lambda1 theta'^2/2 + V(theta) = E - L3^2/(2 lambda3); theta: (n,).
+
+    It is (Lz - L3 cos theta)^2/(2 lambda1 sin^2 theta) + P cos(theta).
+    """
+    phi_dot = attitude.precession_rate(top, l3, lz, np.cos(0.5 * theta) ** 2,
+                                       np.sin(0.5 * theta) ** 2)
+    return (0.5 * top.lambda1 * (phi_dot * np.sin(theta)) ** 2
+            + top.gravity_torque * np.cos(theta))
 
 
 def energies(top: Top, rows: Rows) -> tuple[Rows, Rows]:
