@@ -400,7 +400,7 @@ def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_
     recorder = Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, min_free_bytes=0)
     write(recorder, len(TOPICS), 0, b'')
     summary = recorder.close()
-    assert recorder.state == 'failed' and 'stopped: KeyError:' in (summary.error or '')
+    assert recorder.state == 'failed' and 'stopped: IndexError:' in (summary.error or '')
     assert (is_indexed(summary.path), summary.lost) == (True, 1)
 
 

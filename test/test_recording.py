@@ -236,7 +236,7 @@ def test_messages_of_any_length_are_all_kept_and_the_bytes_are_always_the_same(
         for number, message in enumerate(messages):
             file.add(*single(*message))
             if number % 700 == 0:
-                file.flush(beside=number % 1400 == 0)
+                file.flush()
         file.finish()
         contents.append((folder / 'run.mcap').read_bytes())
     assert contents[0] == contents[1]
@@ -251,4 +251,4 @@ def test_messages_of_any_length_are_all_kept_and_the_bytes_are_always_the_same(
         assert found == [[message[1:] for message in messages if message[0] == topic]
                          for topic in range(3)]
         found = [[], [], []]
-        assert 3 <= len(chunks) <= 9
+        assert 3 <= len(chunks) <= 12
