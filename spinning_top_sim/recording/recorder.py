@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import RecordingError, text_of, why_not_written
@@ -113,10 +112,11 @@ class Recorder:
     def counters(self) -> RecordingSummary:
         """What the recording has come to so far."""
         running = self.state in ('opening', 'recording')    # read first: nothing is written after
-        size, messages = (self._file.size, sum(self._file.message_counts)) if self._file else (0, 0)
+        file = self._file
+        messages = sum(file.message_counts) if file else 0
         missing = self._offered - messages
         return RecordingSummary(
-            self.path, size, messages, queued=missing if running else 0,
+            self.path, file.size if file else 0, messages, queued=missing if running else 0,
             lost=0 if running else missing, error=self.error)
 
     def write(self, rows: Sequence[Rows]) -> None:

@@ -37,8 +37,6 @@ CHUNK_BYTES = 1_000_000     # of messages that make a chunk, about
 # The fastest level that compresses nearly as well as zstd's own default, 3, with a window of a
 # whole chunk: its default, half of one, costs up to 20 %.
 ZSTD = zstandard.ZstdCompressionParameters.from_level(-1, window_log=20)
-COMPRESS = {'zstd': lambda plain: zstandard.ZstdCompressor(compression_params=ZSTD).compress(plain),
-            'lz4': lz4.frame.compress, '': bytes}
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
 
 # The next messages of a topic: its index, log times (n,) [ns], serialized messages (n, size).
@@ -156,7 +154,9 @@ class McapWriter:
         indexes = {topic + 1: np.concatenate(parts) for topic, parts in entries.items()}
         times_ns = np.concatenate([index[:, 0] for index in indexes.values()])
         span = {'message_start_time': int(times_ns.min()), 'message_end_time': int(times_ns.max())}
-        data = COMPRESS[self._compression](plain)
+        data = (zstandard.ZstdCompressor(compression_params=ZSTD).compress(plain)
+                if self._compression == 'zstd' else
+                lz4.frame.compress(plain) if self._compression else bytes(plain))
         # mcap's class of message indexes would make Python objects of all entries.
         blocks = [record_bytes(records.Chunk(
             compression=self._compression, data=data, uncompressed_crc=zlib.crc32(plain),
@@ -197,37 +197,27 @@ class McapWriter:
         """Write the chunk in memory and the summary, bring all to the disk, close the file."""
         try:
             self.flush()
-            span = min(self._times_ns, default=0), max(self._times_ns, default=0)
+            start_ns, end_ns = min(self._times_ns, default=0), max(self._times_ns, default=0)
             self._write_metadata(rosbag2.BAG_METADATA, rosbag2.bag_metadata(
                 [(channel, topic.type_name, count) for channel, topic, count in zip(
                     self._channels, self._topics, self.message_counts, strict=True)],
-                self._path.name, *span))
+                self._path.name, start_ns, end_ns))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
-            self._write([self._summary_section(*span)])
+            kinds = Counter(raw[0] for raw in self._summary)
+            statistics = record_bytes(records.Statistics(
+                attachment_count=0, channel_count=kinds[Opcode.CHANNEL],
+                channel_message_counts=dict(enumerate(self.message_counts, start=1)),
+                chunk_count=kinds[Opcode.CHUNK_INDEX], message_count=sum(self.message_counts),
+                message_end_time=end_ns, message_start_time=start_ns,
+                metadata_count=kinds[Opcode.METADATA_INDEX], schema_count=kinds[Opcode.SCHEMA]))
+            # The summary's checksum runs on into the footer, up to the checksum itself.
+            summary = b''.join([*sorted([*self._summary, statistics], key=itemgetter(0)),
+                                record_bytes(records.Footer(self.size, 0, 0))[:-4]])
+            self._write([summary, zlib.crc32(summary).to_bytes(4, 'little'), MCAP0_MAGIC])
             self.sync()
             _sync_directory(self._path.parent)
         finally:
             self._file.close()
-
-    def _summary_section(self, start_ns: int, end_ns: int) -> bytes:
-        kinds = Counter(raw[0] for raw in self._summary)
-        self._summary.append(record_bytes(records.Statistics(
-            attachment_count=0, channel_count=kinds[Opcode.CHANNEL],
-            channel_message_counts=dict(enumerate(self.message_counts, start=1)),
-            chunk_count=kinds[Opcode.CHUNK_INDEX], message_count=sum(self.message_counts),
-            message_end_time=end_ns, message_start_time=start_ns,
-            metadata_count=kinds[Opcode.METADATA_INDEX], schema_count=kinds[Opcode.SCHEMA])))
-        summary, offsets = b'', b''
-        for opcode, group in itertools.groupby(
-                sorted(self._summary, key=itemgetter(0)), itemgetter(0)):
-            start = len(summary)
-            summary += b''.join(group)
-            offsets += record_bytes(records.SummaryOffset(
-                opcode, self.size + start, len(summary) - start))
-        footer = record_bytes(records.Footer(self.size, self.size + len(summary), 0))
-        # The summary's checksum runs on into the footer, up to the checksum itself.
-        summary += offsets + footer[:-4]
-        return summary + zlib.crc32(summary).to_bytes(4, 'little') + MCAP0_MAGIC
 
     def _write(self, blocks: Iterable[bytes]) -> None:
         """Write whole records that come in blocks, or none of them."""
