@@ -17,29 +17,28 @@ from functools import cached_property
 from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
+from mcap.reader import FOOTER_SIZE
 from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import rosbag2
 from spinning_top_sim.recording.errors import LogError
 
 MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
-MAX_DECLARED = 16 << 20     # of schemas and channels, which may be compressed well
 MOST_INDEX = 1 << 20        # bytes behind the last chunk that may be torn without a loss
-MESSAGE_BYTES = 300         # what a message in memory takes besides its data, about
 MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are grouped together
 HEAD = struct.Struct('<BQ')     # of every record: opcode, length of what follows
 # Where log times stand: the earliest and the latest in a chunk, and that of a message
 TIMES = {Opcode.CHUNK: struct.Struct('<9xQQ'), Opcode.MESSAGE: struct.Struct('<15xQ')}
-UNPACK = {b'\x28\xb5\x2f\xfd': 'zstd -d {} -o {}', b'\x04\x22\x4d\x18': 'lz4 -d {} {}'}
+COMPRESSED = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}     # as a whole
 # What is raised for bytes that are not as they should be.
 UNREADABLE = (McapError, ValueError, OverflowError, struct.error)
 
@@ -85,25 +84,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     What is damaged is left out.  A file that was not closed is read through at once.
 
-    Parameters
-    ----------
-    path : str or path
-        The file, or a folder as `ros2 bag` makes it, which must hold exactly one.
-    max_bytes : int
-        Largest record, and largest uncompressed chunk, that is read into memory.
+    path : the file, or a folder as `ros2 bag` makes it, which must hold exactly one
+    max_bytes : of the largest record, and the largest uncompressed chunk, that is read
 
-    Attributes
-    ----------
-    path, size : Path, int
-        The file, and its size when it was opened [bytes].
-    profile, library : str
-        What its header says: such as 'ros2', and the program that wrote it.
-    whole : bool
-        Whether the file was closed and its summary, if any, is right; see also `damage`.
-    metadata, schemas, channels : dict
-        The last metadata of a name, and mcap's records by id.
-    left_out : int
-        Damaged chunks that `messages` has skipped so far.
+    Attributes: `path` and `size` [bytes] of the file when it was opened; `profile` and `library`,
+    which its header names; `whole`, whether it was closed and its summary, if any, is right;
+    `metadata`, the last of each name; `schemas` and `channels`, mcap's records by id; `span`, the
+    earliest and the latest log time [ns], both 0 without messages; `left_out`, the number of
+    damaged chunks that `messages` has skipped so far.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
@@ -111,7 +99,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.metadata: dict[str, dict[str, str]] = {}
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self._declared_bytes = 0
         try:
             if self.path.exists() and not self.path.is_file():     # opening a pipe would block
                 raise LogError(f'cannot read {self.path}: it is no regular file')
@@ -128,6 +115,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             except UNREADABLE:
                 self.whole = False
             self._places = sorted(self._find_places())
+            self.span = (self._places[0][0] if self._places else 0,
+                         max((end_ns for _, end_ns, *_ in self._places), default=0))
             if not self.whole or not self.channels:
                 _ = self.damage     # notes what is declared in chunks
         except BaseException:
@@ -162,16 +151,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     @cached_property
     def damage(self) -> Damage:
         """What is wrong with the file; reads all of it."""
-        damage = Damage(False)
-        for _ in self.parts(damage):
+        for _ in self.parts():
             pass
-        return damage
-
-    @property
-    def span(self) -> tuple[int, int]:
-        """The earliest and the latest log time [ns]; both 0 without messages."""
-        return (min((start_ns for start_ns, *_ in self._places), default=0),
-                max((end_ns for _, end_ns, *_ in self._places), default=0))
+        return self.damage
 
     def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
                  end: int | None = None) -> Iterator[LogMessage]:
@@ -180,18 +162,10 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
         Those that rosbag2 has compressed one by one are decompressed.
 
-        Parameters
-        ----------
-        topics : iterable of str, optional
-            Names; default: all.
-        start, end : int, optional
-            Log times [ns]; `end` is exclusive.
+        topics : names; default: all
+        start, end : log times [ns]; `end` is exclusive
 
-        Raises
-        ------
-        LogError
-            For a message that cannot be decompressed, and for chunks that overlap in time and do
-            not fit into memory.
+        Raises LogError for a message that cannot be decompressed.
         """
         names = None if topics is None else frozenset(topics)
         wanted = {number: channel.topic for number, channel in self.channels.items()
@@ -199,15 +173,17 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         times = range(start or 0, 1 << 64 if end is None else end)
         # What is read and not yet passed: log time, place, number there
         held: list[tuple[int, int, int, Message]] = []
-        held_bytes = 0
         mode, form = self.compression
         for start_ns, end_ns, offset, its_end in [*self._places, (1 << 64, 1 << 64, 0, 0)]:
             while held and held[0][0] < start_ns:
                 *_, message = heapq.heappop(held)
-                held_bytes -= MESSAGE_BYTES + len(message.data)
                 topic, data = wanted[message.channel_id], message.data
-                if mode == 'MESSAGE':
-                    data = self._decompressed(data, form, topic)
+                try:
+                    if mode == 'MESSAGE':
+                        data = _decompress(data, form or 'unknown', self._max_bytes)
+                except McapError as error:
+                    raise LogError(
+                        f'cannot read {self.path}: a message of {topic}: {error}') from None
                 yield LogMessage(topic, message.log_time, message.publish_time, message.sequence,
                                  data, message.channel_id)
             if end_ns < times.start or start_ns >= times.stop or (
@@ -221,16 +197,12 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for number, one in enumerate(records):
                 if isinstance(one, Message) and one.channel_id in wanted and one.log_time in times:
                     heapq.heappush(held, (one.log_time, offset, number, one))
-                    held_bytes += MESSAGE_BYTES + len(one.data)
-            if held_bytes > 2 * self._max_bytes:
-                raise LogError(f'cannot read {self.path}: messages that overlap in time take more '
-                               f'than {2 * self._max_bytes} bytes')
 
     def _may_hold(self, channels: Container[int], offset: int) -> bool:
         """Return whether a chunk has messages of channels, by its indexes, which begin there."""
         begin = offset
-        for opcode, begin, _ in self._heads(offset):
-            if opcode != Opcode.MESSAGE_INDEX:
+        for opcode, begin, end in self._heads(offset):
+            if opcode != Opcode.MESSAGE_INDEX or end > self.size:
                 break
             if int.from_bytes(self._at(begin + 9, begin + 11), 'little') in channels:
                 return True
@@ -244,21 +216,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
                 yield topic, list(group)
 
-    def _decompressed(self, data: bytes, form: str, topic: str) -> bytes:
-        try:
-            return _decompress(data, form or 'unknown', self._max_bytes)
-        except McapError as error:
-            raise LogError(f'cannot read {self.path}: a message of {topic}: {error}') from None
-
-    def parts(self, damage: Damage) -> Iterator[tuple[int, list[McapRecord]]]:
+    def parts(self) -> Iterator[tuple[int, list[McapRecord]]]:
         """
         Yield (offset, records) of what can be read, in file order: a record, or those of a chunk.
 
-        damage : is set to what cannot be read
+        After that, `damage` tells what cannot be read.
         """
-        damage.torn = not self.whole
-        if damage.torn:
-            damage.reasons.append('found: the file does not end as an MCAP file ends')
+        damage = Damage(not self.whole)
+        damage.reasons += ['found: the file does not end as an MCAP file ends'] * damage.torn
         crc = zlib.crc32(MCAP0_MAGIC)
         for opcode, offset, end in self._heads():
             # What follows the last chunk is made anew.
@@ -279,6 +244,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 damage.reasons.append('found: the checksum of the data section is wrong')
             crc = zlib.crc32(raw, crc)
             yield offset, records
+        self.damage = damage
 
     # -------------------------------------------------------------------------------- the bytes
 
@@ -293,7 +259,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         except OSError as error:
             raise LogError(f'cannot read {self.path}: {error.strerror}') from error
 
-    def _heads(self, end: int = len(MCAP0_MAGIC)) -> Iterator[tuple[int, int, int]]:
+    def _heads(self, end: int = MAGIC_SIZE) -> Iterator[tuple[int, int, int]]:
         """Yield opcode, begin and end of records, of which the last may end behind the file."""
         opcode = 0
         while end < self.size and opcode not in (Opcode.DATA_END, Opcode.FOOTER):
@@ -309,8 +275,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         # Opcodes that are unknown belong to an application.
         if raw[0] > Opcode.DATA_END or raw[0] == Opcode.MESSAGE_INDEX:
             return []
-        record = _parse(raw)
-        records = self._broken_up(record) if isinstance(record, Chunk) else [record]
+        records = [next(_records_in(raw))]
+        if isinstance(chunk := records[0], Chunk):      # which mcap would unpack to any size
+            if chunk.uncompressed_size > self._max_bytes:
+                raise McapError(f'it unpacks to more than {self._max_bytes} bytes')
+            plain = _decompress(chunk.data, chunk.compression, chunk.uncompressed_size)
+            if len(plain) != chunk.uncompressed_size:
+                raise McapError('it has not the size that it says it has')
+            records = breakup_chunk(replace(chunk, compression='', data=plain), validate_crc=True)
         for one in records:
             if not isinstance(one, Message):
                 self._declare(one)
@@ -318,36 +290,17 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 raise McapError('no whole record declares a channel of its messages')
         return records
 
-    def _broken_up(self, chunk: Chunk) -> list[McapRecord]:
-        size = chunk.uncompressed_size
-        if size > self._max_bytes:
-            raise McapError(f'it unpacks to {size} bytes, more than the {self._max_bytes} that '
-                            'are read')
-        plain = _decompress(chunk.data, chunk.compression, size)    # mcap unpacks to any size
-        if len(plain) != size:
-            raise McapError('it has not the size that it says it has')
-        return breakup_chunk(replace(chunk, compression='', data=plain), validate_crc=True)
-
     def _declare(self, record: McapRecord) -> None:
-        """Note a schema, a channel or metadata.  Raises McapError for too many of them."""
+        """Note a schema, a channel or metadata; of several with an id, the first counts."""
         if isinstance(record, Metadata):
             self.metadata[record.name] = record.metadata
-        elif isinstance(record, Schema | Channel):
-            known: dict[int, Any] = (
-                self.schemas if isinstance(record, Schema) else self.channels)
-            if record.id not in known:
-                self._declared_bytes += len(repr(record))
-                if self._declared_bytes > MAX_DECLARED:
-                    raise McapError(f'more than {MAX_DECLARED} bytes of schemas and channels are '
-                                    'not read')
-                known[record.id] = record
+        elif isinstance(record, Schema):
+            self.schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel):
+            self.channels.setdefault(record.id, record)
 
     def _find_places(self) -> Iterator[tuple[int, int, int, int]]:
-        """
-        Yield where messages are: earliest and latest log time, begin and end of a record.
-
-        Notes what is declared outside of chunks.
-        """
+        """Yield log times and places of messages and chunks, noting what is declared outside."""
         for opcode, offset, end in self._heads():
             with contextlib.suppress(*UNREADABLE):
                 if opcode in TIMES and end <= self.size:
@@ -358,47 +311,32 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def _read_summary(self) -> None:
         """Note what the summary declares.  UNREADABLE if it is damaged or the file is torn."""
-        footer = _parse(self._at(self.size - 37, self.size - 8))
+        footer_at = self.size - FOOTER_SIZE - MAGIC_SIZE
+        footer = next(_records_in(self._at(footer_at, self.size)))
         if not isinstance(footer, Footer):
             raise McapError
-        summary = self._at(footer.summary_start or self.size - 37, self.size)
-        if footer.summary_crc not in (0, zlib.crc32(summary[:-12])):
+        summary = self._at(footer.summary_start or footer_at, self.size)
+        if footer.summary_crc not in (0, zlib.crc32(summary[:-MAGIC_SIZE - 4])):
             raise McapError
-        for record in _stream(summary).records:     # up to the magic
+        for record in _records_in(summary):     # to the footer, and the magic behind it
             self._declare(record)
 
     def _read_header(self) -> Header:
         """Return the header.  Raises LogError for no MCAP file."""
-        magic = self._at(0, min(len(MCAP0_MAGIC), self.size))
+        magic = self._at(0, min(MAGIC_SIZE, self.size))
         with contextlib.suppress(*UNREADABLE):
             _, offset, end = next(self._heads(), (0, 0, 0))
-            header = _parse(self._at(offset, end))
+            header = next(_records_in(self._at(offset, end)))
             if magic == MCAP0_MAGIC and isinstance(header, Header):
                 return header
         reason = 'it is no MCAP file' if magic else 'it is empty'
-        if magic[:4] in UNPACK:
-            reason = 'it is compressed as a whole, unpack it by ' + UNPACK[magic[:4]].format(
-                self.path, self.path.with_suffix(''))
+        if form := COMPRESSED.get(magic[:4]):
+            reason = f'it is compressed as a whole, unpack it by {form} -d'
         raise LogError(f'cannot read {self.path}: {reason}')
 
 
-class _Whole(BytesIO):
-    """Bytes; a read of them is complete or EndOfFile: mcap takes truncated fields for shorter."""
-
-    def read(self, size: int | None = -1) -> bytes:
-        data = super().read(size)
-        if size is not None and len(data) < size:
-            raise EndOfFile
-        return data
-
-
-def _stream(raw: bytes) -> StreamReader:
-    return StreamReader(_Whole(raw), skip_magic=True, emit_chunks=True)
-
-
-def _parse(raw: bytes) -> McapRecord:
-    """Return a record of a known kind from all of its bytes; UNREADABLE."""
-    return next(_stream(raw).records)
+def _records_in(raw: bytes) -> Iterator[McapRecord]:
+    return StreamReader(BytesIO(raw), skip_magic=True, emit_chunks=True).records
 
 
 def _decompress(data: bytes, compression: str, most: int) -> bytes:

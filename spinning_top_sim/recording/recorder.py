@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import itertools
 import threading
 import time
 from collections import deque
@@ -21,20 +20,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import RecordingError, text_of, why_not_written
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 
 if TYPE_CHECKING:       # the recorder's thread imports it, which takes 0.1 s
-    from spinning_top_sim.recording.writer import McapWriter
+    from spinning_top_sim.recording.writer import McapWriter, Rows
 
 QUEUE_BYTES = 32_000_000    # of a full queue; a burst that began with room may go on
 ENTRY_BYTES = 300           # what queued rows cost besides their data, about
-
-# The next messages of a topic: its index, log times (n,) [ns], serialized messages (n, size).
-Rows = tuple[int, NDArray[np.int64], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -43,14 +38,10 @@ class RecordingSummary:
 
     path: Path | None       # None before the file is open
     bytes: int              # size of the file
-    counts: dict[str, int]  # messages in it by topic name
+    messages: int           # in it
     queued: int             # messages accepted, not yet in the file
     lost: int               # handed over after the recording stopped, or when it failed
     error: str | None       # why the recording stopped early
-
-    @property
-    def messages(self) -> int:
-        return sum(self.counts.values())
 
 
 class Recorder:
@@ -122,12 +113,11 @@ class Recorder:
         """What the recording has come to so far."""
         running = self.state in ('opening', 'recording')    # read first: nothing is written after
         file = self._file
-        numbers = file.message_counts if file else itertools.repeat(0)
-        counts = {topic.name: number for topic, number in zip(self._topics, numbers, strict=False)}
-        missing = self._offered - sum(counts.values())
+        messages = sum(file.message_counts) if file else 0
+        missing = self._offered - messages
         return RecordingSummary(
-            path=self.path, bytes=file.size if file else 0, counts=counts,
-            queued=missing if running else 0, lost=0 if running else missing, error=self.error)
+            self.path, file.size if file else 0, messages, queued=missing if running else 0,
+            lost=0 if running else missing, error=self.error)
 
     def write(self, rows: Sequence[Rows]) -> None:
         """

@@ -10,7 +10,7 @@ from mcap.records import Attachment, Message, Metadata
 from mcap.writer import Writer
 
 from spinning_top_sim.recording.errors import LogError, why_not_written
-from spinning_top_sim.recording.reader import Damage, LogReader
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata
 
 
@@ -28,8 +28,7 @@ def recover(reader: LogReader, output: Path,
     try:
         with open(output, 'xb') as file:
             try:
-                messages = _copy(reader, Writer(file, enable_data_crcs=True), output.name,
-                                 progress)
+                messages = _copy(reader, Writer(file), output.name, progress)
                 file.flush()
                 os.fsync(file.fileno())
             except BaseException:
@@ -42,44 +41,31 @@ def recover(reader: LogReader, output: Path,
 
 def _copy(reader: LogReader, writer: Writer, name: str,
           progress: Callable[[float], object]) -> int:
-    schemas, channels = {0: 0}, dict[int, int]()        # new ids by old ones
-
-    def declare() -> None:
-        for number, schema in reader.schemas.items():
-            if number not in schemas:
-                schemas[number] = writer.register_schema(schema.name, schema.encoding, schema.data)
-        for number, channel in reader.channels.items():
-            if number not in channels:
-                channels[number] = writer.register_channel(
-                    channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0),
-                    channel.metadata)
-
+    damage, counts = reader.damage, Counter[int]()
     writer.start(reader.profile, reader.library)
-    counts: Counter[int] = Counter()
-    times_ns: list[int] = []
-    for offset, records in reader.parts(Damage(False)):
+    # New ids by old ones; now that all is read, all are known.
+    schemas = {number: writer.register_schema(schema.name, schema.encoding, schema.data)
+               for number, schema in reader.schemas.items()}
+    channels = {number: writer.register_channel(
+        channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0),
+        channel.metadata) for number, channel in reader.channels.items()}
+    for offset, records in reader.parts():
         progress(offset)
-        declare()
         for one in records:
             if isinstance(one, Message):
+                counts[one.channel_id] += 1
                 writer.add_message(channels[one.channel_id], one.log_time, one.data,
                                    one.publish_time, one.sequence)
-                counts[one.channel_id] += 1
-                times_ns = [min([*times_ns, one.log_time]), max([*times_ns, one.log_time])]
             elif isinstance(one, Attachment):
                 writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type,
                                       one.data)
             elif isinstance(one, Metadata) and one.name != BAG_METADATA:
                 writer.add_metadata(one.name, one.metadata)
-    messages = counts.total()
-    if not messages and not reader.whole:
+    if damage.torn and not counts:
         raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
     if reader.profile == 'ros2' or BAG_METADATA in reader.metadata:
-        types = {topic.channel_id: topic.type_name for topic in reader.topics}
         writer.add_metadata(BAG_METADATA, bag_metadata(
-            [(channel, types[number], counts[number])
-             for number, channel in reader.channels.items()], name,
-            min(times_ns, default=0), max(times_ns, default=0), reader.compression))
+            [(reader.channels[topic.channel_id], topic.type_name, counts[topic.channel_id])
+             for topic in reader.topics], name, *reader.span, reader.compression))
     writer.finish()
-    progress(reader.size)
-    return messages
+    return counts.total()

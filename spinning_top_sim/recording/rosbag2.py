@@ -26,7 +26,7 @@ Qos = Mapping[str, Any]
 
 BAG_METADATA = 'rosbag2'  # name of the metadata record
 
-_NEVER = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
+_NEVER = {'sec': 9223372036, 'nsec': 854775807}     # RMW_DURATION_INFINITE
 
 # What a reliable publisher with a queue of ten offers, rmw's enum values.
 DEFAULT_QOS: Qos = {
@@ -72,9 +72,8 @@ def find_definition(type_name: str) -> tuple[str, str]:
     """
     Return schema (`ros2msg`) and type hash (REP-2011) of a type of ROS 2 Jazzy.
 
-    They are the same where ROS is installed and where not.  Other than rosbag2's, the schema,
-    which is the definition followed by those it depends on, has no comments.
-    Raises RecordingError for another type.
+    Other than rosbag2's, the schema, which is the definition followed by those it depends on, has
+    no comments.  Raises RecordingError for another type.
     """
     # rosbags generates definitions.json; to load its types takes 70 ms, a fifth of a start.
     known = read_table('recording/definitions.json')
@@ -97,7 +96,7 @@ def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
     """
     Return the QoS profiles in the metadata of a channel, with policies by number or name.
 
-    A policy that is missing or of another type is as in DEFAULT_QOS; a text that is no list of
+    A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
     profiles has none.
     """
     text = channel.metadata.get('offered_qos_profiles', '')
@@ -139,15 +138,13 @@ def bag_metadata(topics: Sequence[tuple[Channel, str, int]], file_name: str, sta
     """Return the `rosbag2` record; `topics` are channels, types and message counts."""
     # A file name may hold bytes that are no text: they must not spoil the closing of a log.
     file_name = file_name.encode(errors='replace').decode()
-    start = {'nanoseconds_since_epoch': start_ns}
-    duration = {'nanoseconds': end_ns - start_ns}
-    total = sum(messages for _, _, messages in topics)
+    numbers = {'starting_time': {'nanoseconds_since_epoch': start_ns},
+               'duration': {'nanoseconds': end_ns - start_ns},
+               'message_count': sum(messages for _, _, messages in topics)}
     return {'serialized_metadata': _dump({
         'version': 9,   # of rosbag2_storage::BagMetadata in jazzy
         'storage_identifier': 'mcap',
-        'duration': duration,
-        'starting_time': start,
-        'message_count': total,
+        **numbers,
         'topics_with_message_count': [
             {'topic_metadata': {
                 'name': channel.topic,
@@ -161,8 +158,7 @@ def bag_metadata(topics: Sequence[tuple[Channel, str, int]], file_name: str, sta
         'compression_format': compression.format,
         'compression_mode': compression.mode,
         'relative_file_paths': [file_name],
-        'files': [{'path': file_name, 'starting_time': start, 'duration': duration,
-                   'message_count': total}],
+        'files': [{'path': file_name, **numbers}],
         'custom_data': None,
         'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy'})}
 

@@ -13,7 +13,7 @@ import itertools
 import os
 import struct
 import zlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from operator import itemgetter
@@ -39,13 +39,15 @@ CHUNK_BYTES = 1_000_000     # of messages that make a chunk, about
 ZSTD = zstandard.ZstdCompressionParameters.from_level(-1, window_log=20)
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
 
+# The next messages of a topic: its index, log times (n,) [ns], serialized messages (n, size).
+Rows = tuple[int, NDArray[np.int64], NDArray[np.uint8]]
+
 
 class McapWriter:
     """
     A new log, used by one thread at a time; its head is on the disk at once.
 
-    `add` collects messages for a chunk and writes it when it is full; `flush` writes it now.  The
-    topic with index i has the channel i + 1.
+    `add` collects messages for a chunk and writes it when it is full, `flush` writes it now.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
@@ -61,41 +63,35 @@ class McapWriter:
     def __init__(self, path: Path, topics: Sequence[rosbag2.RecordedTopic],
                  metadata: Mapping[str, str], *, compression: str,
                  min_free_bytes: int = 0) -> None:
-        names = [topic.name for topic in topics]
-        for name in names:
-            if names.count(name) > 1:
+        for name, number in Counter(topic.name for topic in topics).items():
+            if number > 1:
                 raise ValueError(f'topic {name!r} is listed twice: once is allowed')
         self._path, self._topics = path, topics
         self._compression = '' if compression == 'none' else compression
-        self._zstd = zstandard.ZstdCompressor(compression_params=ZSTD)
-        # What `add` was given for the next chunk, and its size there
-        self._rows: list[tuple[int, NDArray[np.int64], NDArray[np.uint8]]] = []
-        self._chunk_bytes = 0
+        self._rows: list[Rows] = []                 # of the next chunk,
+        self._chunk_bytes = 0                       # and its size
         self.message_counts = [0] * len(topics)     # messages in the file
         self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         types = list(dict.fromkeys(topic.type_name for topic in topics))
         definitions = {name: rosbag2.find_definition(name) for name in types}
-        schemas = [records.Schema(number, definitions[name][0].encode(), 'ros2msg', name)
-                   for number, name in enumerate(types, start=1)]
-        self._channels = [records.Channel(
+        self._channels = [records.Channel(      # with the index of their topic + 1
             id=number, topic=topic.name, message_encoding='cdr',
             schema_id=1 + types.index(topic.type_name),
             metadata={'offered_qos_profiles': rosbag2.offered_qos_yaml(topic),
                       'topic_type_hash': definitions[topic.type_name][1]})
             for number, topic in enumerate(topics, start=1)]
-        # Records of the summary by opcode.  Serialized: thousands of objects would take memory.
-        self._summary = defaultdict(list, {
-            Opcode.SCHEMA: [*map(record_bytes, schemas)],
-            Opcode.CHANNEL: [*map(record_bytes, self._channels)]})
-        header = records.Header(profile='ros2', library=OUR_LIBRARY + version())
+        # Records of the summary.  Serialized: thousands of objects would take memory.
+        self._summary = [record_bytes(record) for record in (
+            *(records.Schema(number, definitions[name][0].encode(), 'ros2msg', name)
+              for number, name in enumerate(types, start=1)), *self._channels)]
+        header = record_bytes(records.Header(profile='ros2', library=OUR_LIBRARY + version()))
         try:
             self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
             try:
                 self.check_disk(min_free_bytes)
-                self._write([MCAP0_MAGIC, record_bytes(header)])
+                self._write([MCAP0_MAGIC, header, *self._summary])
                 self._write_metadata(METADATA_NAME, dict(metadata))
-                self._write([*self._summary[Opcode.SCHEMA], *self._summary[Opcode.CHANNEL]])
                 self.sync()
                 _sync_directory(path.parent)
             except BaseException:
@@ -110,14 +106,10 @@ class McapWriter:
     def size(self) -> int:
         return self._end[0]
 
-    @property
-    def messages(self) -> int:
-        return sum(self.message_counts)
-
     def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
             rows: NDArray[np.uint8]) -> None:
         """
-        Add messages of a topic, which must not change before the chunk is written.
+        Add messages of a topic.  The arrays must not change before they are written.
 
         log_times_ns : log and publish times (n,), n >= 1, in any order
         rows : serialized messages (n, size)
@@ -142,59 +134,50 @@ class McapWriter:
         self._rows, self._chunk_bytes = [], 0
 
     def _write_chunk(self) -> None:
-        plain, offset = np.empty(self._chunk_bytes, np.uint8), 0
+        plain, offset, counts = np.empty(self._chunk_bytes, np.uint8), 0, [*self.message_counts]
         # By topic, log times and offsets in the chunk (n, 2), as they stand in message indexes
         entries: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
-        counts = [*self.message_counts]
         for (topic, size), alike in itertools.groupby(
                 sorted(self._rows, key=itemgetter(0)), lambda rows: (rows[0], rows[2].shape[1])):
-            _, times_ns, data = map(np.concatenate, zip(*(
-                ((), *rows[1:]) for rows in alike), strict=True))
-            record = _message_type(size)
-            numbers, end = np.arange(len(times_ns)), offset + len(times_ns) * record.itemsize
-            messages = plain[offset:end].view(record)
+            _, times, data = zip(*alike, strict=True)
+            times_ns, record = np.concatenate(times), _message_type(size)
+            numbers = np.arange(len(times_ns))
+            messages = plain[offset:offset + len(numbers) * record.itemsize].view(record)
             messages['opcode'], messages['length'] = Opcode.MESSAGE, record.itemsize - 9
             messages['channel'], messages['sequence'] = topic + 1, numbers + counts[topic]
             messages['log_time'] = messages['publish_time'] = times_ns
-            messages['data'] = data
+            messages['data'] = np.concatenate(data)
             entries[topic].append(np.stack(
                 [times_ns, numbers * record.itemsize + offset], axis=1).astype(np.uint64))
-            counts[topic] += len(times_ns)
-            offset = end
-        indexes = {topic: np.concatenate(parts) for topic, parts in entries.items()}
-        start_ns = min(int(index[:, 0].min()) for index in indexes.values())
-        end_ns = max(int(index[:, 0].max()) for index in indexes.values())
-        data = (self._zstd.compress(plain) if self._compression == 'zstd'
-                else lz4.frame.compress(plain) if self._compression else plain.tobytes())
-        chunk = record_bytes(records.Chunk(
-            compression=self._compression, data=data, message_start_time=start_ns,
-            message_end_time=end_ns, uncompressed_crc=zlib.crc32(plain),
-            uncompressed_size=len(plain)))
-        # mcap's class would make Python objects of all entries.
-        blocks = [chunk, *(
-            INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + index.nbytes, topic + 1, index.nbytes)
-            + index.tobytes() for topic, index in indexes.items())]
-        offsets = list(itertools.accumulate(map(len, blocks), initial=self.size))
-        summary = records.ChunkIndex(
-            chunk_start_offset=self.size, chunk_length=len(chunk),
-            message_index_offsets={
-                topic + 1: at for topic, at in zip(indexes, offsets[1:], strict=False)},
-            message_index_length=offsets[-1] - offsets[1],
-            compression=self._compression, compressed_size=len(data),
-            uncompressed_size=len(plain), message_start_time=start_ns, message_end_time=end_ns)
+            counts[topic] += len(numbers)
+            offset += messages.nbytes
+        indexes = {topic + 1: np.concatenate(parts) for topic, parts in entries.items()}
+        times_ns = np.concatenate([index[:, 0] for index in indexes.values()])
+        span = {'message_start_time': int(times_ns.min()), 'message_end_time': int(times_ns.max())}
+        data = (zstandard.ZstdCompressor(compression_params=ZSTD).compress(plain)
+                if self._compression == 'zstd' else
+                lz4.frame.compress(plain) if self._compression else bytes(plain))
+        # mcap's class of message indexes would make Python objects of all entries.
+        blocks = [record_bytes(records.Chunk(
+            compression=self._compression, data=data, uncompressed_crc=zlib.crc32(plain),
+            uncompressed_size=len(plain), **span)), *(
+                INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + index.nbytes, channel, index.nbytes)
+                + index.tobytes() for channel, index in indexes.items())]
+        first, *offsets, end = itertools.accumulate(map(len, blocks), initial=self.size)
+        summary = record_bytes(records.ChunkIndex(
+            chunk_start_offset=first, chunk_length=len(blocks[0]),
+            message_index_offsets=dict(zip(indexes, offsets, strict=True)),
+            message_index_length=end - offsets[0], compression=self._compression,
+            compressed_size=len(data), uncompressed_size=len(plain), **span))
         self._write(blocks)
-        self._summarize(summary)
-        self._times_ns += start_ns, end_ns
+        self._summary.append(summary)
+        self._times_ns += span.values()
         self.message_counts = counts
 
     def _write_metadata(self, name: str, content: dict[str, str]) -> None:
         offset, raw = self.size, record_bytes(records.Metadata(name, content))
         self._write([raw])
-        self._summarize(records.MetadataIndex(offset, len(raw), name))
-
-    def _summarize(self, record: records.McapRecord) -> None:
-        raw = record_bytes(record)
-        self._summary[raw[0]].append(raw)
+        self._summary.append(record_bytes(records.MetadataIndex(offset, len(raw), name)))
 
     def sync(self) -> None:
         os.fsync(self._file.fileno())
@@ -220,31 +203,21 @@ class McapWriter:
                     self._channels, self._topics, self.message_counts, strict=True)],
                 self._path.name, start_ns, end_ns))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
-            counts = {f'{name}_count': len(self._summary[kind]) for name, kind in (
-                ('schema', Opcode.SCHEMA), ('channel', Opcode.CHANNEL),
-                ('chunk', Opcode.CHUNK_INDEX), ('metadata', Opcode.METADATA_INDEX))}
-            self._summarize(records.Statistics(
-                message_count=self.messages, message_start_time=start_ns, message_end_time=end_ns,
+            kinds = Counter(raw[0] for raw in self._summary)
+            statistics = record_bytes(records.Statistics(
+                attachment_count=0, channel_count=kinds[Opcode.CHANNEL],
                 channel_message_counts=dict(enumerate(self.message_counts, start=1)),
-                attachment_count=0, **counts))
-            self._write([self._summary_section()])
+                chunk_count=kinds[Opcode.CHUNK_INDEX], message_count=sum(self.message_counts),
+                message_end_time=end_ns, message_start_time=start_ns,
+                metadata_count=kinds[Opcode.METADATA_INDEX], schema_count=kinds[Opcode.SCHEMA]))
+            # The summary's checksum runs on into the footer, up to the checksum itself.
+            summary = b''.join([*sorted([*self._summary, statistics], key=itemgetter(0)),
+                                record_bytes(records.Footer(self.size, 0, 0))[:-4]])
+            self._write([summary, zlib.crc32(summary).to_bytes(4, 'little'), MCAP0_MAGIC])
             self.sync()
             _sync_directory(self._path.parent)
         finally:
             self._file.close()
-
-    def _summary_section(self) -> bytes:
-        summary, offsets = bytearray(), bytearray()
-        for opcode, group in sorted(self._summary.items()):
-            if group:
-                start = self.size + len(summary)
-                summary += b''.join(group)
-                offsets += record_bytes(records.SummaryOffset(
-                    opcode, start, self.size + len(summary) - start))
-        footer = record_bytes(records.Footer(self.size, self.size + len(summary), 0))
-        # The summary's checksum runs on into the footer, up to the checksum itself.
-        summary += offsets + footer[:-4]
-        return bytes(summary) + zlib.crc32(summary).to_bytes(4, 'little') + MCAP0_MAGIC
 
     def _write(self, blocks: Iterable[bytes]) -> None:
         """Write whole records that come in blocks, or none of them."""

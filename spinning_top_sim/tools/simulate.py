@@ -190,7 +190,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                                 f'{simulation.now_ns / NANOSECONDS:g} s') from interrupt
     finally:
         file.finish()
-    return f'{file.messages} messages, {file.size / 1e6:.1f} MB'
+    return f'{sum(file.message_counts)} messages, {file.size / 1e6:.1f} MB'
 
 
 main = partial(cli.run, 'simulate', __doc__, add_arguments, _run)
