@@ -216,6 +216,15 @@ def test_pieces_are_joined_and_known_again_with_another_end(method):
         Piece(TOP, State(theta=0.5, l3=1e6, lz=1.0), 0, method=method)
 
 
+@pytest.mark.parametrize(('theta', 'lz'), [(1e-6, 5e-26), (1e-10, 5e-34), (1e-20, 1e-50)])
+def test_a_pole_that_is_missed_by_little_is_not_passed_exactly(theta, lz):
+    """The motion about a line of effective gravity is the one about the vertical."""
+    times, start = np.arange(0, 20 * S, S // 3), State(theta=theta, l3=0.0, lz=lz)
+    one, other = (Piece(TOP, start, 0, *pivot_moves, method='exact').states(times).quaternion
+                  for pivot_moves in ((), (ride(NOWHERE),)))
+    assert np.minimum(abs(one - other).max(1), abs(one + other).max(1)).max() <= BOUND
+
+
 def test_next_to_the_line_of_effective_gravity_an_axis_stays_what_it_is():
     """Within 1e-30 rad it is taken for the line, as the documentation says."""
     for theta, falls in ((1e-29, True), (1e-31, False)):

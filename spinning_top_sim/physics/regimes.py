@@ -29,39 +29,18 @@ def natural_momentum(top: Top) -> float:
 
 @dataclass(frozen=True)
 class Description:
-    """
-    A motion in numbers.
+    """A motion in numbers: angles in rad, rates in rad/s."""
 
-    Parameters
-    ----------
-    name : str
-        The classical name, such as 'cusps'.
-    nutation_period : float or None
-        Period of theta [s], None where it rests.
-    theta_min, theta_max : float
-        Between which the axis swings [rad].
-    mean_precession_rate : float
-        Mean over a nutation [rad/s].
-    precession_min, precession_max : float
-        Least and greatest precession rate [rad/s].
-    mean_spin_rate : float
-        Mean over a nutation [rad/s].
-    separatrix_distance : float
-        1 - m of the elliptic functions; 0 is the motion that rises for ever.
-    gyroscopic_ratio : float
-        L3^2 over 4 lambda1 abs(P); an upright top sleeps above 1; inf without gravity.
-    """
-
-    name: str
-    nutation_period: float | None
-    theta_min: float
-    theta_max: float
-    mean_precession_rate: float
-    precession_min: float
-    precession_max: float
-    mean_spin_rate: float
-    separatrix_distance: float
-    gyroscopic_ratio: float
+    name: str                           #: The classical name, such as 'cusps'.
+    nutation_period: float | None       #: Period of theta [s], None where it rests.
+    theta_min: float                    #: Between which the axis swings.
+    theta_max: float                    #: Between which the axis swings.
+    mean_precession_rate: float         #: Mean over a nutation.
+    precession_min: float               #: Least precession rate.
+    precession_max: float               #: Greatest precession rate.
+    mean_spin_rate: float               #: Mean over a nutation.
+    separatrix_distance: float          #: 1 - m; 0 is the motion that rises for ever.
+    gyroscopic_ratio: float             #: L3^2/(4 lambda1 |P|); an upright top sleeps above 1.
 
 
 def axis_rests(top: Top, state: State) -> bool:

@@ -35,6 +35,7 @@ there are 57 digits, and more if two roots are close; some 40 are left.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from gmpy2 import asinh, const_pi, mpfr, sin_cos, sqrt
@@ -173,7 +174,7 @@ def _resting(side: _Side, lambda1: mpfr) -> Factor:
                   (side.modulus, side.modulus), side.momentum / (2 * lambda1), ZERO)
 
 
-def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
+def _nutating(sides: Sequence[_Side], lambda1: mpfr, mirror: int, l3: mpfr,
               momentum: mpfr, cubic: tuple[mpfr, mpfr, mpfr, mpfr], falling: bool,
               ) -> ThetaMotion:
     """
@@ -197,7 +198,7 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
     y_rate = root_f3 * mean.mean / 2
     factors = [_quotient(form, side, lambda1, y_rate * (stretch or 1), y_rate, start_whole, y0,
                          (direction * sin, cos, xi))
-               for side in _with_poles(*sides, roots, lambda1 ** 2 * f3, imaginary)]
+               for side in _with_poles(sides, roots, lambda1 ** 2 * f3, imaginary)]
     swing_rate = root_f3 * (mirror * a / 2 * roots.gap21)       # w (u2 - u1)
     even, odd = form.slopes_of_sn2()
     turn = mirror * l3 / lambda1
@@ -213,7 +214,7 @@ def _nutating(sides: tuple[_Side, ...], lambda1: mpfr, mirror: int, l3: mpfr,
         m1=roots.gap32 / roots.gap31, size=form.size)
 
 
-def _with_poles(alpha: _Side, beta: _Side, roots: Roots, two_p_lambda1: mpfr,
+def _with_poles(sides: Sequence[_Side], roots: Roots, two_p_lambda1: mpfr,
                 imaginary: bool) -> tuple[_Side, _Side]:
     """
     Return alpha and beta with their poles.
@@ -221,6 +222,7 @@ def _with_poles(alpha: _Side, beta: _Side, roots: Roots, two_p_lambda1: mpfr,
     Nothing cancels: u'^2 at u = -1 and u = 1 is -((Lz +- L3)/lambda1)^2.  So the product of
     three distances is known, and the smallest of them needs no difference.
     """
+    alpha, beta = sides
     c0, s0 = 2 * alpha.modulus ** 2, 2 * beta.modulus ** 2          # 1 + u0 and 1 - u0
     below1, above2 = s0 - roots.y1, c0 + roots.y2
     above1 = alpha.momentum ** 2 / (two_p_lambda1 * above2 * (roots.y3 + c0))

@@ -166,7 +166,9 @@ class ThetaArrays:
     @cached_property
     def _middles(self) -> list[list[float]]:
         """The rows where y = 0, at N = 0 and at N = 1."""
-        return np.where(np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0).T.tolist()
+        middles: list[list[float]] = np.where(
+            np.array(self.prefactors) < SIN_ODD, self.coefficients[-1], 0.0).T.tolist()
+        return middles
 
     @cached_property
     def bounds(self) -> tuple[float, float]:
@@ -186,7 +188,7 @@ class ThetaArrays:
             return False
         low, high = (0.5 * theta for theta in self.bounds)
         least = min(math.sin(2.0 * low), math.sin(2.0 * high))
-        return 2.0 * max(map(abs, self.precession.tolist())) < least * (
+        return 2.0 * max(abs(float(x)) for x in self.precession) < least * (
             abs(self.bottom_rate) * math.tan(high) + abs(self.top_rate) / math.tan(low))
 
     @cached_property

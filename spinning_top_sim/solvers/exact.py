@@ -259,7 +259,7 @@ class _ExactStates(States):
                 spin + (psi + solution.psi_phase))
 
     @cached_property
-    def _rates(self) -> NDArray[np.float64]:
+    def _rates(self) -> Any:
         return self._rows('rates')
 
     @cached_property

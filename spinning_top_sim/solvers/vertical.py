@@ -114,7 +114,7 @@ class PreciseState(NamedTuple):
         lambda1 = real(top.lambda1)
         lz = (cosine - sine) * (cosine + sine) * l3 - (
             2 * lambda1 * rates.real * cosine * sine)
-        most2 = THROUGH ** 2 * (l3 * l3 + lambda1 * (
+        most2 = THROUGH ** 2 * (l3 * l3 + (cosine * sine) ** 2 * lambda1 * (
             lambda1 * _norm(transverse) + abs(top.gravity_torque)))
         lz = next((pole for pole in (l3, -l3) if (lz - pole) ** 2 <= most2), lz)
         return cls(sine, cosine, rates.imag, alpha, beta, l3, lz)
