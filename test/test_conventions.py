@@ -17,9 +17,7 @@ TRUTH = Rotation.random(12, random_state=3)
 
 @pytest.mark.parametrize('one', conventions.group()[::7], ids=lambda one: one.name)
 def test_a_convention_is_found_and_undone(one):
-    told = Rotation.from_quat(one.world) * TRUTH * Rotation.from_quat(one.sensor)
-    told = (told.inv() if one.conjugate else told).as_quat()
-    told = told[:, [3, 0, 1, 2]] if one.w_first else told
+    told = one.tell(TRUTH.as_quat())
     found = conventions.best(told, TRUTH.as_quat())
     assert len(found.convention.parts) <= len(one.parts)
     assert np.allclose((Rotation.from_quat(found.convention.undo(told))

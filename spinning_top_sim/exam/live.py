@@ -7,7 +7,7 @@ import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,16 @@ from rclpy.context import Context
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
 
 from spinning_top_sim.exam.examiner import examine
-from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.scenarios import Reals
-from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
+from spinning_top_sim.exam.feeding import INTERRUPTED, MakeFilter, NodeError, Outcome, feed
+from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
+from spinning_top_sim.tools.report import Report
 
 try:                            # takes least processor time
     from rclpy.experimental import EventsExecutor as Executor
@@ -34,62 +34,77 @@ except ImportError:
     from rclpy.executors import SingleThreadedExecutor as Executor
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
-PATIENCE_S = 20.0               # for a node to start, and for an answer
-DISCOVERY_S = 3.0               # other publishers are found later than the node
-FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
+PATIENCE_S = 20.0               # for a node to start
+ANSWER_S, AGAIN_S, TIMES = 5.0, 0.3, 4      # for an answer; the first sample is sent again
+UNANSWERED = 5                  # samples at the start that a node may leave unanswered
+ALONE_EVERY = 50                # samples after which other publishers are looked for
+ATTEMPTS = 3                    # at a run in which messages are lost
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
-# A running node must never see time go back, not even from one exam to the next.  So the first
-# stamp of an exam is the uptime of the machine multiplied by the greatest speed-up of an exam.
-FASTEST, LAST_NS = 50, 2 * 10 ** 9 * NANOSECONDS
 NAME, FRAME = 'examine', 'imu_link'
+NOWHERE = np.array((0.0, 0.0, 0.0, 1.0))        # until the node answers
 
 
-def examine_node(topic: str, command: str | None = None, level: str = 'quick',
+class LostError(Exception):
+    """A message between exam and node has been lost."""
+
+
+def examine_node(command: str, topic: str, level: str = 'quick',
                  imu: Mapping[str, Any] | str | Path | None = None,
-                 seeds: int | Iterable[int] | None = None) -> Report:
+                 seeds: int | Iterable[int] | None = None,
+                 show: Callable[[float, float], object] | None = None) -> Report:
     """
     Examine a ROS node.
 
     Parameters
     ----------
+    command : str
+        Command that starts the node for each run, without a shell.
     topic : str
         Topic of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
-    command : str, optional
-        Command that starts the node for each run, without a shell; default: the node runs.
-    level, imu, seeds : optional
+    level, imu, seeds, show : optional
         As for `examine`.
 
     Raises
     ------
     NodeError
-        If the node is not found, or other nodes publish on its topics.
+        If other nodes publish on its topics, or messages are lost.
     """
-    with NodeExam(topic, command) as node:
-        return examine(node.start, level, imu, seeds, subject=command or topic,
-                       isolated=False, restart=command is not None)
+    with NodeExam(command, topic) as node:
+        return examine(node.start, level, imu, seeds, subject=command, feed=node.feed, show=show)
 
 
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
-    """A node under examination, which is also a `trial.Filter`; arguments as `examine_node`."""
+    """A node under examination, which is also a `feeding.Filter`; arguments as `examine_node`."""
 
-    def __init__(self, topic: str, command: str | None = None) -> None:
+    def __init__(self, command: str, topic: str) -> None:
         expand_topic_name(topic, NAME, '/')         # raises ValueError
-        self._command = None if command is None else shlex.split(command)
-        self._topic = topic
+        self._command, self._topic = shlex.split(command), topic
         self._context = Context()
         rclpy.init(context=self._context)
         self._node = Node(NAME, context=self._context, parameter_overrides=[
             Parameter('use_sim_time', value=False)])
         self._executor = Executor(context=self._context)
         self._executor.add_node(self._node)
-        profile = QoSProfile(depth=100)
+        # A reliable publisher serves readers of both kinds, and so does a late joiner's.
+        profile = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._clock, self._imu, self._field = (
-            self._node.create_publisher(kind, name, profile) for kind, name in (
-                (Clock, '/clock'), (Imu, IMU_TOPIC), (MagneticField, FIELD_TOPIC)))
-        self._subscription = self._node.create_subscription(Imu, topic, self._take, profile)
+            self._node.create_publisher(kind, name, profile if kind is Clock else 100)
+            for kind, name in ((Clock, '/clock'), (Imu, IMU_TOPIC), (MagneticField, FIELD_TOPIC)))
+        self._subscription: Any = None
         self._process: subprocess.Popen[bytes] | None = None
         self._answers: dict[int, Any] = {}          # by stamp [ns]
         self.covariance: Reals | None = None
+
+    def feed(self, make_filter: MakeFilter, runs: Sequence[Run]) -> list[Outcome]:
+        """Do as `feeding.feed`; begin a run again in which a message is lost."""
+        return [self._feed(make_filter, run) for run in runs]
+
+    def _feed(self, make_filter: MakeFilter, run: Run) -> Outcome:
+        for _ in range(ATTEMPTS):
+            with contextlib.suppress(LostError):
+                return feed(make_filter, [run])[0]
+        raise NodeError(f'messages between exam and node are lost in {ATTEMPTS} runs: make '
+                        f'{IMU_TOPIC} and {self._topic} reliable in the node')
 
     def __exit__(self, *exception: object) -> None:
         self._end_process()
@@ -98,36 +113,51 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         rclpy.shutdown(context=self._context)
 
     def start(self) -> 'NodeExam':
-        """Start the node anew, or find the running one; return it as a filter."""
+        """Start the node anew; return it as a filter."""
         self._end_process()
-        if self._command is not None:
-            try:
-                self._process = subprocess.Popen(self._command, start_new_session=True)
-            except OSError as error:
-                raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
-        there = self._wait(self.is_there, PATIENCE_S)
-        if there and self._process is None:
-            self._wait(lambda: False, DISCOVERY_S)
-        for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
-            if (count := self._node.count_publishers(name)) > 1:
-                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
-                                'needs the topic alone')
-        if not there:
-            text = (f'no node reads {IMU_TOPIC} and publishes {self._topic} within '
-                    f'{PATIENCE_S:g} s: check that it runs, its ROS_DOMAIN_ID '
-                    f'({os.environ.get("ROS_DOMAIN_ID", "0")} here), namespace and remappings')
-            raise RuntimeError(text) if self._process is not None else NodeError(text)
-        self._now_ns = (START_NS if self._process is not None else
-                        FASTEST * time.monotonic_ns() % LAST_NS + START_NS)
+        try:
+            self._process = subprocess.Popen(self._command, start_new_session=True)
+        except OSError as error:
+            raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
+        if not self._wait(self.is_there, PATIENCE_S):
+            raise RuntimeError(
+                f'no node reads {IMU_TOPIC} and publishes {self._topic} within {PATIENCE_S:g} s: '
+                f'check its ROS_DOMAIN_ID ({os.environ.get("ROS_DOMAIN_ID", "0")} here), '
+                'namespace and remappings')
+        self._subscribe()
+        self._now_ns = START_NS
         self._sent = self._answered = 0
         self._answers.clear()
         self.covariance = None
         return self
 
+    def _subscribe(self) -> None:
+        """Read the attitudes with the reliability and durability that they are offered with."""
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+        offered = [one.qos_profile for one in self._node.get_publishers_info_by_topic(
+            self._node.resolve_topic_name(self._topic))]
+        self._reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offered)
+        self._subscription = self._node.create_subscription(Imu, self._topic, self._take, QoSProfile(
+            depth=100, reliability=ReliabilityPolicy.RELIABLE if self._reliable
+            else ReliabilityPolicy.BEST_EFFORT))
+        self._reliable &= all(
+            one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in
+            self._node.get_subscriptions_info_by_topic(self._node.resolve_topic_name(IMU_TOPIC)))
+
+    def _check_alone(self) -> None:
+        """Raise NodeError if another node publishes on a topic of the exam."""
+        for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
+            if (count := self._node.count_publishers(name)) > 1:
+                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
+                                'needs the topic alone')
+
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
         """Publish the readings, and wait for the attitude with their stamp."""
         self._now_ns += round(dt * NANOSECONDS)
+        if self._sent % ALONE_EVERY == 0:
+            self._check_alone()
         self._sent += 1
         clock, imu = Clock(), Imu()
         clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
@@ -139,19 +169,16 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
                                (field.magnetic_field, magnetometer)):
             if values is not None:
                 vector.x, vector.y, vector.z = values.tolist()
-        self._clock.publish(clock)
-        if magnetometer is not None:
-            self._field.publish(field)
-        self._imu.publish(imu)
-        patience = PATIENCE_S if self._answered else FIRST_PATIENCE_S
-        if not self._wait(lambda: self._now_ns in self._answers, patience):
-            if self._command is None and not self.is_there():
-                raise NodeError(f'the node that reads {IMU_TOPIC} and publishes {self._topic} '
-                                'has gone')
-            if self._answered or self._sent > UNANSWERED:
-                raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
-                                   f'sample within {patience:g} s')
-            return np.array((0.0, 0.0, 0.0, 1.0))
+
+        def publish() -> None:
+            self._clock.publish(clock)
+            if magnetometer is not None:
+                self._field.publish(field)
+            self._imu.publish(imu)
+
+        publish()
+        if not self._is_answered(publish):
+            return NOWHERE
         self._answered += 1
         message = self._answers.pop(self._now_ns)
         self._answers.clear()
@@ -159,6 +186,28 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
         q = message.orientation
         return np.array((q.x, q.y, q.z, q.w))
+
+    def _is_answered(self, publish: Callable[[], None]) -> bool:
+        """Wait for the answer; until there has been one, publish again: it may not be matched."""
+        def there() -> bool:
+            return self._now_ns in self._answers
+
+        if self._answered:
+            if self._wait(there, ANSWER_S):
+                return True
+            self._check_alone()
+            if not self._reliable:
+                raise LostError
+            raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
+                               f'sample within {ANSWER_S:g} s')
+        # The first one may come before the node is matched; some nodes do not answer it.
+        for _ in range(TIMES if self._sent == 1 else 1):
+            if self._wait(there, AGAIN_S):
+                return True
+            publish()
+        if self._sent >= UNANSWERED:
+            raise RuntimeError(f'it answers none of its first {self._sent} samples')
+        return False
 
     def is_there(self) -> bool:
         """Return whether a node reads the samples, and one publishes the attitudes."""

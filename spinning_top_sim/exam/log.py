@@ -2,8 +2,8 @@
 """
 The exam of a log: attitudes that a node has published, compared with the truth.
 
-The filter cannot get the readings again, so only the attitudes are judged: misreadings of them,
-wrong stamps, the covariance and divergence.
+The filter cannot get the readings again, so only the attitudes are judged: their convention,
+wrong stamps, the covariance and gross errors.
 """
 
 import itertools
@@ -16,24 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from spinning_top_sim.exam import diagnosis, hypotheses
-from spinning_top_sim.exam.diagnosis import degrees
-from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.scenarios import Reals, Run
-from spinning_top_sim.exam.trial import Outcome, invalid
+from spinning_top_sim.exam.feeding import Outcome, invalid
+from spinning_top_sim.exam.measures import consistency, degrees, errors_of, time_offset
+from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader, LogTopic
+from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
+from spinning_top_sim.tools.identify import rms
 from spinning_top_sim.tools.recorded_run import ForeignLogError, read_run_description
-from spinning_top_sim.tools.verdict import Fault
+from spinning_top_sim.tools.report import Finding, Mark, Report
 
 # The first of these topics in the log is the truth.  An Imu is about the sensor, the others are
 # about the body.
 TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
 ODOMETRY_OF_SENSOR = 'ground_truth/imu_odom'
 LONGEST_GAP_S = 0.1             # of the truth, across which it is interpolated
-GROSS = np.radians(3.0)         # a smaller error is no misreading
+GROSS, USELESS = np.radians((3.0, 10.0))    # errors that are a convention; that are a fault
+LATE, EARLY = 0.75, -1.5        # steps; a node may predict by one
+THINNED = 10                    # every so many attitudes are compared in all conventions
 FEWEST = 100                    # attitudes in a log that can be judged
 
 
@@ -74,8 +76,8 @@ def examine_log(path: str | Path, topic: str, truth: str | None = None,
         turns = _of_sensor(true_topic, true, _places(reader), north)
     subject = one_line(f'{topic} of {Path(path).name}')
     for k, why in invalid(estimates.quaternions, estimates.covariances):
-        return Report(subject, [Fault('invalid_output', f'the message of '
-                                      f'{estimates.stamps_ns[k] * 1e-9:.9f} s: {why}')], {})
+        return Report(subject, [Finding('invalid_output', f'the message of '
+                                        f'{estimates.stamps_ns[k] * 1e-9:.9f} s: {why}')])
     outcome = _beside(one_line(topic), estimates, true.stamps_ns, turns)
     return _judge(subject, outcome, north is not None)
 
@@ -165,30 +167,49 @@ def _beside(name: str, said: Stamped, true_ns: NDArray[np.int64], turns: Rotatio
     rates = np.stack([np.interp(t, middle, column) for column in step.T], axis=1)
     # The period of the filter, which may be shorter than that of the truth.
     dt = np.full(len(t), float(np.median(np.diff(said.stamps_ns))) * 1e-9)
-    readings = np.full((3, len(t), 3), np.nan)          # nothing asks for them
-    return Outcome(Run(name, t - t[0], dt, Slerp(times, turns)(t).as_quat(), rates, *readings),
+    readings = np.full((2, len(t), 3), np.nan)          # nothing asks for them
+    return Outcome(Run(name, dt, Slerp(times, turns)(t).as_quat(), rates, *readings),
                    said.quaternions[chosen], said.covariances[chosen],
                    np.full((len(t), 3), np.nan))
 
 
 def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
-    settled, found = outcome.last(), None
-    before = diagnosis.error_of(settled, absolute)
-    after, best = min(((diagnosis.error_of(replace(
-        settled, estimates=one.on_attitudes(settled.estimates)), absolute), one)
-        for one in hypotheses.MISREADINGS), key=lambda pair: pair[0])
-    if before > GROSS and after < diagnosis.EXPLAINED * before:
-        found = hypotheses.ambiguous(best._replace(
-            text=f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
-            'measures are those after this correction'), absolute)
-    corrected = outcome if found is None else replace(
-        outcome, estimates=found.on_attitudes(outcome.estimates))
-    offset = diagnosis.offset_of(corrected.last(), absolute)
-    consistency = diagnosis.consistency([corrected], absolute)
-    faults = [Fault(name, found.text) for name in found.faults] if found else []
-    faults += filter(None, [diagnosis.stamp_fault(offset, float(outcome.run.dt[0]))])
-    faults = faults or [*filter(None, (diagnosis.inaccuracy(outcome, absolute),
-                                       diagnosis.covariance_fault(consistency)))][:1]
-    measured = {**diagnosis.error_measures([corrected], absolute),
-                'stamp_offset_s': offset.seconds, **diagnosis.nees_measures(consistency)}
-    return Report(subject, faults, measured, [corrected])
+    """Find the convention, the delay, and what is left."""
+    heading = 'absolute' if absolute else 'steady'
+    half = slice(len(outcome.run.dt) // 2, None)
+    settled = outcome.part(half)
+    best = conventions.best(settled.estimates[::THINNED], settled.run.truth[::THINNED], heading)
+    findings, name = [], best.convention.name
+    if name and best.before > GROSS and best.after < 0.25 * best.before:
+        findings.append(Finding(
+            'convention', f'read as {name}, the error falls from {degrees(best.before)} to '
+            f'{degrees(best.after)}; all measures are those after this correction'))
+        outcome = replace(outcome, estimates=best.convention.undo(outcome.estimates))
+        settled = outcome.part(half)
+    offset = time_offset(settled.estimates, settled.run.truth, settled.run.gyroscope, absolute)
+    late = offset.seconds / float(outcome.run.dt[0])
+    if (late > LATE or late < EARLY) and offset.after < 0.25 * offset.before:
+        findings.append(Finding(
+            'timing', f'the attitude is {abs(1e3 * offset.seconds):.3g} ms '
+            f'{"behind" if late > 0.0 else "ahead of"} its stamp: shifted by that, the error '
+            f'falls from {degrees(offset.before)} to {degrees(offset.after)}', offset.seconds))
+    errors = errors_of(settled.estimates, settled.run.truth)
+    heading_error = errors.varying_heading(absolute)
+    value = rms(np.hypot(errors.tilt, heading_error))
+    if not findings and value > USELESS:
+        findings.append(Finding('accuracy', f'the error is {degrees(value)} rms in the second '
+                                'half', math.degrees(value)))
+    marks = {'tilt_rms_deg': Mark(math.degrees(rms(errors.tilt)), meaning='in the second half'),
+             'heading_rms_deg': Mark(math.degrees(rms(heading_error))),
+             'error_rms_deg': Mark(math.degrees(value), math.degrees(USELESS)),
+             'stamp_offset_s': Mark(offset.seconds, meaning='> 0: late')}
+    for what, whole in (('tilt', False), ('attitude', True))[:1 + absolute]:
+        if nees := consistency([outcome], whole):
+            low, high = nees.band
+            text = f'right from {low:.3g} to {high:.3g}'
+            marks[f'nees_{what}'] = Mark(nees.ratio, meaning=text)
+            if not findings and not low <= nees.ratio <= high:
+                findings.append(Finding('covariance', f'the squared error of the {what} is '
+                                        f'{nees.ratio:.3g} times what the covariance says; {text}',
+                                        nees.ratio))
+    return Report(subject, findings, marks, (), [outcome])

@@ -67,6 +67,14 @@ class Convention:
         return ours
 
 
+    def tell(self, ours: Reals) -> Reals:
+        """Return attitudes (n, 4) as they are told; the inverse of `undo`."""
+        q = Rotation.from_quat(self.world) * Rotation.from_quat(ours) * Rotation.from_quat(
+            self.sensor)
+        told: Reals = (q.inv() if self.conjugate else q).as_quat()
+        return told[:, [3, 0, 1, 2]] if self.w_first else told
+
+
 @dataclass(frozen=True)
 class Found:
     """The best convention, and the rms errors [rad] of the attitudes read in ours and in it."""
@@ -80,21 +88,26 @@ def group(worlds: Iterable[str] = WORLDS, most: int = 3) -> list[Convention]:
     """Return the conventions with at most so many parts, those with the fewest first."""
     lefts = [((), Rotation.identity()), *(((f'world {name}',), Rotation.from_matrix(
         [_DIRECTIONS[word] for word in name.split('-')])) for name in worlds)]
-    rights = sorted(((() if turn.magnitude() < SAME else (f'sensor axes {axes(turn)}',), turn)
-                     for turn in TURNS), key=lambda one: len(one[0]))
+    rights = [(() if turn.magnitude() < SAME else (f'sensor axes {axes(turn.as_matrix())}',), turn)
+              for turn in TURNS]
     found = []
     for (said, left), (felt, right), w_first, conjugate in itertools.product(
             lefts, rights, (False, True), (False, True)):
         parts = (('w, x, y, z',) * w_first + ('conjugated',) * conjugate + said + felt)
         if len(parts) <= most:
             found.append(Convention(w_first, conjugate, left.as_quat(), right.as_quat(), parts))
+    # Other axes of world and sensor at once are another order or sign of the vector part.
+    for turn, w_first, conjugate in itertools.product(TURNS, (False, True), (False, True)):
+        matrix = turn.as_matrix() * (-1.0 if conjugate else 1.0)
+        parts = ('w, x, y, z',) * w_first + (f'vector part {axes(matrix)}',)
+        found.append(Convention(w_first, conjugate, turn.as_quat(), turn.inv().as_quat(), parts))
     return sorted(found, key=lambda one: len(one.parts))
 
 
-def axes(turn: Rotation) -> str:
+def axes(matrix: Any) -> str:
     """Return a signed permutation in words: which of our axes their x, y, z are."""
     return ', '.join(f'{"-" if row.sum() < 0.0 else ""}{AXES[int(np.argmax(np.abs(row)))]}'
-                     for row in turn.as_matrix())
+                     for row in matrix)
 
 
 def best(told: Reals, truth: Reals, heading: str = 'absolute',

@@ -1,24 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Feeds a filter with the readings of a run, and checks what it returns."""
+"""Feeds a filter with the readings of runs, and checks what it returns."""
 
+import contextlib
 import math
+import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spinning_top_sim.exam.hypotheses import Hypothesis
-from spinning_top_sim.exam.measures import Errors, errors_of
-from spinning_top_sim.exam.scenarios import Reals, Run
+from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.tools.cli import one_line
 
-# Covariance and bias are read after every tenth update.
-READ_EVERY = 10
-NORM_TOLERANCE = 1e-3
-ASYMMETRIC = 0.01               # difference of a covariance from its transpose, relative
+READ_EVERY = 10                 # updates after which covariance and bias are read
+NORM_TOLERANCE = 1e-3           # of a quaternion: some filters normalise to first order
+ASYMMETRIC = 0.01               # relative difference of a covariance from its transpose
+# The longest time that runs may take, and that they may take in addition for each update [s].
+LONGEST_S, UPDATE_S = 10.0, 0.01
 INTERRUPTED = threading.Event()     # ends the exam of a node; rclpy loses KeyboardInterrupts
 
 
@@ -39,7 +43,7 @@ class Filter(Protocol):
         Parameters
         ----------
         gyroscope : (3,) array
-            Mean angular velocity over the step [rad/s].
+            Rotation of the step over its length [rad/s].
         accelerometer : (3,) array
             Specific force at its end [m/s^2], +g upwards at rest.
         magnetometer : (3,) array or None
@@ -65,84 +69,108 @@ class NodeError(RuntimeError):
     """A node cannot be examined: this ends the exam, any other error is a fault of the node."""
 
 
-# Attitudes, covariances and biases as in `Outcome`.
-Output = tuple[Reals, Reals, Reals]
-# Feeds a new filter.
-Feed = Callable[[MakeFilter, Run], Output]
-
-
 @dataclass(frozen=True)
 class Outcome:
-    """Output of a filter along a motion."""
+    """What a filter has said along a run."""
 
     run: Run
-    estimates: Reals        # unit quaternions q(world <- sensor) (n, 4)
+    estimates: Reals        # unit quaternions as the filter tells them (n, 4)
     covariances: Reals      # (n, 3, 3) [rad^2], NaN where unknown
     biases: Reals           # (n, 3) [rad/s], NaN where unknown
-
-    @property
-    def errors(self) -> Errors:
-        """Tilt and heading errors [rad]."""
-        return errors_of(self.estimates, self.run.truth)
 
     def part(self, rows: slice | NDArray[np.intp]) -> 'Outcome':
         """Return the outcome at these samples only."""
         return Outcome(self.run.part(rows), self.estimates[rows], self.covariances[rows],
                        self.biases[rows])
 
-    def last(self, fraction: float = 0.5) -> 'Outcome':
-        """Return the last part; by default the second half, in which the filter has settled."""
-        return self.part(slice(round(len(self.estimates) * (1.0 - fraction)), None))
+
+# Feeds a new filter with each run.
+Feed = Callable[[MakeFilter, Sequence[Run]], list[Outcome]]
 
 
-def feed(make_filter: MakeFilter, run: Run) -> Output:
-    """Return the output of a new filter.  Raises InvalidOutputError if it fails."""
+def feed(make_filter: MakeFilter, runs: Sequence[Run]) -> list[Outcome]:
+    """Return the outcomes of new filters, one for each run.  Raises InvalidOutputError."""
+    return [_feed(make_filter, run) for run in runs]
+
+
+def _feed(make_filter: MakeFilter, run: Run) -> Outcome:
     k, n = 0, len(run.dt)
     attitudes = np.empty((n, 4))
     covariances, biases = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
     # Copies, because the filter may keep or change its arguments.
     gyroscope, accelerometer = run.gyroscope.copy(), run.accelerometer.copy()
     fields = [None] * n if np.isnan(run.magnetometer[0, 0]) else run.magnetometer.copy()
+    filter_: Any = None
     try:
         filter_ = make_filter()
         for k, (rate, force, field, dt) in enumerate(zip(
                 gyroscope, accelerometer, fields, run.dt.tolist(), strict=True), start=1):
-            attitudes[k - 1] = _numbers(
-                f'update {k} returns', filter_.update(rate, force, field, dt), (4,))
+            attitudes[k - 1] = _numbers('update returns', filter_.update(rate, force, field, dt),
+                                        (4,))
             for name, rows in (('covariance', covariances), ('bias', biases)):
                 said = getattr(filter_, name, None) if k % READ_EVERY == 0 else None
                 if said is not None:
                     rows[k - 1] = _numbers(f'{name} is', said, rows.shape[1:])
-    except (InvalidOutputError, NodeError):
+    except NodeError:
         raise
+    except InvalidOutputError as error:
+        where = f', update {k} of {n}' if k else ''
+        raise InvalidOutputError(f'{run.name}{where}: {error}') from error
     except (Exception, SystemExit) as error:
         where = f'update {k} of {n}' if k else 'making the filter'
-        raise InvalidOutputError(
-            f'{where} raises {type(error).__name__}: {one_line(error)}') from error
+        raise InvalidOutputError(f'{run.name}, {where} raises {type(error).__name__}: '
+                                 f'{one_line(error)}') from error
+    finally:
+        if isinstance(filter_, contextlib.AbstractContextManager):
+            filter_.__exit__(None, None, None)
     covariances[~np.any(covariances, axis=(1, 2))] = np.nan     # in ROS, zeros mean unknown
     for k, why in invalid(attitudes, covariances):
-        raise InvalidOutputError(f'update {k + 1}: {why}')
+        raise InvalidOutputError(f'{run.name}, update {k + 1} of {n}: {why}')
     attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
-    return attitudes, covariances, biases
+    return Outcome(run, attitudes, covariances, biases)
 
 
-def follow(make_filter: MakeFilter, run: Run, undone: Sequence[Hypothesis] = (),
-           feed: Feed = feed) -> Outcome:
+def feed_apart(make_filter: MakeFilter, runs: Sequence[Run]) -> list[Outcome]:
     """
-    Return the outcome of a run that is fed to a new filter.  Raises InvalidOutputError.
+    Do as `feed` in a fork of this process, so that hanging or crashing harms nothing else.
 
-    undone : hypotheses that are inverted; the readings are changed in this order
+    Raises InvalidOutputError for a filter that crashes or never returns, too.
     """
-    fed = run
-    for one in undone:
-        fed = one.on_readings(fed) if one.on_readings else fed
+    context = get_context('fork')
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_serve, args=(make_filter, runs, sender))
+    with warnings.catch_warnings():
+        # The fork runs the filter only, and needs no other thread.
+        warnings.simplefilter('ignore', DeprecationWarning)
+        process.start()
+    sender.close()
+    updates = sum(len(run.dt) for run in runs)
+    patience = LONGEST_S + UPDATE_S * updates
     try:
-        estimates, covariances, biases = feed(make_filter, fed)
+        if not receiver.poll(patience):
+            raise InvalidOutputError(f'{runs[0].name}: {updates} updates take more than '
+                                     f'{patience:g} s')
+        with contextlib.suppress(EOFError):
+            output: list[Outcome] | Exception = receiver.recv()
+            if isinstance(output, Exception):
+                raise output
+            return output
+        process.join()
+        code = process.exitcode or 0
+        how = signal.strsignal(-code) if code < 0 else f'exit code {code}'
+        raise InvalidOutputError(f'{runs[0].name}: the filter ends the process: {how}')
+    finally:
+        process.kill()
+        process.join()
+        receiver.close()
+
+
+def _serve(make_filter: MakeFilter, runs: Sequence[Run], sender: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)        # no traceback after Ctrl-C
+    try:
+        sender.send(feed(make_filter, runs))
     except InvalidOutputError as error:
-        raise InvalidOutputError(f'{run.name}: {error}') from error
-    for one in reversed(undone):
-        estimates = one.on_attitudes(estimates)
-    return Outcome(run, estimates, covariances, biases)
+        sender.send(error)
 
 
 def invalid(quaternions: Reals, covariances: Reals) -> Iterator[tuple[int, str]]:

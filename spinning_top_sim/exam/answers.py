@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How a filter answers small changes of its inputs: what it does with them, by least squares.
+
+A kick is a turn that the gyroscope alone reads, in one step of a rest.  The difference of the
+attitudes with and without it is the filter's answer: at once by its use of the rates, later by
+that of the other sensors, which lead it back.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam.feeding import Outcome
+from spinning_top_sim.exam.measures import increments
+from spinning_top_sim.exam.motions import RATE, REST_S, Motion, Reals, Run
+from spinning_top_sim.tools.identify import in_words
+
+SMALL, LARGE = 0.1, 0.3         # kicks [rad]; the large one shows how a step is integrated
+# Where they are in the last REST_S of a rest, and the longest delay of an answer [samples].
+AT, LATEST = 40, 30
+EARLY = 4           # step of a kick at the start
+LEAST = 1e-6        # share of an error that is corrected, if any
+SETTLED = 800       # uneven steps after which a filter has settled from its start
+
+
+class Kick(NamedTuple):
+    """A turn of the gyroscope alone (3,) [rad] at a sample."""
+
+    sample: int
+    turn: Reals
+
+
+class Rates(NamedTuple):
+    """
+    How turns of the sensor move the attitude.
+
+    matrix : of a turn in axes of the sensor (3, 3); the identity if right
+    off : deviation of an answer over its kick, the median
+    left : the same from this matrix
+    in_world : whether it is one in axes of the world
+    delay : of the answer, in samples; negative: ahead
+    corrects : whether the other sensors have taken something away in the same step
+    lost : the share that they take away in a step
+    """
+
+    matrix: Reals
+    off: float
+    left: float
+    in_world: bool
+    delay: float
+    corrects: bool
+    lost: float
+
+    @property
+    def off_identity(self) -> float:
+        """The largest deviation of an entry of the matrix from the identity."""
+        return float(np.max(np.abs(self.matrix - np.eye(3)))) if not self.in_world else 1.0
+
+    def __str__(self) -> str:
+        text = in_words(self.matrix, 'turns the attitude about')
+        return f'a rate about {text}' + (', axes of the world' if self.in_world else '')
+
+
+def kicks_of(motion: Motion, size: float) -> list[Kick]:
+    """Return a kick of this size [rad] in each rest but the first."""
+    kicks = []
+    for k, part in enumerate(motion.of('rest')[1:]):
+        signs = 1.0 - 2.0 * np.array((k & 1, k >> 1 & 1, k >> 2 & 1))
+        # The large ones are about no axis, so that it matters whether axes are turned in turn.
+        turn = (0.36, 0.48, 0.8) if size > SMALL else np.eye(3)[k % 3]
+        kicks.append(Kick(part.end - round(REST_S * RATE) + AT, size * signs * turn))
+    return kicks
+
+
+def with_kicks(run: Run, kicks: Sequence[Kick]) -> Run:
+    """Return the run with kicks."""
+    gyroscope = run.gyroscope.copy()
+    for kick in kicks:
+        gyroscope[kick.sample] += kick.turn / run.dt[kick.sample]
+    return replace(run, name=f'{run.name}, kicks', gyroscope=gyroscope)
+
+
+def rates(kicks: Sequence[Kick], still: Reals, moved: Reals,
+          corrects: bool | None = None) -> Rates:
+    """
+    Identify the use of the rates from attitudes (n, 4) without and with kicks.
+
+    corrects : as of `Rates`; None: what makes them better
+    """
+    apart = increments(moved) - increments(still)
+    # Without what goes on from the kick before.
+    answers = np.array([apart[one.sample:one.sample + LATEST + 3] - apart[one.sample - 1]
+                        for one in kicks])          # (kicks, samples, 3)
+    turns = np.array([one.turn for one in kicks])
+    moves = np.cumsum(answers, axis=1)
+    size = np.linalg.norm(moves, axis=2).mean(axis=0)
+    whole = int(np.argmax(size[:LATEST] >= 0.97 * np.max(size[:LATEST])))
+    # An attitude that is predicted goes too far at first, and back at once.
+    back = size[whole] - size[whole + 1]
+    if back > 0.25 * size[whole] and abs(size[whole + 1] - size[whole + 2]) < 0.2 * back:
+        whole += 1
+    delay = float(np.sum(1.0 - size[:whole] / max(size[whole], 1e-300)))
+    found = moves[:, whole]
+    lost = Rotation.from_rotvec(2.0 * answers[:, 1] - answers[:, 2])
+    whole_turn = (Rotation.from_rotvec(found) * lost.inv()).as_rotvec()
+    if corrects is None:
+        corrects = not whole and bool(np.median(_off(whole_turn, turns))
+                                      < np.median(_off(found, turns)))
+    found = whole_turn if corrects else found
+    share = float(np.median(np.linalg.norm(answers[:, 1], axis=1)
+                            / np.linalg.norm(turns, axis=1)))
+    off = float(np.median(_off(found, turns)))
+    matrix, left = _fit(found, turns)
+    world = Rotation.from_quat(moved[[one.sample for one in kicks]])
+    of_world, left_of_world = _fit(world.apply(found), turns)
+    if in_world := left_of_world < 0.3 * left:
+        matrix, left = of_world, left_of_world
+    return Rates(matrix, off, left, in_world, delay, corrects, share)
+
+
+def _off(answers: Reals, turns: Reals) -> Reals:
+    off: Reals = np.linalg.norm(answers - turns, axis=1) / np.linalg.norm(turns, axis=1)
+    return off
+
+
+def _fit(answers: Reals, turns: Reals) -> tuple[Reals, float]:
+    """Return the matrix from turns to answers, and the median deviation from it over a turn."""
+    matrix: Reals = np.linalg.lstsq(turns, answers, rcond=None)[0].T
+    return matrix, float(np.median(_off(answers - turns @ matrix.T + turns, turns)))
+
+
+def gains_of_steps(run: Run, kicks: Sequence[Kick], still: Reals, moved: Reals,
+                   ) -> dict[float, float]:
+    """Return for each length of a step [s] how far a turn in it moves the attitude, relative."""
+    apart = increments(moved) - increments(still)
+    found: dict[float, list[float]] = {}
+    for kick in kicks:
+        size = float(kick.turn @ kick.turn)
+        first, second = (float(apart[kick.sample + k] @ kick.turn) / size for k in (0, 1))
+        # With what the other sensors take away in the same step, if they do.
+        lost = -second / (first or 1.0) / run.dt[kick.sample + 1] * run.dt[kick.sample]
+        gain = min(first, first / (1.0 - np.clip(lost, 0.0, 0.5)), key=lambda one: abs(one - 1.0))
+        found.setdefault(round(float(run.dt[kick.sample]), 6), []).append(gain)
+    return {length: float(np.median(gains)) for length, gains in sorted(found.items())}
+
+
+def kicks_of_steps(run: Run) -> list[Kick]:
+    """Return kicks in uneven steps, one in a step of each length about each axis."""
+    lengths = run.dt.round(6)
+    kicks, k = [], SETTLED
+    for axis, length in [(axis, length) for axis in range(3) for length in np.unique(lengths)]:
+        k += int(np.argmax(lengths[k:] == length))
+        kicks.append(Kick(k, SMALL * np.eye(3)[axis]))
+        k += 8
+    return kicks
+
+
+def kicked_start(run: Run, axis: Sequence[float]) -> Run:
+    """Return a run with a kick about an axis of the world in an early step."""
+    return with_kicks(run, [Kick(EARLY, SMALL * Rotation.from_quat(run.truth[0]).inv().apply(
+        axis))])
+
+
+def pull(outcomes: Sequence[Outcome], axes: slice) -> float:
+    """
+    Return where filters go after a kick at the start, in rests in many attitudes.
+
+    axes : of the error in the world: the tilt, or the heading
+
+    It is the cosine of the angle between this way and that to the truth, in the mean: 1 if right,
+    0 if a filter does not go.
+    """
+    errors = np.array([(Rotation.from_quat(one.estimates) * Rotation.from_quat(
+        one.run.truth).inv()).as_rotvec()[[EARLY, -1], axes] for one in outcomes])
+    first, way = errors[:, 0], errors[:, 1] - errors[:, 0]
+    size, length = np.linalg.norm(first, axis=1), np.linalg.norm(way, axis=1)
+    cosines = -np.sum(first * way, axis=1) / np.maximum(size * length, 1e-300)
+    return float(np.mean(np.where(length > LEAST * size, cosines, 0.0)))
