@@ -6,13 +6,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-from helpers.faulty_filters import Misreading
+from helpers.wrong_filters import Part, Vqf, product
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import examine, field
-from spinning_top_sim.exam.adapters import Vqf
-from spinning_top_sim.exam.reference import product
-from spinning_top_sim.exam.scenarios import GRAVITY
+from spinning_top_sim.exam import examine
+from spinning_top_sim.exam import scenes as field
+from spinning_top_sim.exam.motions import GRAVITY
 from spinning_top_sim.streams.parameters import IDENTITY
 
 pytest.importorskip('vqf')

@@ -3,8 +3,9 @@
 How a filter answers small changes of its inputs: what it does with them, by least squares.
 
 A kick is a turn that the gyroscope alone reads, in one step of a rest.  The difference of the
-attitudes with and without it is the filter's answer: at once by its use of the rates, later by
-that of the other sensors, which lead it back.
+attitudes with and without it is the filter's answer.  Without a field, nothing but the gyroscope
+shows a kick about the vertical: the answer is the filter's use of the rates, in axes of the sensor
+that differ from start to start.  After other kicks, gravity or the field leads it back.
 """
 
 from collections.abc import Sequence
@@ -16,15 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import increments
-from spinning_top_sim.exam.motions import RATE, REST_S, Motion, Reals, Run
+from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.tools.identify import in_words
 
 SMALL, LARGE = 0.1, 0.3         # kicks [rad]; the large one shows how a step is integrated
-# Where they are in the last REST_S of a rest, and the longest delay of an answer [samples].
-AT, LATEST = 40, 30
-EARLY = 4           # step of a kick at the start
-LEAST = 1e-6        # share of an error that is corrected, if any
-SETTLED = 800       # uneven steps after which a filter has settled from its start
+EARLY, LATEST = 4, 30           # step of a kick at the start, and longest delay of its answer
+LEAST = 1e-6                    # share of an error that is corrected, if any
+SETTLED = 800                   # uneven steps after which a filter has settled from its start
 
 
 class Kick(NamedTuple):
@@ -39,21 +38,15 @@ class Rates(NamedTuple):
     How turns of the sensor move the attitude.
 
     matrix : of a turn in axes of the sensor (3, 3); the identity if right
-    off : deviation of an answer over its kick, the median
-    left : the same from this matrix
+    left : deviation of an answer from this matrix over its kick, the median
     in_world : whether it is one in axes of the world
     delay : of the answer, in samples; negative: ahead
-    corrects : whether the other sensors have taken something away in the same step
-    lost : the share that they take away in a step
     """
 
     matrix: Reals
-    off: float
     left: float
     in_world: bool
     delay: float
-    corrects: bool
-    lost: float
 
     @property
     def off_identity(self) -> float:
@@ -65,17 +58,6 @@ class Rates(NamedTuple):
         return f'a rate about {text}' + (', axes of the world' if self.in_world else '')
 
 
-def kicks_of(motion: Motion, size: float) -> list[Kick]:
-    """Return a kick of this size [rad] in each rest but the first."""
-    kicks = []
-    for k, part in enumerate(motion.of('rest')[1:]):
-        signs = 1.0 - 2.0 * np.array((k & 1, k >> 1 & 1, k >> 2 & 1))
-        # The large ones are about no axis, so that it matters whether axes are turned in turn.
-        turn = (0.36, 0.48, 0.8) if size > SMALL else np.eye(3)[k % 3]
-        kicks.append(Kick(part.end - round(REST_S * RATE) + AT, size * signs * turn))
-    return kicks
-
-
 def with_kicks(run: Run, kicks: Sequence[Kick]) -> Run:
     """Return the run with kicks."""
     gyroscope = run.gyroscope.copy()
@@ -84,42 +66,40 @@ def with_kicks(run: Run, kicks: Sequence[Kick]) -> Run:
     return replace(run, name=f'{run.name}, kicks', gyroscope=gyroscope)
 
 
-def rates(kicks: Sequence[Kick], still: Reals, moved: Reals,
-          corrects: bool | None = None) -> Rates:
-    """
-    Identify the use of the rates from attitudes (n, 4) without and with kicks.
-
-    corrects : as of `Rates`; None: what makes them better
-    """
-    apart = increments(moved) - increments(still)
-    # Without what goes on from the kick before.
-    answers = np.array([apart[one.sample:one.sample + LATEST + 3] - apart[one.sample - 1]
-                        for one in kicks])          # (kicks, samples, 3)
-    turns = np.array([one.turn for one in kicks])
-    moves = np.cumsum(answers, axis=1)
-    size = np.linalg.norm(moves, axis=2).mean(axis=0)
-    whole = int(np.argmax(size[:LATEST] >= 0.97 * np.max(size[:LATEST])))
+def rates(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Rates:
+    """Identify the use of the rates from starts without and with kicks about the vertical."""
+    apart = np.array([increments(other.estimates) - increments(one.estimates)
+                      for one, other in zip(still, moved, strict=True)])[:, EARLY:]
+    turns = _turns(still, moved)
+    moves = np.cumsum(apart, axis=1)                # (starts, samples, 3)
+    size = np.median(np.linalg.norm(moves, axis=2), axis=0)
+    # At once, or when it is greatest: an unstable filter goes on.
+    whole = 0 if abs(size[0] / np.linalg.norm(turns[0]) - 1.0) < 0.1 else int(
+        np.argmax(size[:LATEST] >= 0.97 * np.max(size[:LATEST])))
     # An attitude that is predicted goes too far at first, and back at once.
     back = size[whole] - size[whole + 1]
     if back > 0.25 * size[whole] and abs(size[whole + 1] - size[whole + 2]) < 0.2 * back:
         whole += 1
     delay = float(np.sum(1.0 - size[:whole] / max(size[whole], 1e-300)))
-    found = moves[:, whole]
-    lost = Rotation.from_rotvec(2.0 * answers[:, 1] - answers[:, 2])
-    whole_turn = (Rotation.from_rotvec(found) * lost.inv()).as_rotvec()
-    if corrects is None:
-        corrects = not whole and bool(np.median(_off(whole_turn, turns))
-                                      < np.median(_off(found, turns)))
-    found = whole_turn if corrects else found
-    share = float(np.median(np.linalg.norm(answers[:, 1], axis=1)
-                            / np.linalg.norm(turns, axis=1)))
-    off = float(np.median(_off(found, turns)))
-    matrix, left = _fit(found, turns)
-    world = Rotation.from_quat(moved[[one.sample for one in kicks]])
-    of_world, left_of_world = _fit(world.apply(found), turns)
-    if in_world := left_of_world < 0.3 * left:
+    matrix, left = _fit(moves[:, whole], turns)
+    world = Rotation.from_quat([one.estimates[EARLY] for one in moved])
+    of_world, left_of_world = _fit(world.apply(moves[:, whole]), turns)
+    if in_world := left_of_world < 0.3 * left and left > 0.1:
         matrix, left = of_world, left_of_world
-    return Rates(matrix, off, left, in_world, delay, corrects, share)
+    return Rates(matrix, left, in_world, delay)
+
+
+def _turns(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Reals:
+    """Return the kicks (n, 3) [rad]."""
+    return np.array([(other.run.gyroscope - one.run.gyroscope)[EARLY] * one.run.dt[EARLY]
+                     for one, other in zip(still, moved, strict=True)])
+
+
+def off_rotation(still: Sequence[Outcome], moved: Sequence[Outcome]) -> float:
+    """Return how far the answers to kicks at the start are off them, relative, the median."""
+    found = [(increments(other.estimates) - increments(one.estimates))[EARLY]
+             for one, other in zip(still, moved, strict=True)]
+    return float(np.median(_off(np.array(found), _turns(still, moved))))
 
 
 def _off(answers: Reals, turns: Reals) -> Reals:
@@ -129,7 +109,7 @@ def _off(answers: Reals, turns: Reals) -> Reals:
 
 def _fit(answers: Reals, turns: Reals) -> tuple[Reals, float]:
     """Return the matrix from turns to answers, and the median deviation from it over a turn."""
-    matrix: Reals = np.linalg.lstsq(turns, answers, rcond=None)[0].T
+    matrix = np.asarray(np.linalg.lstsq(turns, answers, rcond=None)[0].T, dtype=np.float64)
     return matrix, float(np.median(_off(answers - turns @ matrix.T + turns, turns)))
 
 
@@ -159,10 +139,12 @@ def kicks_of_steps(run: Run) -> list[Kick]:
     return kicks
 
 
-def kicked_start(run: Run, axis: Sequence[float]) -> Run:
-    """Return a run with a kick about an axis of the world in an early step."""
-    return with_kicks(run, [Kick(EARLY, SMALL * Rotation.from_quat(run.truth[0]).inv().apply(
-        axis))])
+def kicked_starts(runs: Sequence[Run], axis: Sequence[float],
+                  size: float = SMALL) -> list[Run]:
+    """Return runs with a kick about an axis of the world in an early step, to and fro."""
+    turns = [Rotation.from_quat(run.truth[0]).inv().apply(axis) for run in runs]
+    return [with_kicks(run, [Kick(EARLY, size * (-1) ** k * turn)])
+            for k, (run, turn) in enumerate(zip(runs, turns, strict=True))]
 
 
 def pull(outcomes: Sequence[Outcome], axes: slice) -> float:

@@ -40,7 +40,8 @@ class Effect(NamedTuple):
 def effects(exam: 'Exam') -> tuple[Outcome, list[Effect]]:
     """Return the outcome with a bias, and its effects, in rests as long as the filter needs."""
     for seconds in RESTS_S:
-        motion = Motion(euler(NEAR)).rest(exam.lead_s).rest(seconds).turn(euler(X_UP)).rest(seconds)
+        motion = Motion(euler(NEAR)).rest(exam.lead_s).rest(seconds)
+        motion.turn(euler(X_UP)).rest(seconds)
         (lead, *rests), run = motion.of('rest'), motion.run('bias')
         rates = run.gyroscope.copy()
         rates[lead.end:] += BIAS
@@ -69,3 +70,8 @@ def _effect(axis: int, size: Reals) -> Effect:
                   last > before + MOVES * largest)
 
 
+def said_bias(outcome: Outcome) -> Reals:
+    """Return the last bias that a filter has told (3,) [rad/s], NaN if none."""
+    known = outcome.biases[np.isfinite(outcome.biases[:, 0])]
+    last: Reals = known[-1] if len(known) else np.full(3, np.nan)
+    return last

@@ -24,7 +24,7 @@ import contextlib
 import runpy
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,8 @@ from spinning_top_sim.tools import cli, scene_file
 from spinning_top_sim.tools.report import Report
 
 # What is examined, with the options that it needs and those that it may have.
-KINDS = {'log': (('topic',), ('truth', 'heading')), 'node': (('topic',), ('level', 'imu', 'seeds')),
+KINDS = {'log': (('topic',), ('truth', 'heading')),
+         'node': (('topic',), ('level', 'imu', 'seeds')),
          'filter': ((), ('level', 'imu', 'seeds', 'data')),
          'command': ((), ('level', 'imu', 'seeds', 'data'))}
 # With --data there is nothing to choose.
@@ -201,5 +202,6 @@ def _own_filter(given: str) -> Callable[[], Filter]:
     return made
 
 
-EXAMS = {'log': _of_log, 'node': _of_node, 'filter': _of_filter, 'command': _of_program}
+EXAMS: Mapping[str, Callable[..., Report]] = {
+    'log': _of_log, 'node': _of_node, 'filter': _of_filter, 'command': _of_program}
 main = partial(cli.run, 'examine', __doc__, add_arguments, _run)

@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, motions
 from spinning_top_sim.exam.checks import CHECKS
-from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter, Outcome
+from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter, Outcome, feed_apart
 from spinning_top_sim.exam.feeding import feed as feed_here
-from spinning_top_sim.exam.feeding import feed_apart
 from spinning_top_sim.exam.measures import Errors, errors_of
 from spinning_top_sim.exam.motions import NEAR, RATE, Motion, Run
 from spinning_top_sim.exam.scenes import examine_field
@@ -223,11 +222,6 @@ class Exam:
         return self.motion.run('excitation')
 
     @cached_property
-    def kicks(self) -> Sequence[answers.Kick]:
-        """The small kicks of the excitation."""
-        return answers.kicks_of(self.motion, answers.SMALL)
-
-    @cached_property
     def uneven(self) -> tuple[Run, Sequence[answers.Kick]]:
         """A rest in uneven steps without magnetometer, and kicks in it."""
         run = motions.uneven(1200).without_field()
@@ -279,20 +273,25 @@ def _begin(exam: Exam) -> list[Run]:
     return [replace(exam.run, name='force of the begin', accelerometer=force, magnetometer=field)]
 
 
+def _starts(axis: Sequence[float] | None, size: float = answers.SMALL) -> list[Run]:
+    """Return starts without a field, with kicks about an axis of the world."""
+    runs = [run.without_field() for run in motions.starts()]
+    return runs if axis is None else answers.kicked_starts(runs, axis, size)
+
+
+UPRIGHT = 0.0, 0.0, 1.0
 RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     'twice': lambda exam: 2 * [motions.noisy('twice', motions.CALIBRATED, 0, 1.0, 1.0)],
     'excitation': lambda exam: [exam.run],
     'force of the begin': _begin,
-    'small kicks': lambda exam: [answers.with_kicks(exam.run, exam.kicks)],
-    'large kicks': lambda exam: [answers.with_kicks(exam.run, answers.kicks_of(
-        exam.motion, answers.LARGE))],
     'field turned': _field_turned,
     'no field': lambda exam: [exam.run.without_field()],
     'steps': lambda exam: [exam.uneven[0], answers.with_kicks(*exam.uneven)],
-    'tilted starts': lambda exam: [answers.kicked_start(run.without_field(), (0.6, 0.8, 0.0))
-                                   for run in motions.starts()],
-    'turned starts': lambda exam: [answers.kicked_start(run, (0.0, 0.0, 1.0))
-                                   for run in motions.starts()],
+    'starts': lambda exam: _starts(None),
+    'turns': lambda exam: _starts(UPRIGHT),
+    'large turns': lambda exam: _starts(UPRIGHT, answers.LARGE),
+    'tilts': lambda exam: _starts((0.6, 0.8, 0.0)),
+    'turns with field': lambda exam: answers.kicked_starts(motions.starts(), UPRIGHT),
     'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM, ARM_AFTER_S)],
     'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
                                          NOISE_S) for seed in exam.seeds]}

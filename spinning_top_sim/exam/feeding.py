@@ -6,7 +6,7 @@ import math
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -28,7 +28,7 @@ INTERRUPTED = threading.Event()     # ends the exam of a node; rclpy loses Keybo
 
 class Filter(Protocol):
     """
-    An attitude filter as the exam uses it.
+    An attitude filter as the exam uses it; `examine` describes the arguments of `update`.
 
     It may also have `covariance` (3, 3), of the rotation vector from its attitude to the true one
     [rad^2], and `bias` (3,), of the gyroscope [rad/s].  The exam reads both after updates.  None,
@@ -37,25 +37,7 @@ class Filter(Protocol):
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> ArrayLike:
-        """
-        Take the readings of a step; return the attitude at its end.
-
-        Parameters
-        ----------
-        gyroscope : (3,) array
-            Rotation of the step over its length [rad/s].
-        accelerometer : (3,) array
-            Specific force at its end [m/s^2], +g upwards at rest.
-        magnetometer : (3,) array or None
-            Field at its end [T].
-        dt : float
-            Length of the step [s].
-
-        Returns
-        -------
-        (4,) array_like
-            q(world <- sensor) as x, y, z, w; x of the world is east, y north and z up.
-        """
+        """Take the readings of a step; return the attitude at its end."""
 
 
 MakeFilter = Callable[[], Filter]
@@ -124,8 +106,8 @@ def _feed(make_filter: MakeFilter, run: Run) -> Outcome:
         if isinstance(filter_, contextlib.AbstractContextManager):
             filter_.__exit__(None, None, None)
     covariances[~np.any(covariances, axis=(1, 2))] = np.nan     # in ROS, zeros mean unknown
-    for k, why in invalid(attitudes, covariances):
-        raise InvalidOutputError(f'{run.name}, update {k + 1} of {n}: {why}')
+    if (wrong := invalid(attitudes, covariances)) is not None:
+        raise InvalidOutputError(f'{run.name}, update {wrong[0] + 1} of {n}: {wrong[1]}')
     attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
     return Outcome(run, attitudes, covariances, biases)
 
@@ -173,22 +155,20 @@ def _serve(make_filter: MakeFilter, runs: Sequence[Run], sender: Connection) -> 
         sender.send(error)
 
 
-def invalid(quaternions: Reals, covariances: Reals) -> Iterator[tuple[int, str]]:
-    """Yield the first row of each (n, 4), (n, 3, 3) that is invalid, and why; NaN: unknown."""
+def invalid(quaternions: Reals, covariances: Reals) -> tuple[int, str] | None:
+    """Return the first row of (n, 4) or (n, 3, 3) that is invalid, and why; NaN: unknown."""
     with np.errstate(over='ignore'):
         norms = np.linalg.norm(quaternions, axis=1)
     for k in np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))[:1].tolist():
-        yield k, f'the quaternion is {quaternions[k].tolist()}: its norm must be 1'
-    finite = np.all(np.isfinite(covariances), axis=(1, 2))
-    wrong = ~finite & ~np.any(np.isnan(covariances), axis=(1, 2))
-    known, other = covariances[finite], np.swapaxes(covariances[finite], 1, 2)
-    eigenvalues = np.linalg.eigvalsh(0.5 * known + 0.5 * other)
-    largest = np.abs(eigenvalues).max(axis=1)
-    wrong[finite] = (eigenvalues[:, 0] < -1e-5 * largest) | (
-        np.max(np.abs(known - other), axis=(1, 2)) > ASYMMETRIC * largest)
-    for k in np.flatnonzero(wrong)[:1].tolist():
-        yield k, (f'the covariance is {covariances[k].tolist()}: must be symmetric and have no '
-                  'negative eigenvalue')
+        return k, f'the quaternion is {quaternions[k].tolist()}: its norm must be 1'
+    for k in np.flatnonzero(~np.all(np.isnan(covariances), axis=(1, 2))).tolist():
+        matrix = covariances[k]
+        size = float(np.max(np.abs(matrix)))
+        if not (np.isfinite(size) and np.max(np.abs(matrix - matrix.T)) <= ASYMMETRIC * size
+                and np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] >= -1e-5 * size):
+            return k, (f'the covariance is {matrix.tolist()}: must be symmetric and have no '
+                       'negative eigenvalue')
+    return None
 
 
 def _numbers(what: str, value: object, shape: tuple[int, ...]) -> Reals:

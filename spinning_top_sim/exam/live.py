@@ -138,9 +138,9 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         offered = [one.qos_profile for one in self._node.get_publishers_info_by_topic(
             self._node.resolve_topic_name(self._topic))]
         self._reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offered)
-        self._subscription = self._node.create_subscription(Imu, self._topic, self._take, QoSProfile(
-            depth=100, reliability=ReliabilityPolicy.RELIABLE if self._reliable
-            else ReliabilityPolicy.BEST_EFFORT))
+        profile = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE if self._reliable
+                             else ReliabilityPolicy.BEST_EFFORT)
+        self._subscription = self._node.create_subscription(Imu, self._topic, self._take, profile)
         self._reliable &= all(
             one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in
             self._node.get_subscriptions_info_by_topic(self._node.resolve_topic_name(IMU_TOPIC)))

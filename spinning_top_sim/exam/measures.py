@@ -13,7 +13,7 @@ from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.tools.identify import autocorrelation_time, rms
 
-SIGMAS, TOLERATED = 4.0, 1.1    # of the band of a squared error; factor by which P may be off
+SIGMAS, TOLERATED = 4.0, 2.0    # of the band of a squared error; factor by which P may be off
 
 
 class Errors(NamedTuple):

@@ -44,7 +44,8 @@ def draw_page(report: Report, path: Path) -> None:
         tilt, heading = (figure.add_subplot(grid[0, column]) for column in (0, 1))
         for outcome in report.outcomes:
             errors = errors_of(outcome.estimates, outcome.run.truth)
-            for axes, error in ((tilt, errors.tilt), (heading, errors.varying_heading(absolute))):
+            errors = errors if absolute else errors.about_mean()
+            for axes, error in ((tilt, errors.tilt), (heading, errors.heading)):
                 axes.semilogy(outcome.run.t, np.maximum(np.degrees(np.abs(error)), LEAST_DEG),
                               linewidth=0.8, label=outcome.run.name)
         for axes, name in ((tilt, 'tilt'), (heading, 'heading')):

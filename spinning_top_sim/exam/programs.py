@@ -92,8 +92,8 @@ class Program(contextlib.AbstractContextManager['Program']):
         except (KeyError, ValueError):
             attitude = np.empty(0)
         if attitude.shape != (4,):
-            raise InvalidOutputError(f'answers {one_line(line)[:80]!r}: must be x y z w, and may go on '
-                               'with bias and 3 numbers, covariance and 9')
+            raise InvalidOutputError(f'answers {one_line(line)[:80]!r}: must be x y z w, and may '
+                                     'go on with bias and 3 numbers, covariance and 9')
         self.bias = found.get('bias')
         self.covariance = found['covariance'].reshape(3, 3) if 'covariance' in found else None
         return attitude

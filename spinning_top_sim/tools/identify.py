@@ -98,8 +98,8 @@ def affine(read: Reals, should: Reals, lags: Iterable[int] = (0,)) -> Affine:
     rest = (target - flat @ solution).reshape(3, n)
     scale = rms(rest) * math.sqrt(autocorrelation_time(rest) * 3 * n / max(3 * n - 13, 1))
     sigma = scale * np.sqrt(np.maximum(np.diag(np.linalg.pinv(flat.T @ flat)), 0.0))
-    entries: Reals = solution[:12].reshape(3, 4)
-    spread: Reals = sigma[:12].reshape(3, 4)
+    entries = np.asarray(solution[:12], dtype=np.float64).reshape(3, 4)
+    spread = np.asarray(sigma[:12], dtype=np.float64).reshape(3, 4)
     return Affine(entries[:, :3], entries[:, 3], lag + float(solution[12]), spread[:, :3],
                   spread[:, 3], float(sigma[12]), rms(rest), rms(read - should))
 
