@@ -4,8 +4,9 @@ How a filter answers small changes of its inputs: what it does with them, by lea
 
 A kick is a turn that the gyroscope alone reads, in one step of a rest.  The difference of the
 attitudes with and without it is the filter's answer.  Without a field, nothing but the gyroscope
-shows a kick about the vertical: the answer is the filter's use of the rates, in axes of the sensor
-that differ from start to start.  After other kicks, gravity or the field leads it back.
+shows a kick about what a filter takes for the vertical: the answer is its use of the rates, in
+axes of the sensor that differ from start to start.  After other kicks, gravity or the field leads
+it back.
 """
 
 from collections.abc import Sequence
@@ -20,8 +21,10 @@ from spinning_top_sim.exam.measures import increments
 from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.tools.identify import in_words
 
-SMALL, LARGE = 0.1, 0.3         # kicks [rad]; the large one shows how a step is integrated
-EARLY, LATEST = 4, 30           # step of a kick at the start, and longest delay of its answer
+# Kicks [rad]: that lead away, that show the use of the rates, and how a step is integrated.
+TINY, SMALL, LARGE = 0.02, 0.1, 0.3
+# Step of a kick, when filters have no high gains of a start, and longest delay of its answer.
+EARLY, LATEST = 360, 30
 LEAST = 1e-6                    # share of an error that is corrected, if any
 SETTLED = 800                   # uneven steps after which a filter has settled from its start
 
@@ -113,36 +116,29 @@ def _fit(answers: Reals, turns: Reals) -> tuple[Reals, float]:
     return matrix, float(np.median(_off(answers - turns @ matrix.T + turns, turns)))
 
 
-def gains_of_steps(run: Run, kicks: Sequence[Kick], still: Reals, moved: Reals,
-                   ) -> dict[float, float]:
+def kicked_steps(still: Outcome) -> Run:
+    """Return a run of uneven steps with kicks about what the filter takes for the vertical."""
+    lengths, run = still.run.dt.round(6), still.run
+    up = Rotation.from_quat(still.estimates[SETTLED]).inv().apply((0.0, 0.0, 1.0))
+    # In a later step of each length.
+    return with_kicks(run, [Kick(SETTLED + 20 * k + int(np.argmax(
+        lengths[SETTLED + 20 * k:] == length)), SMALL * up)
+        for k, length in enumerate(np.unique(lengths))])
+
+
+def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
     """Return for each length of a step [s] how far a turn in it moves the attitude, relative."""
-    apart = increments(moved) - increments(still)
-    found: dict[float, list[float]] = {}
-    for kick in kicks:
-        size = float(kick.turn @ kick.turn)
-        first, second = (float(apart[kick.sample + k] @ kick.turn) / size for k in (0, 1))
-        # With what the other sensors take away in the same step, if they do.
-        lost = -second / (first or 1.0) / run.dt[kick.sample + 1] * run.dt[kick.sample]
-        gain = min(first, first / (1.0 - np.clip(lost, 0.0, 0.5)), key=lambda one: abs(one - 1.0))
-        found.setdefault(round(float(run.dt[kick.sample]), 6), []).append(gain)
-    return {length: float(np.median(gains)) for length, gains in sorted(found.items())}
+    turns = (moved.run.gyroscope - still.run.gyroscope) * still.run.dt[:, np.newaxis]
+    steps = np.flatnonzero(np.any(turns, axis=1))
+    answers = (increments(moved.estimates) - increments(still.estimates))[steps]
+    gains = np.sum(answers * turns[steps], axis=1) / SMALL ** 2
+    return dict(sorted(zip(still.run.dt[steps].round(6).tolist(), gains.tolist(), strict=True)))
 
 
-def kicks_of_steps(run: Run) -> list[Kick]:
-    """Return kicks in uneven steps, one in a step of each length about each axis."""
-    lengths = run.dt.round(6)
-    kicks, k = [], SETTLED
-    for axis, length in [(axis, length) for axis in range(3) for length in np.unique(lengths)]:
-        k += int(np.argmax(lengths[k:] == length))
-        kicks.append(Kick(k, SMALL * np.eye(3)[axis]))
-        k += 8
-    return kicks
-
-
-def kicked_starts(runs: Sequence[Run], axis: Sequence[float],
-                  size: float = SMALL) -> list[Run]:
-    """Return runs with a kick about an axis of the world in an early step, to and fro."""
-    turns = [Rotation.from_quat(run.truth[0]).inv().apply(axis) for run in runs]
+def kicked_starts(runs: Sequence[Run], axis: Sequence[float], attitudes: Sequence[Reals],
+                  size: float = TINY) -> list[Run]:
+    """Return runs with a kick about an axis of the world, in attitudes there, to and fro."""
+    turns = [Rotation.from_quat(one[EARLY - 1]).inv().apply(axis) for one in attitudes]
     return [with_kicks(run, [Kick(EARLY, size * (-1) ** k * turn)])
             for k, (run, turn) in enumerate(zip(runs, turns, strict=True))]
 

@@ -111,8 +111,7 @@ def delay(exam: 'Exam') -> Measured:
 
 def steps(exam: 'Exam') -> Measured:
     """Compare turns in steps of different lengths."""
-    still, moved = (one.estimates for one in exam.outcomes('steps'))
-    gains = answers.gains_of_steps(*exam.uneven, still, moved)
+    gains = answers.gains_of_steps(*exam.outcomes('uneven'), *exam.outcomes('uneven turns'))
     return Measured(max(abs(gain - 1.0) for gain in gains.values()),
                     f'in steps of {", ".join(f"{1e3 * one:g}" for one in gains)} ms a turn moves '
                     f'the attitude {", ".join(f"{one:.3g}" for one in gains.values())} times as '
@@ -287,7 +286,7 @@ CHECKS = (
     Check('gyroscope', 'rates_off', 0.02, 'matrix of the rates off the identity', gyroscope,
           FIRST),
     Check('timing', 'delay_samples', DELAY, 'of the attitude behind the gyroscope', delay, INPUTS),
-    Check('timing', 'steps_off', 0.1, 'turns in steps of 2.5 to 15 ms', steps, INPUTS),
+    Check('timing', 'steps_off', 0.02, 'turns in steps of 2.5 to 15 ms', steps, INPUTS),
     Check('integration', 'large_turn_off', 0.003, 'turns of 0.3 rad in a step', large_turns,
           INPUTS),
     Check('accelerometer', 'tilt_way', 1.0 - SURE, '1 - cosine of the way to the vertical',

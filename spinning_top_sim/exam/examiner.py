@@ -118,6 +118,8 @@ def checked_imu(imu: Mapping[str, Any] | str | Path | None, level: str) -> Mappi
     checked, source = parameters.checked(given), 'imu' if imu is given else imu
     taken = motions.TAKEN + motions.OF_SCENES * (level != 'quick')
     for name, value in given.items():
+        if not name.startswith(('imu.', 'mag.')):
+            raise ValueError(f'{source} has {name}: must have parameters imu.* and mag.* only')
         default = parameters.BY_NAME[name].default
         if not name.startswith(taken) and checked[name] != default:
             raise ValueError(f'{source} has {name} = {value!r}: must be {default!r}, because '
@@ -198,7 +200,7 @@ class Exam:
         """Read the attitudes of all runs in another convention than before."""
         self._outcomes = {name: [replace(one, estimates=convention.undo(
             self.convention.tell(one.estimates))) for one in outcomes]
-            for name, outcomes in self._outcomes.items()}
+            for name, outcomes in self._outcomes.items() if name != 'turns'}
         self.convention = convention
 
     @cached_property
@@ -220,12 +222,6 @@ class Exam:
     def run(self) -> Run:
         """The excitation as a perfect IMU reads it."""
         return self.motion.run('excitation')
-
-    @cached_property
-    def uneven(self) -> tuple[Run, Sequence[answers.Kick]]:
-        """A rest in uneven steps without magnetometer, and kicks in it."""
-        run = motions.uneven(1200).without_field()
-        return run, answers.kicks_of_steps(run)
 
     @cached_property
     def heading(self) -> bool:
@@ -273,25 +269,32 @@ def _begin(exam: Exam) -> list[Run]:
     return [replace(exam.run, name='force of the begin', accelerometer=force, magnetometer=field)]
 
 
-def _starts(axis: Sequence[float] | None, size: float = answers.SMALL) -> list[Run]:
-    """Return starts without a field, with kicks about an axis of the world."""
-    runs = [run.without_field() for run in motions.starts()]
-    return runs if axis is None else answers.kicked_starts(runs, axis, size)
+def _starts() -> list[Run]:
+    return [run.without_field() for run in motions.starts()]
 
 
-UPRIGHT = 0.0, 0.0, 1.0
+def _turns(exam: Exam, size: float) -> list[Run]:
+    """Return starts with kicks about what the filter takes for the vertical."""
+    said = [one.estimates for one in exam.outcomes('starts')]
+    return answers.kicked_starts(_starts(), UPRIGHT, said, size)
+
+
+UPRIGHT, LEVEL = (0.0, 0.0, 1.0), (0.6, 0.8, 0.0)
 RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     'twice': lambda exam: 2 * [motions.noisy('twice', motions.CALIBRATED, 0, 1.0, 1.0)],
     'excitation': lambda exam: [exam.run],
     'force of the begin': _begin,
     'field turned': _field_turned,
     'no field': lambda exam: [exam.run.without_field()],
-    'steps': lambda exam: [exam.uneven[0], answers.with_kicks(*exam.uneven)],
-    'starts': lambda exam: _starts(None),
-    'turns': lambda exam: _starts(UPRIGHT),
-    'large turns': lambda exam: _starts(UPRIGHT, answers.LARGE),
-    'tilts': lambda exam: _starts((0.6, 0.8, 0.0)),
-    'turns with field': lambda exam: answers.kicked_starts(motions.starts(), UPRIGHT),
+    'uneven': lambda exam: [motions.uneven(1000).without_field()],
+    'uneven turns': lambda exam: [answers.kicked_steps(exam.outcomes('uneven')[0])],
+    'starts': lambda exam: _starts(),
+    'turns': lambda exam: _turns(exam, answers.SMALL),
+    'large turns': lambda exam: _turns(exam, answers.LARGE),
+    'tilts': lambda exam: answers.kicked_starts(_starts(), LEVEL, [
+        run.truth for run in motions.starts()]),
+    'turns with field': lambda exam: answers.kicked_starts(motions.starts(), UPRIGHT, [
+        run.truth for run in motions.starts()]),
     'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM, ARM_AFTER_S)],
     'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
                                          NOISE_S) for seed in exam.seeds]}

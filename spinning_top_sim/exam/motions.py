@@ -165,7 +165,7 @@ def excitation(lead_s: float) -> Motion:
 
 def starts() -> list[Run]:
     """Return short rests in many attitudes."""
-    return [Motion(turn).rest(0.4).run('start') for turn in Rotation.random(10, random_state=4)]
+    return [Motion(turn).rest(4.0).run('start') for turn in Rotation.random(6, random_state=4)]
 
 
 def uneven(count: int) -> Run:
