@@ -103,8 +103,8 @@ def _feed(make_filter: MakeFilter, run: Run) -> Outcome:
         raise InvalidOutputError(f'{run.name}, {where} raises {type(error).__name__}: '
                                  f'{one_line(error)}') from error
     finally:
-        if isinstance(filter_, contextlib.AbstractContextManager):
-            filter_.__exit__(None, None, None)
+        if callable(close := getattr(filter_, 'close', None)):
+            close()
     covariances[~np.any(covariances, axis=(1, 2))] = np.nan     # in ROS, zeros mean unknown
     if (wrong := invalid(attitudes, covariances)) is not None:
         raise InvalidOutputError(f'{run.name}, update {wrong[0] + 1} of {n}: {wrong[1]}')

@@ -35,16 +35,15 @@ except ImportError:
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start
-ANSWER_S, AGAIN_S, TIMES = 5.0, 0.3, 4      # for an answer; the first sample is sent again
-UNANSWERED = 5                  # samples at the start that a node may leave unanswered
+ANSWER_S = 5.0                  # for an answer
+AGAIN_S, FIRST = 0.3, 20        # for the first one; how often its sample is sent again
 ALONE_EVERY = 50                # samples after which other publishers are looked for
 ATTEMPTS = 3                    # at a run in which messages are lost
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 NAME, FRAME = 'examine', 'imu_link'
-NOWHERE = np.array((0.0, 0.0, 0.0, 1.0))        # until the node answers
 
 
-class LostError(Exception):
+class LostError(NodeError):
     """A message between exam and node has been lost."""
 
 
@@ -85,10 +84,10 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             Parameter('use_sim_time', value=False)])
         self._executor = Executor(context=self._context)
         self._executor.add_node(self._node)
-        # A reliable publisher serves readers of both kinds, and so does a late joiner's.
-        profile = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        # A reliable publisher that keeps messages serves readers of every kind.
+        profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._clock, self._imu, self._field = (
-            self._node.create_publisher(kind, name, profile if kind is Clock else 100)
+            self._node.create_publisher(kind, name, profile)
             for kind, name in ((Clock, '/clock'), (Imu, IMU_TOPIC), (MagneticField, FIELD_TOPIC)))
         self._subscription: Any = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -110,7 +109,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._end_process()
         self._executor.shutdown()
         self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
+        rclpy.try_shutdown(context=self._context)
 
     def start(self) -> 'NodeExam':
         """Start the node anew; return it as a filter."""
@@ -126,24 +125,24 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
                 'namespace and remappings')
         self._subscribe()
         self._now_ns = START_NS
-        self._sent = self._answered = 0
+        self._answered = 0
+        self._check_alone()
         self._answers.clear()
         self.covariance = None
         return self
 
     def _subscribe(self) -> None:
-        """Read the attitudes with the reliability and durability that they are offered with."""
-        if self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
-        offered = [one.qos_profile for one in self._node.get_publishers_info_by_topic(
-            self._node.resolve_topic_name(self._topic))]
-        self._reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offered)
-        profile = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE if self._reliable
-                             else ReliabilityPolicy.BEST_EFFORT)
-        self._subscription = self._node.create_subscription(Imu, self._topic, self._take, profile)
-        self._reliable &= all(
-            one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in
-            self._node.get_subscriptions_info_by_topic(self._node.resolve_topic_name(IMU_TOPIC)))
+        """Read the attitudes with the reliability that they are offered with."""
+        read, told = (self._node.resolve_topic_name(name) for name in (IMU_TOPIC, self._topic))
+        offered, asked = ([one.qos_profile.reliability for one in infos(name)] for infos, name in (
+            (self._node.get_publishers_info_by_topic, told),
+            (self._node.get_subscriptions_info_by_topic, read)))
+        best_effort = ReliabilityPolicy.BEST_EFFORT
+        self._reliable = best_effort not in (*offered, *asked)
+        self._subscription = self._subscription or self._node.create_subscription(
+            Imu, self._topic, self._take, QoSProfile(
+                depth=100, reliability=best_effort if best_effort in offered
+                else ReliabilityPolicy.RELIABLE))
 
     def _check_alone(self) -> None:
         """Raise NodeError if another node publishes on a topic of the exam."""
@@ -154,11 +153,39 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """Publish the readings, and wait for the attitude with their stamp."""
-        self._now_ns += round(dt * NANOSECONDS)
-        if self._sent % ALONE_EVERY == 0:
+        """
+        Publish the readings, and wait for the attitude with their stamp.
+
+        The first ones are published again, later, until there is an answer: the node may not yet
+        be matched, or have no step to take.
+        """
+        for _ in range(1 if self._answered else FIRST):
+            self._publish(gyroscope, accelerometer, magnetometer, dt)
+            if self._wait(lambda: self._now_ns in self._answers,
+                          ANSWER_S if self._answered else AGAIN_S):
+                break
+        else:
             self._check_alone()
-        self._sent += 1
+            if not self._answered:
+                raise RuntimeError(f'it answers none of {FIRST} samples')
+            if not self._reliable:
+                raise LostError
+            raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
+                               f'sample within {ANSWER_S:g} s')
+        message = self._answers.pop(self._now_ns)
+        self._answers.clear()
+        self._answered += 1
+        if self._answered % ALONE_EVERY == 0:
+            self._check_alone()
+        matrix = np.array(message.orientation_covariance).reshape(3, 3)
+        self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
+        q = message.orientation
+        return np.array((q.x, q.y, q.z, q.w))
+
+    def _publish(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
+                 dt: float) -> None:
+        """Publish the readings of the next step."""
+        self._now_ns += round(dt * NANOSECONDS)
         clock, imu = Clock(), Imu()
         clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
         imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
@@ -169,45 +196,10 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
                                (field.magnetic_field, magnetometer)):
             if values is not None:
                 vector.x, vector.y, vector.z = values.tolist()
-
-        def publish() -> None:
-            self._clock.publish(clock)
-            if magnetometer is not None:
-                self._field.publish(field)
-            self._imu.publish(imu)
-
-        publish()
-        if not self._is_answered(publish):
-            return NOWHERE
-        self._answered += 1
-        message = self._answers.pop(self._now_ns)
-        self._answers.clear()
-        matrix = np.array(message.orientation_covariance).reshape(3, 3)
-        self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
-        q = message.orientation
-        return np.array((q.x, q.y, q.z, q.w))
-
-    def _is_answered(self, publish: Callable[[], None]) -> bool:
-        """Wait for the answer; until there has been one, publish again: it may not be matched."""
-        def there() -> bool:
-            return self._now_ns in self._answers
-
-        if self._answered:
-            if self._wait(there, ANSWER_S):
-                return True
-            self._check_alone()
-            if not self._reliable:
-                raise LostError
-            raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
-                               f'sample within {ANSWER_S:g} s')
-        # The first one may come before the node is matched; some nodes do not answer it.
-        for _ in range(TIMES if self._sent == 1 else 1):
-            if self._wait(there, AGAIN_S):
-                return True
-            publish()
-        if self._sent >= UNANSWERED:
-            raise RuntimeError(f'it answers none of its first {self._sent} samples')
-        return False
+        self._clock.publish(clock)
+        if magnetometer is not None:
+            self._field.publish(field)
+        self._imu.publish(imu)
 
     def is_there(self) -> bool:
         """Return whether a node reads the samples, and one publishes the attitudes."""

@@ -21,7 +21,7 @@ LONGEST_LINE = 4096             # bytes; an answer has less than a tenth of that
 WORDS = {'bias': 3, 'covariance': 9}
 
 
-class Program(contextlib.AbstractContextManager['Program']):
+class Program:
     """
     A process that is a filter, as `feeding.Filter`.
 
@@ -106,7 +106,8 @@ class Program(contextlib.AbstractContextManager['Program']):
         raise InvalidOutputError(f'the program has ended, {"signal" if code < 0 else "exit code"} '
                            f'{abs(code)}')
 
-    def __exit__(self, *exception: object) -> None:
+    def close(self) -> None:
+        """End the process."""
         self._selector.close()
         self._process.kill()
         self._process.wait()
