@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exam of a running node: in lockstep, sample by sample."""
+"""The exam of a ROS node: in lockstep, sample by sample."""
 
 import importlib
+import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,102 +13,133 @@ import pytest
 from helpers.node_harness import wait_for
 from helpers.reference import ROOT
 
-from spinning_top_sim.exam import scenarios
+from spinning_top_sim.exam import feeding, motions
 from spinning_top_sim.exam.adapters import Vqf
 from spinning_top_sim.exam.command import main
-from spinning_top_sim.exam.trial import InvalidOutputError, NodeError, follow
 
 pytest.importorskip('rclpy')
 pytest.importorskip('vqf')
 live = importlib.import_module('spinning_top_sim.exam.live')
 NODE = f'{sys.executable} {ROOT / "examples/attitude_node.py"}'
+# A node that answers each sample with the identity, as best it can.
+PLAIN = """
+import sys, rclpy
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Imu
+rclpy.init()
+node = rclpy.create_node('plain')
+publisher = node.create_publisher(Imu, 'imu/data', qos_profile_sensor_data)
+count = 0
+def take(message):
+    global count
+    count += 1
+    if count not in LEFT_OUT:
+        publisher.publish(message)
+node.create_subscription(Imu, 'imu/data_raw', take, qos_profile_sensor_data)
+rclpy.spin(node)
+"""
 
 
 @pytest.fixture(scope='module')
 def run():
-    return scenarios.record(replace(scenarios.SLOW, duration=1.5), scenarios.CALIBRATED, 1)
-
-
-def test_a_node_says_what_its_filter_says_in_every_run(run):
-    # The node takes the first sample for the begin of its first step.
-    direct = follow(partial(Vqf, magnetic=False), run.part(slice(1, None)))
-    with live.NodeExam('imu/data', NODE) as node:
-        for _ in range(2):
-            outcome = follow(node.start, run)
-            assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
-            assert np.isnan(outcome.covariances).all()
+    return motions.noisy('short', motions.CALIBRATED, 1, 0.2, 0.3)
 
 
 @pytest.fixture
-def running():
-    process = subprocess.Popen([sys.executable, str(ROOT / 'examples/attitude_node.py')])
-    yield process
-    process.kill()
-    process.wait()
+def plain(tmp_path):
+    """Return what returns the command of a best-effort node that leaves out some samples."""
+    def plain(left_out=()):
+        path = tmp_path / 'plain.py'
+        path.write_text(PLAIN.replace('LEFT_OUT', repr(left_out)))
+        return f'{sys.executable} {path}'
+    return plain
 
 
-def test_a_node_that_runs_gets_one_run_after_the_other(run, running, monkeypatch, capfd):
-    twice = run.preceded_by(run)
-    direct = follow(partial(Vqf, magnetic=False), twice.part(slice(1, None)))
-    with monkeypatch.context() as alone, live.NodeExam('imu/data') as node:
-        alone.setattr(live, 'DISCOVERY_S', 0.0)
-        outcome = follow(node.start, twice)
-        assert np.max(np.abs(outcome.estimates[1:] - direct.estimates)) < 1e-9
-        filter_ = node.start()          # later than the first run, for the node
+def test_a_node_says_what_its_filter_says_in_every_run(run):
+    # The node takes the first sample for the begin of its first step; so it is sent again.
+    (direct,) = feeding.feed(partial(Vqf, magnetic=False), [run])
+    with live.NodeExam(NODE, 'imu/data') as node:
+        for outcome in node.feed(node.start, [run, run]):
+            assert np.max(np.abs(outcome.estimates - direct.estimates)) < 1e-9
+            assert np.isnan(outcome.covariances).all()
+
+
+def test_a_best_effort_node_is_examined_and_a_lost_message_is_no_fault(run, plain):
+    with live.NodeExam(plain(), 'imu/data') as node:
+        (outcome,) = node.feed(node.start, [run])
+        assert len(outcome.estimates) == len(run.dt)
+
+
+def test_a_run_that_loses_messages_begins_again_and_the_exam_ends_with_a_line(
+        run, plain, monkeypatch):
+    monkeypatch.setattr(live, 'ANSWER_S', 0.3)
+    with (live.NodeExam(plain(left_out=(30,)), 'imu/data') as node,
+          pytest.raises(feeding.NodeError, match='are lost in 3 runs: make imu/data_raw')):
+        node.feed(node.start, [run])
+
+
+def test_another_publisher_is_told_whenever_it_comes(run, monkeypatch):
+    monkeypatch.setattr(live, 'ALONE_EVERY', 1)
+    with live.NodeExam(NODE, 'imu/data') as node:
+        filter_ = node.start()
         readings = run.gyroscope[0], run.accelerometer[0], run.magnetometer[0], 0.01
-        for _ in range(10):
+        for _ in range(3):
             filter_.update(*readings)
-        # Another source of samples is told.
-        alone.undo()
-        assert main(['--topic', 'imu/data']) == 1
-        assert '/clock has 2 publishers: end the others' in capfd.readouterr().err
-        running.send_signal(signal.SIGINT)
-        running.wait()
-        wait_for('the node to leave the graph', lambda: not node.is_there())
-        monkeypatch.setattr(live, 'PATIENCE_S', 0.1)
-        with pytest.raises(NodeError, match='publishes imu/data has gone'):
-            filter_.update(*readings)
+        other = subprocess.Popen([sys.executable, '-c', (
+            "import rclpy; from sensor_msgs.msg import Imu; rclpy.init(); "
+            "node = rclpy.create_node('other'); p = node.create_publisher(Imu, 'imu/data_raw', 1);"
+            ' rclpy.spin(node)')])
+        try:
+            with pytest.raises(feeding.NodeError, match='data_raw has 2 publishers: end the'):
+                for _ in range(3000):
+                    filter_.update(*readings)
+        finally:
+            other.kill()
+            other.wait()
 
 
-def test_an_interrupt_ends_the_exam(monkeypatch, capfd):
-    monkeypatch.setattr(live.NodeExam, 'is_there', lambda _: signal.raise_signal(signal.SIGINT))
-    assert main(['--topic', '/imu/data']) == 130
-    assert 'spinning-top examine: interrupted' in capfd.readouterr().err
+def children(pid):
+    said = subprocess.run(['ps', '-o', 'pid=', '--ppid', str(pid)], capture_output=True, text=True,
+                          check=False).stdout.split()
+    return [int(one) for one in said]
 
 
-def test_a_node_that_does_not_run_is_told(monkeypatch, capfd):
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT])
+def test_the_node_ends_with_the_exam(number):
+    exam = subprocess.Popen([sys.executable, '-m', 'spinning_top_sim', 'examine', '--node', NODE,
+                             '--topic', 'imu/data'], stderr=subprocess.PIPE, cwd=ROOT, text=True,
+                            env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    try:
+        wait_for('the node to start', lambda: children(exam.pid))
+        node = children(exam.pid)
+        exam.send_signal(number)
+        assert exam.wait(30.0) == 130
+        assert 'interrupted' in exam.stderr.read()
+        wait_for('the node to end', lambda: not any(os.path.exists(f'/proc/{one}')
+                                                    for one in node))
+    finally:
+        exam.kill()
+        exam.wait()
+
+
+def test_a_node_that_does_not_start_or_answer_is_told(run, plain, monkeypatch):
+    with (live.NodeExam('/nope', 'imu/data') as node,
+          pytest.raises(feeding.NodeError, match='cannot start /nope')):
+        node.start()
+    monkeypatch.setattr(live, 'AGAIN_S', 0.05)
+    with (live.NodeExam(plain(left_out=range(99)), 'imu/data') as node,
+          pytest.raises(feeding.InvalidOutputError, match='answers none of 20 samples')):
+        node.feed(node.start, [run])
     monkeypatch.setattr(live, 'PATIENCE_S', 0.5)
-    assert main(['--topic', '/imu/data']) == 1
-    said = capfd.readouterr().err
-    assert 'no node reads imu/data_raw and publishes /imu/data within 0.5 s: check that' in said
+    with (live.NodeExam(f'{sys.executable} -c "import time; time.sleep(9)"', 'imu/data') as node,
+          pytest.raises(feeding.InvalidOutputError, match='no node reads imu/data_raw and')):
+        node.feed(node.start, [run])
 
 
 @pytest.mark.parametrize(('arguments', 'says'), [
-    (['--topic', 'a b'], 'a b'),
+    (['--node', 'x', '--topic', 'a b'], 'a b'),
     (['--topic', 'a', '--node', "a 'b"], 'No closing quotation')])
 def test_what_is_no_topic_or_command_is_told_in_one_line(arguments, says, capfd):
     assert main(arguments) == 2
     said = capfd.readouterr().err
     assert says in said and said.count('\n') == 1
-
-
-def test_a_node_that_does_not_answer_is_told(run, monkeypatch):
-    monkeypatch.setattr(live, 'FIRST_PATIENCE_S', 0.05)
-    deaf = ("import rclpy; from sensor_msgs.msg import Imu; rclpy.init(); "
-            "node = rclpy.create_node('deaf'); node.create_publisher(Imu, 'imu/data', 1); "
-            "s = node.create_subscription(Imu, 'imu/data_raw', lambda message: None, 1); "
-            'rclpy.spin(node)')
-    with (live.NodeExam('imu/data', f'{sys.executable} -c "{deaf}"') as node,
-          pytest.raises(InvalidOutputError, match='update 6 of 150 raises RuntimeError: no '
-                        r'attitude has the stamp 1\.0600')):
-        follow(node.start, run)
-
-
-def test_the_example_for_launch_testing_passes(tmp_path):
-    pytest.importorskip('launch_testing', reason='launch comes with ROS: it is not on PyPI')
-    ended = subprocess.run(
-        [sys.executable, '-m', 'launch_testing.launch_test',
-         str(ROOT / 'examples/test_attitude_node.launch.py')],
-        cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False)
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    assert 'Ran 1 test' in ended.stdout + ended.stderr

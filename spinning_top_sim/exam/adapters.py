@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam.reference import ReferenceFilter, from_two_vectors
-from spinning_top_sim.exam.scenarios import FIELD, GRAVITY, Reals
-from spinning_top_sim.exam.trial import Filter
+from spinning_top_sim.exam.feeding import Filter
+from spinning_top_sim.exam.measures import from_two_vectors
+from spinning_top_sim.exam.motions import FIELD, GRAVITY, Reals
 
 W_FIRST, W_LAST = [3, 0, 1, 2], [1, 2, 3, 0]
 # From axes north, west, up to east, north, up.
@@ -32,7 +32,7 @@ class Vqf:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """See `trial.Filter`."""
+        """See `feeding.Filter`."""
         if not self._period:
             self._filter, self._period = self._make(dt), dt
         uses_field = self._magnetic and magnetometer is not None
@@ -71,7 +71,7 @@ class Ahrs:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """See `trial.Filter`."""
+        """See `feeding.Filter`."""
         uses_field = self._magnetic and magnetometer is not None
         readings = [gyroscope, accelerometer, *([magnetometer] * uses_field)]
         if self._attitude is None:
@@ -104,7 +104,7 @@ class Imufusion:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """See `trial.Filter`."""
+        """See `feeding.Filter`."""
         self._filter.set_sample_period(dt)
         rates, force = np.degrees(gyroscope), accelerometer / GRAVITY
         if self._magnetic and magnetometer is not None:
@@ -117,7 +117,6 @@ class Imufusion:
 
 # By name; '-6d' is without magnetometer.
 FILTERS: dict[str, Callable[[], Filter]] = {
-    'reference': ReferenceFilter,
     'vqf': Vqf, 'vqf-6d': partial(Vqf, magnetic=False),
     'madgwick': partial(Ahrs, 'Madgwick'), 'madgwick-6d': partial(Ahrs, 'Madgwick', False),
     'mahony': partial(Ahrs, 'Mahony'), 'mahony-6d': partial(Ahrs, 'Mahony', False),

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.scenarios import Run
+from spinning_top_sim.exam.feeding import NORM_TOLERANCE, Feed, MakeFilter, feed_apart
+from spinning_top_sim.exam.motions import Run
 from spinning_top_sim.exam.scored import ScoredRun, report_of
-from spinning_top_sim.exam.trial import NORM_TOLERANCE, MakeFilter
 from spinning_top_sim.installation import needed
 from spinning_top_sim.tools.cli import one_line
+from spinning_top_sim.tools.report import Report
 
 SUFFIXES = '.mat', '.hdf5', '.h5'
 # Arrays of a trial with their columns; the field is in microtesla, quaternions are w, x, y, z.
@@ -25,32 +25,32 @@ COLUMNS = {'imu_gyr': 3, 'imu_acc': 3, 'imu_mag': 3, 'opt_quat': 4, 'movement': 
 
 
 def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | None = None,
-                 show: Callable[[float], object] = lambda done: None) -> Report:
+                 feed: Feed = feed_apart,
+                 show: Callable[[float, float], object] = lambda done, total: None) -> Report:
     """
     Examine a filter with the trials in a folder.
 
     The filter gets each trial from its first sample on.  The measures are the root mean squares
-    of the errors in motion, of each trial and their means.  `invalid_output` is the only fault
-    that can be found.
+    of the errors in motion, of each trial and their means.  `accuracy` and `invalid_output` are
+    the faults that can be found.
 
     Parameters
     ----------
-    make_filter : callable
+    make_filter, feed, show : optional
         As of `examine`.
     folder : path
         With files of BROAD: .mat, or .hdf5, which need h5py.
     subject : str, optional
         Name in the report.  The default is the name of the filter's class.
-    show : callable, optional
-        Is called with the number of trials that are done.
 
     Raises
     ------
     ValueError
         If there is no folder, no trial in it, or a file is none.
     """
-    return report_of(make_filter, map(read_trial, trials_in(folder)), 'data', one_line(
-        subject or getattr(make_filter, '__name__', 'filter')), show=show)
+    paths = trials_in(folder)
+    return report_of(make_filter, map(read_trial, paths), len(paths), 'data', one_line(
+        subject or getattr(make_filter, '__name__', 'filter')), feed, show)
 
 
 def trials_in(folder: str | Path) -> list[Path]:
@@ -85,9 +85,8 @@ def read_trial(path: Path) -> ScoredRun:
         raise ValueError(f'{path}: must have a sampling_rate > 0, finite readings, and movement '
                          'with opt_quat')
     step = np.full(len(truth), 1.0 / rate)
-    no_rates = np.full((len(truth), 3), np.nan)
-    return ScoredRun(Run(one_line(path.stem), np.cumsum(step), step, truth[:, [1, 2, 3, 0]],
-                         no_rates, gyroscope, accelerometer, 1e-6 * magnetometer), counts)
+    return ScoredRun(Run(one_line(path.stem), step, truth[:, [1, 2, 3, 0]], gyroscope,
+                         accelerometer, 1e-6 * magnetometer), counts)
 
 
 def _hdf5(path: Path) -> Mapping[str, Any]:

@@ -1,57 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exam of a filter in Python: the runs that it consists of, and the report on them."""
+"""The exam of a filter: its runs, each fed when a check asks for it, and the loop over checks."""
 
 import math
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import diagnosis, measures, scenarios
-from spinning_top_sim.exam.bias import judge_bias
-from spinning_top_sim.exam.diagnosis import degrees
-from spinning_top_sim.exam.field import examine_field
-from spinning_top_sim.exam.integration import judge_integration
-from spinning_top_sim.exam.isolation import feed_apart
-from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.exam.report import Findings, Report
-from spinning_top_sim.exam.response import Response
-from spinning_top_sim.exam.subject import LastingSubject, Subject
-from spinning_top_sim.exam.trial import InvalidOutputError, MakeFilter, Outcome, feed
+from spinning_top_sim.exam import answers, bias, motions
+from spinning_top_sim.exam.checks import CHECKS
+from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter, Outcome, feed_apart
+from spinning_top_sim.exam.feeding import feed as feed_here
+from spinning_top_sim.exam.measures import Errors, errors_of
+from spinning_top_sim.exam.motions import NEAR, RATE, Motion, Run
+from spinning_top_sim.exam.scenes import examine_field
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.cli import one_line
+from spinning_top_sim.tools.conventions import Convention
+from spinning_top_sim.tools.report import Finding, Mark, Report
 from spinning_top_sim.tools.scene_file import read_scene
-from spinning_top_sim.tools.verdict import Fault
 
 # Seeds of the noisy runs.
 SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
-# When the lever arm comes, and from when until when its effect is measured [s].  Later the
-# estimate of a bias would have adapted to the force.
-ARM_S = 13.33, 14.33, 19.33
-# What begins the names of the parameters that the exam takes, and that only its scenes take.
-TAKEN = ('imu.gyroscope_', 'imu.accelerometer_', 'imu.bias_', *scenarios.OF_PLACE, 'mag.enabled',
-         'mag.soft_iron', 'mag.hard_iron', 'mag.noise_density', 'mag.random_walk', 'mag.range',
-         'mag.resolution')
-OF_SCENES = 'imu.bandwidth', 'imu.vibration.', 'mag.disturbance.'
+# A filter is settled if it has turned by less than STILL [rad] in the second half of a rest at
+# the start; slow ones get longer ones.
+LEADS_S, STILL = (10.0, 40.0, 160.0), math.radians(0.05)
+ARM, ARM_AFTER_S = (0.1, 0.0, 0.0), 4.0     # of the IMU [m], and when it comes in the top's motion
+FIELD_TURN = math.radians(3.0)              # of the field about the vertical
+NOISE_LEAD_S, NOISE_S = 6.0, 20.0           # rest and motion of the noisy runs
 
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
             imu: Mapping[str, Any] | str | Path | None = None,
             seeds: int | Iterable[int] | None = None, *, subject: str | None = None,
-            isolated: bool = True, restart: bool = True) -> Report:
+            isolated: bool = True, feed: Feed | None = None,
+            show: Callable[[float, float], object] | None = None,
+            ) -> Report:
     """
     Examine an attitude filter.
 
-    The filter has a method ``update(gyroscope, accelerometer, magnetometer, dt)``: the mean
-    angular velocity over the step [rad/s], specific force [m/s^2, +g upwards at rest] and field
+    The filter has a method ``update(gyroscope, accelerometer, magnetometer, dt)``: the rotation
+    of the step over its length [rad/s], specific force [m/s^2, +g upwards at rest] and field
     [T, or None] at its end, in the frame of the sensor, and the length of the step [s].  It
     returns the attitude at the end of the step, q(world <- sensor) in the order x, y, z, w; x of
     the world is east, y north and z up.  Attributes `covariance` and `bias` are optional, see
-    `trial.Filter`.
+    `feeding.Filter`.
 
     Parameters
     ----------
@@ -61,9 +59,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     level : {'quick', 'full', 'field'}
         'full' has more seeds, and a seed of the scenes of 'field'.
     imu : mapping or path, optional
-        Parameters imu.* and mag.* by name, or the path of a parameter file such as those in
-        config/imu.  The default, `scenarios.CALIBRATED`, is the noise of a calibrated device.
-        Only the scenes of the field have bandwidth, vibration and disturbed fields.
+        Parameters imu.* and mag.* that replace those of the noisy runs and of the scenes, or the
+        path of a parameter file such as those in config/imu.
     seeds : int or iterable of int, optional
         Seeds of the noisy runs, or their number.  The default, SEEDS, depends on the level.
     subject : str, optional
@@ -71,8 +68,10 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     isolated : bool, optional
         If False, the filter runs in this process, where a debugger can reach it.  A filter that
         crashes or never returns then ends the exam.
-    restart : bool, optional
-        If False, one filter is made, in this process, and used for all runs.
+    feed : callable, optional
+        What feeds a filter, instead of `feeding.feed`.
+    show : callable, optional
+        Is called with what is done and what there is to do.
 
     Returns
     -------
@@ -92,48 +91,43 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
                         "spinning_top_sim.exam.adapters.FILTERS, such as FILTERS['vqf']")
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
-    has_scenes = level == 'field' or (level == 'full' and restart)
-    values = _imu_parameters(imu, has_scenes)
+    values = checked_imu(imu, level)
     numbers = list(SEEDS[level]) if seeds is None else _seed_numbers(seeds)
-    if level == 'field' and not restart:
-        raise ValueError("level = 'field': the filter must be made anew for each scene")
-    run_feed = feed_apart if isolated and restart else feed
+    feed = feed or (feed_apart if isolated else feed_here)
+    show = show or (lambda done, total: None)
     subject = one_line(subject or getattr(make_filter, '__name__', 'filter'))
-    # The scenes have a device of their own, whose parameters `imu` replaces.
-    in_field = partial(examine_field, make_filter, subject, imu=values if imu else {},
-                       feed=run_feed)
     if level == 'field':
-        return in_field(numbers)
-    values = {name: value for name, value in values.items() if not name.startswith(OF_SCENES)}
-    exam = _Exam(Subject(make_filter, run_feed, values, numbers[0]) if restart else
-                 LastingSubject(make_filter, values, numbers[0]), numbers)
-    exam.sit()
-    if has_scenes and exam.outcomes:
-        scenes = in_field(numbers[:1])
-        exam.findings.measures |= scenes.measures
-        exam.findings.faults += scenes.found
-    return exam.findings.report(subject, exam.outcomes)
+        return examine_field(make_filter, subject, numbers, values, feed, show)
+    of_noise = {name: value for name, value in values.items()
+                if not name.startswith(motions.OF_SCENES)}
+    report = Exam(make_filter, feed, {**motions.CALIBRATED, **of_noise}, numbers).sit(subject,
+                                                                                      show)
+    if level == 'full' and report.outcomes:
+        scenes = examine_field(make_filter, subject, numbers[:1], values, feed, show)
+        report = replace(report, found=[*report.found, *scenes.found],
+                         marks={**report.marks, **scenes.marks},
+                         notes=[*report.notes, *scenes.notes])
+    return report
 
 
-def _imu_parameters(imu: Mapping[str, Any] | str | Path | None,
-                    has_scenes: bool) -> Mapping[str, Any]:
+def checked_imu(imu: Mapping[str, Any] | str | Path | None, level: str) -> Mapping[str, Any]:
+    """Return the parameters that are given.  Raises ValueError for what the level has not."""
     if imu is None:
-        return scenarios.CALIBRATED
+        return {}
     given = imu if isinstance(imu, Mapping) else read_scene(imu)
-    checked = parameters.checked(given)
-    source = 'imu' if imu is given else imu
-    for name in given:
+    checked, source = parameters.checked(given), 'imu' if imu is given else imu
+    taken = motions.TAKEN + motions.OF_SCENES * (level != 'quick')
+    for name, value in given.items():
         if not name.startswith(('imu.', 'mag.')):
             raise ValueError(f'{source} has {name}: must have parameters imu.* and mag.* only')
-        taken = has_scenes if name.startswith(OF_SCENES) else name.startswith(TAKEN)
         default = parameters.BY_NAME[name].default
-        if not taken and checked[name] != default:
-            raise ValueError(f'{source} has {name} = {given[name]!r}: must be {default!r}, '
-                             'because this exam has no run with it')
+        if not name.startswith(taken) and checked[name] != default:
+            raise ValueError(f'{source} has {name} = {value!r}: must be {default!r}, because '
+                             f'nothing in level {level} has it')
     if not any(checked['mag.field'][:2]):
         raise ValueError(f'{source} has mag.field = {given["mag.field"]!r}: must have a '
                          'horizontal part, which shows north')
-    return {name: checked[name] for name in given}
+    return {name: checked[name] for name in given if name.startswith(taken)}
 
 
 def _seed_numbers(seeds: int | Iterable[int]) -> list[int]:
@@ -146,93 +140,161 @@ def _seed_numbers(seeds: int | Iterable[int]) -> list[int]:
     return numbers
 
 
-class _Exam:
-    """The runs of one exam."""
+class Exam:
+    """
+    The runs of one exam, and what the checks have found so far.
 
-    def __init__(self, subject: Subject, seeds: Sequence[int]) -> None:
-        self._subject, self._seeds = subject, seeds
-        self.findings = Findings()
-        self.outcomes: list[Outcome] = []       # of the noisy runs
+    convention : of the attitudes; it is undone in all outcomes
+    """
 
-    def sit(self) -> None:
-        """Do all runs."""
-        if not self._do(self._begin):
-            return
-        identified = self._do(self._response.identify)
-        for seed in self._seeds:        # those for which the filter fails are dropped
-            self._do(partial(self._do_noisy_run, seed))
-        if not self.outcomes:
-            return
-        self.findings.measures = (
-            diagnosis.error_measures(self.outcomes, self._absolute) | self.findings.measures)
-        self._do(partial(judge_integration, self._response))
-        if not self._response.unclear:
-            self._do(self._judge_lever_arm)
-            if identified:
-                self._do(partial(judge_bias, self._response))
-        self._do(self._judge_noisy_runs)
-        self._do(lambda: self.findings.measures.update(self._subject.convergence()))
+    def __init__(self, make_filter: MakeFilter, feed: Feed, imu: Mapping[str, Any],
+                 seeds: Sequence[int]) -> None:
+        self._make_filter, self._feed = make_filter, feed
+        self.imu, self.seeds = imu, seeds
+        self.convention = Convention()
+        self._outcomes: dict[str, list[Outcome]] = {}
 
-    def _do(self, part: Callable[[], object]) -> bool:
-        """Do a part of the exam; return False where the filter fails, which is reported."""
-        try:
-            part()
-        except InvalidOutputError as error:
-            self.findings.faults.append(Fault('invalid_output', str(error)))
-            return False
-        return True
+    def sit(self, subject: str, show: Callable[[float, float], object]) -> Report:
+        """Do all checks but those that a fault hides."""
+        found: list[Finding] = []
+        marks: dict[str, Mark] = {}
+        hides: dict[str, list[str]] = {}
+        for k, check in enumerate(CHECKS):
+            show(k, len(CHECKS))
+            names = [finding.name for finding in found]
+            if hidden := [name for name in check.needs if name in names]:
+                hides.setdefault(', '.join(hidden), []).append(check.mark)
+                continue
+            try:
+                measured = check.measure(self)
+            except InvalidOutputError as error:
+                found.append(Finding('invalid_output', str(error)))
+                continue
+            if measured is None:
+                continue
+            limit = check.limit if measured.limit is None else measured.limit
+            marks |= {check.mark: Mark(measured.value, limit, check.meaning), **measured.others}
+            if measured.value > limit:
+                found.append(Finding(measured.name or check.fault, measured.evidence,
+                                     measured.value))
+        show(len(CHECKS), len(CHECKS))
+        notes = [f'not judged because of {names}: {", ".join(left_out)}'
+                 for names, left_out in hides.items()]
+        if 'field turned' in self._outcomes and not self.heading:
+            notes.append('the magnetometer changes nothing: tilt and steady heading are judged')
+        return Report(subject, found, marks, notes, self._outcomes.get('noise', ()))
 
-    def _begin(self) -> None:
-        if self._subject.restarts and self._subject.shares_state():
-            raise InvalidOutputError('the attitudes depend on a filter that ran before in '
-                                     'the same process: filters must share no state')
-        self._absolute = self._subject.uses_field()
-        self._response = Response(self._subject, self._absolute, self.findings)
+    def outcomes(self, name: str) -> list[Outcome]:
+        """Return the outcomes of a run by its name in RUNS, in our convention."""
+        if name not in self._outcomes:
+            self._outcomes[name] = self.fed(RUNS[name](self))
+        return self._outcomes[name]
 
-    def _do_noisy_run(self, seed: int) -> None:
-        self.outcomes.append(self._response.respond(
-            self._subject.record(scenarios.SLOW, seed), shifted=False))
+    def fed(self, runs: Sequence[Run]) -> list[Outcome]:
+        """Return the outcomes of other runs, in our convention."""
+        told = self._feed(self._make_filter, runs)
+        return [replace(one, estimates=self.convention.undo(one.estimates)) for one in told
+                ] if self.convention.parts else told
 
-    def _judge_noisy_runs(self) -> None:
-        measured = self.findings.measures
-        measured |= diagnosis.quality(self.outcomes, self._subject.imu, self._absolute)
-        measured['stamp_offset_s'] = diagnosis.offset_of(
-            self.outcomes[0].last(), self._absolute).seconds
-        outcomes = [self._response.respond(one.run) for one in self.outcomes
-                    ] if self._response.shifts else self.outcomes
-        self._judge_errors(outcomes)
-        self._judge_covariance(outcomes)
+    def read_in(self, convention: Convention) -> None:
+        """Read the attitudes of all runs in another convention than before."""
+        self._outcomes = {name: [replace(one, estimates=convention.undo(
+            self.convention.tell(one.estimates))) for one in outcomes]
+            for name, outcomes in self._outcomes.items() if name != 'turns'}
+        self.convention = convention
 
-    def _judge_errors(self, outcomes: Sequence[Outcome]) -> None:
-        limit = diagnosis.noisy_limit(outcomes[0].run, self._absolute, self._subject.imu)
-        for outcome in outcomes:
-            if fault := diagnosis.inaccuracy(outcome, self._absolute, limit):
-                self.findings.faults.append(self._response.blamed(fault))
-                return
+    @cached_property
+    def lead_s(self) -> float:
+        """How long the filter rests at the start until it is settled [s]."""
+        for seconds in LEADS_S[:-1]:
+            (outcome,) = self.fed([Motion(motions.euler(NEAR)).rest(seconds).run('rest')])
+            turns = Rotation.from_quat(outcome.estimates[len(outcome.estimates) // 2:])
+            if float(np.max((turns[0].inv() * turns).magnitude())) < STILL:
+                return seconds
+        return LEADS_S[-1]
 
-    def _judge_covariance(self, outcomes: Sequence[Outcome]) -> None:
-        consistency = diagnosis.consistency(outcomes, self._absolute)
-        self.findings.measures |= diagnosis.nees_measures(consistency)
-        # Faults are another reason for errors; without noise there is nothing random to judge by.
-        # After minutes of learning the bias, a filter that goes on is too sure of it.
-        if self._subject.restarts and not self.findings.faults and any(
-                self._subject.imu.get(f'imu.{sensor}_noise_density')
-                for sensor in ('gyroscope', 'accelerometer')):
-            self.findings.faults += filter(None, [diagnosis.covariance_fault(consistency)])
+    @cached_property
+    def motion(self) -> Motion:
+        """The excitation."""
+        return motions.excitation(self.lead_s)
 
-    def _judge_lever_arm(self) -> None:
-        """Compare the attitudes with and without a lever arm."""
-        still, moving = map(self._subject.record, (scenarios.PIVOT, scenarios.LEVER_ARM))
-        # The lever arm comes when the filter has settled, so that its start does not matter.
-        begin, first, end = (round(t * scenarios.SLOW.rate) for t in ARM_S)
-        with_arm = replace(still, accelerometer=np.concatenate(
-            (still.accelerometer[:begin], moving.accelerometer[begin:])))
-        arm, pivot = (self._response.respond(run).estimates[first:end]
-                      for run in (with_arm, still))
-        effect, before = (rms(measures.errors_of(one, other).tilt) for one, other in (
-            (arm, pivot), (pivot, still.truth[first:end])))
-        self.findings.measures['lever_arm_deg'] = math.degrees(effect)
-        if effect > max(diagnosis.LEVER_ARM, before):
-            self.findings.faults.append(Fault(
-                'lever_arm', f'10 cm off the axis adds {degrees(effect)}: motion is mistaken for '
-                'gravity'))
+    @cached_property
+    def run(self) -> Run:
+        """The excitation as a perfect IMU reads it."""
+        return self.motion.run('excitation')
+
+    @cached_property
+    def heading(self) -> bool:
+        """Whether the field changes attitudes: only then the heading is judged against north."""
+        one, other = (self.outcomes(name)[0].estimates for name in ('excitation', 'field turned'))
+        return bool(np.max(np.abs(one - other)) > 1e-6)
+
+    @cached_property
+    def bias(self) -> tuple[Outcome, list[bias.Effect]]:
+        """The effects of a bias."""
+        return bias.effects(self)
+
+    def errors(self, name: str = 'excitation') -> Errors:
+        """Return the errors in the excitation; without north, the heading from when settled on."""
+        errors = errors_of(self.outcomes(name)[0].estimates, self.run.truth)
+        if not self.heading:
+            turned = errors.heading - errors.heading[round(self.lead_s * RATE)]
+            errors = errors._replace(heading=(turned + math.pi) % math.tau - math.pi)
+        return errors
+
+    @cached_property
+    def clean(self) -> Errors:
+        """The errors in the excitation; filters may read force and field at the begin of steps."""
+        errors, settled = self.errors(), slice(round(self.lead_s * RATE), None)
+        if np.max(errors.whole[settled]) < STILL:
+            return errors
+        return min(errors, self.errors('force of the begin'),
+                   key=lambda one: float(np.max(one.whole[settled])))
+
+
+def _field_turned(exam: Exam) -> list[Run]:
+    """Turn the field about the vertical, to one side and then to the other."""
+    middle = len(exam.run.dt) // 2
+    turns = Rotation.from_quat(exam.run.truth)
+    west = np.where(np.arange(2 * middle + 1)[:len(turns)] < middle, FIELD_TURN, -FIELD_TURN)
+    field = turns.inv().apply(Rotation.from_euler('z', west[:, np.newaxis]).apply(
+        turns.apply(exam.run.magnetometer)))
+    return [replace(exam.run, name='field turned', magnetometer=field)]
+
+
+def _begin(exam: Exam) -> list[Run]:
+    """Read force and field at the begin of each step."""
+    force, field = (np.vstack((rows[:1], rows[:-1]))
+                    for rows in (exam.run.accelerometer, exam.run.magnetometer))
+    return [replace(exam.run, name='force of the begin', accelerometer=force, magnetometer=field)]
+
+
+def _starts() -> list[Run]:
+    return [run.without_field() for run in motions.starts()]
+
+
+def _turns(exam: Exam, size: float) -> list[Run]:
+    """Return starts with kicks about what the filter takes for the vertical."""
+    said = [one.estimates for one in exam.outcomes('starts')]
+    return answers.kicked_starts(_starts(), UPRIGHT, said, size)
+
+
+UPRIGHT, LEVEL = (0.0, 0.0, 1.0), (0.6, 0.8, 0.0)
+RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
+    'twice': lambda exam: 2 * [motions.noisy('twice', motions.CALIBRATED, 0, 1.0, 1.0)],
+    'excitation': lambda exam: [exam.run],
+    'force of the begin': _begin,
+    'field turned': _field_turned,
+    'no field': lambda exam: [exam.run.without_field()],
+    'uneven': lambda exam: [motions.uneven(1000).without_field()],
+    'uneven turns': lambda exam: [answers.kicked_steps(exam.outcomes('uneven')[0])],
+    'starts': lambda exam: _starts(),
+    'turns': lambda exam: _turns(exam, answers.SMALL),
+    'large turns': lambda exam: _turns(exam, answers.LARGE),
+    'tilts': lambda exam: answers.kicked_starts(_starts(), LEVEL, [
+        run.truth for run in motions.starts()]),
+    'turns with field': lambda exam: answers.kicked_starts(motions.starts(), UPRIGHT, [
+        run.truth for run in motions.starts()]),
+    'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM, ARM_AFTER_S)],
+    'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
+                                         NOISE_S) for seed in exam.seeds]}

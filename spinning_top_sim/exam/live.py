@@ -7,7 +7,7 @@ import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,16 @@ from rclpy.context import Context
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
 
 from spinning_top_sim.exam.examiner import examine
-from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.scenarios import Reals
-from spinning_top_sim.exam.trial import INTERRUPTED, NodeError
+from spinning_top_sim.exam.feeding import INTERRUPTED, MakeFilter, NodeError, Outcome, feed
+from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
+from spinning_top_sim.tools.report import Report
 
 try:                            # takes least processor time
     from rclpy.experimental import EventsExecutor as Executor
@@ -34,101 +34,158 @@ except ImportError:
     from rclpy.executors import SingleThreadedExecutor as Executor
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
-PATIENCE_S = 20.0               # for a node to start, and for an answer
-DISCOVERY_S = 3.0               # other publishers are found later than the node
-FIRST_PATIENCE_S, UNANSWERED = 1.0, 5       # some nodes do not answer their first samples
+PATIENCE_S = 20.0               # for a node to start
+ANSWER_S = 5.0                  # for an answer
+AGAIN_S, FIRST = 0.3, 20        # for the first one; how often its sample is sent again
+ALONE_EVERY = 50                # samples after which other publishers are looked for
+ATTEMPTS = 3                    # at a run in which messages are lost
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
-# A running node must never see time go back, not even from one exam to the next.  So the first
-# stamp of an exam is the uptime of the machine multiplied by the greatest speed-up of an exam.
-FASTEST, LAST_NS = 50, 2 * 10 ** 9 * NANOSECONDS
 NAME, FRAME = 'examine', 'imu_link'
 
 
-def examine_node(topic: str, command: str | None = None, level: str = 'quick',
+class LostError(NodeError):
+    """A message between exam and node has been lost."""
+
+
+def examine_node(command: str, topic: str, level: str = 'quick',
                  imu: Mapping[str, Any] | str | Path | None = None,
-                 seeds: int | Iterable[int] | None = None) -> Report:
+                 seeds: int | Iterable[int] | None = None,
+                 show: Callable[[float, float], object] | None = None) -> Report:
     """
     Examine a ROS node.
 
     Parameters
     ----------
+    command : str
+        Command that starts the node for each run, without a shell.
     topic : str
         Topic of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
-    command : str, optional
-        Command that starts the node for each run, without a shell; default: the node runs.
-    level, imu, seeds : optional
+    level, imu, seeds, show : optional
         As for `examine`.
 
     Raises
     ------
     NodeError
-        If the node is not found, or other nodes publish on its topics.
+        If other nodes publish on its topics, or messages are lost.
     """
-    with NodeExam(topic, command) as node:
-        return examine(node.start, level, imu, seeds, subject=command or topic,
-                       isolated=False, restart=command is not None)
+    with NodeExam(command, topic) as node:
+        return examine(node.start, level, imu, seeds, subject=command, feed=node.feed, show=show)
 
 
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
-    """A node under examination, which is also a `trial.Filter`; arguments as `examine_node`."""
+    """A node under examination, which is also a `feeding.Filter`; arguments as `examine_node`."""
 
-    def __init__(self, topic: str, command: str | None = None) -> None:
+    def __init__(self, command: str, topic: str) -> None:
         expand_topic_name(topic, NAME, '/')         # raises ValueError
-        self._command = None if command is None else shlex.split(command)
-        self._topic = topic
+        self._command, self._topic = shlex.split(command), topic
         self._context = Context()
         rclpy.init(context=self._context)
         self._node = Node(NAME, context=self._context, parameter_overrides=[
             Parameter('use_sim_time', value=False)])
         self._executor = Executor(context=self._context)
         self._executor.add_node(self._node)
-        profile = QoSProfile(depth=100)
+        # A reliable publisher that keeps messages serves readers of every kind.
+        profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._clock, self._imu, self._field = (
-            self._node.create_publisher(kind, name, profile) for kind, name in (
-                (Clock, '/clock'), (Imu, IMU_TOPIC), (MagneticField, FIELD_TOPIC)))
-        self._subscription = self._node.create_subscription(Imu, topic, self._take, profile)
+            self._node.create_publisher(kind, name, profile)
+            for kind, name in ((Clock, '/clock'), (Imu, IMU_TOPIC), (MagneticField, FIELD_TOPIC)))
+        self._subscription: Any = None
         self._process: subprocess.Popen[bytes] | None = None
         self._answers: dict[int, Any] = {}          # by stamp [ns]
         self.covariance: Reals | None = None
+
+    def feed(self, make_filter: MakeFilter, runs: Sequence[Run]) -> list[Outcome]:
+        """Do as `feeding.feed`; begin a run again in which a message is lost."""
+        return [self._feed(make_filter, run) for run in runs]
+
+    def _feed(self, make_filter: MakeFilter, run: Run) -> Outcome:
+        for _ in range(ATTEMPTS):
+            with contextlib.suppress(LostError):
+                return feed(make_filter, [run])[0]
+        raise NodeError(f'messages between exam and node are lost in {ATTEMPTS} runs: make '
+                        f'{IMU_TOPIC} and {self._topic} reliable in the node')
 
     def __exit__(self, *exception: object) -> None:
         self._end_process()
         self._executor.shutdown()
         self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
+        rclpy.try_shutdown(context=self._context)
 
     def start(self) -> 'NodeExam':
-        """Start the node anew, or find the running one; return it as a filter."""
+        """Start the node anew; return it as a filter."""
         self._end_process()
-        if self._command is not None:
-            try:
-                self._process = subprocess.Popen(self._command, start_new_session=True)
-            except OSError as error:
-                raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
-        there = self._wait(self.is_there, PATIENCE_S)
-        if there and self._process is None:
-            self._wait(lambda: False, DISCOVERY_S)
-        for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
-            if (count := self._node.count_publishers(name)) > 1:
-                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
-                                'needs the topic alone')
-        if not there:
-            text = (f'no node reads {IMU_TOPIC} and publishes {self._topic} within '
-                    f'{PATIENCE_S:g} s: check that it runs, its ROS_DOMAIN_ID '
-                    f'({os.environ.get("ROS_DOMAIN_ID", "0")} here), namespace and remappings')
-            raise RuntimeError(text) if self._process is not None else NodeError(text)
-        self._now_ns = (START_NS if self._process is not None else
-                        FASTEST * time.monotonic_ns() % LAST_NS + START_NS)
-        self._sent = self._answered = 0
+        try:
+            self._process = subprocess.Popen(self._command, start_new_session=True)
+        except OSError as error:
+            raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
+        if not self._wait(self.is_there, PATIENCE_S):
+            raise RuntimeError(
+                f'no node reads {IMU_TOPIC} and publishes {self._topic} within {PATIENCE_S:g} s: '
+                f'check its ROS_DOMAIN_ID ({os.environ.get("ROS_DOMAIN_ID", "0")} here), '
+                'namespace and remappings')
+        self._subscribe()
+        self._now_ns = START_NS
+        self._answered = 0
+        self._check_alone()
         self._answers.clear()
         self.covariance = None
         return self
 
+    def _subscribe(self) -> None:
+        """Read the attitudes with the reliability that they are offered with."""
+        read, told = (self._node.resolve_topic_name(name) for name in (IMU_TOPIC, self._topic))
+        offered, asked = ([one.qos_profile.reliability for one in infos(name)] for infos, name in (
+            (self._node.get_publishers_info_by_topic, told),
+            (self._node.get_subscriptions_info_by_topic, read)))
+        best_effort = ReliabilityPolicy.BEST_EFFORT
+        self._reliable = best_effort not in (*offered, *asked)
+        self._subscription = self._subscription or self._node.create_subscription(
+            Imu, self._topic, self._take, QoSProfile(
+                depth=100, reliability=best_effort if best_effort in offered
+                else ReliabilityPolicy.RELIABLE))
+
+    def _check_alone(self) -> None:
+        """Raise NodeError if another node publishes on a topic of the exam."""
+        for name in ('/clock', IMU_TOPIC, FIELD_TOPIC, self._topic):
+            if (count := self._node.count_publishers(name)) > 1:
+                raise NodeError(f'{name} has {count} publishers: end the others, because the exam '
+                                'needs the topic alone')
+
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """Publish the readings, and wait for the attitude with their stamp."""
+        """
+        Publish the readings, and wait for the attitude with their stamp.
+
+        The first ones are published again, later, until there is an answer: the node may not yet
+        be matched, or have no step to take.
+        """
+        for _ in range(1 if self._answered else FIRST):
+            self._publish(gyroscope, accelerometer, magnetometer, dt)
+            if self._wait(lambda: self._now_ns in self._answers,
+                          ANSWER_S if self._answered else AGAIN_S):
+                break
+        else:
+            self._check_alone()
+            if not self._answered:
+                raise RuntimeError(f'it answers none of {FIRST} samples')
+            if not self._reliable:
+                raise LostError
+            raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
+                               f'sample within {ANSWER_S:g} s')
+        message = self._answers.pop(self._now_ns)
+        self._answers.clear()
+        self._answered += 1
+        if self._answered % ALONE_EVERY == 0:
+            self._check_alone()
+        matrix = np.array(message.orientation_covariance).reshape(3, 3)
+        self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
+        q = message.orientation
+        return np.array((q.x, q.y, q.z, q.w))
+
+    def _publish(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
+                 dt: float) -> None:
+        """Publish the readings of the next step."""
         self._now_ns += round(dt * NANOSECONDS)
-        self._sent += 1
         clock, imu = Clock(), Imu()
         clock.clock.sec, clock.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
         imu.header.stamp, imu.header.frame_id = clock.clock, FRAME
@@ -143,22 +200,6 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         if magnetometer is not None:
             self._field.publish(field)
         self._imu.publish(imu)
-        patience = PATIENCE_S if self._answered else FIRST_PATIENCE_S
-        if not self._wait(lambda: self._now_ns in self._answers, patience):
-            if self._command is None and not self.is_there():
-                raise NodeError(f'the node that reads {IMU_TOPIC} and publishes {self._topic} '
-                                'has gone')
-            if self._answered or self._sent > UNANSWERED:
-                raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
-                                   f'sample within {patience:g} s')
-            return np.array((0.0, 0.0, 0.0, 1.0))
-        self._answered += 1
-        message = self._answers.pop(self._now_ns)
-        self._answers.clear()
-        matrix = np.array(message.orientation_covariance).reshape(3, 3)
-        self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix
-        q = message.orientation
-        return np.array((q.x, q.y, q.z, q.w))
 
     def is_there(self) -> bool:
         """Return whether a node reads the samples, and one publishes the attitudes."""

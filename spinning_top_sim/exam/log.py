@@ -2,11 +2,12 @@
 """
 The exam of a log: attitudes that a node has published, compared with the truth.
 
-The filter cannot get the readings again, so only the attitudes are judged: misreadings of them,
-wrong stamps, the covariance and divergence.
+The filter cannot get the readings again, so only the attitudes are judged: their convention,
+wrong stamps, the covariance and gross errors.
 """
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,24 +17,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from spinning_top_sim.exam import diagnosis, hypotheses
-from spinning_top_sim.exam.diagnosis import degrees
-from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.scenarios import Reals, Run
-from spinning_top_sim.exam.trial import Outcome, invalid
+from spinning_top_sim.exam.feeding import Outcome, invalid
+from spinning_top_sim.exam.measures import degrees, errors_of, nees_of
+from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader, LogTopic
+from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
+from spinning_top_sim.tools.identify import rms
 from spinning_top_sim.tools.recorded_run import ForeignLogError, read_run_description
-from spinning_top_sim.tools.verdict import Fault
+from spinning_top_sim.tools.report import Finding, Mark, Report
 
 # The first of these topics in the log is the truth.  An Imu is about the sensor, the others are
 # about the body.
 TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
 ODOMETRY_OF_SENSOR = 'ground_truth/imu_odom'
 LONGEST_GAP_S = 0.1             # of the truth, across which it is interpolated
-GROSS = np.radians(3.0)         # a smaller error is no misreading
+GROSS, USELESS = np.radians((3.0, 10.0))    # errors that are a convention; that are a fault
+LATE, EARLY = 0.75, -1.5        # steps; a node may predict by one
+EXPLAINED = 0.25                # most of an error that its cause leaves
+THINNED = 10                    # every so many attitudes are compared in all conventions
 FEWEST = 100                    # attitudes in a log that can be judged
 
 
@@ -71,11 +75,12 @@ def examine_log(path: str | Path, topic: str, truth: str | None = None,
         estimates = _read(reader, examined)
         true_topic = _topic(reader, truth) if truth else _first_truth(reader, examined)
         true = _read(reader, true_topic)
-        turns = _of_sensor(true_topic, true, _places(reader), north)
+        turns = _of_sensor(reader, true_topic, true, north)
     subject = one_line(f'{topic} of {Path(path).name}')
-    for k, why in invalid(estimates.quaternions, estimates.covariances):
-        return Report(subject, [Fault('invalid_output', f'the message of '
-                                      f'{estimates.stamps_ns[k] * 1e-9:.9f} s: {why}')], {})
+    if (wrong := invalid(estimates.quaternions, estimates.covariances)) is not None:
+        k, why = wrong
+        return Report(subject, [Finding('invalid_output', f'the message of '
+                                        f'{estimates.stamps_ns[k] * 1e-9:.9f} s: {why}')])
     outcome = _beside(one_line(topic), estimates, true.stamps_ns, turns)
     return _judge(subject, outcome, north is not None)
 
@@ -83,10 +88,10 @@ def examine_log(path: str | Path, topic: str, truth: str | None = None,
 def _topic(reader: LogReader, name: str) -> LogTopic:
     for topic in reader.topics:
         if topic.name.lstrip('/') == name.lstrip('/'):
-            if topic.type_name not in LAYOUTS:
-                raise ValueError(f'{topic.name} has the type {topic.type_name or "unknown"}: must '
-                                 f'be one of {", ".join(LAYOUTS)}')
-            return topic
+            if topic.type_name in LAYOUTS:
+                return topic
+            raise ValueError(f'{topic.name} has the type {topic.type_name or "unknown"}: must be '
+                             f'one of {", ".join(LAYOUTS)}')
     raise ValueError(f'{reader.path} has no topic {name}; it has '
                      f'{", ".join(topic.name for topic in reader.topics) or "none"}')
 
@@ -114,36 +119,28 @@ def _read(reader: LogReader, topic: LogTopic) -> Stamped:
                    np.array([rows[k].covariance for k in first]))
 
 
-def _places(reader: LogReader) -> dict[int, Mapping[str, Any]]:
-    """Return the parameters by the log time from which they hold [ns].  Raises ValueError."""
+def _of_sensor(reader: LogReader, topic: LogTopic, true: Stamped, north: str | None) -> Rotation:
+    """Return the true attitudes of the sensor, in a world with this north.  Raises ValueError."""
+    if (wrong := invalid(true.quaternions, np.empty((0, 3, 3)))) is not None:
+        raise ValueError(f'{topic.name} at {true.stamps_ns[wrong[0]] * 1e-9:.9f} s: {wrong[1]}')
+    turns = Rotation.from_quat(true.quaternions)
+    values: Mapping[str, Any] = {}
     try:
         run = read_run_description(reader)
+        values = run.values_at_start
+        if any('imu.rpy' in event.details.get('parameters', {}) and event.details['parameters'][
+                'imu.rpy'] != values['imu.rpy'] for stamp_ns, event in run.events):
+            raise ValueError(f'{reader.path}: a reset turns the sensor on the body: name '
+                             'the topic of an Imu by --truth')
     except ForeignLogError as error:
         if reader.metadata.get(METADATA_NAME):
             raise ValueError(f'{reader.path}: {error}') from error
-        return {0: {}}
-    return {0: run.values_at_start, **{
-        stamp_ns: event.details['parameters'] for stamp_ns, event in run.events
-        if event.kind == 'reset'}}
-
-
-def _of_sensor(topic: LogTopic, true: Stamped, places: Mapping[int, Mapping[str, Any]],
-               north: str | None) -> Rotation:
-    """Return the true attitudes of the sensor, in a world with this north.  Raises ValueError."""
-    for k, why in invalid(true.quaternions, np.empty((0, 3, 3))):
-        raise ValueError(f'{topic.name} at {true.stamps_ns[k] * 1e-9:.9f} s: {why}')
-    turns = Rotation.from_quat(true.quaternions)
-    place = np.searchsorted([*places], true.stamps_ns, 'right') - 1
     if not (topic.type_name == 'sensor_msgs/msg/Imu' or topic.name.endswith(ODOMETRY_OF_SENSOR)):
-        turns = turns * Rotation.from_euler('xyz', np.array([
-            values.get('imu.rpy', (0.0, 0.0, 0.0)) for values in places.values()])[place])
+        turns = turns * Rotation.from_euler('xyz', values.get('imu.rpy', (0.0, 0.0, 0.0)))
     if north == 'magnetic':
-        if not all('mag.field' in values for values in places.values()):
+        if 'mag.field' not in values:
             raise ValueError('the log does not say where magnetic north is')
-        east_part, north_part, _ = np.array([
-            values['mag.field'] for values in places.values()])[place].T
-        turns = Rotation.from_euler(
-            'z', np.arctan2(east_part, north_part)[:, np.newaxis]) * turns
+        turns = Rotation.from_euler('z', math.atan2(*values['mag.field'][:2])) * turns
     return turns
 
 
@@ -161,34 +158,60 @@ def _beside(name: str, said: Stamped, true_ns: NDArray[np.int64], turns: Rotatio
     times, t = (true_ns - true_ns[0]) * 1e-9, (stamps - true_ns[0]) * 1e-9
     # Central differences.
     step = (turns[:-1].inv() * turns[1:]).as_rotvec() / np.diff(times)[:, np.newaxis]
-    middle = 0.5 * (times[1:] + times[:-1])
-    rates = np.stack([np.interp(t, middle, column) for column in step.T], axis=1)
+    rates = np.stack([np.interp(t, 0.5 * (times[1:] + times[:-1]), column) for column in step.T],
+                     axis=1)
     # The period of the filter, which may be shorter than that of the truth.
     dt = np.full(len(t), float(np.median(np.diff(said.stamps_ns))) * 1e-9)
-    readings = np.full((3, len(t), 3), np.nan)          # nothing asks for them
-    return Outcome(Run(name, t - t[0], dt, Slerp(times, turns)(t).as_quat(), rates, *readings),
-                   said.quaternions[chosen], said.covariances[chosen],
-                   np.full((len(t), 3), np.nan))
+    unknown = np.full((len(t), 3), np.nan)
+    return Outcome(Run(name, dt, Slerp(times, turns)(t).as_quat(), rates, unknown, unknown),
+                   said.quaternions[chosen], said.covariances[chosen], unknown)
+
+
+def _delay(outcome: Outcome, absolute: bool) -> tuple[float, float, float]:
+    """Fit e = -s w + h z; return s [s], and the rms of e without and with it [rad]."""
+    true, est = (Rotation.from_quat(rows) for rows in (outcome.run.truth, outcome.estimates))
+    errors = errors_of(outcome.estimates, outcome.run.truth)
+    mean = 0.0 if absolute else float(np.angle(np.mean(np.exp(1j * errors.heading))))
+    vector = (true.inv() * Rotation.from_euler('z', -mean) * est).as_rotvec().ravel()
+    columns = np.stack((-outcome.run.gyroscope.ravel(), true.inv().apply((0, 0, 1)).ravel()),
+                       axis=1)[:, :2 - absolute]
+    found = np.linalg.lstsq(columns, vector, rcond=None)[0]
+    return (float(found[0]), rms(vector - columns[:, 1:] @ found[1:]),
+            rms(vector - columns @ found))
 
 
 def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
-    settled, found = outcome.last(), None
-    before = diagnosis.error_of(settled, absolute)
-    after, best = min(((diagnosis.error_of(replace(
-        settled, estimates=one.on_attitudes(settled.estimates)), absolute), one)
-        for one in hypotheses.MISREADINGS), key=lambda pair: pair[0])
-    if before > GROSS and after < diagnosis.EXPLAINED * before:
-        found = hypotheses.ambiguous(best._replace(
-            text=f'{best.text}, the error falls from {degrees(before)} to {degrees(after)}; all '
-            'measures are those after this correction'), absolute)
-    corrected = outcome if found is None else replace(
-        outcome, estimates=found.on_attitudes(outcome.estimates))
-    offset = diagnosis.offset_of(corrected.last(), absolute)
-    consistency = diagnosis.consistency([corrected], absolute)
-    faults = [Fault(name, found.text) for name in found.faults] if found else []
-    faults += filter(None, [diagnosis.stamp_fault(offset, float(outcome.run.dt[0]))])
-    faults = faults or [*filter(None, (diagnosis.inaccuracy(outcome, absolute),
-                                       diagnosis.covariance_fault(consistency)))][:1]
-    measured = {**diagnosis.error_measures([corrected], absolute),
-                'stamp_offset_s': offset.seconds, **diagnosis.nees_measures(consistency)}
-    return Report(subject, faults, measured, [corrected])
+    """Find the convention, the delay, and what is left, in the second half."""
+    settled = outcome.part(slice(len(outcome.run.dt) // 2, None))
+    best = conventions.best(settled.estimates[::THINNED], settled.run.truth[::THINNED],
+                            'absolute' if absolute else 'steady')
+    findings, name = [], best.convention.name
+    if name and best.before > GROSS and best.after < EXPLAINED * best.before:
+        findings.append(Finding('convention', f'read as {name}, the error falls from '
+                                f'{degrees(best.before)} to {degrees(best.after)}; all measures '
+                                'are those after this correction'))
+        outcome, settled = (replace(one, estimates=best.convention.undo(one.estimates))
+                            for one in (outcome, settled))
+    seconds, before, after = _delay(settled, absolute)
+    late = seconds / float(outcome.run.dt[0])
+    if not EARLY <= late <= LATE and after < EXPLAINED * before:
+        findings.append(Finding(
+            'timing', f'the attitude is {abs(1e3 * seconds):.3g} ms '
+            f'{"behind" if late > 0.0 else "ahead of"} its stamp: shifted by that, the error '
+            f'falls from {degrees(before)} to {degrees(after)}', seconds))
+    errors = errors_of(settled.estimates, settled.run.truth)
+    errors = errors if absolute else errors.about_mean()
+    value, nees = rms(errors.whole), nees_of([outcome])
+    marks = {'tilt_rms_deg': Mark(math.degrees(rms(errors.tilt)), meaning='in the second half'),
+             'heading_rms_deg': Mark(math.degrees(rms(errors.heading))),
+             'error_rms_deg': Mark(math.degrees(value), math.degrees(USELESS)),
+             'stamp_offset_s': Mark(seconds, meaning='> 0: late')}
+    if not findings and value > USELESS:
+        findings.append(Finding('accuracy', f'the error is {degrees(value)} rms'))
+    if nees is not None:
+        text = f'consistent are {nees.low:.3g} to {nees.high:.3g}'
+        marks['nees'] = Mark(nees.ratio, nees.high, text)
+        if not findings and not nees.low <= nees.ratio <= nees.high:
+            findings.append(Finding('covariance', 'the squared error of the tilt is '
+                                    f'{nees.ratio:.3g} times what the covariance says; {text}'))
+    return Report(subject, findings, marks, (), [outcome])

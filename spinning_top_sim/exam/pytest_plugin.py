@@ -6,8 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from spinning_top_sim.exam.examiner import examine
-from spinning_top_sim.exam.report import Report
-from spinning_top_sim.tools.verdict import passing
+from spinning_top_sim.tools.report import Report, passing
 
 
 @pytest.fixture

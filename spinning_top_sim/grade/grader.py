@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from spinning_top_sim.exam.measures import convergence_order
 from spinning_top_sim.grade import dynamics, sensors
 from spinning_top_sim.grade.motion import InvalidTrajectoryError, Motion, Trajectory
 from spinning_top_sim.grade.report import Report
@@ -176,3 +175,10 @@ def _motion_faults(motions: Sequence[Motion], orders: Mapping[str, float], dt: f
     yield from (fault._replace(evidence=f'{text}; {fault.evidence}') for fault in causes)
     if not (first or causes):
         yield Fault('inaccurate', text, math.degrees(worst.worst))
+
+
+def convergence_order(rates: Sequence[float], errors: Sequence[float]) -> float:
+    """Return p where errors fall as rate^-p; NaN for one rate or errors of rounding size."""
+    if len(rates) < 2 or min(errors) < 1e-9:
+        return math.nan
+    return float(-np.polyfit(np.log(rates), np.log(errors), 1)[0])

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Filters of three kinds, right or wrong by their parameters."""
+"""Filters that are right, and filters with one mistake each and the faults that may be named."""
 
+import importlib.util
 import math
 from collections import deque
 from functools import partial
@@ -8,132 +9,101 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from helpers.faulty_filters import longer
-from spinning_top_sim.exam import reference
+from helpers.reference import ROOT
+from spinning_top_sim.exam.adapters import Vqf
+from spinning_top_sim.exam.measures import from_two_vectors
 
-X, Y, Z = np.eye(3)
+_spec = importlib.util.spec_from_file_location(
+    'reference_filter', ROOT / 'examples/reference_filter.py')
+reference = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(reference)
+ReferenceFilter, product = reference.ReferenceFilter, reference.product
 
 
 class Part:
-    """The part of a filter that can be wrong: what it takes, and what it says."""
+    """Another filter, of which something is taken for what it is not."""
 
-    def __init__(self, gyroscope=None, accelerometer=None, magnetometer=None, late=(0, 0, 0, 0),
-                 smooth=(0.0, 0.0, 0.0), said=None, report=None, step=None, **settings):
-        self._maps = [
-            one if one is not None else (lambda v: v)
-            for one in (gyroscope, accelerometer, magnetometer)]
-        self._lines = [deque() for _ in range(4)]
-        self._late, self._smooth, self._smoothed = late, smooth, [None] * 3
-        self._said, self._report = said or (lambda q: q), report or (lambda b: b)
-        self._step = step or (lambda dt: dt)
-        self.bias = np.zeros(3)
-        self.start(**settings)
+    def __init__(self, make=Vqf, rates=None, force=None, field=None, said=None, step=None,
+                 late=(0, 0, 0, 0), smooth=(0.0, 0.0, 0.0), report=None, covariance=None):
+        self._filter = make()
+        self._maps = [one or (lambda v: v) for one in (rates, force, field, said)]
+        self._step, self._report, self._covariance = step or (lambda dt: dt), report, covariance
+        self._lines = [deque(maxlen=n + 1) for n in late]
+        self._smooth, self._smoothed = (*smooth, 0.0), [None] * 4
 
-    @staticmethod
-    def _delay(line, value, n):
-        if not n:
-            return value
-        line.append(value)
-        return line.popleft() if len(line) > n else line[0]
-
-    def _read(self, k, reading, dt):
-        reading = self._delay(self._lines[k], self._maps[k](reading), self._late[k])
-        before = self._smoothed[k]
+    def _read(self, k, value, dt):
+        if value is None:
+            return None
+        self._lines[k].append(self._maps[k](value))
+        value, before = self._lines[k][0], self._smoothed[k]
         if self._smooth[k] and before is not None:
-            reading = before + dt / (dt + self._smooth[k]) * (reading - before)
-        self._smoothed[k] = reading
-        return reading
+            value = before + dt / (dt + self._smooth[k]) * (value - before)
+        self._smoothed[k] = value
+        return value
 
-    def update(self, gyroscope, accelerometer, magnetometer, dt):
-        q = self.turn(*(None if reading is None else self._read(k, reading, dt) for k, reading
-                        in enumerate((gyroscope, accelerometer, magnetometer))), self._step(dt))
-        self.bias = self._report(self._bias)
-        return self._said(self._delay(self._lines[3], q, self._late[3]))
+    def update(self, *readings):
+        *sensors, dt = readings
+        read = [self._read(k, value, dt) for k, value in enumerate(sensors)]
+        return self._read(3, self._filter.update(*read, self._step(dt)), dt)
 
+    @property
+    def bias(self):
+        bias = getattr(self._filter, 'bias', None)
+        return self._report(bias) if self._report else bias
 
-def cross(one, other):
-    (a, b, c), (x, y, z) = one.tolist(), other.tolist()
-    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
+    @property
+    def covariance(self):
+        covariance = getattr(self._filter, 'covariance', None)
+        return covariance if self._covariance is None else self._covariance * covariance
 
 
 def body(q, turn):
-    return reference.product(q, reference.exponential(turn))
+    return product(q, reference.exponential(turn))
 
 
 def world(q, turn):
-    return reference.product(reference.exponential(turn), q)
+    return product(reference.exponential(turn), q)
 
 
-def euler(q, turn):
-    angles = Rotation.from_quat(q).as_euler('ZYX') + turn[::-1]
-    return Rotation.from_euler('ZYX', angles).as_quat()
+def first_order(q, turn):
+    return product(q, np.array((*(0.5 * turn), 1.0)))
 
 
-class Mahony(Part):
-    """A filter of Mahony (2008) with exact steps."""
+class Mahony:
+    """A filter of Mahony (2008): gains of tilt, heading [1/s] and bias [1/s^2]."""
 
-    def start(self, up=0.3, north=0.3, learns=0.15, most=np.inf, advance=body, triad=True,
-              level=True, declination=0.0, about=None, angle=math.atan2, felt=(X, Y, Z)):
-        self._gains, self._most, self._advance = (up, north, learns), most, advance
-        self._triad, self._level, self._declination, self._about = triad, level, declination, about
-        self._angle, self._felt = angle, np.array(felt)
-        self._q, self._bias = None, np.zeros(3)
+    def __init__(self, up=0.3, north=0.3, learns=0.02, advance=body, triad=True, first=False,
+                 number=np.float64, level=True, most=np.inf, feels=(1.0, 1.0, 1.0), six=False):
+        self._gains, self._advance, self._triad, self._first = (
+            (up, north, learns), advance, triad, first)
+        self._number, self._level, self._most, self._feels = number, level, most, feels
+        self._six, self._q, self.bias = six, None, np.zeros(3)
 
-    def turn(self, w, a, m, dt):
-        if self._q is None:
-            self._q = np.array((0.0, 0.0, 0.0, 1.0))
-            if self._triad:
-                self._q = reference.from_two_vectors(a, m)
+    def _turn(self, a, m, dt):
         up, north, learns = self._gains
-        self._q = self._advance(self._q, (w - self._bias) * dt)
         r = reference.matrix_of(self._q)
-        e = up * self._felt @ cross(a, r[2]) / math.sqrt(a @ a)
+        e = up * np.cross(a, r[2]) / np.linalg.norm(a) * self._feels
         if m is not None:
             h = r @ m
             if not self._level:
                 yaw = Rotation.from_quat(self._q).as_euler('ZYX')[0]
                 h = Rotation.from_euler('z', yaw).apply(m)
-            angle = self._angle(h[0], h[1]) + self._declination
-            e = e + north * angle * (r[2] if self._about is None else self._about)
-        self._bias = np.minimum(np.maximum(self._bias - learns * e * dt, -self._most), self._most)
-        self._q = body(self._q, e * dt)
-        return self._q.copy()
+            e = e + north * math.atan2(h[0], h[1]) * r[2]
+        self.bias = np.clip(self.bias - learns * e * dt, -self._most, self._most)
+        return e * dt
 
-
-class Complementary(Part):
-    """It turns by the gyroscope, then a part of the way to the attitude of gravity and field."""
-
-    def start(self, share=0.003, learns=0.0004, most=np.inf, advance=body):
-        self._share, self._learns, self._advance, self._q = share, learns, advance, None
-        self._most, self._bias = most, np.zeros(3)
-
-    def turn(self, w, a, m, dt):
+    def update(self, w, a, m, dt):
+        m = None if self._six else m
         if self._q is None:
-            self._q = reference.from_two_vectors(a, m)
-        self._q = self._advance(self._q, (w - self._bias) * dt)
-        if m is None:
-            r = reference.matrix_of(self._q)
-            e = cross(a, r[2]) / math.sqrt(a @ a)
+            self._q = from_two_vectors(a, m) if self._triad else np.array((0.0, 0.0, 0.0, 1.0))
+        elif self._first:       # corrects by the force of the end before it turns
+            self._q = self._advance(self._q, self._turn(a, m, dt) + (w - self.bias) * dt)
         else:
-            e = reference.product(self._q * (-1.0, -1.0, -1.0, 1.0),
-                                  reference.from_two_vectors(a, m))
-            e = 2.0 * e[:3] * np.sign(e[3])
-        self._bias = np.minimum(np.maximum(self._bias - self._learns * e, -self._most), self._most)
-        self._q = body(self._q, self._share * e)
+            self._q = self._advance(self._q, (w - self.bias) * dt)
+            self._q = body(self._q, self._turn(a, m, dt))
+        self._q = self._q.astype(self._number).astype(float)
+        self._q /= np.linalg.norm(self._q)
         return self._q.copy()
-
-
-class Ekf(Part):
-    """The reference filter of the exam."""
-
-    def start(self, fields=10 ** 9, **settings):
-        self._filter, self._bias = reference.ReferenceFilter(**settings), np.zeros(3)
-        self._fields = iter(range(fields))
-
-    def turn(self, w, a, m, dt):
-        q = self._filter.update(w, a, None if next(self._fields, None) is None else m, dt)
-        self._bias = self._filter.bias
-        return q
 
 
 def axes(*rows):
@@ -150,80 +120,61 @@ def added(*offset):
     return lambda v: v + offset
 
 
-GYROSCOPE, GRAVITY, FIELD = 'gyroscope_wiring', 'accelerometer_wiring', 'magnetometer_wiring'
-UNITS, STEP, LAG, OFF = 'gyroscope_units', 'time_step', 'lag', 'inaccurate'
-# For each kind of filter: the changes, and the causes that may be named; none is a right filter.
-CHANGES = {
-    'right': ({}, ''),
-    'rates y x z': ({'gyroscope': axes(2, 1, 3)}, GYROSCOPE),
-    'rates -x y z': ({'gyroscope': axes(-1, 2, 3)}, GYROSCOPE),
-    'rates negated': ({'gyroscope': axes(-1, -2, -3)}, GYROSCOPE),
-    'rates z x y': ({'gyroscope': axes(3, 1, 2)}, GYROSCOPE),
-    'rates x 1.05': ({'gyroscope': scaled(1.05, 1.0, 1.0)}, GYROSCOPE),
-    'rates in deg': ({'gyroscope': np.degrees}, UNITS),
-    'rates twice in rad': ({'gyroscope': np.radians}, UNITS),
-    'rates clipped': ({'gyroscope': lambda v: np.clip(v, -8.0, 8.0)}, OFF),
-    'rates late': ({'late': (5, 0, 0, 0)}, LAG),
-    'rates smoothed': ({'smooth': (0.05, 0.0, 0.0)}, LAG),
-    'force y x z': ({'accelerometer': axes(2, 1, 3)}, GRAVITY),
-    'force x -y z': ({'accelerometer': axes(1, -2, 3)}, GRAVITY),
-    'force x -y -z': ({'accelerometer': axes(1, -2, -3)}, GRAVITY),
-    'force negated': ({'accelerometer': axes(-1, -2, -3)}, 'gravity_sign'),
-    'force x 1.2': ({'accelerometer': scaled(1.2, 1.0, 1.0)}, GRAVITY),
-    'force late': ({'late': (0, 8, 0, 0)}, LAG),
-    'force smoothed': ({'smooth': (0.0, 0.1, 0.0)}, LAG),
-    'field y x z': ({'magnetometer': axes(2, 1, 3)}, FIELD),
-    'field x y -z': ({'magnetometer': axes(1, 2, -3)}, FIELD),
-    'hard iron': ({'magnetometer': added(1e-5, 0.0, 0.0)}, 'hard_iron'),
-    'soft iron': ({'magnetometer': scaled(1.4, 1.0, 1.0)}, FIELD),
-    'conjugated': ({'said': lambda q: q * (-1.0, -1.0, -1.0, 1.0)}, 'conjugated'),
-    'w first': ({'said': lambda q: q[[3, 0, 1, 2]]}, 'component_order'),
-    'vector longer': ({'said': longer}, OFF),
-    'vector positive': ({'said': np.abs}, OFF),
-    'vector y x z': ({'said': lambda q: q[[1, 0, 2, 3]]}, 'component_order'),
-    'attitude late': ({'late': (0, 0, 0, 5)}, 'stamp_offset'),
-    'twice dt': ({'step': lambda dt: 2.0 * dt}, f'{GYROSCOPE} {STEP}'),
-    'dt of 100 Hz': ({'step': lambda dt: 0.01}, STEP)}
-OWN = {     # and these
-    'mahony': {
-        'wrong side': ({'advance': world}, GYROSCOPE),
-        'Euler angles': ({'advance': euler}, GYROSCOPE),
-        # It ends upside down, and its error grows until then.
-        'gain < 0': ({'up': -0.3}, f'gravity_sign {GRAVITY} diverges {OFF}'),
-        'no gravity': ({'up': 0.0}, GRAVITY), 'no field': ({'north': 0.0}, FIELD),
-        'field of a level sensor': ({'level': False}, FIELD),
-        'heading by atan': ({'angle': lambda x, y: math.atan(x / y)}, OFF),
-        'heading from 0 on': ({'angle': lambda x, y: math.atan2(x, y) % math.tau}, OFF),
-        'heading about z': ({'about': np.array((0.0, 0.0, 1.0))}, f'{FIELD} {OFF}'),
-        'tilt about x as y': ({'felt': (X, X, Z)}, f'{OFF} {GRAVITY}'),
-        'tilt about y as x': ({'felt': (Y, Y, Z)}, f'{OFF} {GRAVITY}'),
-        'no tilt about y': ({'felt': (X, 0 * Y, Z)}, GRAVITY),
-        'slow turns dropped': ({'gyroscope': lambda v: v * (v @ v > 0.04)}, OFF),
-        'dt at most 10 ms': ({'step': lambda dt: min(dt, 0.01)}, STEP),
-        'dt cut': ({'step': lambda dt: int(100.0 * dt) / 100.0}, STEP),
-        'dt rounded': ({'step': lambda dt: round(dt, 3)}, STEP),
-        'slow heading': ({'north': 0.01, 'learns': 0.02}, 'no_bias_estimate'),
-        'declination': ({'declination': np.radians(5.0)}, 'heading_offset'),
-        'bias gain < 0': ({'learns': -0.15}, f'no_bias_estimate diverges {OFF}'),
-        'no bias': ({'learns': 0.0}, 'no_bias_estimate'),
-        'bias about z': ({'learns': np.array((0.0, 0.0, 0.15))}, 'no_bias_estimate'),
-        'bias off': ({'report': lambda b: b + 0.02}, 'bias_report'),
-        'bias in deg/s': ({'report': np.degrees}, 'bias_report'),
-        'bias turned': ({'learns': 0.06, 'report': lambda b: b + np.cross(b, (-0.3, -0.3, -0.9))},
-                        'bias_report'),
-        'bias clamped': ({'most': np.radians(0.1)}, 'no_bias_estimate'),
-        'bias negated': ({'report': np.negative}, 'bias_report')},
-    'complementary': {
-        'wrong side': ({'advance': world}, GYROSCOPE),
-        'Euler angles': ({'advance': euler}, GYROSCOPE),
-        'never corrects': ({'share': 0.0, 'learns': 0.0}, f'{GRAVITY} {FIELD}'),
-        'corrects by the bias': ({'share': 0.0}, f'{OFF} no_bias_estimate')},
-    'ekf': {
-        # It takes the lag for motion of the device, and follows such forces little.
-        'force smoothed': ({'smooth': (0.0, 0.1, 0.0)}, f'{LAG} {OFF}'),
-        'field at its start': ({'fields': 50}, FIELD),
-        'bias negated': ({'report': np.negative}, 'bias_report')}}
-KINDS = {'mahony': Mahony, 'complementary': Complementary, 'ekf': Ekf}
-TABLE = {f'{kind}, {name}': (partial(make, **change), set(causes.split()))
-         for kind, make in KINDS.items()
-         for name, (change, causes) in {**CHANGES, **OWN[kind]}.items()}
+def turned(axis, deg):
+    q = Rotation.from_euler(axis, deg, degrees=True).as_quat()
+    return partial(product, q)
+
+
+NED = Rotation.from_matrix([(0, 1, 0), (1, 0, 0), (0, 0, -1)]).as_quat()
+RIGHT = {
+    'vqf': Vqf, 'vqf, six axes': partial(Vqf, magnetic=False), 'vqf, slow': partial(
+        Vqf, tauAcc=30.0), 'vqf, options': partial(Vqf, tauAcc=6.0, tauMag=20.0),
+    'reference': ReferenceFilter, 'mahony': Mahony, 'mahony, six axes': partial(Mahony, six=True),
+    'mahony, slow': partial(Mahony, 0.1, 0.1, 0.01), 'mahony, slower': partial(
+        Mahony, 0.1, 0.05, 0.001), 'mahony, fast': partial(Mahony, 1.0, 1.0, 0.1),
+    'mahony, float32': partial(Mahony, number=np.float32),
+    'mahony, from the identity': partial(Mahony, triad=False),
+    'mahony, slow from the identity': partial(Mahony, 0.1, 0.1, 0.01, triad=False),
+    'mahony, corrects first': partial(Mahony, 1.0, 0.5, 0.1, first=True)}
+# Each with the faults that may be named.
+WRONG = {
+    'rates y x z': (partial(Part, rates=axes(2, 1, 3)), 'gyroscope'),
+    'rates negated': (partial(Part, rates=np.negative), 'gyroscope'),
+    'rates x 1.05': (partial(Part, rates=scaled(1.05, 1.0, 1.0)), 'gyroscope'),
+    'rates in deg': (partial(Part, rates=np.radians), 'gyroscope'),
+    'rates clipped': (partial(Part, rates=lambda v: np.clip(v, -8.0, 8.0)), 'gyroscope'),
+    'rates late': (partial(Part, late=(5, 0, 0, 0)), 'timing'),
+    'rates smoothed': (partial(Part, smooth=(0.05, 0.0, 0.0)), 'timing'),
+    'slow turns dropped': (partial(Part, Mahony, rates=lambda v: v * (v @ v > 0.04)), 'accuracy'),
+    'force y x z': (partial(Part, force=axes(2, 1, 3)), 'accelerometer'),
+    'force negated': (partial(Part, force=np.negative), 'accelerometer'),
+    'force x 1.2': (partial(Part, force=scaled(1.2, 1.0, 1.0)), 'accelerometer'),
+    'force offset': (partial(Part, force=added(0.0, 0.8, 0.0)), 'accelerometer'),
+    'force smoothed': (partial(Part, Mahony, smooth=(0.0, 0.3, 0.0)), 'accuracy'),
+    'no tilt about y': (partial(Mahony, feels=(1.0, 0.0, 1.0)), 'accelerometer'),
+    'gain < 0': (partial(Mahony, -0.3), 'accelerometer'),
+    'no gravity': (partial(Mahony, 0.0), 'accelerometer'),
+    'field y x z': (partial(Part, field=axes(2, 1, 3)), 'magnetometer'),
+    'hard iron': (partial(Part, field=added(1e-5, 0.0, 0.0)), 'magnetometer'),
+    'field of a level sensor': (partial(Mahony, level=False), 'magnetometer'),
+    'no field': (partial(Mahony, north=0.0), 'magnetometer'),
+    'declination': (partial(Part, said=turned('z', 5.0)), 'magnetometer'),
+    'conjugated': (partial(Part, said=lambda q: q * (-1.0, -1.0, -1.0, 1.0)), 'convention'),
+    'w first': (partial(Part, said=lambda q: q[[3, 0, 1, 2]]), 'convention'),
+    'w first, NED': (partial(Part, said=lambda q: product(NED, q)[[3, 0, 1, 2]]), 'convention'),
+    'vector x y -z': (partial(Part, said=lambda q: q * (1.0, 1.0, -1.0, 1.0)), 'convention'),
+    'vector positive': (partial(Part, said=np.abs), 'accuracy'),
+    'attitude late': (partial(Part, late=(0, 0, 0, 5)), 'timing'),
+    'one step late': (partial(Part, late=(0, 0, 0, 1)), 'timing'),
+    'dt of 100 Hz': (partial(Part, Mahony, step=lambda dt: 0.01), 'timing'),
+    'wrong side': (partial(Mahony, advance=world), 'gyroscope'),
+    'first order': (partial(Mahony, advance=first_order), 'integration'),
+    'follows forces': (partial(Vqf, tauAcc=0.1), 'lever_arm'),
+    'no bias': (partial(Mahony, learns=0.0), 'bias'),
+    'bias gain < 0': (partial(Mahony, learns=-0.02), 'bias'),
+    'bias clamped': (partial(Mahony, most=math.radians(0.1)), 'bias'),
+    'bias negated': (partial(Part, report=np.negative), 'bias'),
+    'covariance / 4': (partial(Part, ReferenceFilter, covariance=0.25), 'covariance'),
+    'covariance x 4': (partial(Part, ReferenceFilter, covariance=4.0), 'covariance'),
+    'not a number': (partial(Part, said=lambda q: q * np.nan), 'invalid_output')}
+TABLE = {**{name: (make, '') for name, make in RIGHT.items()}, **WRONG}

@@ -8,22 +8,22 @@ moves.  Rates, accelerations, their frequencies and lever arms are those of the 
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.exam.feeding import Feed, MakeFilter
 from spinning_top_sim.exam.measures import gyroscope_alone
-from spinning_top_sim.exam.report import Report
-from spinning_top_sim.exam.scenarios import GRAVITY, Reals, Run
+from spinning_top_sim.exam.motions import GRAVITY, Reals, Run
 from spinning_top_sim.exam.scored import ScoredRun, report_of
-from spinning_top_sim.exam.trial import Feed, MakeFilter
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
 from spinning_top_sim.streams.vibration import Vibration
+from spinning_top_sim.tools.report import Report
 
 # The motion is computed every half step.
 PERIOD_NS, HALF_NS = 7_000_000, 3_500_000
@@ -79,11 +79,13 @@ SCENES = (
         'mag.disturbance.body': (0.0, 1e3, -2e-6, 5e-7, 9e-6)}))
 
 
-def examine_field(make_filter: MakeFilter, subject: str, seeds: Iterable[int],
-                  imu: Mapping[str, Any], feed: Feed) -> Report:
+def examine_field(make_filter: MakeFilter, subject: str, seeds: Sequence[int],
+                  imu: Mapping[str, Any], feed: Feed,
+                  show: Callable[[float, float], object]) -> Report:
     """Examine a filter with the scenes; the arguments are those of `record` and `report_of`."""
     return report_of(make_filter, (record(scene, seed, imu) for seed in seeds
-                                   for scene in SCENES), 'field', subject, feed)
+                                   for scene in SCENES), len(seeds) * len(SCENES), 'field',
+                     subject, feed, show)
 
 
 def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> ScoredRun:
@@ -100,7 +102,7 @@ def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> ScoredRun:
     readings = _readings(values, turns, rates + BIAS * bias / np.linalg.norm(bias),
                          turns.inv().apply(acceleration + UP))
     step = np.full(len(moves) // 2, 1e-9 * PERIOD_NS)
-    run = Run(scene.name, np.cumsum(step), step, turns[1::2].as_quat(), rates[1::2], *readings)
+    run = Run(scene.name, step, turns[1::2].as_quat(), *readings)
     counts = np.flatnonzero(moves[1::2] > 0.5)
     return ScoredRun(run, counts, gyroscope_alone(run, counts))
 

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How a filter answers small changes of its inputs: what it does with them, by least squares.
+
+A kick is a turn that the gyroscope alone reads, in one step of a rest.  The difference of the
+attitudes with and without it is the filter's answer.  Without a field, nothing but the gyroscope
+shows a kick about what a filter takes for the vertical: the answer is its use of the rates, in
+axes of the sensor that differ from start to start.  After other kicks, gravity or the field leads
+it back.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam.feeding import Outcome
+from spinning_top_sim.exam.measures import increments
+from spinning_top_sim.exam.motions import Reals, Run
+from spinning_top_sim.tools.identify import in_words
+
+# Kicks [rad]: that lead away, that show the use of the rates, and how a step is integrated.
+TINY, SMALL, LARGE = 0.02, 0.1, 0.3
+# Step of a kick, when filters have no high gains of a start, and longest delay of its answer.
+EARLY, LATEST = 360, 30
+LEAST = 1e-6                    # share of an error that is corrected, if any
+SETTLED = 800                   # uneven steps after which a filter has settled from its start
+
+
+class Kick(NamedTuple):
+    """A turn of the gyroscope alone (3,) [rad] at a sample."""
+
+    sample: int
+    turn: Reals
+
+
+class Rates(NamedTuple):
+    """
+    How turns of the sensor move the attitude.
+
+    matrix : of a turn in axes of the sensor (3, 3); the identity if right
+    left : deviation of an answer from this matrix over its kick, the median
+    in_world : whether it is one in axes of the world
+    delay : of the answer, in samples; negative: ahead
+    """
+
+    matrix: Reals
+    left: float
+    in_world: bool
+    delay: float
+
+    @property
+    def off_identity(self) -> float:
+        """The largest deviation of an entry of the matrix from the identity."""
+        return float(np.max(np.abs(self.matrix - np.eye(3)))) if not self.in_world else 1.0
+
+    def __str__(self) -> str:
+        text = in_words(self.matrix, 'turns the attitude about')
+        return f'a rate about {text}' + (', axes of the world' if self.in_world else '')
+
+
+def with_kicks(run: Run, kicks: Sequence[Kick]) -> Run:
+    """Return the run with kicks."""
+    gyroscope = run.gyroscope.copy()
+    for kick in kicks:
+        gyroscope[kick.sample] += kick.turn / run.dt[kick.sample]
+    return replace(run, name=f'{run.name}, kicks', gyroscope=gyroscope)
+
+
+def rates(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Rates:
+    """Identify the use of the rates from starts without and with kicks about the vertical."""
+    apart = np.array([increments(other.estimates) - increments(one.estimates)
+                      for one, other in zip(still, moved, strict=True)])[:, EARLY:]
+    turns = _turns(still, moved)
+    moves = np.cumsum(apart, axis=1)                # (starts, samples, 3)
+    size = np.median(np.linalg.norm(moves, axis=2), axis=0)
+    # At once, or when it is greatest: an unstable filter goes on.
+    whole = 0 if abs(size[0] / np.linalg.norm(turns[0]) - 1.0) < 0.1 else int(
+        np.argmax(size[:LATEST] >= 0.97 * np.max(size[:LATEST])))
+    # An attitude that is predicted goes too far at first, and back at once.
+    back = size[whole] - size[whole + 1]
+    if back > 0.25 * size[whole] and abs(size[whole + 1] - size[whole + 2]) < 0.2 * back:
+        whole += 1
+    delay = float(np.sum(1.0 - size[:whole] / max(size[whole], 1e-300)))
+    matrix, left = _fit(moves[:, whole], turns)
+    world = Rotation.from_quat([one.estimates[EARLY] for one in moved])
+    of_world, left_of_world = _fit(world.apply(moves[:, whole]), turns)
+    if in_world := left_of_world < 0.3 * left and left > 0.1:
+        matrix, left = of_world, left_of_world
+    return Rates(matrix, left, in_world, delay)
+
+
+def _turns(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Reals:
+    """Return the kicks (n, 3) [rad]."""
+    return np.array([(other.run.gyroscope - one.run.gyroscope)[EARLY] * one.run.dt[EARLY]
+                     for one, other in zip(still, moved, strict=True)])
+
+
+def off_rotation(still: Sequence[Outcome], moved: Sequence[Outcome]) -> float:
+    """Return how far the answers to kicks at the start are off them, relative, the median."""
+    found = [(increments(other.estimates) - increments(one.estimates))[EARLY]
+             for one, other in zip(still, moved, strict=True)]
+    return float(np.median(_off(np.array(found), _turns(still, moved))))
+
+
+def _off(answers: Reals, turns: Reals) -> Reals:
+    off: Reals = np.linalg.norm(answers - turns, axis=1) / np.linalg.norm(turns, axis=1)
+    return off
+
+
+def _fit(answers: Reals, turns: Reals) -> tuple[Reals, float]:
+    """Return the matrix from turns to answers, and the median deviation from it over a turn."""
+    matrix = np.asarray(np.linalg.lstsq(turns, answers, rcond=None)[0].T, dtype=np.float64)
+    return matrix, float(np.median(_off(answers - turns @ matrix.T + turns, turns)))
+
+
+def kicked_steps(still: Outcome) -> Run:
+    """Return a run of uneven steps with kicks about what the filter takes for the vertical."""
+    lengths, run = still.run.dt.round(6), still.run
+    up = Rotation.from_quat(still.estimates[SETTLED]).inv().apply((0.0, 0.0, 1.0))
+    # In a later step of each length.
+    return with_kicks(run, [Kick(SETTLED + 20 * k + int(np.argmax(
+        lengths[SETTLED + 20 * k:] == length)), SMALL * up)
+        for k, length in enumerate(np.unique(lengths))])
+
+
+def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
+    """Return for each length of a step [s] how far a turn in it moves the attitude, relative."""
+    turns = (moved.run.gyroscope - still.run.gyroscope) * still.run.dt[:, np.newaxis]
+    steps = np.flatnonzero(np.any(turns, axis=1))
+    answers = (increments(moved.estimates) - increments(still.estimates))[steps]
+    gains = np.sum(answers * turns[steps], axis=1) / SMALL ** 2
+    return dict(sorted(zip(still.run.dt[steps].round(6).tolist(), gains.tolist(), strict=True)))
+
+
+def kicked_starts(runs: Sequence[Run], axis: Sequence[float], attitudes: Sequence[Reals],
+                  size: float = TINY) -> list[Run]:
+    """Return runs with a kick about an axis of the world, in attitudes there, to and fro."""
+    turns = [Rotation.from_quat(one[EARLY - 1]).inv().apply(axis) for one in attitudes]
+    return [with_kicks(run, [Kick(EARLY, size * (-1) ** k * turn)])
+            for k, (run, turn) in enumerate(zip(runs, turns, strict=True))]
+
+
+def pull(outcomes: Sequence[Outcome], axes: slice) -> float:
+    """
+    Return where filters go after a kick at the start, in rests in many attitudes.
+
+    axes : of the error in the world: the tilt, or the heading
+
+    It is the cosine of the angle between this way and that to the truth, in the mean: 1 if right,
+    0 if a filter does not go.
+    """
+    errors = np.array([(Rotation.from_quat(one.estimates) * Rotation.from_quat(
+        one.run.truth).inv()).as_rotvec()[[EARLY, -1], axes] for one in outcomes])
+    first, way = errors[:, 0], errors[:, 1] - errors[:, 0]
+    size, length = np.linalg.norm(first, axis=1), np.linalg.norm(way, axis=1)
+    cosines = -np.sum(first * way, axis=1) / np.maximum(size * length, 1e-300)
+    return float(np.mean(np.where(length > LEAST * size, cosines, 0.0)))

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The checks of the exam: one row each in CHECKS, in the order in which they are done.
+
+A check measures one number in runs of the filter; above its limit it is a fault.  A check is left
+out where one of the faults in `needs` has been found, and the report says so.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam import answers, measures
+from spinning_top_sim.exam.bias import BIAS, LEFT, SIZE, said_bias
+from spinning_top_sim.exam.measures import degrees, errors_of
+from spinning_top_sim.exam.motions import RATE, Reals
+from spinning_top_sim.tools import conventions
+from spinning_top_sim.tools.identify import rms
+from spinning_top_sim.tools.report import Mark
+
+if TYPE_CHECKING:
+    from spinning_top_sim.exam.examiner import Exam
+
+# Without noise a right filter has no error; what is left is its own rounding and settling.
+CLEAN_DEG = 0.3
+GROSS_DEG = 5.0         # an error at rest that another convention may explain
+ODD = 0.2               # deviation of an answer to the rates beyond delays and integration
+SURE = 0.98             # cosine of the way after a kick to that to the truth, if right
+# A right filter that corrects before it turns lags by a step, on the top by 2.3 deg.
+NOISY_DEG = 5.0
+
+
+class Measured(NamedTuple):
+    """
+    What a check has measured.
+
+    name : of the fault, if it is another than the check's
+    limit : if it depends on the runs
+    others : further measures
+    """
+
+    value: float
+    evidence: str
+    name: str = ''
+    limit: float | None = None
+    others: Mapping[str, Mark] = {}
+
+
+class Check(NamedTuple):
+    """A row: the fault, the measure and its limit, and the faults that would hide it."""
+
+    fault: str
+    mark: str
+    limit: float
+    meaning: str
+    measure: Callable[['Exam'], Measured | None]    # None: there is nothing to judge
+    needs: Sequence[str] = ()
+
+
+def repeat(exam: 'Exam') -> Measured:
+    """Feed two filters of one process with the same readings."""
+    one, other = (Rotation.from_quat(outcome.estimates) for outcome in exam.outcomes('twice'))
+    apart = float(np.max((one.inv() * other).magnitude()))
+    return Measured(apart, 'two new filters of one process that get the same readings are '
+                    f'{degrees(apart)} apart: they are random, or share state')
+
+
+def convention(exam: 'Exam') -> Measured:
+    """Read the attitudes at the rests in every convention; undo the one that fits."""
+    told, rests = exam.outcomes('excitation')[0].estimates, _rests(exam)
+    truth, heading = exam.run.truth[rests], 'absolute' if exam.heading else 'any'
+    before = math.degrees(conventions.error_of(told[rests], Rotation.from_quat(truth), heading))
+    if before < GROSS_DEG:
+        return Measured(before, '', limit=math.inf)
+    found = conventions.best(told[rests], truth, heading)
+    after, as_told = math.degrees(found.after), _rates(exam).off_identity
+    if found.convention.parts and after < max(0.1 * before, CLEAN_DEG):
+        exam.read_in(found.convention)
+        # What is taken for axes of the sensor may be a sensor that is read wrongly.
+        if _rates(exam).off_identity > max(as_told, ODD):
+            exam.read_in(conventions.Convention())
+    name = exam.convention.name
+    return Measured(before, f'read as {name}, the error at rest falls from {before:.3g} to '
+                    f'{after:.2g} deg; the other checks undo it', limit=None if name else math.inf)
+
+
+def gyroscope(exam: 'Exam') -> Measured:
+    """Identify the matrix from turns that the gyroscope reads to those of the attitude."""
+    found = _rates(exam)
+    off = found.off_identity
+    if found.left > max(0.5, 0.3 * off):
+        return Measured(max(off, found.left), f'turns of the gyroscope move the attitude '
+                        f'otherwise, by {found.left:.2g} of them, differently in each attitude',
+                        'accuracy')
+    # What comes late has lost something on its way.
+    return Measured(off if off > ODD or abs(found.delay) < DELAY else 0.0, str(found))
+
+
+DELAY = 0.25            # samples; the half of a trapezoid is found
+
+
+def delay(exam: 'Exam') -> Measured:
+    """Identify the delay with which the attitude follows the gyroscope."""
+    found = _rates(exam).delay
+    return Measured(abs(found), f'the attitude follows the gyroscope {abs(found):.3g} samples '
+                    f'{"late" if found > 0.0 else "ahead"}')
+
+
+def steps(exam: 'Exam') -> Measured:
+    """Compare turns in steps of different lengths."""
+    gains = answers.gains_of_steps(*exam.outcomes('uneven'), *exam.outcomes('uneven turns'))
+    return Measured(max(abs(gain - 1.0) for gain in gains.values()),
+                    f'in steps of {", ".join(f"{1e3 * one:g}" for one in gains)} ms a turn moves '
+                    f'the attitude {", ".join(f"{one:.3g}" for one in gains.values())} times as '
+                    'far: the length of the step is misused')
+
+
+def large_turns(exam: 'Exam') -> Measured:
+    """Compare large turns in one step with the closed form of the rotation."""
+    off = answers.off_rotation(exam.outcomes('starts'), exam.outcomes('large turns'))
+    turn = f'a turn of {answers.LARGE:g} rad in one step'
+    if off > ODD:
+        return Measured(off, f'{turn}, {answers.LARGE * RATE:g} rad/s, moves the attitude '
+                        f'otherwise, by {off:.2g} of it; a small one does not', 'gyroscope')
+    return Measured(off, f'{turn} is {off:.2%} off the rotation; a step of first order is '
+                    f'{answers.LARGE ** 2 / 12:.2%} off')
+
+
+def way_of_tilt(exam: 'Exam') -> Measured:
+    """Turn the gyroscope alone: gravity leads the tilt back, straight and in every attitude."""
+    right = answers.pull(exam.outcomes('tilts'), slice(2))
+    tilt = float(np.max(exam.clean.tilt[_rests(exam)]))
+    return Measured(1.0 - right, f'{_way(right, "the vertical")}; at rest the tilt is up to '
+                    f'{degrees(tilt)} off', others={
+                        'rest_tilt_deg': Mark(math.degrees(tilt), CLEAN_DEG, 'without noise')})
+
+
+def errors_by_field(exam: 'Exam') -> Measured | None:
+    """Judge the heading at rest, and a tilt that the field causes."""
+    if not exam.heading:
+        return None
+    rests = _rests(exam)
+    tilt, heading = (np.degrees(rows[rests]) for rows in exam.clean)
+    worst = float(np.max(np.abs(heading)))
+    evidence = f'at rest the heading is off by {min(heading):.3g} to {max(heading):.3g} deg'
+    if np.max(tilt) > max(worst, CLEAN_DEG):
+        alone = float(np.max(np.degrees(exam.errors('no field').tilt[rests])))
+        return Measured(np.max(tilt), f'at rest the tilt is up to {np.max(tilt):.3g} deg off, '
+                        f'without the magnetometer {alone:.3g} deg',
+                        '' if alone < 0.5 * np.max(tilt) else 'accuracy')
+    if worst <= CLEAN_DEG:
+        return Measured(worst, evidence)
+    right = answers.pull(exam.outcomes('turns with field'), slice(2, 3))
+    return Measured(worst, f'{evidence}; {_way(right, "north")}',
+                    'accuracy' if right > SURE else '')
+
+
+def heading_answer(exam: 'Exam') -> Measured | None:
+    """Turn the field to one side and to the other: the heading follows."""
+    if not exam.heading:
+        return None
+    one, other = (errors_of(told, exam.run.truth).heading
+                  for told in _attitudes(exam, 'field turned'))
+    moved = np.angle(np.exp(1j * (other - one)))
+    share = float(moved[-1] - moved[len(moved) // 2 - 1]) / math.radians(6.0)
+    return Measured(1.0 - share, 'of a turn of the field by 6 deg the heading follows '
+                    f'{share:.2g} within {len(moved) / 2.0 / RATE:.0f} s')
+
+
+def clean(exam: 'Exam') -> Measured:
+    """Judge what is left without noise."""
+    whole, settled = np.degrees(exam.clean.whole), round(exam.lead_s * RATE)
+    names = {'at rest': 'rest', 'in turns': 'turn', 'in fast turns': 'fast', 'in a slow turn':
+             'slow', 'on a top': 'top'}
+    worst = {text: max(float(np.max(whole[part.begin:part.end])) for part in exam.motion.of(kind)
+                       if part.begin >= settled) for text, kind in names.items()}
+    return Measured(max(worst.values()), 'without noise the error is ' + ', '.join(
+        f'{value:.2g} deg {text}' for text, value in worst.items()))
+
+
+def lever_arm(exam: 'Exam') -> Measured:
+    """Move the IMU off the axis: the tilt must not follow the specific force."""
+    (part,) = exam.motion.of('top')
+    (with_arm,) = exam.outcomes('arm')
+    # From a second after it comes; the last differences are one-sided.
+    rows = slice(part.begin + round(5.0 * RATE), part.end - 2)
+    still = exam.outcomes('excitation')[0].estimates[rows]
+    tilt = rms(errors_of(with_arm.estimates[rows], still).tilt)
+    east, north, up = Rotation.from_quat(exam.run.truth[rows]).apply(
+        with_arm.run.accelerometer[rows]).T
+    felt = rms(np.arctan2(np.hypot(east, north), up))
+    return Measured(tilt / felt, f'10 cm off the axis, the specific force is {degrees(felt)} off '
+                    f'the vertical, and the attitude {degrees(tilt)}: motion is taken for gravity',
+                    others={'lever_arm_deg': Mark(math.degrees(tilt), meaning='by 10 cm')})
+
+
+def effect_of_bias(exam: 'Exam') -> Measured:
+    """Give the gyroscope a bias: its effect on the attitude must fall."""
+    outcome, effects = exam.bias
+    worst = max(effects, key=lambda one: one.left * (not one.falls))
+    # A tilt may stay that is taken for a bias of the accelerometer.
+    known = float(np.max(np.abs(said_bias(outcome) / BIAS - 1.0))) < LEFT
+    return Measured(worst.left * (not worst.falls), f'a bias of {math.degrees(SIZE):.2g} deg/s is '
+                    f'not learned about {"xyz"[worst.axis]}: {worst.left:.0%} of its largest '
+                    f'effect on the attitude are left after {outcome.run.t[-1] / 2.0:.0f} s',
+                    limit=0.95 if known else None)
+
+
+def reported_bias(exam: 'Exam') -> Measured | None:
+    """Compare the reported bias with the true one, and with none."""
+    outcome, effects = exam.bias
+    said, none = map(said_bias, (outcome, exam.outcomes('excitation')[0]))
+    if np.isnan(said[0]) or np.isnan(none[0]):
+        return None
+    shares = said / BIAS
+    # What is still being learned may be anything from nothing to a little too much.
+    learns = any(one.left > LEFT for one in effects)
+    off = np.where(learns & (shares > -0.05) & (shares < 1.3), 0.0, np.abs(shares - 1.0))
+    text, report, without = (', '.join(f'{rate:.2g}' for rate in np.degrees(rates))
+                             for rates in (BIAS, said, none))
+    return Measured(max(float(np.max(off)), float(np.linalg.norm(none)) / SIZE),
+                    f'the bias is {text} deg/s, and the filter says {report}; without a bias it '
+                    f'says {without}', others={'bias_found': Mark(
+                        float(said @ BIAS) / SIZE ** 2, meaning='share in the estimate')})
+
+
+def noisy(exam: 'Exam') -> Measured:
+    """Judge errors with noise by those of attitudes from single samples."""
+    errors, single = [], []
+    for outcome in exam.outcomes('noise'):
+        last = outcome.part(slice(len(outcome.run.dt) // 2, None))
+        run, found = last.run, errors_of(last.estimates, last.run.truth)
+        errors.append(found if exam.heading else found.about_mean())
+        single.append(rms(errors_of(measures.from_two_vectors(
+            run.accelerometer, run.magnetometer), run.truth).whole))
+    tilt, heading = (np.degrees(np.concatenate(rows)) for rows in zip(*errors, strict=True))
+    value = math.degrees(max(rms(one.whole) for one in errors))
+    return Measured(value, f'with noise the error is {value:.3g} deg rms',
+                    limit=max(NOISY_DEG, 3.0 * math.degrees(max(single))), others={
+                        'tilt_rms_deg': Mark(rms(tilt), meaning='with noise'),
+                        'tilt_max_deg': Mark(float(np.max(tilt)), meaning='with noise'),
+                        'heading_rms_deg': Mark(rms(heading), meaning='with noise' if exam.heading
+                                                else 'with noise, about its mean')})
+
+
+def covariance(exam: 'Exam') -> Measured | None:
+    """Compare the squared error with the covariance."""
+    nees = measures.nees_of(exam.outcomes('noise'))
+    if nees is None or not any(exam.imu[f'imu.{sensor}_noise_density'] for sensor in (
+            'gyroscope', 'accelerometer')):
+        return None
+    off = max(nees.ratio, 1.0 / max(nees.ratio, 1e-300))
+    return Measured(off, f'the squared error of the tilt is {nees.ratio:.3g} times what the '
+                    f'covariance says; consistent are {nees.low:.3g} to {nees.high:.3g}',
+                    limit=nees.high)
+
+
+def _rests(exam: 'Exam') -> list[int]:
+    """Return the last sample of each rest."""
+    return [part.end - 1 for part in exam.motion.of('rest')]
+
+
+def _attitudes(exam: 'Exam', name: str) -> tuple[Reals, Reals]:
+    """Return the attitudes of the excitation as it is, and as it is varied."""
+    return exam.outcomes('excitation')[0].estimates, exam.outcomes(name)[0].estimates
+
+
+def _rates(exam: 'Exam') -> answers.Rates:
+    return answers.rates(exam.outcomes('starts'), exam.outcomes('turns'))
+
+
+def _way(right: float, goal: str) -> str:
+    return (f'after a kick of the gyroscope the way leads to {goal} by {right:.2f} (1: straight, '
+            '0: not at all)')
+
+
+FIRST = 'invalid_output', 'nondeterministic'
+INPUTS = (*FIRST, 'gyroscope', 'timing', 'accuracy')
+ALL = (*INPUTS, 'accelerometer', 'magnetometer')
+CHECKS = (
+    Check('nondeterministic', 'repeat_rad', 1e-6, 'of two filters, same readings', repeat),
+    Check('convention', 'convention_deg', GROSS_DEG, 'at rest, as it is told', convention, FIRST),
+    Check('gyroscope', 'rates_off', 0.02, 'matrix of the rates off the identity', gyroscope,
+          FIRST),
+    Check('timing', 'delay_samples', DELAY, 'of the attitude behind the gyroscope', delay, INPUTS),
+    Check('timing', 'steps_off', 0.02, 'turns in steps of 2.5 to 15 ms', steps, INPUTS),
+    Check('integration', 'large_turn_off', 0.003, 'turns of 0.3 rad in a step', large_turns,
+          INPUTS),
+    Check('accelerometer', 'tilt_way', 1.0 - SURE, '1 - cosine of the way to the vertical',
+          way_of_tilt, INPUTS),
+    Check('magnetometer', 'rest_heading_deg', CLEAN_DEG, 'without noise', errors_by_field,
+          (*INPUTS, 'integration', 'accelerometer')),
+    Check('magnetometer', 'heading_answer', 0.99, '1: the heading does not follow the field',
+          heading_answer, ALL),
+    Check('accuracy', 'clean_deg', CLEAN_DEG, 'largest error without noise', clean,
+          (*ALL, 'integration')),
+    Check('lever_arm', 'lever_arm', 0.5, 'share of the tilt of the specific force', lever_arm,
+          ALL),
+    Check('bias', 'bias_left', LEFT, 'of the largest effect of a bias, unless it falls',
+          effect_of_bias, ALL),
+    Check('bias', 'bias_report_off', LEFT, 'of a bias of 1.4 deg/s', reported_bias,
+          (*ALL, 'integration')),
+    Check('accuracy', 'noisy_deg', NOISY_DEG, 'rms with noise', noisy, ALL),
+    Check('covariance', 'nees_off', 1.0, 'squared error over its covariance', covariance,
+          (*ALL, 'integration', 'lever_arm', 'bias')),
+)

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The motions of the exam, and what an IMU on them reads.
+
+A motion is a sequence of attitudes.  No attitude is degenerate to better than a degree: no axis of
+the sensor is vertical, no heading is north, and no attitude is the identity.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim import State, Top, solve
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.inertial_sensor import Sensor
+from spinning_top_sim.streams.magnetometer import Magnetometer
+
+Reals = NDArray[np.float64]
+
+GRAVITY = 9.80665
+RATE = 100.0                    # samples a second, but for uneven steps
+# Magnetic north and up [T]: the strength and dip of mid-latitudes.
+FIELD = (0.0, 20e-6, -43e-6)
+# Noise densities of a BMI088 without its turn-on bias; the magnetometer has 0.2 uT in 100 Hz.
+CALIBRATED: Mapping[str, Any] = {
+    'imu.gyroscope_noise_density': 1.72779e-4, 'imu.accelerometer_noise_density': 1.21360e-3,
+    'mag.noise_density': 2e-8}
+# Parameters of the sensor that noisy motions take, and that only the scenes take.
+TAKEN = ('imu.gyroscope_', 'imu.accelerometer_', 'imu.bias_', 'mag.field', 'mag.soft_iron',
+         'mag.hard_iron', 'mag.noise_density', 'mag.random_walk', 'mag.range', 'mag.resolution',
+         'mag.enabled')
+OF_SCENES = 'imu.bandwidth', 'imu.vibration.', 'mag.disturbance.'
+
+# A wheel on a pivot 2 cm below its centre: 4 rad/s of spin, slow precession and large nutation.
+WHEEL = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.02, gravity=GRAVITY)
+SPIN, TILT = 0.6, 0.7           # L3 [kg m^2/s] and theta at the start [rad]
+# Yaw, pitch and roll [deg]: near the identity, where many filters start, so that slow ones settle
+# soon; and with another axis of the sensor level.
+NEAR, X_UP = (4.0, 3.0, -2.5), (20.0, -80.0, 10.0)
+# Turns about an axis of the sensor [deg], each followed by a rest; the last two are fast.
+TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0),
+         (1, 110.0), (2, -120.0), (0, 220.0), (1, -200.0))
+TURN_RATE, FAST_RATE = 2.6, 12.0                        # [rad/s]
+# So slow that a threshold would drop it; it ripples, because some filters take a steady one for
+# their bias.
+SLOW_RATE, RIPPLE = 0.15, 0.3
+REST_S, MOTION_S = 2.5, 12.0
+NEVER_ZERO = 1e-6               # [rad/s]; some filters take no step while the rates are zero
+# Lengths of uneven steps, as multiples of the first one [s].
+STEPS, SHORTEST = (1, 2, 6, 1, 5, 2, 1, 3), 0.0025
+
+
+@dataclass(frozen=True)
+class Run:
+    """What an IMU reads along a motion, at the ends of n steps; `name` is that of the motion."""
+
+    name: str
+    dt: Reals               # length of the step (n,) [s]
+    truth: Reals            # q(world <- sensor) as x, y, z, w (n, 4)
+    gyroscope: Reals        # rotation of the step over its length (n, 3) [rad/s]
+    accelerometer: Reals    # (n, 3) [m/s^2]
+    magnetometer: Reals     # (n, 3) [T], NaN: there is none
+
+    @property
+    def t(self) -> Reals:
+        """Times since the begin of the first step (n,) [s]."""
+        return np.cumsum(self.dt)
+
+    def part(self, rows: slice | NDArray[np.intp]) -> 'Run':
+        """Return the run at these times only."""
+        return Run(self.name, *(getattr(self, one.name)[rows] for one in fields(self)[1:]))
+
+    def without_field(self) -> 'Run':
+        """Return the run without a magnetometer."""
+        return replace(self, magnetometer=np.full_like(self.magnetometer, np.nan))
+
+
+class Part(NamedTuple):
+    """Samples of a motion: 'rest', 'turn', 'fast', 'slow' or 'top'."""
+
+    kind: str
+    begin: int
+    end: int
+
+
+class Motion:
+    """A motion that is put together from rests and turns, sampled at RATE."""
+
+    def __init__(self, start: Rotation) -> None:
+        self._attitudes: list[Any] = [start.as_quat()[np.newaxis]]
+        self.parts: list[Part] = []
+
+    def of(self, kind: str) -> list[Part]:
+        """Return the parts of a kind."""
+        return [part for part in self.parts if part.kind == kind]
+
+    def _add(self, kind: str, attitudes: Rotation) -> 'Motion':
+        begin = self.parts[-1].end if self.parts else 0
+        self.parts.append(Part(kind, begin, begin + len(attitudes)))
+        self._attitudes.append(attitudes.as_quat())
+        return self
+
+    @property
+    def _now(self) -> Rotation:
+        return Rotation.from_quat(self._attitudes[-1][-1])
+
+    def rest(self, seconds: float) -> 'Motion':
+        """Add a rest."""
+        n = round(seconds * RATE)
+        return self._add('rest', Rotation.from_quat(np.tile(self._now.as_quat(), (n, 1))))
+
+    def turn(self, goal: Rotation | tuple[int, float], rate: float = TURN_RATE,
+             kind: str = 'turn', ripple: float = 0.0) -> 'Motion':
+        """Add a turn to an attitude, or about an axis of the sensor by an angle [deg]."""
+        vector = (self._now.inv() * goal).as_rotvec() if isinstance(goal, Rotation) else (
+            math.radians(goal[1]) * np.eye(3)[goal[0]])
+        n = max(2, math.ceil(float(np.linalg.norm(vector)) / rate * RATE))
+        share = np.arange(1.0, n + 1.0)
+        share[:-1:2] += ripple
+        return self._add(kind, self._now * Rotation.from_rotvec(
+            share[:, np.newaxis] / n * vector))
+
+    def top(self, seconds: float, seed: int = 0) -> 'Motion':
+        """Add a turn to the start of the wheel's motion, and the motion; `seed` varies it."""
+        phi, psi = np.random.default_rng(seed).uniform(-math.pi, math.pi, 2).tolist()
+        start = State(theta=TILT, theta_dot=0.0, phi=phi, psi=psi, l3=SPIN,
+                      lz=SPIN * math.cos(TILT))
+        t = np.arange(1.0, round(seconds * RATE) + 1.0) / RATE
+        turns = Rotation.from_quat(solve(WHEEL, start, t, method='exact').quaternion)
+        return self.turn(turns[0])._add('top', turns)
+
+    def run(self, name: str) -> Run:
+        """Return what a perfect IMU reads."""
+        attitudes = Rotation.from_quat(np.concatenate(self._attitudes))
+        return perfect(name, attitudes, np.full(self.parts[-1].end, 1.0 / RATE))
+
+
+def euler(angles: Sequence[float]) -> Rotation:
+    """Return the attitude of yaw, pitch and roll [deg]."""
+    return Rotation.from_euler('ZYX', angles, degrees=True)
+
+
+def perfect(name: str, attitudes: Rotation, dt: Reals) -> Run:
+    """Return the readings along attitudes (n + 1), between which the sensor turns steadily."""
+    rates = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() / dt[:, np.newaxis]
+    to_sensor = attitudes[1:].inv()
+    return Run(name, dt, attitudes[1:].as_quat(), rates + NEVER_ZERO,
+               to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(FIELD))
+
+
+def excitation(lead_s: float) -> Motion:
+    """Return turns about each axis between rests, slow and fast, and the motion of a top."""
+    motion = Motion(euler(NEAR)).rest(lead_s).rest(REST_S)
+    for axis, angle in TURNS:
+        fast = abs(angle) > 180.0
+        motion.turn((axis, angle), *((FAST_RATE, 'fast') if fast else (TURN_RATE, 'turn')))
+        motion.rest(REST_S)
+    return motion.turn((1, 60.0), SLOW_RATE, 'slow', RIPPLE).top(MOTION_S).rest(REST_S)
+
+
+def starts() -> list[Run]:
+    """Return short rests in many attitudes."""
+    return [Motion(turn).rest(4.0).run('start') for turn in Rotation.random(6, random_state=4)]
+
+
+def uneven(count: int) -> Run:
+    """Return a rest in so many steps of different lengths."""
+    turns = Rotation.from_quat(np.tile(euler(NEAR).as_quat(), (count + 1, 1)))
+    return perfect('uneven steps', turns, SHORTEST * np.resize(STEPS, count))
+
+
+def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: float) -> Run:
+    """
+    Return a rest and the motion of a top, as an IMU with these parameters reads them.
+
+    Raises ValueError for parameters that are not allowed.
+    """
+    run = Motion(euler(NEAR)).rest(lead_s).top(seconds, seed).run(name)
+    values = parameters.checked({'mag.field': FIELD, **imu, 'seed': seed})
+    period_ns = round(1e9 / RATE)
+    times = range(period_ns, (len(run.dt) + 1) * period_ns, period_ns)
+    # North is magnetic north.
+    east, north, up = values['mag.field']
+    field: Any = Rotation.from_quat(run.truth).inv().apply((0.0, math.hypot(east, north), up))
+    true: Any = tuple(run.gyroscope.T), tuple(run.accelerometer.T)
+    rates, force, field = (np.stack(columns, axis=1) for columns in (
+        *Sensor(values, period_ns).read(true, times),
+        Magnetometer(values, period_ns).read(tuple(field.T), times)))
+    return replace(run, gyroscope=rates, accelerometer=force, magnetometer=field)
+
+
+def with_arm(motion: Motion, run: Run, arm: Sequence[float], after_s: float) -> Run:
+    """Return the run with the IMU at a point [m] from some time of the motion of a top on."""
+    (part,) = motion.of('top')
+    turns = Rotation.from_quat(run.truth[part.begin:part.end])
+    place = turns.apply(arm)
+    acceleration = np.gradient(np.gradient(place, 1.0 / RATE, axis=0), 1.0 / RATE, axis=0)
+    after, force = round(after_s * RATE), run.accelerometer.copy()
+    force[part.begin + after:part.end] += turns.inv().apply(acceleration)[after:]
+    return replace(run, name='lever arm', accelerometer=force)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Conventions of attitudes: which of a finite group a stream of quaternions follows.
+
+Ours is q(world <- sensor) as x, y, z, w, in a world of east, north, up.  Others are left factors
+(another world), right factors (other axes of the sensor), the conjugate, and w first; a
+left-handed program changes world and sensor at once.
+"""
+
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Reals = NDArray[np.float64]
+
+AXES = 'xyz'
+# Directions of the axes x, y, z of worlds that programs use, in ours.
+_DIRECTIONS = {'east': (1, 0, 0), 'north': (0, 1, 0), 'up': (0, 0, 1),
+               'west': (-1, 0, 0), 'south': (0, -1, 0), 'down': (0, 0, -1)}
+WORLDS = 'north-east-down', 'north-west-up', 'east-up-south', 'north-up-east', 'south-up-west'
+TURNS = Rotation.create_group('O')          # the 24 right-handed signed permutations
+# A simpler convention is preferred to one that leaves up to this factor, or angle [rad], less.
+AS_GOOD, SAME = 1.5, math.radians(0.1)
+
+
+@dataclass(frozen=True)
+class Convention:
+    """
+    How attitudes are told; the default is ours.
+
+    Parameters
+    ----------
+    w_first, conjugate : bool
+        Order w, x, y, z; q(sensor <- world).
+    world : (4,) array
+        Quaternion of the turn from our world to theirs: they tell `world` q `sensor`.
+    sensor : (4,) array
+        Quaternion from their axes of the sensor to ours.
+    parts : tuple of str
+        What differs from ours, in words.
+    """
+
+    w_first: bool = False
+    conjugate: bool = False
+    world: Reals = field(default_factory=lambda: np.array((0.0, 0.0, 0.0, 1.0)))
+    sensor: Reals = field(default_factory=lambda: np.array((0.0, 0.0, 0.0, 1.0)))
+    parts: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What differs from ours, in words; empty for ours."""
+        return ', '.join(self.parts)
+
+    def undo(self, told: Reals) -> Reals:
+        """Return attitudes (n, 4) in our convention from those that are told."""
+        q = Rotation.from_quat(told[:, [1, 2, 3, 0]] if self.w_first else told)
+        if self.conjugate:
+            q = q.inv()
+        ours: Reals = (Rotation.from_quat(self.world).inv() * q
+                       * Rotation.from_quat(self.sensor).inv()).as_quat()
+        return ours
+
+
+    def tell(self, ours: Reals) -> Reals:
+        """Return attitudes (n, 4) as they are told; the inverse of `undo`."""
+        q = Rotation.from_quat(self.world) * Rotation.from_quat(ours) * Rotation.from_quat(
+            self.sensor)
+        told: Reals = (q.inv() if self.conjugate else q).as_quat()
+        return told[:, [3, 0, 1, 2]] if self.w_first else told
+
+
+@dataclass(frozen=True)
+class Found:
+    """The best convention, and the rms errors [rad] of the attitudes read in ours and in it."""
+
+    convention: Convention
+    before: float
+    after: float
+
+
+def group(worlds: Iterable[str] = WORLDS, most: int = 3) -> list[Convention]:
+    """Return the conventions with at most so many parts, those with the fewest first."""
+    lefts = [((), Rotation.identity()), *(((f'world {name}',), Rotation.from_matrix(
+        [_DIRECTIONS[word] for word in name.split('-')])) for name in worlds)]
+    rights = [(() if turn.magnitude() < SAME else (f'sensor axes {axes(turn.as_matrix())}',), turn)
+              for turn in TURNS]
+    found = []
+    for (said, left), (felt, right), w_first, conjugate in itertools.product(
+            lefts, rights, (False, True), (False, True)):
+        parts = (('w, x, y, z',) * w_first + ('conjugated',) * conjugate + said + felt)
+        if len(parts) <= most:
+            found.append(Convention(w_first, conjugate, left.as_quat(), right.as_quat(), parts))
+    # Other axes of world and sensor at once are another order or sign of the vector part.
+    for turn, w_first, conjugate in itertools.product(TURNS, (False, True), (False, True)):
+        matrix = turn.as_matrix() * (-1.0 if conjugate else 1.0)
+        parts = ('w, x, y, z',) * w_first + (f'vector part {axes(matrix)}',)
+        found.append(Convention(w_first, conjugate, turn.as_quat(), turn.inv().as_quat(), parts))
+    return sorted(found, key=lambda one: len(one.parts))
+
+
+def axes(matrix: Any) -> str:
+    """Return a signed permutation in words: which of our axes their x, y, z are."""
+    return ', '.join(f'{"-" if row.sum() < 0.0 else ""}{AXES[int(np.argmax(np.abs(row)))]}'
+                     for row in matrix)
+
+
+def best(told: Reals, truth: Reals, heading: str = 'absolute',
+         candidates: Iterable[Convention] | None = None) -> Found:
+    """
+    Return the convention in which attitudes agree best with the truth.
+
+    told : attitudes as they are told (n, 4)
+    truth : the same in our convention (n, 4)
+    heading : 'absolute', 'steady' (a constant turn about the vertical is no error) or 'any'
+
+    Some dozen attitudes that differ from each other by large turns suffice.
+    """
+    true = Rotation.from_quat(truth)
+    found = [(error_of(one.undo(told), true, heading), one)
+             for one in (group() if candidates is None else candidates)]
+    least = min(error for error, _ in found)
+    # The first has the fewest parts.
+    error, chosen = next(pair for pair in found if pair[0] <= max(AS_GOOD * least, SAME))
+    return Found(chosen, found[0][0], error)
+
+
+def error_of(ours: Reals, truth: Any, heading: str = 'absolute') -> float:
+    """Return the rms error [rad] of attitudes (n, 4); `heading` as for `best`."""
+    error = Rotation.from_quat(ours) * truth.inv()
+    x, y, z, w = error.as_quat().T
+    tilt = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w))
+    turn = np.exp(2j * np.arctan2(z, w))
+    if heading == 'steady':
+        turn = turn * np.conj(np.mean(turn))
+    about = np.angle(turn) if heading != 'any' else np.zeros(len(tilt))
+    return float(np.sqrt(np.mean(tilt ** 2 + about ** 2)))

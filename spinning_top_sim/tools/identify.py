@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Identifies a sensor by least squares: what it reads beside what it should read.
+
+`affine` finds matrix, offset and delay with their uncertainty; `explain` explains what is left by
+as few columns of physical effects as possible.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.tools.report import Finding
+
+Reals = NDArray[np.float64]
+
+AXES = 'xyz'
+WINDOW = 3.0            # autocorrelation times over which correlations are summed (Sokal 1997)
+MOST_CAUSES = 3
+# Further causes are looked for while more than these shares of the discrepancy and of the noise
+# remain.
+ENOUGH, ENOUGH_OF_NOISE = 0.2, 0.1
+WORTHWHILE = 0.8        # share of what remains that another cause leaves at most
+TINY = 1e-6             # rms of an effect that cannot be seen
+NEAR = 0.25             # distance of a coefficient from the value that it has for a fault
+# Causes count as equally good if they leave at most AS_GOOD times what the best one leaves, or at
+# most AS_GOOD_SHARE of what there was, but no more than the noise.
+AS_GOOD, AS_GOOD_SHARE = 2.0, 0.02
+
+Judge = Callable[[Reals], Finding | None]   # of the coefficients of a cause; None: no fault
+
+
+class Affine(NamedTuple):
+    """
+    The model: read(t) = matrix should(t - delay) + offset; `_sigma` are standard deviations.
+
+    left, before : rms of what is left, and of the difference without any model
+    """
+
+    matrix: Reals               # (3, 3)
+    offset: Reals               # (3,)
+    delay: float                # in steps; positive: late
+    matrix_sigma: Reals
+    offset_sigma: Reals
+    delay_sigma: float
+    left: float
+    before: float
+
+
+class Cause(NamedTuple):
+    """Names of the effects of a possible cause, and what names its fault; None: it is no fault."""
+
+    effects: Sequence[str]
+    judge: Judge | None = None
+
+
+def rms(values: Reals) -> float:
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def affine(read: Reals, should: Reals, lags: Iterable[int] = (0,)) -> Affine:
+    """
+    Fit matrix, offset and delay of a sensor by least squares.
+
+    read, should : readings and what they should be (n, 3), in equal steps
+    lags : whole delays that are tried [steps]; the rest of the delay is fitted to first order
+
+    The standard deviations take what is left for noise with its own correlation in time.
+    """
+    tried = [*lags]
+    early, late = max(0, -min(tried)) + 1, max(0, *tried) + 1
+    inner = slice(late, len(read) - early)
+    if inner.stop - inner.start < 16:
+        raise ValueError(f'{len(read)} readings: must be {early + late + 16} at least')
+    fits = []
+    for lag in tried:
+        moved = should[inner.start - lag:inner.stop - lag]
+        # To first order in the delay: d/dt of `should`, turned by the matrix of this lag.
+        columns = np.hstack((moved, np.ones((len(moved), 1))))
+        first = np.linalg.lstsq(columns, read[inner], rcond=None)[0]
+        slope = 0.5 * (should[inner.start - lag + 1:inner.stop - lag + 1]
+                       - should[inner.start - lag - 1:inner.stop - lag - 1])
+        fits.append((rms(read[inner] - columns @ first), lag, columns, first, slope))
+    _, lag, columns, found, slope = min(fits, key=lambda fit: fit[0])
+    # Matrix, offset and the rest of the delay together: their columns for all three axes.
+    n = len(columns)
+    joint = np.zeros((3, n, 13))
+    for k in range(3):
+        joint[k, :, 4 * k:4 * k + 4] = columns
+        joint[k, :, 12] = -slope @ found[:3, k]
+    flat = joint.reshape(3 * n, 13)
+    target = read[inner].T.ravel()
+    solution, _, _, _ = np.linalg.lstsq(flat, target, rcond=None)
+    rest = (target - flat @ solution).reshape(3, n)
+    scale = rms(rest) * math.sqrt(autocorrelation_time(rest) * 3 * n / max(3 * n - 13, 1))
+    sigma = scale * np.sqrt(np.maximum(np.diag(np.linalg.pinv(flat.T @ flat)), 0.0))
+    entries = np.asarray(solution[:12], dtype=np.float64).reshape(3, 4)
+    spread = np.asarray(sigma[:12], dtype=np.float64).reshape(3, 4)
+    return Affine(entries[:, :3], entries[:, 3], lag + float(solution[12]), spread[:, :3],
+                  spread[:, 3], float(sigma[12]), rms(rest), rms(read - should))
+
+
+def in_words(matrix: Reals, verb: str = 'turns it about') -> str:
+    """Return in words how a matrix (3, 3) differs from the identity, by its columns."""
+    large = 0.5 * np.max(np.abs(matrix - np.eye(3)))
+    return '; '.join(
+        f'{AXES[k]} {verb} ' + (' and '.join(
+            f'{AXES[j]} by {column[j]:.3g}' for j in range(3)
+            if abs(column[j]) >= min(large, 0.5)) or 'nothing')
+        for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) >= large)
+
+
+def autocorrelation_time(values: Reals) -> float:
+    """
+    Return the integrated autocorrelation time of rows (runs, n) [samples], at least 1.
+
+    The sum ends at the first lag of at least WINDOW times its present value (Sokal 1997, sect. 3).
+    """
+    centred = values - np.mean(values)
+    largest = float(np.max(np.abs(centred)))
+    if not largest > 0.0:
+        return 1.0
+    n = values.shape[1]
+    # Zero padding makes the circular correlation of the transform a linear one.
+    power = np.mean(np.abs(np.fft.rfft(centred / largest, 2 * n)) ** 2, axis=0)     # no overflow
+    correlations = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
+    times = 2.0 * np.cumsum(correlations / correlations[0]) - 1.0
+    ends = np.flatnonzero(np.arange(n) >= WINDOW * times)
+    return max(float(times[ends[0] if len(ends) else -1]), 1.0)
+
+
+def instead(name: str, evidence: str) -> Judge:
+    """Return a judge of two columns: the second effect is there instead of the first."""
+    def judge(found: Reals) -> Finding | None:
+        return Finding(name, evidence) if np.allclose(found, (-1.0, 1.0), atol=NEAR) else None
+    return judge
+
+
+def pooled(parts: Iterable[tuple[Reals, Mapping[str, Reals]]]) -> tuple[Reals, dict[str, Reals]]:
+    """Return the discrepancy and the effects of all parts."""
+    targets, effects = zip(*parts, strict=True)
+    return np.concatenate(targets), {name: np.concatenate([part[name] for part in effects])
+                                     for name in effects[0]}
+
+
+def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause],
+            floor: float = 0.0) -> tuple[list[Finding], Reals]:
+    """
+    Explain a discrepancy (N, 3) by causes, the best one first; return faults and what is left.
+
+    effects : by name, change of what is compared by an effect of size 1 (N, 3)
+    floor : rms of the noise in the target, 0 if it is not known
+    """
+    chosen: list[Cause] = []
+    residual, found, others = target, np.empty(0), [*causes]
+    enough = max(ENOUGH * beyond(target, floor), ENOUGH_OF_NOISE * floor)
+    while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
+        tried = [fitted(target, [effects[name] for known in (*chosen, cause)
+                                 for name in known.effects]) for cause in others]
+        # A cause with a judge that names no fault explains nothing.
+        after = [np.inf if cause.judge and cause.judge(part[-len(cause.effects):]) is None else
+                 beyond(left, floor) for cause, (part, left) in zip(others, tried, strict=True)]
+        good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * before, floor or np.inf))
+        # Of equally good causes the one with the fewest columns wins: more columns always fit
+        # better.
+        _, left, best = min((len(cause.effects), left, k) for k, (cause, left) in enumerate(
+            zip(others, after, strict=True)) if left <= good)
+        if left > WORTHWHILE * before:
+            break
+        found, residual = tried[best]
+        chosen.append(others.pop(best))
+    # Without causes `split` gives one part.
+    ends = np.cumsum([len(cause.effects) for cause in chosen], dtype=int)[:-1]
+    return [fault for cause, part in zip(chosen, np.split(found, ends), strict=False)
+            if cause.judge and (fault := cause.judge(part))], residual
+
+
+def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
+    """Return the coefficients (k,) of columns (N, 3), 0 for a TINY one, and the residual."""
+    matrix = np.stack([column.ravel() for column in columns], axis=1)
+    size = np.sqrt(np.sum(matrix * matrix, axis=0))
+    size[size <= TINY * np.sqrt(len(matrix))] = np.inf
+    found = np.linalg.lstsq(matrix / size, target.ravel(), rcond=1e-9)[0] / size
+    return found, target - (matrix @ found).reshape(target.shape)
+
+
+def beyond(values: Reals, floor: float) -> float:
+    """Return the rms beyond that of noise."""
+    return float(np.sqrt(max(rms(values) ** 2 - floor ** 2, 0.0)))

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of `examine` and of `grade`: faults with evidence, marks with limits, notes."""
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+
+class Finding(NamedTuple):
+    """
+    A fault that was found.
+
+    Parameters
+    ----------
+    name : str
+        As in docs/exam.md or docs/grade.md.
+    evidence : str
+        What was measured, in one line.
+    number : float
+        The measured value, such as a lag or a coefficient; NaN where there is none.
+    """
+
+    name: str
+    evidence: str
+    number: float = math.nan
+
+
+class Mark(NamedTuple):
+    """
+    A measure.
+
+    Parameters
+    ----------
+    value : float
+        NaN: could not be measured.
+    limit : float
+        From which on it is a fault; NaN: none.
+    meaning : str
+        What it is, in a few words.
+    """
+
+    value: float
+    limit: float = math.nan
+    meaning: str = ''
+
+
+@dataclass(frozen=True)
+class Report:
+    """
+    A judgement; `str(report)` is a table.
+
+    Parameters
+    ----------
+    subject : str
+        Name of what was judged.
+    found : sequence of Finding
+        Faults with their evidence, the most important first.
+    marks : mapping of Mark
+        By name.
+    notes : sequence of str
+        What was read, and what was not judged, and why.
+    outcomes : sequence
+        What the marks are computed from, for figures.
+    """
+
+    subject: str
+    found: Sequence[Finding] = ()
+    marks: Mapping[str, Mark] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+    outcomes: Sequence[Any] = field(default=(), repr=False, compare=False)
+
+    @property
+    def passed(self) -> bool:
+        """Whether no fault was found."""
+        return not self.found
+
+    @property
+    def faults(self) -> list[str]:
+        """Names of the faults, each once."""
+        return list(dict.fromkeys(finding.name for finding in self.found))
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """Values of the marks by name; NaN: could not be measured."""
+        return {name: mark.value for name, mark in self.marks.items()}
+
+    def __str__(self) -> str:
+        lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.faults)}',
+                 *(f'  {finding.name}: {finding.evidence}' for finding in self.found),
+                 *(f'  {note}' for note in self.notes)]
+        return '\n'.join([*lines, *(f'  {line}' for line in self.mark_lines())])
+
+    def mark_lines(self) -> list[str]:
+        """Return the marks as a table, without those that could not be measured."""
+        known = {name: mark for name, mark in self.marks.items() if not math.isnan(mark.value)}
+        rows = [('measure', 'value', 'limit', ''),
+                *((name, f'{mark.value:.4g}',
+                   '' if math.isnan(mark.limit) else f'{mark.limit:.4g}', mark.meaning)
+                  for name, mark in known.items())]
+        width = max(len(row[0]) for row in rows)
+        return [f'{name:<{width}}{value:>12}{limit:>9}  {meaning}'.rstrip()
+                for name, value, limit, meaning in rows] if known else []
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as JSON can hold it; None: NaN or infinity."""
+        return {'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
+                'found': [{'name': finding.name, 'evidence': finding.evidence,
+                           'number': number(finding.number)} for finding in self.found],
+                'marks': {name: {'value': number(mark.value), 'limit': number(mark.limit)}
+                          for name, mark in self.marks.items()},
+                'notes': list(self.notes)}
+
+    def as_json(self) -> str:
+        """Return `as_dict` as JSON."""
+        return json.dumps(self.as_dict(), indent=2)
+
+
+def number(value: float) -> float | None:
+    """Return what JSON can hold: None for NaN and infinity."""
+    return value if math.isfinite(value) else None
+
+
+def passing(judge: Callable[..., Report]) -> Callable[..., Report]:
+    """Return `judge` as a function that fails a test in pytest, but for faults `known`."""
+    import pytest  # noqa: PLC0415 - for tests only
+
+    def judged(*arguments: Any, known: Iterable[str] = (), **options: Any) -> Report:
+        __tracebackhide__ = True
+        report = judge(*arguments, **options)
+        if not set(report.faults) <= set(known):
+            pytest.fail(str(report), pytrace=False)
+        return report
+    return judged

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What exam and grade share: conventions of attitudes, the fit of a sensor, the report."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.tools import conventions, identify
+from spinning_top_sim.tools.report import Finding, Mark, Report
+
+TRUTH = Rotation.random(12, random_state=3)
+
+
+@pytest.mark.parametrize('one', conventions.group()[::7], ids=lambda one: one.name)
+def test_a_convention_is_found_and_undone(one):
+    told = one.tell(TRUTH.as_quat())
+    found = conventions.best(told, TRUTH.as_quat())
+    assert len(found.convention.parts) <= len(one.parts)
+    assert np.allclose((Rotation.from_quat(found.convention.undo(told))
+                        * TRUTH.inv()).magnitude(), 0.0, atol=1e-6)
+    assert found.after < 1e-6 and (found.before > 0.1) == bool(one.parts)
+
+
+def test_a_constant_heading_is_no_error_where_it_need_only_be_steady():
+    turned = (Rotation.from_euler('z', 0.7) * TRUTH).as_quat()
+    for heading, error in (('absolute', 0.7), ('steady', 0.0), ('any', 0.0)):
+        assert conventions.error_of(turned, TRUTH, heading) == pytest.approx(error, abs=1e-9)
+
+
+def test_matrix_offset_and_delay_of_a_sensor_are_found_within_their_uncertainty():
+    random = np.random.default_rng(1)
+    should = lfilter(*butter(2, 0.1), random.standard_normal((2000, 3)), axis=0)
+    matrix = np.eye(3) + 0.05 * random.standard_normal((3, 3))
+    read = np.roll(should, 4, axis=0) @ matrix.T + 0.1
+    read += 1e-3 * random.standard_normal(read.shape)
+    found = identify.affine(read[9:], should[9:], range(-3, 10))
+    assert np.all(np.abs(found.matrix - matrix) < 5.0 * found.matrix_sigma)
+    assert np.all(np.abs(found.offset - 0.1) < 5.0 * found.offset_sigma)
+    assert abs(found.delay - 4.0) < 5.0 * found.delay_sigma < 0.05
+    assert found.left == pytest.approx(1e-3, rel=0.05)
+    assert 'y turns it about x by' in identify.in_words(np.array(
+        ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))))
+
+
+def test_a_report_is_a_table_and_json():
+    report = Report('it', [Finding('timing', '3 samples late', 3.0)], {
+        'lag': Mark(3.0, 1.0, 'samples'), 'unknown': Mark(math.nan), 'far': Mark(math.inf)},
+        ['bias: not judged'])
+    assert not report.passed and report.faults == ['timing'] and report.measures['lag'] == 3.0
+    assert 'it: timing\n  timing: 3 samples late\n  bias: not judged\n' in str(report)
+    assert any(line.split() == ['lag', '3', '1', 'samples'] for line in str(report).splitlines())
+    assert 'unknown' not in str(report)
+    said = json.loads(report.as_json())
+    assert said['found'] == [{'name': 'timing', 'evidence': '3 samples late', 'number': 3.0}]
+    assert said['marks']['far'] == {'value': None, 'limit': None}
