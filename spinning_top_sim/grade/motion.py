@@ -3,25 +3,24 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from scipy.ndimage import correlate1d
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.scenes import Body, Reals, Start, rotation_of
-from spinning_top_sim.physics.states import States, relative_drift
+from spinning_top_sim.grade.kinematics import SIDE, Smoothed, Stretch, white
+from spinning_top_sim.grade.scenes import Body, Reals
+from spinning_top_sim.physics.states import relative_drift
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools.analysis import Attitudes, measure
 
 # Columns of each part.
 _PARTS = {'attitudes': (4,), 'rates': (3,), 'accelerations': (3,), 'gyroscope': (3,),
           'magnetometer': (3,), 'increments': (6,), 'energy': ()}
-LEAST_SAMPLES = 20
-# Sixth-order central differences, for samples -3 .. 3.
-_WEIGHTS = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
-MARGIN = 3
+LEAST_SAMPLES = 30
+READINGS = 'gyroscope', 'accelerations', 'magnetometer'
 
 
 class InvalidTrajectoryError(ValueError):
@@ -38,7 +37,7 @@ class Trajectory:
     t : (n,) array
         Times [s].
     attitudes : (n, 4) array
-        q(world <- body) as w, x, y, z.
+        q(world <- body) as x, y, z, w.
     rates : (n, 3) array, optional
         Angular velocity in the body frame [rad/s].
     accelerations, gyroscope, magnetometer : (n, 3) array, optional
@@ -62,9 +61,6 @@ class Trajectory:
     increments: Reals | None = None
     energy: Reals | None = None
     covariance: Mapping[str, Reals] = field(default_factory=dict)
-    step: float = field(init=False)             # [s]
-    rotation: Rotation = field(init=False)      # world <- body
-
     @classmethod
     def of(cls, said: Any, times: Any = None) -> Self:
         """Return what a run has said, by default at its `t`.  Raises InvalidTrajectoryError."""
@@ -103,9 +99,32 @@ class Trajectory:
             name: _numbers(f'covariance of {name}', matrix, (3, 3))
             for name, matrix in told.items()})
 
-    def __post_init__(self) -> None:
-        self.step = float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
-        self.rotation = rotation_of(self.attitudes)
+    @property
+    def rotation(self) -> Rotation:
+        """The attitudes, world <- body."""
+        return Rotation.from_quat(self.attitudes)
+
+    @property
+    def step(self) -> float:
+        """Interval between samples [s]."""
+        return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
+
+    def moved(self, seconds: float) -> Self:
+        """Return the motion with its attitudes at later times."""
+        return replace(self, t=self.t + seconds)
+
+    def stretch(self, rates: Reals | None = None) -> Stretch:
+        """Return the motion with its readings; `rates` are those that the simulator tells."""
+        readings = {name: values for name in READINGS
+                    if (values := getattr(self, name)) is not None}
+        if self.rates is not None:
+            readings['rates'] = self.rates
+        if self.increments is not None:
+            readings |= {'rotations': self.increments[:, :3], 'velocities': self.increments[:, 3:]}
+        sigma = {name: float(np.sqrt(np.mean(white(values) ** 2)))
+                 for name, values in readings.items()}
+        return Stretch(self.t, self.rotation, np.zeros((len(self.t), 3)), readings, sigma,
+                       rates=rates)
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
@@ -143,49 +162,46 @@ class Motion:
 
     name: str
     body: Body
-    start: Start
+    start: State
     trajectory: Trajectory
-    derived: bool = True        # the rates are from the attitudes, as before `use_told_rates`
+    told: bool = False          # the rates told are those of the motion
+    stretch: Stretch = field(init=False)
+    smoothed: Smoothed = field(init=False)          # of it
     solution: ExactSolution = field(init=False)
-    truth: States = field(init=False)               # of it, at the times of the trajectory
     errors: Mapping[str, Reals] = field(init=False)     # as of `errors_by_angle`
-    worst: float = field(init=False)                # total error [rad]
-    # In the body, at all samples but MARGIN at each end (n - 6, 3) [rad/s].
-    rates: Reals = field(init=False)
+    worst: float = field(init=False)                    # total error [rad]
 
     def __post_init__(self) -> None:
-        self.solution = ExactSolution(self.body, self.start.state_of(self.body))
-        self.truth = self.solution.states_at_seconds(self.trajectory.t)
-        right = Rotation.from_quat(self.truth.quaternion)
-        self.errors = errors_by_angle(self.trajectory.rotation, right)
+        self.solution = ExactSolution(self.body, self.start)
+        truth = Rotation.from_quat(self.solution.states_at_seconds(self.trajectory.t).quaternion)
+        self.errors = errors_by_angle(self.trajectory.rotation, truth)
         self.worst = float(np.max(self.errors['total']))
-        # The rotation from the exact attitudes turns slowly.
-        error, n = right.inv() * self.trajectory.rotation, len(self.trajectory.t) - 2 * MARGIN
-        here = error[MARGIN:-MARGIN].inv()
-        total = sum(weight * (here * error[at:at + n]).as_rotvec()
-                    for at, weight in enumerate(_WEIGHTS) if weight)
-        self.rates = total / self.trajectory.step + here.apply(
-            self.truth.angular_velocity[MARGIN:-MARGIN])
+        self.use_rates(told=False, in_world=False)
 
-    def use_told_rates(self, in_world: bool) -> None:
-        """Make the rates told those of the motion; `in_world` : they are in axes of the world."""
-        told = self.trajectory.rates
-        if told is not None:
-            rates = self.trajectory.rotation.inv().apply(told) if in_world else told
-            self.derived, self.rates = False, rates[MARGIN:-MARGIN]
+    def use_rates(self, told: bool, in_world: bool) -> None:
+        """Take rates from the attitudes, or those told; `in_world` : these are in its axes."""
+        rates, self.told = self.trajectory.rates, told and self.trajectory.rates is not None
+        if rates is not None and in_world:
+            rates = self.trajectory.rotation.inv().apply(rates)
+        self.stretch = self.trajectory.stretch(rates if self.told else None)
+        self.smoothed = self.stretch.at(1)
 
     @property
-    def angular_accelerations(self) -> Reals:
-        """In the body (n - 12, 3) [rad/s^2]."""
-        inner = slice(MARGIN, -MARGIN)
-        total = correlate1d(self.rates - self.truth.angular_velocity[inner], _WEIGHTS, axis=0)
-        return (total / self.trajectory.step + self.truth.angular_acceleration[inner])[inner]
+    def rates(self) -> Reals:
+        """In the body, at all samples but SIDE at each end [rad/s]."""
+        return self.smoothed.rates
+
+    @property
+    def slack(self) -> float:
+        """By how much readings may differ from attitudes: half a step may be between them."""
+        first, second = self.trajectory.rotation[0], self.trajectory.rotation[1]
+        return 0.0 if self.told else float(0.5 * (first.inv() * second).magnitude()) ** 2
 
     @property
     def data(self) -> Attitudes:
         """Attitudes and rates."""
-        part = self.trajectory.rotation[MARGIN:-MARGIN].as_quat()
-        stamps = np.rint(1e9 * self.trajectory.t[MARGIN:-MARGIN]).astype(np.int64)
+        part = self.trajectory.rotation[SIDE:-SIDE].as_quat()
+        stamps = np.rint(1e9 * self.trajectory.t[SIDE:-SIDE]).astype(np.int64)
         return Attitudes(stamps, np.vstack((part.T, self.rates.T)))
 
     @property

@@ -148,35 +148,53 @@ def pooled(parts: Iterable[tuple[Reals, Mapping[str, Reals]]]) -> tuple[Reals, d
 
 
 def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause],
-            floor: float = 0.0) -> tuple[list[Finding], Reals]:
+            floor: float = 0.0, always: Sequence[str] = (),
+            ) -> tuple[list[tuple[Cause, Finding]], Reals]:
     """
-    Explain a discrepancy (N, 3) by causes, the best one first; return faults and what is left.
+    Explain a discrepancy (N, 3) by causes, the best one first.
 
     effects : by name, change of what is compared by an effect of size 1 (N, 3)
     floor : rms of the noise in the target, 0 if it is not known
+    always : names of effects of a size that is not known; their coefficients come before those of
+        the cause in what a judge gets
+
+    Returns the causes with their faults, and what is left.  A fault without a name is none: it
+    explains, as a known property does.
     """
     chosen: list[Cause] = []
-    residual, found, others = target, np.empty(0), [*causes]
-    enough = max(ENOUGH * beyond(target, floor), ENOUGH_OF_NOISE * floor)
+    found, residual = fitted(target, [effects[name] for name in always]) if always else (
+        np.empty(0), target)
+    first, others = len(always), [*causes]
+    enough = max(ENOUGH * beyond(residual, floor), ENOUGH_OF_NOISE * floor)
+
+    def judged(cause: Cause, part: Reals) -> Finding | None:
+        assert cause.judge is not None
+        return cause.judge(np.append(part[:first], part[-len(cause.effects):]))
+
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
-        tried = [fitted(target, [effects[name] for known in (*chosen, cause)
-                                 for name in known.effects]) for cause in others]
+        tried = [fitted(target, [effects[name] for name in (*always, *(
+            name for known in (*chosen, cause) for name in known.effects))]) for cause in others]
         # A cause with a judge that names no fault explains nothing.
-        after = [np.inf if cause.judge and cause.judge(part[-len(cause.effects):]) is None else
-                 beyond(left, floor) for cause, (part, left) in zip(others, tried, strict=True)]
+        after = [np.inf if cause.judge and judged(cause, part) is None else beyond(left, floor)
+                 for cause, (part, left) in zip(others, tried, strict=True)]
         good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * before, floor or np.inf))
-        # Of equally good causes the one with the fewest columns wins: more columns always fit
-        # better.
-        _, left, best = min((len(cause.effects), left, k) for k, (cause, left) in enumerate(
-            zip(others, after, strict=True)) if left <= good)
+        # Of equally good causes the one with the fewest columns wins, for more columns always fit
+        # better, then the one that is named first.
+        _, _, best = min((len(cause.effects), max(left, good / AS_GOOD), k) for k, (
+            cause, left) in enumerate(zip(others, after, strict=True)) if left <= good)
+        left = after[best]
         if left > WORTHWHILE * before:
             break
         found, residual = tried[best]
         chosen.append(others.pop(best))
-    # Without causes `split` gives one part.
-    ends = np.cumsum([len(cause.effects) for cause in chosen], dtype=int)[:-1]
-    return [fault for cause, part in zip(chosen, np.split(found, ends), strict=False)
-            if cause.judge and (fault := cause.judge(part))], residual
+    pairs = []
+    for cause in chosen:
+        width = len(cause.effects)
+        fault = cause.judge(np.append(found[:len(always)], found[first:first + width])) \
+            if cause.judge else None
+        pairs.append((cause, fault or Finding('', 'no fault')))
+        first += width
+    return pairs, residual
 
 
 def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:

@@ -14,7 +14,7 @@ from spinning_top_sim.physics import attitude
 
 def exact(top, start, times, dt, **options):
     """Return attitudes x y z w, body rates and angular accelerations of the exact motion."""
-    motion = solve(top, start.state, times, **options)
+    motion = solve(top, start, times, **options)
     return motion.quaternion, motion.angular_velocity, motion.angular_acceleration
 
 
@@ -150,7 +150,8 @@ class Stepped:
     turn: float = 1.0
 
     def __call__(self, top, start, times, dt):
-        q, (w1, w2, spin) = start.attitude, start.rates
+        (x, y, z, w), (w1, w2, spin) = start.attitude, start.rates
+        q = w, x, y, z
         across, stride = complex(w1, w2), round((times[1] - times[0]) / dt)
         rows = []
         for number in range((len(times) - 1) * stride + 1):
@@ -186,11 +187,10 @@ class Imu:
         q, w, a = self._motion(top, start, times, dt)
         self.top, self.h = top, times[1] - times[0]
         self.rotation, self.w, self.a = Rotation.from_quat(q), w, a
-        x, y, z, s = (*top.mounting[1:], top.mounting[0])
-        self.mounting = Rotation.from_quat((x, y, z, s))
+        self.mounting = Rotation.from_quat(top.mounting)
         self.arm = np.array(top.lever_arm)
         self.up = self.rotation.inv().apply((0.0, 0.0, 1.0))
-        said = {'attitudes': q[:, [3, 0, 1, 2]], 'rates': w,
+        said = {'attitudes': q, 'rates': w,
                 'accelerations': self.mounting.inv().apply(self.force()),
                 'gyroscope': self.mounting.inv().apply(w),
                 'magnetometer': self.mounting.inv().apply(self.rotation.inv().apply(top.field))}
@@ -356,7 +356,7 @@ PUBLISHED = {
     'gravity_fixed': ('gravity_frame',),
     'gyroscope_in_world': ('rates_in_world',),
     'mounting_ignored': ('mounting',),
-    'late': ('imu_one_step_late',),
+    'late': ('late',),
     'field_reversed': ('rotation_reversed',),
     'residuals': ('noise_scale',),
     'density_as_deviation': ('noise_scale',),
@@ -367,7 +367,7 @@ OTHER = {
     'without_gravity': ('no_gravity',),
     'in_g': ('units',),
     'in_degrees': ('units',),
-    'late_by_seven': ('imu_one_step_late',),
+    'late_by_seven': ('late',),
     'gyroscope_sign': ('reading_sign',),
     'field_in_world': ('reading_in_world',),
     'gyroscope_twice': ('reading_scale',),
