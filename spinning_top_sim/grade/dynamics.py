@@ -8,13 +8,12 @@ every motion, and for every size of the error.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
 from spinning_top_sim.grade.effects import STANDARD_GRAVITY
-from spinning_top_sim.grade.kinematics import SIDE
 from spinning_top_sim.grade.motion import Motion
 from spinning_top_sim.grade.scenes import Body, Reals
 from spinning_top_sim.grade.sensors import GRAVITY_BAND, listed
@@ -26,7 +25,6 @@ _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
 UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
 EXPLAINED = 0.25    # of the discrepancy is left at most
 SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
-WRONG_ENERGY = 0.1  # of the change of the potential energy
 
 
 def faults_of(motions: Sequence[Motion], dt: float) -> list[Finding]:
@@ -46,23 +44,11 @@ def faults_of(motions: Sequence[Motion], dt: float) -> list[Finding]:
     return [fault for _, fault in pairs if fault.name] if rms(residual) < EXPLAINED * rms(target) else []
 
 
-def energy_fault(motion: Motion) -> Iterator[Finding]:
-    """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
-    told, data = motion.trajectory.energy, motion.data
-    if told is None or (constants := data.constants(motion.body)) is None:
-        return
-    potential = motion.body.gravity_torque * data.height
-    share = float(np.ptp(told[SIDE:-SIDE] - constants[0]) / (np.ptp(potential) or 1.0))
-    if share > WRONG_ENERGY:
-        yield Finding('energy', f'{motion.name}: the energy told differs from that of attitude and '
-                    f'rates by up to {100.0 * share:.3g} % of the change of the potential energy',
-                    share)
-
-
 def _terms(motion: Motion, dt: float) -> tuple[Reals, Mapping[str, Reals]]:
     """Return the angular acceleration that is not explained (N, 3), and effects of causes."""
-    body, step, w = motion.body, motion.trajectory.step, motion.rates
-    rotation, inertia, axes = motion.trajectory.rotation[SIDE:-SIDE], body.inertia, np.eye(3)
+    body, step, w = motion.body, motion.trajectory.step, motion.smoothed.rates
+    rotation, inertia = motion.stretch.rotation[motion.smoothed.inner], body.inertia
+    axes = np.eye(3)
     z, world = rotation.inv().apply((0.0, 0.0, 1.0)), rotation.apply(w)
     gyroscopic = -np.cross(w, w * inertia) / inertia
     arms = [-body.mass * body.gravity * np.cross(axis, z) / inertia for axis in axes]

@@ -11,23 +11,29 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.kinematics import CLEAR, WIDTHS, Reals, Smoothed, Stretch, gain
-from spinning_top_sim.grade.kinematics import margin as margin_of
-from spinning_top_sim.tools.identify import TINY, fitted, pooled, rms
+from spinning_top_sim.tools.identify import Fit, compressed, fit, fitted, rms
+from spinning_top_sim.tools.kinematics import (
+    WIDTHS,
+    Reals,
+    Smoothed,
+    Stretch,
+    along,
+    gain,
+    margin,
+)
 
-FORCES, ANGLES = ('accelerations', 'velocities'), ('rates', 'gyroscope', 'rotations')
-UP = np.array((0.0, 0.0, 1.0))
-AXES = np.eye(3)
+ANGLES = 'rates', 'gyroscope'
+UP, AXES = np.array((0.0, 0.0, 1.0)), np.eye(3)
+ENTRIES = [(i, j) for i in range(3) for j in range(3)]
 STANDARD_GRAVITY = 9.80665
+CLEAR = 0.03            # noise of what is differentiated, relative to it, that is small
+NOISY = 1e-3            # the same, that counts
 # Signed permutations of axes but for the identity; those that change the fewest axes first.
 PERMUTATIONS = sorted((
     np.eye(3)[list(order)] * np.array(signs)[:, np.newaxis]
     for order in itertools.permutations(range(3))
     for signs in itertools.product((1.0, -1.0), repeat=3)),
     key=lambda one: np.sum(np.abs(one - np.eye(3))))[1:]
-NOISY = 1e-3            # noise of the motion, relative to it, that counts
-HIDDEN = 1e-3           # share of a coefficient in what cannot be told, from which on it cannot
-BLOCKS = 20             # into which residuals are split, to know their correlation
 _per_step = partial(np.gradient, axis=0)        # change per step of values (m, 3)
 
 
@@ -56,272 +62,188 @@ class Imu:
     accelerometer_noise_density: float | None = None
 
 
-@dataclass
-class View:
+class Compared(NamedTuple):
     """
-    Readings of one kind in one stretch beside what they should be, along axes of the body.
+    Readings beside what they should be, stretch after stretch, over the rms of the readings.
 
-    reading : smoothed (m, 3)
-    terms : names of what a right reading is the sum of
-    effects : by name, changes of the reading by an effect of size 1 (m, 3)
+    target : what a right reading does not explain (N, 3)
+    effects : by name, changes of the reading by an effect of size 1 (N, 3)
     always : names of effects whose size is not known, even of a right reading
-    noises : standard deviations of a component of reading - total, and of the total
-    """
-
-    reading: Reals
-    terms: Sequence[str]
-    effects: Mapping[str, Reals]
-    always: Sequence[str]
-    noises: tuple[float, float]
-
-
-class Stack(NamedTuple):
-    """
-    Views of all stretches, one after another, each relative to the rms of its reading.
-
-    target : what is not explained by a right reading (N, 3)
-    effects, always, terms : as of `View`
-    floor, noise : rms of the noise of a component of the target, and of the total
-    sizes : rms of the reading of each view
-    counts : rows of each view
+    floor, noise : rms of the noise of a component of the target, and of effects by name
     """
 
     target: Reals
     effects: Mapping[str, Reals]
     always: Sequence[str]
-    terms: Sequence[str]
     floor: float
-    noise: float
-    sizes: Reals
-    counts: Sequence[int]
-
-    @classmethod
-    def of(cls, views: Sequence[View]) -> 'Stack':
-        """Return them."""
-        sizes = np.array([rms(view.reading) or 1.0 for view in views])
-        target, effects = pooled(((view.reading - view.effects['total']) / size, {
-            name: effect / size for name, effect in view.effects.items()})
-            for view, size in zip(views, sizes, strict=True))
-        floor, noise = (rms(np.array([view.noises[k] for view in views]) / sizes) for k in (0, 1))
-        return cls(target, effects, views[0].always, views[0].terms, floor, noise, sizes,
-                   [len(view.reading) for view in views])
+    noise: Mapping[str, float]
 
     def column(self, name: str) -> Reals:
         """Return an effect; also 'axes k': `free`, or an arm, along PERMUTATIONS[k]."""
-        if not name.startswith('axes ') or name in self.effects:
+        if not name.startswith('axes '):
             return self.effects[name]
         _, k, *of = name.split()
         turned: Reals = self.effects[' '.join(of) or 'free'] @ PERMUTATIONS[int(k)].T
         return turned
 
-    def fit(self, names: Sequence[str]) -> tuple[Reals, Reals, Reals]:
-        """
-        Return coefficients (k,) of effects, their standard deviations, and what is left.
-
-        The deviations are those of blocks of the residual: of noise that is correlated, too.
-        """
-        effects = [self.column(name) for name in names]
-        columns = np.stack([effect.ravel() for effect in effects], axis=1)
-        size = np.maximum(np.linalg.norm(columns, axis=0), TINY * math.sqrt(len(columns)))
-        columns = columns / size
-        # Noise of the total makes it larger, and the target by as much smaller.
-        noise = np.array([self.noise ** 2 * len(columns) / (3.0 if name != 'total' else 1.0)
-                          if name == 'total' or name.startswith('matrix') and 'arm' not in name
-                          else 0.0 for name in names])
-        own = np.array([name in ('total', 'matrix 00', 'matrix 11', 'matrix 22')
-                        for name in names])
-        values, vectors = np.linalg.eigh(columns.T @ columns - np.diag(noise / size ** 2))
-        known = values > np.maximum(1e-9, vectors.T ** 2 @ (noise / size ** 2))
-        inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
-        found = inverse @ (columns.T @ self.target.ravel() + noise * own / size)
-        residual = self.target - (columns @ found).reshape(self.target.shape)
-        scores = np.array([part.T @ left for part, left in zip(
-            np.array_split(columns, BLOCKS), np.array_split(residual.ravel(), BLOCKS),
-            strict=True)])
-        variance = np.maximum(np.diag(inverse @ scores.T @ scores @ inverse),
-                              np.diag(inverse) * rms(residual) ** 2)
-        hidden = np.any(np.abs(vectors[:, ~known]) > HIDDEN, axis=1)
-        return found / size, np.where(hidden, np.inf, np.sqrt(variance)) / size, residual
+    def fit(self, names: Sequence[str]) -> Fit:
+        """Return the best coefficients of effects."""
+        if not names:
+            return Fit(np.empty(0), np.empty(0), self.target)
+        return fit(self.target, [self.column(name) for name in names],
+                   [self.noise.get(name, self.noise.get(name[:7].strip('012 '), 0.0))
+                    for name in names],
+                   [name not in [f'matrix {i}{j}' for i, j in ENTRIES if i != j]
+                    for name in names])
 
     def compressed(self) -> tuple[Reals, dict[str, Reals]]:
-        """Return target and effects with few rows, whose least squares are the same."""
-        names = [*self.effects]
-        columns = [*(self.effects[name].ravel() for name in names), self.target.ravel()]
-        rows = np.linalg.qr(np.stack(columns, axis=1), mode='r')
-        rows = rows * math.sqrt(len(rows) / self.target.size)
-        effects = {name: rows[:, k, np.newaxis] for k, name in enumerate(names)}
+        """Return target and effects with few rows, 'axes k' among them."""
+        target, effects = compressed(self.target, self.effects)
         for k, matrix in enumerate(PERMUTATIONS):
             for of in ('', *(f' {name}' for name in self.always if name.startswith('arm'))):
-                effects[f'axes {k}{of}'] = sum((
-                    matrix[i, j] * effects[f'matrix {i}{j}{of}']
-                    for i, j in np.argwhere(matrix)), np.zeros((1, 1)))
-        return rows[:, -1, np.newaxis], effects
+                effects[f'axes {k}{of}'] = sum((matrix[i, j] * effects[f'matrix {i}{j}{of}']
+                                                for i, j in np.argwhere(matrix)), np.zeros((1, 1)))
+        return target, effects
 
 
 class Comparison:
     """
-    A kind of readings in the stretches of a motion, smoothed as far as the noise asks for.
+    Readings of a kind in the stretches of a motion, smoothed as far as the noise asks for.
 
     arm, field : as given, or as last found
+    share : noise of what is differentiated, relative to it
+    sizes, counts : rms and number of the readings of each stretch that are compared
+    own_step, steps : interval of the sensor [s], and its samples per sample that is compared
     """
 
     def __init__(self, kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> None:
         self.kind, self.imu, self.gravity = kind, imu, gravity
         self.arm = np.array(imu.lever_arm or np.zeros(3))
         self.field = np.array(imu.field or np.zeros(3))
-        self.stretches = [one for one in stretches if kind in one.readings]
+        stretches = [one for one in stretches if kind in one.readings]
         self.mounting = Rotation.identity() if kind == 'rates' else \
             Rotation.from_quat(imu.mounting)
-        self.readings = [self.mounting.apply(one.readings[kind]) for one in self.stretches]
-        self.reading_noise = max((one.sigma.get(kind, 0.0) for one in self.stretches), default=0.0)
-        self.smoothed = self._clear() if self.stretches else []
-        self.width = self.smoothed[0].width if self.smoothed else 1
+        self.readings = [self.mounting.apply(one.readings[kind]) for one in stretches]
+        self.reading_noise = max((one.sigma.get(kind, 0.0) for one in stretches), default=0.0)
+        self.share, self.smoothed = self._clear(stretches)
+        self.counts = [len(one.rates) for one in self.smoothed]
+        self.sizes = np.array([rms(one) or 1.0 for one in self.readings])
+        self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
+        self.steps = stretches[0].step / self.own_step if stretches else 1.0
+        self.noisy = self.share > NOISY or any(one.width > 1 for one in self.smoothed)
 
-        self.shortest = min((len(one.rates) for one in self.smoothed), default=0)
-        self.size = rms(np.concatenate(self.readings)) if self.readings else 0.0
-        self.own_step = max((one.intervals.get(kind, one.step) for one in self.stretches),
-                            default=1.0)
-        # Samples of the sensor per step of the comparison.
-        self.steps = self.stretches[0].step / self.own_step if self.stretches else 1.0
+    def _clear(self, stretches: Sequence[Stretch]) -> tuple[float, list[Smoothed]]:
+        """Return the share of noise, and the motions smoothed so that it is small."""
+        best: tuple[float, list[Smoothed]] = math.inf, []
+        for width in WIDTHS if self.kind in ('gyroscope', 'accelerations') else (1,):
+            if any(len(one.t) < 4 * margin(width) for one in stretches) or not stretches:
+                break
+            smoothed = [Smoothed(one, width) for one in stretches]
+            noise = max(self._noises(one)['total'] for one in smoothed)
+            size = rms(np.array([rms(one.rates) if self.kind in ANGLES else math.hypot(
+                rms(one.acceleration), rms(one.second) * max(np.linalg.norm(self.arm), 0.1))
+                for one in smoothed]))
+            share = noise / max(math.sqrt(max(size ** 2 - noise ** 2, 0.0)), 1e-12)
+            best = min(best, (share, smoothed), key=lambda one: one[0])
+            if share < CLEAR:
+                break
+        return best
 
-    def read_at(self, lag: int) -> list[Reals]:
-        """Return readings that are `lag` samples late, smoothed (m, 3); ends are wrapped."""
-        return [self._read(smoothed, np.roll(reading, -lag, axis=0))
-                for smoothed, reading in zip(self.smoothed, self.readings, strict=True)]
-
-    def _read(self, smoothed: Smoothed, reading: Reals) -> Reals:
-        if self.kind in ('rotations', 'velocities'):
-            return reading[smoothed.inner][1:] / smoothed.body.step
-        return smoothed.rate(reading) if self.kind in ANGLES else smoothed.vector(reading)
-
-    @property
-    def noisy(self) -> bool:
-        """Whether the noise of the poses counts."""
-        return self.width > 1 or self.share > NOISY
+    def _noises(self, smoothed: Smoothed) -> dict[str, float]:
+        """Return the noise of a component of what the motion says, by terms."""
+        turns, rates, second, linear = smoothed.body.noise(smoothed.width)
+        if self.kind in ANGLES:
+            return {'total': rates, 'free': rates, 'matrix': rates / math.sqrt(3.0)}
+        across = math.sqrt(2.0 / 3.0)           # a turn of a vector has no noise along it
+        if self.kind == 'magnetometer':
+            return {'total': across * turns * float(np.linalg.norm(self.field))}
+        arm = across * second * (float(np.linalg.norm(self.arm)) or 0.1)
+        free = math.hypot(linear, across * turns * self.gravity)
+        total = math.hypot(free, arm)
+        whole = free if self.imu.lever_arm is None else total
+        return {'total': total, 'free': whole, 'matrix': whole / math.sqrt(3.0), 'linear': linear,
+                'lever': arm, 'tangential': arm, 'centripetal': arm, 'arm': across * second,
+                'motion': math.hypot(linear, arm)}
 
     def undo(self, matrix: Reals) -> None:
         """Make the readings those of a sensor without a matrix (3, 3)."""
         self.readings = [reading @ np.linalg.inv(matrix).T for reading in self.readings]
-        self.reading_noise /= abs(np.linalg.det(matrix)) ** (1.0 / 3.0)
+        scale = abs(np.linalg.det(matrix)) ** (1.0 / 3.0)
+        self.sizes, self.reading_noise = self.sizes / scale, self.reading_noise / scale
 
-    def stack(self, lag: int) -> Stack:
+    def read_at(self, lag: int) -> list[Reals]:
+        """Return readings that are `lag` samples late, smoothed (m, 3); ends are wrapped."""
+        return [(one.rate if self.kind in ANGLES else one.vector)(np.roll(reading, -lag, axis=0))
+                for one, reading in zip(self.smoothed, self.readings, strict=True)]
+
+    def compare(self, lag: int) -> Compared:
         """Return what is compared, of readings that are `lag` samples late."""
-        stack = Stack.of(self.views(lag))
-        if not stack.always:
-            return stack
-        found, _ = fitted(stack.target, [stack.effects[name] for name in stack.always])
-        if self.kind == 'magnetometer':
-            self.field = self.field + found
-        else:
-            self.arm = self.arm + found
-        return Stack.of(self.views(lag))
-
-    def _clear(self) -> list[Smoothed]:
-        """Return the motions smoothed so that what is differentiated is clear of noise."""
-        best: tuple[float, list[Smoothed]] = np.inf, []
-        for width in WIDTHS if self.kind in ('gyroscope', 'accelerations') else (1,):
-            if any(len(one.t) < 4 * margin_of(width) for one in self.stretches):
-                break
-            smoothed = [one.at(width) for one in self.stretches]
-            noises = np.array([self._motion_noise(one) for one in smoothed])
-            sizes = np.array([rms(one.rates) if self.kind in ANGLES else np.hypot(
-                rms(one.acceleration), rms(one.second) * max(np.linalg.norm(self.arm), 0.1))
-                for one in smoothed])
-            share = float(np.max(noises) / max(np.sqrt(max(
-                np.mean(sizes ** 2) - np.mean(noises ** 2), 0.0)), 1e-12))
-            if share < best[0]:
-                best = share, smoothed
-            if share < CLEAR:
-                break
-        self.share = best[0]
-        return best[1]
-
-    def _motion_noise(self, smoothed: Smoothed) -> float:
-        """Return the noise of what the motion says of a component of a reading."""
-        rates, second, linear = smoothed.body.noise(smoothed.width)
-        turns = smoothed.body.sigma.get('attitudes', 0.0) * gain(smoothed.width)
-        if self.kind in ANGLES:
-            return rates
-        if self.kind == 'magnetometer':
-            return turns * float(np.linalg.norm(self.field))
-        # R^T R'' r has the noise of a turn of r.
-        arm = float(np.linalg.norm(self.arm)) if np.any(self.arm) else 0.1
-        return float(np.sqrt(linear ** 2 + 2.0 / 3.0 * ((second * arm) ** 2
-                                                        + (turns * self.gravity) ** 2)))
-
-    def views(self, lag: int = 0) -> list[View]:
-        """Return what is compared, of readings that are `lag` samples late."""
-        return [self._view(smoothed, np.roll(reading, -lag, axis=0), lag)
-                for smoothed, reading in zip(self.smoothed, self.readings, strict=True)]
-
-    def _view(self, smoothed: Smoothed, reading: Reals, lag: int) -> View:
-        edge = abs(lag)
-        part = slice(edge, -edge or None)      # of what a roll has not wrapped
-        terms, always = self._terms(smoothed), []
-        smooth = self._read(smoothed, reading)
-        if self.kind == 'rotations':
-            turns = smoothed.body.rotation[smoothed.inner]
-            terms = {'rates': (turns[:-1].inv() * turns[1:]).as_rotvec() / smoothed.body.step}
-        elif self.kind == 'velocities':         # means over a step
-            terms = {name: 0.5 * (term[:-1] + term[1:]) for name, term in terms.items()}
-        total = sum(terms.values(), np.zeros(1))
-        turn = smoothed.turn[:len(total)]
-        back = turn.transpose(0, 2, 1)
-        world = np.einsum('nij,nj->ni', turn, total)
-        in_world = self.mounting.apply(world)
-        effects = {
-            **terms, 'total': total, 'step': _per_step(total), 'world': in_world,
-            'reversed': self.mounting.apply(np.einsum('nij,nj->ni', turn, in_world)),
-            **{f'offset {k}': 0.0 * total + axis for k, axis in enumerate(AXES)},
-            'free': total}
-        if self.kind in FORCES:
-            effects |= self._of_forces(smoothed, terms, total, turn, back)
-            always = [f'arm {k}' for k in range(3) if self.imu.lever_arm is None]
-            if always:                          # the arm is not in what does not depend on it
-                effects['free'] = total - effects['lever']
-        if self.kind == 'magnetometer' and self.imu.field is None:
-            always = [f'field {k}' for k in range(3)]
-            effects |= {f'{name} {k}': column for k, axis in enumerate(AXES) for name, column in (
-                ('field', back @ axis), ('turned', turn @ axis))}
-        effects |= {f'matrix {i}{j}{of}': np.outer(effects[of.strip() or 'free'][:, j], AXES[i])
-                    for of in ('', *(f' {name}' for name in always if name.startswith('arm')))
-                    for i in range(3) for j in range(3)}
-        moving = self._motion_noise(smoothed)
-        noise = math.hypot(moving, self.reading_noise * gain(smoothed.width))
-        return View(smooth[part], [*terms], {
-            name: effect[part] for name, effect in effects.items()}, always, (noise, moving))
-
-    def _terms(self, smoothed: Smoothed) -> dict[str, Reals]:
-        if self.kind in ANGLES:
-            return {'rates': smoothed.rates}
-        if self.kind == 'magnetometer':
-            return {'field': smoothed.of_world(self.field)}
-        second, transposed = smoothed.second, smoothed.second.transpose(0, 2, 1)
-        terms = {'gravity': self.gravity * smoothed.of_world(UP),
-                 'tangential': 0.5 * (second - transposed) @ self.arm,
-                 'centripetal': 0.5 * (second + transposed) @ self.arm}
-        if np.any(smoothed.acceleration):
-            terms['linear'] = smoothed.acceleration
-        return terms
-
-    def _of_forces(self, smoothed: Smoothed, terms: Mapping[str, Reals], total: Reals,
-                   turn: Reals, back: Reals) -> dict[str, Reals]:
-        def along(matrices: Reals, vectors: Reals) -> Reals:
-            found: Reals = np.einsum('nij,nj->ni', matrices, vectors)
+        found = self._compared(lag)
+        if not found.always:
             return found
+        more, _ = fitted(found.target, [found.effects[name] for name in found.always])
+        if self.kind == 'magnetometer':
+            self.field = self.field + more
+        else:
+            self.arm = self.arm + more
+        return self._compared(lag)
 
-        n, motion = len(total), total - terms['gravity']
-        second = smoothed.second[:n]
-        antisymmetric = 0.5 * (second - second.transpose(0, 2, 1))
-        lever = terms['tangential'] + terms['centripetal']
-        speed = along(back, smoothed.velocity[:n])
+    def _compared(self, lag: int) -> Compared:
+        keep = slice(abs(lag), -abs(lag) or None)       # what a roll has not wrapped
+        self.counts = [len(one.rates) - 2 * abs(lag) for one in self.smoothed]
+        every = [self.effects(one) for one in self.smoothed]
+        effects = {name: np.concatenate([one[name][keep] / size for one, size in zip(
+            every, self.sizes, strict=True)]) for name in every[0]}
+        readings = np.concatenate([one[keep] / size for one, size in zip(
+            self.read_at(lag), self.sizes, strict=True)])
+        noises = [self._noises(one) for one in self.smoothed]
+        noise = {name: rms(np.array([one[name] for one in noises]) / self.sizes)
+                 for name in noises[0]}
+        reading = self.reading_noise * rms(gain(self.smoothed[0].width) / self.sizes)
+        return Compared(readings - effects['total'], effects, [
+            name for name in effects if name[:-2] in ('arm', 'field')
+            and (self.imu.lever_arm if name[:3] == 'arm' else self.imu.field) is None],
+            math.hypot(noise['total'], reading), noise)
+
+    def effects(self, smoothed: Smoothed) -> dict[str, Reals]:
+        """Return the terms of a right reading, their sum `total`, and effects of defects."""
+        effects = {}
+        if self.kind in ANGLES:
+            effects['total'] = smoothed.rates
+        elif self.kind == 'magnetometer':
+            effects = {f'field {k}': smoothed.back @ axis for k, axis in enumerate(AXES)}
+            effects['total'] = smoothed.back @ self.field
+        else:
+            effects = self._of_forces(smoothed)
+        total = effects['total']
+        world = self.mounting.apply(along(smoothed.turn, total))
+        known = self.kind != 'accelerations' or self.imu.lever_arm is not None
+        effects |= {
+            'step': _per_step(total), 'world': world,
+            'reversed': self.mounting.apply(along(smoothed.turn, world)),
+            'free': total if known else total - effects['lever'],   # of an arm that is not known
+            **{f'offset {k}': 0.0 * total + axis for k, axis in enumerate(AXES)}}
+        for of in ('free', *(() if known else ('arm 0', 'arm 1', 'arm 2'))):
+            effects |= {f'matrix {i}{j}' + f' {of}' * (of != 'free'): np.outer(
+                effects[of][:, j], AXES[i]) for i, j in ENTRIES}
+        return effects
+
+    def _of_forces(self, smoothed: Smoothed) -> dict[str, Reals]:
+        second, transposed = smoothed.second, smoothed.second.transpose(0, 2, 1)
+        tangential, centripetal = (0.5 * (second + sign * transposed) @ self.arm
+                                   for sign in (-1.0, 1.0))
+        lever, gravity = tangential + centripetal, self.gravity * smoothed.back @ UP
+        linear = {'linear': smoothed.acceleration} if np.any(smoothed.acceleration) else {}
+        motion = lever + smoothed.acceleration
+        total = gravity + motion
+        turned, back = along(smoothed.turn, motion), smoothed.back
         return {
-            'lever': lever, 'motion': motion,
-            'transport': np.cross(smoothed.rates[:n], speed),
+            'tangential': tangential, 'centripetal': centripetal, 'gravity': gravity, **linear,
+            'lever': lever, 'motion': motion, 'total': total,
             # The motion a step later, then the axes, then the angular acceleration.
-            'difference': along(back, _per_step(along(turn, motion))),
-            'axes late': along(back, _per_step(along(turn, total))) - _per_step(total),
-            'tangential step': _per_step(terms['tangential']),
+            'difference': along(back, _per_step(turned)),
+            'axes late': along(back, _per_step(along(smoothed.turn, total))) - _per_step(total),
+            'tangential step': _per_step(tangential),
             # A lever arm that is longer by 1 m along axes of the body, and a x r alone.
             **{f'arm {k}': second[:, :, k] for k in range(3)},
-            **{f'turned arm {k}': antisymmetric[:, :, k] for k in range(3)}}
+            **{f'turned arm {k}': 0.5 * (second - transposed)[:, :, k] for k in range(3)}}

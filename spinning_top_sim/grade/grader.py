@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from spinning_top_sim.grade import dynamics, rigid, sensors
-from spinning_top_sim.grade.effects import STANDARD_GRAVITY, Imu
-from spinning_top_sim.grade.motion import InvalidTrajectoryError, Motion, Trajectory
-from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Reals, Scene, Start
+from spinning_top_sim.grade import dynamics, sensors
+from spinning_top_sim.grade.motion import READINGS, InvalidTrajectoryError, Motion, Trajectory
+from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.cli import one_line, progress
+from spinning_top_sim.tools.kinematics import Reals
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
 Simulate = Callable[[Body, Start, Reals, float], Any]
@@ -130,27 +130,6 @@ def grade_trajectory(trajectory: Any, top: Top, start: State, *,
     return judgement.report()
 
 
-def grade_readings(parts: rigid.Parts, imu: Imu | None = None, *,
-                   gravity: float = STANDARD_GRAVITY, subject: str = 'readings') -> Report:
-    """
-    Grade the IMU of any rigid body against its poses.
-
-    Parameters
-    ----------
-    parts : mapping
-        Times (n,) [s] and values (n, k) of each of 'attitudes' (q(world <- body) as x, y, z, w),
-        'positions', 'gyroscope', 'accelerations', 'magnetometer' that there is; SI.
-    imu : Imu, optional
-        What is known of it; default: nothing, along axes of the body.
-    gravity : float
-        [m/s^2]; another value on Earth is no fault.
-    subject : str
-        Name of what is graded.
-    """
-    found = rigid.judge(parts, imu or Imu(), gravity)
-    return Report(subject, found.faults, found.marks, found.notes)
-
-
 def _run(run: Simulate, body: Body, start: Start, times: Reals, dt: float) -> Trajectory:
     """Return the motion.  Raises InvalidTrajectoryError."""
     try:
@@ -189,21 +168,19 @@ class Judgement:
             self.first = told.attitudes.copy()
         motion = Motion(name, body, start, told)
         early = slice(0, EARLY)
-        error = float(np.max(motion.errors['total'][early]))
+        error = float(np.max(motion.errors[early]))
         if error > min(WRONG, 2.0 * self.tolerance):
             for steps in (1, -1):
-                moved = told.moved(steps * self.dt)
-                other = Motion(name, body, start, moved)
-                if np.max(other.errors['total'][early]) < RIGHT * error and (
-                        np.median(other.errors['total'])
-                        < RIGHT * np.median(motion.errors['total'])):
+                other = Motion(name, body, start, replace(told, t=told.t + steps * self.dt))
+                if np.max(other.errors[early]) < RIGHT * error and (
+                        np.median(other.errors)
+                        < RIGHT * np.median(motion.errors)):
                     self._tell('early' if steps > 0 else 'late', f'{name}: the attitudes are '
                                f'those of one step {"after" if steps > 0 else "before"}',
                                -float(steps))
                     return other
         if error > WRONG:
-            truth = motion.solution.states_at_seconds(told.t[early]).quaternion
-            found = conventions.best(told.attitudes[early], truth)
+            found = conventions.best(told.attitudes[early], motion.truth[early])
             if found.convention.parts and found.after < RIGHT * found.before:
                 self._tell('convention', f'{name}: attitudes are told as '
                            f'{found.convention.name}; this is undone', found.before)
@@ -234,12 +211,10 @@ class Judgement:
         known = any(fault.name == 'rates_scale' for fault in faults)
         faults += [fault for fault in self._of_motions()
                    if not (known and fault.name == 'inaccurate')]
-        faults += dynamics.energy_fault(motions[0])
-        for kind in sensors.KINDS:
-            if kind != 'rates':
-                found = self._readings(kind, body)
-                faults, marks = [*faults, *found.faults], {**marks, **found.marks}
-                self.notes.extend(found.notes)
+        for kind in READINGS[1:]:
+            found = self._readings(kind, body)
+            faults, marks = [*faults, *found.faults], {**marks, **found.marks}
+            self.notes.extend(found.notes)
         if not {*motions[0].stretch.readings} - {'rates'}:
             self.notes.append('no readings: the IMU is not graded')
         return Report(self.subject, faults, marks, self.notes)

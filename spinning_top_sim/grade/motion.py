@@ -1,26 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a simulator returns, checked, beside the exact motion: errors, drifts, rates."""
+"""What a simulator returns, checked, beside the exact motion."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.kinematics import SIDE, Smoothed, Stretch, white
-from spinning_top_sim.grade.scenes import Body, Reals
+from spinning_top_sim.grade.scenes import Body
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.tools.analysis import Attitudes, measure
+from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, white
 
-# Columns of each part.
-_PARTS = {'attitudes': (4,), 'rates': (3,), 'accelerations': (3,), 'gyroscope': (3,),
-          'magnetometer': (3,), 'increments': (6,), 'energy': ()}
+READINGS = 'rates', 'gyroscope', 'accelerations', 'magnetometer'
 LEAST_SAMPLES = 30
-READINGS = 'gyroscope', 'accelerations', 'magnetometer'
+NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 
 
 class InvalidTrajectoryError(ValueError):
@@ -40,13 +37,8 @@ class Trajectory:
         q(world <- body) as x, y, z, w.
     rates : (n, 3) array, optional
         Angular velocity in the body frame [rad/s].
-    accelerations, gyroscope, magnetometer : (n, 3) array, optional
-        Readings in the frame of the IMU [m/s^2, +g upwards at rest], [rad/s], [T].
-    increments : (n, 6) array, optional
-        Rotation [rad] and velocity [m/s] in the frame of the IMU over the interval that ends at
-        each time; the first row is not used.
-    energy : (n,) array, optional
-        Kinetic and potential energy, but for a constant [J].
+    gyroscope, accelerations, magnetometer : (n, 3) array, optional
+        Readings in the frame of the IMU [rad/s], [m/s^2, +g upwards at rest], [T].
     covariance : mapping, optional
         Covariances (3, 3) that the simulator tells of 'gyroscope' and 'accelerations'; a single
         matrix is meant for both.
@@ -55,19 +47,17 @@ class Trajectory:
     t: Reals
     attitudes: Reals
     rates: Reals | None = None
-    accelerations: Reals | None = None
     gyroscope: Reals | None = None
+    accelerations: Reals | None = None
     magnetometer: Reals | None = None
-    increments: Reals | None = None
-    energy: Reals | None = None
     covariance: Mapping[str, Reals] = field(default_factory=dict)
+
     @classmethod
     def of(cls, said: Any, times: Any = None) -> Self:
         """Return what a run has said, by default at its `t`.  Raises InvalidTrajectoryError."""
-        if hasattr(said, 'attitudes'):
-            said = {name: getattr(said, name, None) for name in (*_PARTS, 't', 'covariance')}
-        elif not isinstance(said, Mapping):
-            said = {'attitudes': said}
+        if not isinstance(said, Mapping):
+            said = {name: getattr(said, name, None) for name in cls.__dataclass_fields__} if (
+                hasattr(said, 'attitudes')) else {'attitudes': said}
         said = {str(name): part for name, part in said.items() if part is not None}
         if 'attitudes' not in said:
             raise InvalidTrajectoryError(f'what is returned has {sorted(said) or "nothing"}: must '
@@ -82,49 +72,34 @@ class Trajectory:
         for at in np.flatnonzero(~(np.abs(steps - usual) <= 1e-3 * usual) | (steps <= 0.0))[:1]:
             raise InvalidTrajectoryError(f'times[{at + 1}] - times[{at}] = {steps[at]:g} s where '
                                          f'{usual:g} s is usual: must be equally spaced, > 0')
-        parts = {name: _numbers(name, said[name], (len(t), *columns))
-                 for name, columns in _PARTS.items() if name in said}
-        attitudes = parts.pop('attitudes')
+        attitudes = _numbers('attitudes', said['attitudes'], (len(t), 4))
         norms = np.linalg.norm(attitudes, axis=1, keepdims=True)
-        for at in np.flatnonzero(~(np.abs(norms - 1.0) < 1e-2)):
+        for at in np.flatnonzero(~(np.abs(norms - 1.0) < NORM))[:1]:
             raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
                                          'must be 1')
-        told = said.get('covariance')
+        told = said.get('covariance', {})
         if not isinstance(told, Mapping):
-            told = {} if told is None else {'gyroscope': told, 'accelerations': told}
+            told = {'gyroscope': told, 'accelerations': told}
         if others := [*map(str, told.keys() - {'gyroscope', 'accelerations'})]:
             raise InvalidTrajectoryError(f'covariance of {", ".join(others)}: must be of gyroscope'
                                          ' or accelerations')
-        return cls(t, attitudes / norms, **parts, covariance={
-            name: _numbers(f'covariance of {name}', matrix, (3, 3))
-            for name, matrix in told.items()})
-
-    @property
-    def rotation(self) -> Rotation:
-        """The attitudes, world <- body."""
-        return Rotation.from_quat(self.attitudes)
+        return cls(t, attitudes / norms, **{
+            name: _numbers(name, said[name], (len(t), 3)) for name in READINGS if name in said},
+            covariance={name: _numbers(f'covariance of {name}', matrix, (3, 3))
+                        for name, matrix in told.items()})
 
     @property
     def step(self) -> float:
         """Interval between samples [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
-    def moved(self, seconds: float) -> Self:
-        """Return the motion with its attitudes at later times."""
-        return replace(self, t=self.t + seconds)
-
     def stretch(self, rates: Reals | None = None) -> Stretch:
-        """Return the motion with its readings; `rates` are those that the simulator tells."""
+        """Return the motion with its readings; `rates` are those of the motion if not None."""
         readings = {name: values for name in READINGS
                     if (values := getattr(self, name)) is not None}
-        if self.rates is not None:
-            readings['rates'] = self.rates
-        if self.increments is not None:
-            readings |= {'rotations': self.increments[:, :3], 'velocities': self.increments[:, 3:]}
-        sigma = {name: float(np.sqrt(np.mean(white(values) ** 2)))
-                 for name, values in readings.items()}
-        return Stretch(self.t, self.rotation, np.zeros((len(self.t), 3)), readings, sigma,
-                       rates=rates)
+        return Stretch(self.t, Rotation.from_quat(self.attitudes), np.zeros((len(self.t), 3)),
+                       readings, {name: white(values, jumps=False)
+                                  for name, values in readings.items()}, rates=rates)
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
@@ -140,83 +115,52 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
     return numbers
 
 
-def errors_by_angle(rotation: Rotation, truth: Rotation) -> dict[str, Reals]:
-    """
-    Return the angle between attitudes world <- body (n,), and its parts [rad].
-
-    precession : about the vertical, times sin(theta); nutation : of theta; spin : about the axis
-    """
-    axes = [one.apply((0.0, 0.0, 1.0)).T for one in (rotation, truth)]
-    tip, right = (x + 1j * y for x, y, _ in axes)
-    tilt, right_tilt = (np.arctan2(np.hypot(x, y), z) for x, y, z in axes)
-    between = truth.inv() * rotation
-    _, _, z, w = between.as_quat().T
-    return {'total': between.magnitude(),
-            'precession': np.unwrap(np.angle(tip * np.conj(right))) * np.abs(right),
-            'nutation': tilt - right_tilt, 'spin': np.unwrap(2.0 * np.arctan2(z, w))}
-
-
-@dataclass
 class Motion:
-    """A motion beside the exact one from the same state."""
+    """
+    A motion beside the exact one from the same state.
 
-    name: str
-    body: Body
-    start: State
-    trajectory: Trajectory
-    told: bool = False          # the rates told are those of the motion
-    stretch: Stretch = field(init=False)
-    smoothed: Smoothed = field(init=False)          # of it
-    solution: ExactSolution = field(init=False)
-    errors: Mapping[str, Reals] = field(init=False)     # as of `errors_by_angle`
-    worst: float = field(init=False)                    # total error [rad]
+    errors : angles to the exact attitudes (n,) [rad]
+    smoothed : what the body does, by its attitudes or by the rates told
+    """
 
-    def __post_init__(self) -> None:
-        self.solution = ExactSolution(self.body, self.start)
-        truth = Rotation.from_quat(self.solution.states_at_seconds(self.trajectory.t).quaternion)
-        self.errors = errors_by_angle(self.trajectory.rotation, truth)
-        self.worst = float(np.max(self.errors['total']))
+    def __init__(self, name: str, body: Body, start: State, trajectory: Trajectory) -> None:
+        self.name, self.body, self.start, self.trajectory = name, body, start, trajectory
+        self.solution = ExactSolution(body, start)
+        self.truth: Reals = self.solution.states_at_seconds(trajectory.t).quaternion
         self.use_rates(told=False, in_world=False)
+        rotation = self.stretch.rotation
+        self.errors: Reals = (Rotation.from_quat(self.truth).inv() * rotation).magnitude()
+
+    @property
+    def worst(self) -> float:
+        """The largest error [rad]."""
+        return float(np.max(self.errors))
 
     def use_rates(self, told: bool, in_world: bool) -> None:
         """Take rates from the attitudes, or those told; `in_world` : these are in its axes."""
-        rates, self.told = self.trajectory.rates, told and self.trajectory.rates is not None
+        rates = self.trajectory.rates if told else None
         if rates is not None and in_world:
-            rates = self.trajectory.rotation.inv().apply(rates)
-        self.stretch = self.trajectory.stretch(rates if self.told else None)
-        self.smoothed = self.stretch.at(1)
-
-    @property
-    def rates(self) -> Reals:
-        """In the body, at all samples but SIDE at each end [rad/s]."""
-        return self.smoothed.rates
+            rates = self.stretch.rotation.inv().apply(rates)
+        self.stretch = self.trajectory.stretch(rates)
+        self.smoothed = Smoothed(self.stretch, 1)
 
     @property
     def slack(self) -> float:
         """By how much readings may differ from attitudes: half a step may be between them."""
-        first, second = self.trajectory.rotation[0], self.trajectory.rotation[1]
-        return 0.0 if self.told else float(0.5 * (first.inv() * second).magnitude()) ** 2
-
-    @property
-    def data(self) -> Attitudes:
-        """Attitudes and rates."""
-        part = self.trajectory.rotation[SIDE:-SIDE].as_quat()
-        stamps = np.rint(1e9 * self.trajectory.t[SIDE:-SIDE]).astype(np.int64)
-        return Attitudes(stamps, np.vstack((part.T, self.rates.T)))
+        first, second = self.stretch.rotation[0], self.stretch.rotation[1]
+        told = self.stretch.rates is not None
+        return 0.0 if told else float(0.5 * (first.inv() * second).magnitude()) ** 2
 
     @property
     def marks(self) -> dict[str, float]:
-        """The measures; docs/grade.md defines them."""
-        marks = {f'{name}_error_deg': math.degrees(float(np.max(np.abs(values))))
-                 for name, values in self.errors.items()}
+        """The largest error, and the largest relative changes of the constants of the motion."""
+        body, w = self.body, self.smoothed.rates
+        up = self.smoothed.turn[:, 2]
+        momenta = w * body.inertia
+        values = {'energy': 0.5 * np.sum(momenta * w, axis=1) + body.gravity_torque * up[:, 2],
+                  'l3': momenta[:, 2], 'lz': np.sum(momenta * up, axis=1)}
         first = self.solution.states_at_seconds(np.zeros(1))
-        for name, values in zip(('energy', 'l3', 'lz'), self.data.constants(self.body) or (),
-                                strict=True):
-            marks[f'{name}_drift'] = float(np.max(np.abs(relative_drift(
-                values, float(getattr(first, name)[0])))))
-        exact = self.solution.describe()
-        found = measure(self.data, exact.nutation_period)
-        for name in ('nutation_period', 'mean_precession_rate'):
-            value, right = getattr(found, name), getattr(exact, name)
-            marks[f'{name}_error'] = value / right - 1.0 if value and right else math.nan
-        return marks
+        return {'total_error_deg': math.degrees(self.worst), **{
+            f'{name}_drift': float(np.max(np.abs(relative_drift(
+                value, float(getattr(first, name)[0]))))) for name, value in values.items()}}
+

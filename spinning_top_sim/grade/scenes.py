@@ -7,15 +7,14 @@ from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
 from spinning_top_sim.grade.effects import Imu
 from spinning_top_sim.physics.placement import state_of
 from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.tools.kinematics import Reals
 
-Reals = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,83 +3,68 @@
 Compares readings with the motion of the same simulator or recording, and names what is wrong.
 
 A reading is fitted with its physical terms: for the accelerometer gravity, the acceleration of the
-origin, a x r and w x (w x r).  What remains is the discrepancy; as few causes as possible explain
-it, by least squares.  What is found and can be undone without a loss (a delay, other axes, another
-unit) is undone, and the rest is looked for again.
+origin, a x r and w x (w x r).  As few causes as possible explain what remains, by least squares.
+What is found and can be undone without a loss (a delay, other axes, another unit) is undone, and
+the rest is looked for again.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade.effects import (
     ANGLES,
-    FORCES,
+    ENTRIES,
     PERMUTATIONS,
     STANDARD_GRAVITY,
+    Compared,
     Comparison,
     Imu,
-    Stack,
 )
-from spinning_top_sim.grade.kinematics import ORDER, Reals, Stretch
-from spinning_top_sim.tools.identify import (
-    NEAR,
-    Cause,
-    beyond,
-    explain,
-    instead,
-    rms,
-)
+from spinning_top_sim.tools.identify import NEAR, Cause, beyond, explain, instead, rms
+from spinning_top_sim.tools.kinematics import Reals, Stretch
 from spinning_top_sim.tools.report import Finding, Mark
 
-
-class Kind(NamedTuple):
-    """A kind of readings: factors of other units, and from where on a discrepancy is strange."""
-
-    units: Mapping[str, float]
-    strange: float = 2e-3
-    unit: str = ''
-
-
-_DEGREES = {'deg/s': 180.0 / math.pi, 'rad/s for deg/s': math.pi / 180.0, 'rpm': 30.0 / math.pi}
-_G = {'g': 1.0 / STANDARD_GRAVITY, 'mg': 1e3 / STANDARD_GRAVITY}
-# Rates may be those of the middle of a step; velocities are means over a step, compared with those
-# of its ends: a larger discrepancy is not strange.
-KINDS = {
-    'rates': Kind(_DEGREES, 2e-2, 'rad/s'), 'gyroscope': Kind(_DEGREES, unit='rad/s'),
-    'accelerations': Kind(_G, unit='m/s^2'),
-    'magnetometer': Kind({'gauss': 1e4, 'mT': 1e3, 'uT': 1e6, 'nT': 1e9}, unit='T'),
-    'rotations': Kind(_DEGREES, unit='rad/s'), 'velocities': Kind(_G, 5e-2, 'm/s^2')}
+_ANGLE = {'deg/s': 180.0 / math.pi, 'rad/s, taken for deg/s': math.pi / 180.0}
+# By kind: the factors of other units by name; the unit of a reading.
+UNITS = {'rates': _ANGLE, 'gyroscope': _ANGLE, 'accelerations': {'g': 1.0 / STANDARD_GRAVITY},
+         'magnetometer': {'gauss': 1e4, 'mT': 1e3, 'uT': 1e6, 'nT': 1e9}}
+SI = {'gyroscope': 'rad/s', 'accelerations': 'm/s^2', 'magnetometer': 'T'}
 DENSITIES = {'gyroscope': 'gyroscope_noise_density',
              'accelerations': 'accelerometer_noise_density'}
+# Terms of a specific force: what each is, and the fault where it is missing.
+TERMS = {'tangential': ('a x r', 'no_tangential_term'),
+         'centripetal': ('w x (w x r)', 'no_centripetal_term'), 'gravity': ('gravity', 'no_gravity'),
+         'linear': ('the acceleration of the origin', 'no_linear_acceleration'),
+         'lever': ('the lever arm', 'no_lever_arm'), 'motion': ('motion', 'no_acceleration')}
+OFFSETS = 'offset 0', 'offset 1', 'offset 2'
 LAGS = range(-5, 41)        # lags that are tried [samples]
-ROUNDING = 1e-5         # share of a reading from which on a lag is looked for
-LATE = 0.75                 # lag from which on it is a fault [samples]
-REAL = 0.03             # share by which a device may differ where poses have noise
+LATE = 0.75                 # lag from which on it is a fault [samples of the sensor]
+ROUNDING = 1e-5             # share of a reading from which on a lag is looked for
 SURE = 5.0                  # standard deviations from which on a number is not chance
-BLOCKS = 20                 # into which residuals are split, to know their correlation
-SAME_POWER = 1.05           # of the noise, by which it may be larger besides
-MISSING = 0.05          # share of a whole reading that is none
-UNEXPLAINED = 0.5           # share of a discrepancy that causes leave where they explain nothing
+# Share of a reading from which on a discrepancy is strange: rates that are told may be those of
+# the middle of a step; a real device, where poses have noise, has errors that no simulator needs.
+STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
+UNEXPLAINED, ROUGH = 0.5, 0.3   # shares of a discrepancy, and with noise of a reading, left at most
+MISSING = 0.05              # share of a whole reading that is none
 GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
 EARTH_FIELD = 15e-6, 90e-6  # [T]
-NOISY = 1e-4                # smaller noise, relative to the reading, is rounding
-NOISE_BAND = 0.05           # share by which noise may differ from what is declared
+SAME_POWER = 1.05           # of noise, by which it may be larger besides
+NOISE_BAND, NOISY = 0.05, 1e-4  # by which noise may differ from what is declared; is rounding
 LEAST_KURTOSIS = 2.4        # of normal noise; it is 3, and 1.8 of uniform noise
 FOUR_SIGMA = 4.0            # standard deviations by which a measured noise may differ besides
 TELLS = 0.5                 # uncertainty of a share of a term up to which its fault can be told
-# The relative standard deviation of white noise that is measured by the median of n differences,
-# times sqrt(n).
-SIXTH = 6               # order of the differences by which noise is judged
-_SPREAD = 1.65 * math.sqrt(0.5 * math.comb(4 * ORDER, 2 * ORDER)) / math.comb(2 * ORDER, ORDER)
+SIXTH = 6                   # order of the differences by which noise is judged
+# The relative standard deviation of white noise by n of them, times sqrt(n).
+_SPREAD = math.sqrt(0.5 * math.comb(4 * SIXTH, 2 * SIXTH)) / math.comb(2 * SIXTH, SIXTH)
 
 
 class Judged(NamedTuple):
-    """Faults, marks by name, and notes on what was found or could not be told."""
+    """Faults, marks by name, and notes on what could not be told."""
 
     faults: list[Finding]
     marks: dict[str, Mark]
@@ -90,41 +75,37 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
           exact_gravity: bool = True, covariance: Reals | None = None,
           slack: float = 0.0) -> Judged:
     """
-    Return what is wrong with the readings of one of KINDS.
+    Return what is wrong with the readings of a kind.
 
     exact_gravity : whether that of another place on Earth is a fault
     covariance : (3, 3) that is declared
     slack : share by which readings may differ, since the motion is known no better
     """
-    comparison = Comparison(kind, stretches, imu, gravity)
-    judged = Judged([], {}, [])
+    comparison, judged = Comparison(kind, stretches, imu, gravity), Judged([], {}, [])
     if not comparison.smoothed:
         return judged
-    lag = 0
-    if kind != 'velocities':        # these are means over a step
-        lag, late, sigma = _lag(comparison)
-        late, sigma = late * comparison.steps, sigma * comparison.steps
-        judged.marks[f'{kind}_lag_steps'] = Mark(late, LATE, _interval(sigma))
-        if abs(late) > max(LATE, SURE * sigma):
-            judged.faults.append(Finding(
-                'late' if late > 0.0 else 'early', f'the readings belong to the motion of '
-                f'{abs(late):.3g} steps ({1e3 * abs(late) * comparison.own_step:.3g} ms) '
-                f'{"before" if late > 0.0 else "after"}', late))
+    lag, late, sigma = _lag(comparison)
+    late, sigma = late * comparison.steps, sigma * comparison.steps
+    judged.marks[f'{kind}_lag_steps'] = Mark(late, LATE, _interval(sigma))
+    if abs(late) > max(LATE, SURE * sigma):
+        judged.faults.append(Finding(
+            'late' if late > 0.0 else 'early', f'the readings belong to the motion of '
+            f'{abs(late):.3g} steps ({1e3 * abs(late) * comparison.own_step:.3g} ms) '
+            f'{"before" if late > 0.0 else "after"}', late))
     for last in (False, False, True):
-        stack = comparison.stack(lag)
-        causes = Causes(comparison, stack, exact_gravity, slack)
+        compared = comparison.compare(lag)
+        causes = Causes(comparison, compared, exact_gravity, slack)
         found, residual = causes.find()
         undone = [fault for fault in found if fault.evidence in causes.undo and not last]
         judged.faults.extend(fault for fault in undone or found if fault.name)
         if not undone:
             break
         comparison.undo(causes.undo[undone[0].evidence])
-    known = {'reading_scale', 'inconsistent_reading', 'matrix'}.isdisjoint(
-        fault.name for fault in found)
-    judged.marks.update(_marks(comparison, stack, residual))
-    if kind in DENSITIES and known:
-        judged.faults.extend(_noise_faults(comparison, stack, residual, covariance))
-    judged.notes.extend(_untold(comparison, stack))
+    judged.marks.update(_marks(comparison, compared))
+    if kind in DENSITIES:
+        if {'reading_scale', 'inaccurate', 'matrix'}.isdisjoint(fault.name for fault in found):
+            judged.faults.extend(_noise_faults(comparison, residual, covariance))
+        judged.notes.extend(_untold(comparison, compared))
     return Judged([fault._replace(evidence=f'{kind}: {fault.evidence}')
                    for fault in judged.faults], judged.marks, judged.notes)
 
@@ -140,47 +121,40 @@ def _lag(comparison: Comparison) -> tuple[int, float, float]:
     The reading is fitted by all terms, of all axes, at each lag: what else is wrong does not
     count.
     """
-    lags = [lag for lag in LAGS if 4 * abs(lag) < comparison.shortest]
-    bases = []
-    for view in comparison.views():
-        names = ['total'] if comparison.kind in ANGLES else [*view.terms, *view.always]
-        columns = np.hstack([*(view.effects[name] for name in (*names, 'world')),
-                             np.ones((len(view.reading), 1))])[_cut(lags)]
-        columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    unknown = math.nan, math.inf
+    lags = [lag for lag in LAGS if 4 * abs(lag) < min(comparison.counts)]
+    part, bases = slice(-lags[0], -lags[-1] or None), []
+    for smoothed in comparison.smoothed:
+        effects = comparison.effects(smoothed)
+        names = {*effects} & {'tangential', 'centripetal', 'gravity', 'linear', 'world', *(
+            f'{name} {k}' for name in ('arm', 'field') for k in range(3))}
+        columns = [effects[name] for name in sorted(names if len(names) > 1 else {*names, 'total'})]
+        design = np.hstack([*columns, np.ones((len(columns[0]), 1))])[part]
+        left, sizes, _ = np.linalg.svd(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300),
+                                       full_matrices=False)
         bases.append(left[:, sizes > 1e-9 * sizes[0]])
 
     def left_at(lag: int) -> float:
-        total = 0.0
-        for basis, reading in zip(bases, comparison.read_at(lag), strict=True):
-            part = reading[_cut(lags)]
-            total += float(np.sum((part - basis @ (basis.T @ part)) ** 2))
-        return total
+        readings = [reading[part] for reading in comparison.read_at(lag)]
+        return sum(float(np.sum((reading - basis @ (basis.T @ reading)) ** 2))
+                   for basis, reading in zip(bases, readings, strict=True))
 
     found = {lag: left_at(lag) for lag in lags}
     best = min(found, key=lambda lag: found[lag])
-    if best in (lags[0], lags[-1]):
-        return 0, math.nan, math.inf
+    count, size = 3 * sum(map(len, bases)), rms(comparison.sizes)
+    if best in (lags[0], lags[-1]) or found[0] < count * (ROUNDING * size) ** 2:
+        return 0, *unknown                      # every lag explains it
     # Around its minimum the sum of squares is a parabola.
     now, least, before, after = (found[lag] for lag in (0, best, best - 1, best + 1))
     curvature = before - 2.0 * least + after
     if curvature <= 0.0:
-        return 0, math.nan, math.inf
+        return 0, *unknown
     late = best + 0.5 * (before - after) / curvature
-    count = sum(3 * len(basis) for basis in bases)
-    variance = least / count * 2.0 * comparison.width       # of correlated noise
-    small = sum(view.noises[0] ** 2 for view in comparison.views()) / len(bases) * 1.5 + (
-        KINDS[comparison.kind].strange * comparison.size) ** 2
-    if now < count * (ROUNDING * comparison.size) ** 2:     # every lag explains it
-        return 0, math.nan, math.inf
-    clear = least < 0.25 * now or (least < count * small and now - least > SURE ** 2 * variance)
-    return (best, late, math.sqrt(2.0 * variance / curvature)) if best == 0 or clear else (
-        0, math.nan, math.inf)
-
-
-def _cut(lags: Sequence[int]) -> slice:
-    """Return the samples for which there is a reading at all lags."""
-    return slice(-lags[0], -lags[-1] or None)
+    variance = least / count * 2.0 * comparison.smoothed[0].width       # of correlated noise
+    small = 1.5 * (comparison.compare(0).floor * size) ** 2 + (STRANGE * size) ** 2
+    clear = best == 0 or least < 0.25 * now or (
+        least < count * small and now - least > SURE ** 2 * variance)
+    return (best, late, math.sqrt(2.0 * variance / curvature)) if clear else (0, late, math.inf)
 
 
 class Causes:
@@ -190,84 +164,77 @@ class Causes:
     undo : by the evidence of a fault that can be undone, the matrix by which it multiplied
     """
 
-    def __init__(self, comparison: Comparison, stack: Stack, exact_gravity: bool,
+    def __init__(self, comparison: Comparison, compared: Compared, exact_gravity: bool,
                  slack: float) -> None:
-        self.comparison, self.stack = comparison, stack
-        self.kind, self.exact_gravity = comparison.kind, exact_gravity
-        self.undo: dict[str, Reals] = {}
-        # A real device has errors that no simulator needs.
-        self.least = KINDS[self.kind].strange + slack
+        self.comparison, self.compared, self.kind = comparison, compared, comparison.kind
+        self.exact_gravity, self.undo = exact_gravity, dict[str, Reals]()
+        self.known = comparison.imu.lever_arm is not None       # where the IMU is
+        self.least = (OF_STEPS if self.kind == 'rates' else STRANGE) + slack
         self.strange = max(self.least, REAL * comparison.noisy)
 
     def find(self) -> tuple[list[Finding], Reals]:
         """Return the faults, and what they leave of the discrepancy."""
-        stack = self.stack
-        _, _, residual = stack.fit(stack.always) if stack.always else (0, 0, stack.target)
+        compared, always = self.compared, self.compared.always
+        residual = compared.fit(always).residual
         doubt = FOUR_SIGMA * _SPREAD / math.sqrt(residual.size)
-        most = stack.floor * math.sqrt(SAME_POWER + 2.0 * doubt)
+        most = compared.floor * math.sqrt(SAME_POWER + 2.0 * doubt)
         before = beyond(residual, most)
-        unit = [*self._field_unit()]
-        if unit or before <= self.least:
+        if unit := [*self._field_unit()]:
             return unit, residual
-        target, effects = stack.compressed()
-        pairs, _ = explain(target, effects, [*self._causes()], math.hypot(
-            stack.floor, 0.5 * self.least), stack.always)
-        while pairs:
-            names = [*stack.always, *(name for cause, _ in pairs for name in cause.effects)]
-            found, sigma, residual = stack.fit(names)
-            sure = np.abs(found) > SURE * sigma
-            ends = len(stack.always) + np.cumsum([len(cause.effects) for cause, _ in pairs])
-            chance = [k for k, (end, (cause, _)) in enumerate(zip(ends, pairs, strict=True))
-                      if not np.any(sure[end - len(cause.effects):end])]
-            if not chance:
+        if before <= self.least:
+            return [], residual
+        pairs, _ = explain(*compared.compressed(), [*self._causes()], math.hypot(
+            compared.floor, 0.5 * self.least), always)
+        while True:                             # without what may be chance
+            names = [*always, *(name for cause, _ in pairs for name in cause.effects)]
+            found, sigma, residual = compared.fit(names)
+            sure, end = np.abs(found) > SURE * sigma, len(names)
+            for k in reversed(range(len(pairs))):
+                first = end - len(pairs[k][0].effects)
+                if not np.any(sure[first:end]):
+                    del pairs[k]
+                    break
+                end = first
+            else:
                 break
-            del pairs[chance[-1]]
-        else:
-            residual = stack.fit(stack.always)[2] if stack.always else stack.target
         rest = beyond(residual, most)
-        if rest > max(UNEXPLAINED * before, self.strange, 2.0 * stack.floor):
+        if rest > max(UNEXPLAINED * before, self.strange, 2.0 * compared.floor,
+                      ROUGH * self.comparison.noisy):
             return [Finding('inaccurate', f'{100.0 * rest:.3g} % of the reading is not that of '
                             'the motion', rest)], residual
         return [fault for _, fault in pairs], residual
 
     def _causes(self) -> Iterator[Cause]:
-        last = {'rates': 'rates_in_world', 'gyroscope': 'rates_in_world'}
-        text = 'the readings are in axes of '
-        if self.kind in FORCES:
+        if self.kind == 'accelerations':
             yield from self._causes_of_forces()
         yield Cause(['total'], self._scale)
         yield Cause(['step'])
-        yield Cause(['offset 0', 'offset 1', 'offset 2'], self._bias)
-        yield Cause(['total', 'world'], lambda found: instead(
-            last.get(self.kind, 'reading_in_world'), f'{text}the world, not of the IMU')(
-                found[-2:]))
-        yield Cause(['total', 'reversed'], lambda found: instead(
-            'rotation_reversed', f'{text}a sensor that turns against the IMU')(found[-2:]))
-        arms = [name for name in self.stack.always if self.kind in FORCES]
+        yield Cause(OFFSETS, self._bias)
+        for effect, name, text in (
+                ('world', 'rates_in_world' if self.kind in ANGLES else 'reading_in_world',
+                 'the world, not of the IMU'),
+                ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
+            swap = instead(name, f'the readings are in axes of {text}')
+            yield Cause(['total', effect], lambda found, swap=swap: swap(found[-2:]))
+        arms = [name for name in self.compared.always if name.startswith('arm')]
         for k in range(len(PERMUTATIONS)):
             yield Cause(['free', f'axes {k}', *(f'axes {k} {arm}' for arm in arms)],
                         partial(self._axes, k, len(arms)))
-        entries = [f'matrix {i}{j}' for i in range(3) for j in range(3)]
+        entries = [f'matrix {i}{j}' for i, j in ENTRIES]
         yield Cause([*entries, *(f'{entry} {arm}' for arm in arms for entry in entries)],
-                    self._matrix)
-        if self.kind == 'magnetometer' and self.stack.always:
-            yield Cause([f'turned {k}' for k in range(3)], self._turned_field)
+                    partial(self._matrix, 9 * len(arms)))
 
     def _causes_of_forces(self) -> Iterator[Cause]:
-        known = self.comparison.imu.lever_arm is not None
-        for name in ('tangential', 'centripetal', 'gravity', 'linear', 'lever', 'motion',
-                     'transport'):
-            if name in self.stack.effects and (known or name in (
-                    'gravity', 'linear', 'motion', 'transport')):
+        for name in TERMS:
+            if name in self.compared.effects and (self.known or name in (
+                    'gravity', 'linear', 'motion')):
                 yield Cause([name], partial(self._term, name))
         yield Cause(['difference'], self._difference)
         yield Cause(['tangential step'])
         yield Cause(['axes late'])
-        yield Cause(['gravity', 'offset 0', 'offset 1', 'offset 2'], self._gravity_frame)
-        if known:
-            yield Cause(['arm 0', 'arm 1', 'arm 2'], self._arm)
-        else:
-            yield Cause(['turned arm 0', 'turned arm 1', 'turned arm 2'], self._split_arm)
+        yield Cause(['gravity', *OFFSETS], self._gravity_frame)
+        yield Cause([f'arm {k}' for k in range(3)], self._arm) if self.known else Cause(
+            [f'turned arm {k}' for k in range(3)], self._split_arm)
 
     def _undone(self, matrix: Reals, name: str, evidence: str, number: float) -> Finding:
         self.undo[evidence] = matrix
@@ -275,113 +242,90 @@ class Causes:
 
     def _scale(self, found: Reals) -> Finding | None:
         factor = 1.0 + float(found[-1])
-        for unit, times in KINDS[self.kind].units.items():
-            if abs(abs(factor) / times - 1.0) < 0.01:
-                factor = math.copysign(times, factor)
-                return self._undone(factor * np.eye(3), 'units', f'the readings are {factor:.4g} '
-                                    f'times what they should be: they are in {unit}', factor)
         text = f'the readings are {factor:.4g} times what they should be'
+        for unit, times in UNITS[self.kind].items():
+            if abs(abs(factor) / times - 1.0) < 0.01:
+                return self._undone(math.copysign(times, factor) * np.eye(3), 'units',
+                                    f'{text}: they are in {unit}', factor)
         if abs(factor) < MISSING:
             return None
         if factor < 0.0:
             return self._undone(factor * np.eye(3), 'reading_sign', text, factor)
-        known = self.kind in FORCES and not self.exact_gravity and (
-            abs(factor - 1.0) < GRAVITY_BAND)
-        scale = 'rates_scale' if self.kind == 'rates' else 'reading_scale'
-        return Finding('' if known or abs(factor - 1.0) < self.strange else scale, text, factor)
+        small = self.strange if self.exact_gravity or self.kind != 'accelerations' else max(
+            self.strange, GRAVITY_BAND)
+        name = 'rates_scale' if self.kind == 'rates' else 'reading_scale'
+        return Finding(name * (abs(factor - 1.0) > small), text, factor)
 
     def _bias(self, found: Reals) -> Finding:
-        offset = found[-3:]
-        size = float(np.linalg.norm(offset))
-        if self.kind == 'magnetometer' and self.stack.always and (
-                np.linalg.norm(found[:3] + self.comparison.field) < NEAR * np.linalg.norm(
-                    self.comparison.field)):
+        offset, field = found[-3:], self.comparison.field
+        if len(found) > 3 and self.kind == 'magnetometer' and np.linalg.norm(
+                found[:3] + field) < NEAR * np.linalg.norm(field):
             return Finding('reading_in_world', 'the field does not turn with the IMU')
-        return Finding('bias', f'a constant ({listed(offset)}) {KINDS[self.kind].unit} is added',
-                       size)
+        return Finding('bias', f'a constant ({listed(offset)}) {SI.get(self.kind, "rad/s")} is '
+                       'added', float(np.linalg.norm(offset)))
 
     def _axes(self, k: int, arms: int, found: Reals) -> Finding | None:
-        less, factor = found[-2 - arms:len(found) - arms].tolist()
-        if arms and less == 0.0 and factor == 0.0:      # weightless: the arm alone is seen
+        less, factor = found[len(found) - arms - 2:len(found) - arms].tolist()
+        if arms and less == factor == 0.0:      # weightless: the arm alone is seen
             less, factor = -1.0, 1.0
-        if abs(less + 1.0) > NEAR or factor < NEAR:
-            return None
-        units = {unit: times for unit, times in KINDS[self.kind].units.items()
+        sizes = {unit: times for unit, times in UNITS[self.kind].items()
                  if abs(factor / times - 1.0) < 0.05}
-        if not units and abs(factor - 1.0) > NEAR:
+        if abs(less + 1.0) > NEAR or (not sizes and abs(factor - 1.0) > NEAR):
             return None
         matrix = PERMUTATIONS[k]
-        words = ', '.join(f'{axis} reads {"-" if np.sum(row) < 0.0 else ""}'
+        words = ', '.join(f'{axis} reads {"-" * bool(np.sum(row) < 0.0)}'
                           f'{"xyz"[int(np.argmax(np.abs(row)))]}'
                           for axis, row in zip('xyz', matrix, strict=True))
-        size = next(iter(units.values()), 1.0)
-        sign = np.array_equal(np.abs(matrix), np.eye(3))
-        return self._undone(size * matrix, 'sign' if sign else 'axes', words + ''.join(
-            f', in {unit}' for unit in units), factor)
+        return self._undone(
+            next(iter(sizes.values()), 1.0) * matrix,
+            'sign' if np.array_equal(np.abs(matrix), np.eye(3)) else 'axes',
+            words + ''.join(f', in {unit}' for unit in sizes), factor)
 
-    def _matrix(self, found: Reals) -> Finding | None:
-        arms = 27 if self.kind in FORCES and self.stack.always else 0
-        matrix = np.eye(3) + found[len(found) - 9 - arms:len(found) - arms].reshape(3, 3)
+    def _matrix(self, arms: int, found: Reals) -> Finding:
+        matrix = np.eye(3) + found[len(found) - arms - 9:len(found) - arms].reshape(3, 3)
         left, _, right = np.linalg.svd(matrix)
-        turn = left @ right
-        change = float(np.max(np.abs(matrix - np.eye(3))))
+        turn, change = left @ right, float(np.max(np.abs(matrix - np.eye(3))))
         if np.linalg.det(turn) > 0.0 and np.max(np.abs(matrix - turn)) < max(0.02, 0.1 * change):
             vector = Rotation.from_matrix(turn).inv().as_rotvec()
             angle = float(np.linalg.norm(vector))
-            return self._undone(turn, 'mounting' if angle > self.strange else '',
-                                f'the readings are in axes that are turned by ({listed(vector)}) '
-                                'rad from those of the IMU', angle)
-        words = '; '.join(f'({listed(row)})' for row in matrix)
-        return Finding('matrix' if change > self.strange else '', f'the readings are the matrix '
-                       f'[{words}] times what they should be', change)
+            return self._undone(turn, 'mounting' * (angle > self.strange), 'the readings are in '
+                                f'axes that are turned by ({listed(vector)}) rad from those of '
+                                'the IMU', angle)
+        rows = '; '.join(map(listed, matrix))
+        return Finding('matrix' * (change > self.strange), f'the readings are the matrix [{rows}] '
+                       'times what they should be', change)
 
     def _field_unit(self) -> Iterator[Finding]:
         """Yield the unit of a field that is not known, if it is not that of the Earth in T."""
-        size = float(np.linalg.norm(self.comparison.field))
-        if self.kind == 'magnetometer' and self.stack.always and not (
-                EARTH_FIELD[0] < size < EARTH_FIELD[1]):
-            for unit, times in KINDS[self.kind].units.items():
-                if EARTH_FIELD[0] < size / times < EARTH_FIELD[1]:
+        size, (low, high) = float(np.linalg.norm(self.comparison.field)), EARTH_FIELD
+        if self.kind == 'magnetometer' and self.compared.always and not low < size < high:
+            for unit, times in UNITS[self.kind].items():
+                if low < size / times < high:
                     yield self._undone(times * np.eye(3), 'units', f'the field is {size:.4g}: it '
                                        f'is in {unit}, not in T', times)
 
-    def _turned_field(self, found: Reals) -> Finding | None:
-        field = self.comparison.field
-        gone = np.linalg.norm(found[:3] + field) < NEAR * np.linalg.norm(field)
-        return Finding('rotation_reversed', 'the field turns against the IMU') if gone else None
-
-    # Terms of a specific force: what each is, and the fault where it is missing.
-    _TERMS: ClassVar = {
-        'gravity': ('gravity', 'no_gravity'), 'tangential': ('a x r', 'no_tangential_term'),
-        'centripetal': ('w x (w x r)', 'no_centripetal_term'),
-        'linear': ('the acceleration of the origin', 'no_linear_acceleration'),
-        'lever': ('the lever arm', 'no_lever_arm'), 'motion': ('motion', 'no_acceleration'),
-        'transport': ('w x v', 'no_transport_term')}
-
     def _term(self, term: str, found: Reals) -> Finding | None:
-        share, (what, missing) = 1.0 + float(found[-1]), self._TERMS[term]
-        if term == 'motion' and 'linear' not in self.stack.terms:
+        share, (what, missing) = 1.0 + float(found[-1]), TERMS[term]
+        if term == 'motion' and self.known and 'linear' not in self.compared.effects:
             missing = 'no_lever_arm'
-        if term == 'motion' and self.stack.always:      # whose arm is not known
-            return None if abs(share) < NEAR else Finding('acceleration_scale', f'accelerations, without gravity, are {share:.3g} times what they should be', share)
+        noise = self.compared.noise.get(term, 0.0)
+        if self.comparison.noisy and rms(self.compared.effects[term]) < 10.0 * noise:
+            return None                         # a term of noise seems to be missing
         text = f'the term of {what} has {share:.3g} times its size'
-        if term == 'gravity' and self.stack.always and abs(share * STANDARD_GRAVITY - 1.0) < 0.01:
-            return None                                 # in g: the arm is as much smaller
+        if term == 'gravity':
+            if not self.known and abs(share * STANDARD_GRAVITY - 1.0) < 0.01:
+                return None                     # in g: the arm is as much smaller
+            if abs(share - 1.0) < GRAVITY_BAND and not self.exact_gravity:
+                return Finding('', text)
+            if share > NEAR:
+                return Finding('gravity', f'gravity is {share:.4g} times what it should be', share)
         if abs(share) < NEAR:
-            return Finding(missing, text, share)
-        if term == 'transport':
-            return None
-        if term == 'gravity' and not self.exact_gravity and abs(share - 1.0) < GRAVITY_BAND:
-            return Finding('', text)
-        if term == 'gravity' and share > 0.0:
-            return Finding('gravity', f'gravity is {share:.4g} times {STANDARD_GRAVITY} m/s^2',
-                           share)
+            return Finding(missing, text, share) if self.known or term != 'motion' else None
         return Finding('acceleration_scale' if share > 0.0 else
                        'gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
 
     def _gravity_frame(self, found: Reals) -> Finding | None:
-        fixed = float(np.linalg.norm(found[-3:]))
-        gravity = self.comparison.gravity
+        fixed, gravity = float(np.linalg.norm(found[-3:])), self.comparison.gravity
         there = abs(found[-4] + 1.0) <= NEAR and abs(fixed / gravity - 1.0) <= NEAR
         text = f'gravity, {fixed:.4g} m/s^2, does not turn with the IMU'
         return Finding('gravity_frame', text, fixed) if there else None
@@ -392,80 +336,75 @@ class Causes:
             'finite_differences', f'the acceleration, without gravity, is that of {delay:.3g} '
             'steps before, as a difference of two velocities', delay)
 
-    def _arm(self, found: Reals) -> Finding:
+    def _arm(self, found: Reals) -> Finding | None:
         arm = self.comparison.arm
         point, size = found[-3:] + arm, float(np.linalg.norm(arm))
         share = float(point @ arm) / (size * size or 1.0)
-        term = 'lever' if 'linear' in self.stack.terms else 'motion'
         if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * share * size:
-            return self._term(term, np.array([share - 1.0])) or Finding('', '')
+            return self._term('lever', np.array([share - 1.0]))
         return Finding('no_lever_arm', f'the readings are those at ({listed(point)}) m, not at '
                        f'({listed(arm)}) m', float(np.linalg.norm(found[-3:])))
 
     def _split_arm(self, found: Reals) -> Finding | None:
         """Judge by the arms that a x r and w x (w x r) have, where none is given."""
         centripetal = self.comparison.arm + found[:3]
-        tangential = centripetal + found[-3:]
-        sizes = np.linalg.norm(centripetal), np.linalg.norm(tangential)
+        sizes = np.linalg.norm(centripetal), np.linalg.norm(centripetal + found[-3:])
         for (small, large), term in ((sizes, 'centripetal'), (sizes[::-1], 'tangential')):
             if small < NEAR * large:
                 return self._term(term, np.array([float(small / large) - 1.0]))
         return None
 
 
-def _marks(comparison: Comparison, stack: Stack, residual: Reals) -> dict[str, Mark]:
+def _marks(comparison: Comparison, compared: Compared) -> dict[str, Mark]:
     """Return what the sensor is found to be, with intervals of 95 %."""
-    kind = comparison.kind
-    names = [f'matrix {i}{j}' for i in range(3) for j in range(3)] + [
-        f'offset {k}' for k in range(3)]
-    found, sigma, _ = stack.fit([*stack.always, *names])
-    marks = {f'{kind}_discrepancy': Mark(beyond(stack.target, stack.floor)),
+    kind, always = comparison.kind, compared.always
+    marks = {f'{kind}_discrepancy': Mark(beyond(compared.target, compared.floor)),
              f'{kind}_noise': Mark(comparison.reading_noise)}
-    if kind in ('gyroscope', 'accelerations'):
-        extra = min(comparison.share, 1.0) ** 2     # a motion with noise seems larger
-        first = len(stack.always)
-        for i, axis in enumerate('xyz'):
-            for j, other in enumerate('xyz'):
-                value, deviation = found[first + 3 * i + j], sigma[first + 3 * i + j]
-                marks[f'{kind}_matrix_{axis}{other}'] = Mark(
-                    float(value) + (i == j), meaning=_interval(float(deviation) + extra / 1.96))
-            marks[f'{kind}_bias_{axis}'] = Mark(
-                float(found[first + 9 + i]), meaning=_interval(float(sigma[first + 9 + i])))
-    if comparison.kind == 'accelerations' and stack.always:
-        _, deviations, _ = stack.fit(stack.always)
-        marks.update({f'lever_arm_{axis}': Mark(float(value), meaning=_interval(float(deviation)))
-                      for axis, value, deviation in zip('xyz', comparison.arm, deviations,
-                                                        strict=True)})
-    if comparison.kind == 'magnetometer':
-        marks.update({f'field_{axis}': Mark(float(value))
-                      for axis, value in zip('xyz', comparison.field, strict=True)})
+    if kind in DENSITIES:
+        found, sigma, _ = compared.fit([*always, *(f'matrix {i}{j}' for i, j in ENTRIES), *OFFSETS])
+        names = [f'matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES] + [
+            f'bias_{axis}' for axis in 'xyz']
+        for name, value, deviation in zip(names, found[len(always):], sigma[len(always):],
+                                          strict=True):
+            one = name in ('matrix_xx', 'matrix_yy', 'matrix_zz')
+            marks[f'{kind}_{name}'] = Mark(float(value) + one, meaning=_interval(deviation))
+    if always:
+        what, values = ('field', comparison.field) if kind == 'magnetometer' else (
+            'lever_arm', comparison.arm)
+        marks.update({f'{what}_{axis}': Mark(float(value), meaning=_interval(deviation))
+                      for axis, value, deviation in zip(
+                          'xyz', values, compared.fit(always).sigma, strict=True)})
     return marks
 
 
-def _untold(comparison: Comparison, stack: Stack) -> Iterator[str]:
+def _untold(comparison: Comparison, compared: Compared) -> Iterator[str]:
     """Yield what cannot be told of the readings, and the poses that could tell it."""
     # What is not known is the arm, of both terms together.
-    terms = [name for name in stack.terms if not (stack.always and name == 'tangential')]
-    _, sigma, _ = stack.fit([*terms, *stack.always])
-    turns = max(one.sigma.get('attitudes', 0.0) for one in comparison.stretches)
-    places = max(one.sigma.get('positions', 0.0) for one in comparison.stretches)
+    terms = [name for name in ('total', *TERMS) if name in compared.effects and (
+        name in ('centripetal', 'linear') or (name == 'total' and comparison.kind in ANGLES))]
+    terms = [name for name in terms if rms(compared.effects[name]) > 0.0]
+    _, sigma, _ = compared.fit([*terms, *compared.always])
+    turns, places = (max(one.body.sigma.get(name, 0.0) for one in comparison.smoothed)
+                     for name in ('attitudes', 'positions'))
     for name, deviation in zip(terms, sigma.tolist(), strict=False):
-        if (worse := SURE * deviation / TELLS) > 1.0 and rms(stack.effects[name]) > 0.0:
+        if (worse := SURE * deviation / TELLS) > 1.0:
             yield (f'{comparison.kind}: the size of the term {name} is known to '
-                   f'+- {100.0 * 1.96 * deviation:.2g} % only: its faults are not told; noise '
-                   f'of poses below {turns / worse:.2g} rad, {places / worse:.2g} m would tell')
+                   f'+- {196.0 * deviation:.2g} % only: its faults are not told' + (
+                       f'; poses with noise of {turns / worse:.2g} rad, {places / worse:.2g} m '
+                       'would tell' if comparison.noisy and worse < math.inf else ''))
 
 
-def _noise_faults(comparison: Comparison, stack: Stack, residual: Reals,
+def _noise_faults(comparison: Comparison, residual: Reals,
                   covariance: Reals | None) -> Iterator[Finding]:
     """Compare noise with what is declared, and with normal noise."""
-    density, size = getattr(comparison.imu, DENSITIES[comparison.kind]), rms(stack.sizes)
+    density, size = getattr(comparison.imu, DENSITIES[comparison.kind]), rms(comparison.sizes)
     noise, root = comparison.reading_noise, math.sqrt(comparison.own_step)
     if not comparison.noisy:            # all that is left is noise of the readings
-        residual = residual * np.repeat(stack.sizes, stack.counts)[:, np.newaxis]
-        parts = np.split(residual, np.cumsum(stack.counts)[:-1])
+        parts = [part * one for part, one in zip(np.split(
+            residual, np.cumsum(comparison.counts)[:-1]), comparison.sizes, strict=True)]
         noise = rms(np.array([rms(np.diff(part, SIXTH, axis=0)) for part in parts])) / math.sqrt(
             math.comb(2 * SIXTH, SIXTH))
+        residual = np.concatenate(parts)
     exists = noise > NOISY * size
     band = NOISE_BAND + FOUR_SIGMA * _SPREAD / math.sqrt(residual.size)
     text = f'the noise has a standard deviation of {noise:.4g}'
@@ -475,16 +414,15 @@ def _noise_faults(comparison: Comparison, stack: Stack, residual: Reals,
     declared = (told or math.nan) if density is None else density / root
     ratio = noise / declared if declared else math.inf if exists else 1.0
     if abs(ratio - 1.0) > band:
-        factors = {'sqrt(2)': math.sqrt(2.0), '1/sqrt(2)': math.sqrt(0.5), 'sqrt(dt)': root,
-                   '1/sqrt(dt)': 1.0 / root}
-        as_if = min(factors, key=lambda name: abs(ratio / factors[name] - 1.0))
-        named = f' ({as_if})' if abs(ratio / factors[as_if] - 1.0) < band else ''
-        yield Finding('noise_scale', f'{text}, {ratio:.4g}{named} times what is declared, '
+        factors: Mapping[str, float] = {'sqrt(2)': math.sqrt(2.0), '1/sqrt(2)': math.sqrt(0.5),
+                                        'sqrt(dt)': root, '1/sqrt(dt)': 1.0 / root}
+        as_if = ''.join(f' ({name})' for name, factor in factors.items()
+                        if abs(ratio / factor - 1.0) < band)
+        yield Finding('noise_scale', f'{text}, {ratio:.4g}{as_if} times what is declared, '
                       f'{declared:.4g}', ratio)
     if exists and not comparison.noisy and noise > rms(residual) / (1.0 + band):
         kurtosis = float(np.mean(residual ** 4)) / rms(residual) ** 4
-        doubt = FOUR_SIGMA * math.sqrt(24.0 / residual.size)
-        if kurtosis < min(LEAST_KURTOSIS, 3.0 - doubt):
+        if kurtosis < min(LEAST_KURTOSIS, 3.0 - FOUR_SIGMA * math.sqrt(24.0 / residual.size)):
             yield Finding('uniform_noise', f'the noise has a kurtosis of {kurtosis:.3g}; normal '
                           'noise has 3, uniform noise 1.8', kurtosis)
 

@@ -25,6 +25,8 @@ MOST_CAUSES = 3
 ENOUGH, ENOUGH_OF_NOISE = 0.2, 0.1
 WORTHWHILE = 0.8        # share of what remains that another cause leaves at most
 TINY = 1e-6             # rms of an effect that cannot be seen
+BLOCKS = 20             # into which residuals are split, to know their correlation
+HIDDEN = 1e-3           # share of a coefficient in what cannot be told, from which on it cannot
 NEAR = 0.25             # distance of a coefficient from the value that it has for a fault
 # Causes count as equally good if they leave at most AS_GOOD times what the best one leaves, or at
 # most AS_GOOD_SHARE of what there was, but no more than the noise.
@@ -204,6 +206,50 @@ def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
     size[size <= TINY * np.sqrt(len(matrix))] = np.inf
     found = np.linalg.lstsq(matrix / size, target.ravel(), rcond=1e-9)[0] / size
     return found, target - (matrix @ found).reshape(target.shape)
+
+
+class Fit(NamedTuple):
+    """Coefficients (k,), their standard deviations, inf: cannot be told, and what is left."""
+
+    found: Reals
+    sigma: Reals
+    residual: Reals
+
+
+def fit(target: Reals, columns: Sequence[Reals], noise: Sequence[float] | None = None,
+        own: Sequence[bool] | None = None) -> Fit:
+    """
+    Fit columns (N, 3) that have noise of their own.
+
+    noise : rms of the noise in each column, which makes it larger than it is
+    own : whether the target is what is measured less this column, and so has its noise
+
+    The deviations are those of the residual in blocks: its noise may be correlated in time.
+    """
+    matrix = np.stack([column.ravel() for column in columns], axis=1)
+    size = np.maximum(np.linalg.norm(matrix, axis=0), TINY * math.sqrt(len(matrix)))
+    matrix = matrix / size
+    excess = np.square(noise or np.zeros(len(columns))) * len(matrix) / size ** 2
+    values, vectors = np.linalg.eigh(matrix.T @ matrix - np.diag(excess))
+    known = values > np.maximum(1e-9, vectors.T ** 2 @ excess)
+    inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
+    found = inverse @ (matrix.T @ target.ravel() + excess * size * (own if own is not None else 0))
+    residual = target - (matrix @ found).reshape(target.shape)
+    scores = np.array([part.T @ left for part, left in zip(
+        np.array_split(matrix, BLOCKS), np.array_split(residual.ravel(), BLOCKS), strict=True)])
+    variance = np.maximum(np.diag(inverse @ scores.T @ scores @ inverse),
+                          np.diag(inverse) * rms(residual) ** 2)
+    hidden = np.any(np.abs(vectors[:, ~known]) > HIDDEN, axis=1)
+    return Fit(found / size, np.where(hidden, np.inf, np.sqrt(variance)) / size, residual)
+
+
+def compressed(target: Reals, effects: Mapping[str, Reals]) -> tuple[Reals, dict[str, Reals]]:
+    """Return a target and effects with few rows, whose least squares and rms are the same."""
+    rows = np.linalg.qr(np.stack([*(effect.ravel() for effect in effects.values()),
+                                  target.ravel()], axis=1), mode='r')
+    rows = rows * math.sqrt(len(rows) / target.size)
+    return rows[:, -1, np.newaxis], {name: rows[:, k, np.newaxis]
+                                     for k, name in enumerate(effects)}
 
 
 def beyond(values: Reals, floor: float) -> float:

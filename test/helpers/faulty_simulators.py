@@ -201,7 +201,7 @@ class Imu:
             said[name] = said[name] + self.sigma * self._random.standard_normal(w.shape)
         self._defect(said)
         return {name: value for name, value in said.items()
-                if name in ('attitudes', 'covariance', 'energy', 'increments', *self._parts)}
+                if name in ('attitudes', 'covariance', *self._parts)}
 
     def force(self, tangential=1.0, centripetal=1.0, gravity=1.0, arm=None):
         """Return the specific force in the body frame."""
@@ -326,24 +326,6 @@ class Imu:
                 ('gyroscope', self.top.gyroscope_noise_density),
                 ('accelerations', self.top.accelerometer_noise_density))}
 
-    def increments(self, said):
-        """Right increments."""
-        turned = (self.rotation[:-1].inv() * self.rotation[1:]).as_rotvec()
-        v = self.rotation.apply(np.cross(self.w, self.arm))
-        gravity = np.array((0.0, 0.0, self.top.gravity * self.h))
-        gained = self.rotation[:-1].inv().apply(np.diff(v, axis=0) + gravity)
-        both = np.hstack((self.mounting.inv().apply(turned), self.mounting.inv().apply(gained)))
-        said['increments'] = np.vstack((np.zeros(6), both))
-
-    def increments_in_degrees(self, said):
-        self.increments(said)
-        said['increments'][:, :3] = np.degrees(said['increments'][:, :3])
-
-    def wrong_energy(self, said):
-        w, top = self.w, self.top
-        said['energy'] = 0.5 * top.lambda1 * (w[:, 0] ** 2 + w[:, 1] ** 2) \
-            - top.gravity_torque * self.up[:, 2]
-
 
 # What is wrong with each simulator, and the faults that name it.  These are published:
 PUBLISHED = {
@@ -371,9 +353,7 @@ OTHER = {
     'gyroscope_sign': ('reading_sign',),
     'field_in_world': ('reading_in_world',),
     'gyroscope_twice': ('reading_scale',),
-    'times_root_two': ('noise_scale',),
-    'increments_in_degrees': ('units',),
-    'wrong_energy': ('energy',)}
+    'times_root_two': ('noise_scale',)}
 NOISY = ('density_as_deviation', 'uniform', 'covariance_unknown', 'times_root_two')
 STEPPED = {
     # avianphysics/avian#420: the term of the begin of a step adds energy.

@@ -9,7 +9,7 @@ own bias.  The noise of what comes out follows from the white noise of the poses
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from itertools import pairwise
@@ -21,6 +21,7 @@ from scipy.ndimage import correlate1d
 from scipy.spatial.transform import Rotation
 
 Reals = NDArray[np.float64]
+Parts = Mapping[str, tuple[Reals, Reals]]       # times (n,) [s] and values (n, k) by name
 # Central differences of tenth order, for samples 0 .. 5: they are exact to (angle/step)^10/3000.
 _FIRST = np.array([0.0, 5.0 / 6, -5.0 / 21, 5.0 / 84, -5.0 / 504, 1.0 / 1260])
 _SECOND = np.array([-5269.0 / 1800, 5.0 / 3, -5.0 / 21, 5.0 / 126, -5.0 / 1008, 1.0 / 3150])
@@ -29,7 +30,6 @@ SIDE = 5                        # samples that a derivative needs on each side
 WIDTHS = 1, 3, 5, 9, 15, 25, 41, 65     # of kernels [samples]
 ORDER = 10                      # of the differences in which motions vanish and noise does not
 MEDIAN = 0.6745                 # of the absolute values of normal noise, in standard deviations
-CLEAR = 0.03                    # noise of what is differentiated, relative to it, that is small
 GAP = 2.5                       # intervals that are a gap
 EVEN = 1e-4                     # share of the interval by which stamps may be uneven
 DEGREE = 5                      # of the splines between samples
@@ -43,10 +43,9 @@ def kernel(width: int) -> Reals:
     return np.convolve(np.convolve(box, box), box)
 
 
-def gain(width: int, derivative: Reals | None = None) -> float:
+def gain(width: int, derivative: Sequence[float] | Reals = (1.0,)) -> float:
     """Return by how much a kernel, and a derivative by samples, multiply white noise."""
-    weights = kernel(width) if derivative is None else np.convolve(kernel(width), derivative)
-    return float(np.linalg.norm(weights))
+    return float(np.linalg.norm(np.convolve(kernel(width), derivative)))
 
 
 def margin(width: int) -> int:
@@ -54,25 +53,30 @@ def margin(width: int) -> int:
     return len(kernel(width)) // 2 + SIDE
 
 
-def white(values: Reals) -> Reals:
-    """Return the standard deviation of white noise of columns (k,), by high differences."""
-    differences = np.abs(np.diff(values, ORDER, axis=0))    # the median does not see jumps
-    level: Reals = np.median(differences, axis=0) / math.sqrt(math.comb(2 * ORDER, ORDER))
-    return level / MEDIAN
+def white(values: Reals, jumps: bool = True) -> float:
+    """Return the deviation of white noise by high differences; `jumps` : these count, too."""
+    differences = np.abs(np.diff(values, ORDER, axis=0))
+    level = np.sqrt(np.mean(differences ** 2)) if jumps else np.median(differences) / MEDIAN
+    return float(level) / math.sqrt(math.comb(2 * ORDER, ORDER))
 
 
-def hat(vectors: Reals) -> Reals:
+def _hat(vectors: Reals) -> Reals:
     """Return the matrices (n, 3, 3) of cross products with vectors (n, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack((zero, -z, y, z, zero, -x, -y, x, zero), axis=1).reshape(-1, 3, 3)
+    matrices: Reals = np.cross(vectors[:, np.newaxis, :], np.eye(3)).transpose(0, 2, 1)
+    return matrices
 
 
-def vee(matrices: Reals) -> Reals:
+def _vee(matrices: Reals) -> Reals:
     """Return the vectors (n, 3) of the antisymmetric parts of matrices (n, 3, 3)."""
-    return 0.5 * np.stack((matrices[:, 2, 1] - matrices[:, 1, 2],
-                           matrices[:, 0, 2] - matrices[:, 2, 0],
-                           matrices[:, 1, 0] - matrices[:, 0, 1]), axis=1)
+    upper, lower = matrices[:, [1, 2, 0], [2, 0, 1]], matrices[:, [2, 0, 1], [1, 2, 0]]
+    vectors: Reals = 0.5 * (lower - upper)
+    return vectors
+
+
+def along(matrices: Reals, vectors: Reals) -> Reals:
+    """Return the products of matrices (n, 3, 3) and vectors (n, 3)."""
+    products: Reals = np.einsum('nij,nj->ni', matrices, vectors)
+    return products
 
 
 @dataclass
@@ -108,27 +112,22 @@ class Stretch:
         matrices: Reals = self.rotation.as_matrix()
         return matrices
 
-    def at(self, width: int) -> 'Smoothed':
-        """Return the motion smoothed by a kernel."""
-        return Smoothed(self, width)
-
-    def noise(self, width: int) -> tuple[float, float, float]:
-        """Return the noise of rates, of R^T R'' and of accelerations of the origin."""
+    def noise(self, width: int) -> tuple[float, float, float, float]:
+        """Return the noise of turns, of rates, of R^T R'' and of accelerations of the origin."""
         turns, places = self.sigma.get('attitudes', 0.0), self.sigma.get('positions', 0.0)
         first, second = (gain(width, weights) / self.step ** k
                          for k, weights in ((1, FIRST), (2, SECOND)))
-        return turns * first, turns * second, places * second
+        return turns * gain(width), turns * first, turns * second, places * second
 
 
 class Smoothed:
     """
     A motion smoothed by a kernel, where a derivative is known: `inner` of its samples.
 
-    turn : smoothed rotation matrices (m, 3, 3)
+    turn, back : smoothed rotation matrices, and their transposes (m, 3, 3)
     rates : angular velocity in the body (m, 3) [rad/s]
     second : R^T R'' (m, 3, 3): its antisymmetric part is that of the angular acceleration, its
         symmetric part that of w x (w x ..) [1/s^2]
-    velocity : of the origin in the world (m, 3) [m/s]
     acceleration : of the origin, along axes of the body (m, 3) [m/s^2]
     """
 
@@ -140,16 +139,13 @@ class Smoothed:
             correlate1d(smooth, weights, axis=0)[self.inner].reshape(-1, 3, 3) / body.step ** k
             for k, weights in enumerate((np.ones(1), FIRST, SECOND)))
         self.back = self.turn.transpose(0, 2, 1)
-        self.rates, self.second = vee(self.back @ first), self.back @ second
+        self.rates, self.second = _vee(self.back @ first), self.back @ second
         if body.rates is not None:
             change = correlate1d(body.rates, FIRST, axis=0)[self.inner] / body.step
-            self.rates, turning = body.rates[self.inner], hat(body.rates[self.inner])
-            self.second = hat(change) + turning @ turning
-        places = self._convolved(body.positions)
-        self.velocity, acceleration = (
-            correlate1d(places, weights, axis=0)[self.inner] / body.step ** k
-            for k, weights in ((1, FIRST), (2, SECOND)))
-        self.acceleration = self._turned(self.back, acceleration)
+            self.rates, turning = body.rates[self.inner], _hat(body.rates[self.inner])
+            self.second = _hat(change) + turning @ turning
+        places = correlate1d(self._convolved(body.positions), SECOND, axis=0)[self.inner]
+        self.acceleration = along(self.back, places / body.step ** 2)
 
     def _convolved(self, values: Reals) -> Reals:
         if self.width == 1:
@@ -157,89 +153,64 @@ class Smoothed:
         smooth: Reals = correlate1d(values, kernel(self.width), axis=0)
         return smooth
 
-    @staticmethod
-    def _turned(turn: Reals, vectors: Reals) -> Reals:
-        turned: Reals = np.einsum('nij,nj->ni', turn, vectors)
-        return turned
-
     def rate(self, values: Reals) -> Reals:
         """Return rates in the body (n, 3), smoothed as `rates` are (m, 3)."""
         if self.width == 1:
             return values[self.inner]
-        matrices = self._convolved((self.body.matrices @ hat(values)).reshape(-1, 9))
-        return vee(self.back @ matrices[self.inner].reshape(-1, 3, 3))
+        matrices = self._convolved((self.body.matrices @ _hat(values)).reshape(-1, 9))
+        return _vee(self.back @ matrices[self.inner].reshape(-1, 3, 3))
 
     def vector(self, values: Reals) -> Reals:
         """Return vectors in the body (n, 3), smoothed as those of the world are (m, 3)."""
         if self.width == 1:
             return values[self.inner]
-        world = self._convolved(self._turned(self.body.matrices, values))
-        return self._turned(self.back, world[self.inner])
-
-    def of_world(self, vector: Reals) -> Reals:
-        """Return a vector of the world along axes of the body (m, 3)."""
-        along: Reals = self.back @ vector
-        return along
+        return along(self.back, self._convolved(along(self.body.matrices, values))[self.inner])
 
 
-def stretches(parts: Mapping[str, tuple[Reals, Reals]], notes: list[str]) -> list[Stretch]:
+def stretches(parts: Parts) -> tuple[list[Stretch], float]:
     """
-    Return the motions between gaps, with the readings at the same times.
+    Return the motions between gaps, with the readings at the same times, and what is left out [s].
 
-    parts : times (n,) [s] and values (n, k) by name, as of `files.Recorded`
+    parts : with 'attitudes', q(world <- body) as x, y, z, w; also 'positions', and readings
 
     The interval is that of the attitudes or of the readings, whichever is longer.
     """
-    times, quaternions = parts['attitudes']
-    others = {name: part for name, part in parts.items() if name != 'attitudes'}
-    intervals = {name: float(np.median(np.diff(at))) for name, (at, _) in parts.items()}
-    step = max(intervals.values())
-    q = quaternions * np.cumprod(np.append(1.0, np.sign(np.sum(
-        quaternions[1:] * quaternions[:-1], axis=1) + 1e-300)))[:, np.newaxis]
-    values = {'attitudes': (times, q), **others}
-    sigma = {name: float(np.linalg.norm(_least([
-        white(part) for part in _stretched(at, rows) if len(part) > 2 * ORDER])) / math.sqrt(3.0))
-        for name, (at, rows) in values.items()}
-    sigma['attitudes'] *= 2.0                   # of an angle
-    edges = sorted({edge for at, _ in values.values() for edge in _edges(at)})
+    times, q = parts['attitudes']
+    signs = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0)
+    values = {**parts, 'attitudes': (times, q * np.cumprod([1.0, *signs])[:, np.newaxis])}
+    intervals = {name: float(np.median(np.diff(at))) for name, (at, _) in values.items()}
+    step, sigma = max(intervals.values()), {}
+    for name, (at, rows) in values.items():
+        squares = [(white(part, name in ('attitudes', 'positions')) ** 2, len(part))
+                   for part in np.split(rows, _gaps(at) + 1) if len(part) > 2 * ORDER]
+        sigma[name] = math.sqrt(sum(one * n for one, n in squares)
+                                / max(sum(n for _, n in squares), 1))
+    sigma['attitudes'] *= 4.0 / math.sqrt(3.0)      # four components of half an angle
+    edges = sorted({float(edge) for at, _ in values.values() for edge in (
+        at[0], *at[_gaps(at)], *at[_gaps(at) + 1], at[-1])})
     found, left_out = [], 0.0
     for begin, end in pairwise(edges):
-        inside = [(at >= begin - 1e-9) & (at <= end + 1e-9) for at, _ in values.values()]
-        covered = [np.count_nonzero(one) > 0.5 * (end - begin) / intervals[name]
-                   for one, name in zip(inside, values, strict=True)]
-        first = max(at[one][0] if np.any(one) else end for (at, _), one in zip(
-            values.values(), inside, strict=True))
-        last = min(at[one][-1] if np.any(one) else begin for (at, _), one in zip(
-            values.values(), inside, strict=True))
+        inside = {name: np.flatnonzero((at >= begin - 1e-9) & (at <= end + 1e-9))
+                  for name, (at, _) in values.items()}
+        covered = all(len(rows) > 1 and len(rows) > 0.5 * (end - begin) / intervals[name]
+                      for name, rows in inside.items())
+        first, last = (pick([float(values[name][0][rows[k]]) for name, rows in inside.items()])
+                       if covered else begin for k, pick in ((0, max), (-1, min)))
         count = int((last - first) / step + 1e-6) + 1
-        if not all(covered) or count < LEAST:
+        if count < LEAST:
             left_out += end - begin
             continue
         even = first + step * np.arange(count)
-        at_even = {name: _at(even, at[one], rows[one]) for (name, (at, rows)), one in zip(
-            values.items(), inside, strict=True)}
+        at_even = {name: _at(even, values[name][0][rows], values[name][1][rows])
+                   for name, rows in inside.items()}
         rotation = Rotation.from_quat(at_even.pop('attitudes'))
         positions = at_even.pop('positions', np.zeros((count, 3)))
-        found.append(Stretch(even, rotation, positions - positions[0], at_even, sigma,
-                             intervals))
-    if left_out > GAP * step:
-        notes.append(f'gaps, and parts between them that are too short: {left_out:.3g} s are not '
-                     'graded')
-    return found
+        found.append(Stretch(even, rotation, positions - positions[0], at_even, sigma, intervals))
+    return found, left_out
 
 
-def _edges(times: Reals) -> list[float]:
-    gaps = np.flatnonzero(np.diff(times) > GAP * np.median(np.diff(times)))
-    return [float(times[0]), *times[gaps].tolist(), *times[gaps + 1].tolist(), float(times[-1])]
-
-
-def _stretched(times: Reals, values: Reals) -> list[Reals]:
-    return np.split(values, np.flatnonzero(np.diff(times) > GAP * np.median(np.diff(times))) + 1)
-
-
-def _least(levels: list[Reals]) -> Reals:
-    """Return the median over stretches."""
-    return np.median(levels, axis=0) if levels else np.zeros(1)
+def _gaps(times: Reals) -> NDArray[np.intp]:
+    return np.flatnonzero(np.diff(times) > GAP * np.median(np.diff(times)))
 
 
 def _at(even: Reals, times: Reals, values: Reals) -> Reals:
