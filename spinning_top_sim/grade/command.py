@@ -16,8 +16,9 @@ docs/grade.md says what a file may contain.
 """
 
 import argparse
-import json
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,20 +26,131 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import files, rigid
-from spinning_top_sim.grade.effects import Imu
-from spinning_top_sim.grade.grader import Judgement, TOLERANCE, Truth
-from spinning_top_sim.grade.kinematics import Stretch, stretches
-from spinning_top_sim.grade.logs import read_log
+from spinning_top_sim.grade import files, grade_readings, grade_trajectory
+from spinning_top_sim.grade.effects import STANDARD_GRAVITY, Imu
+from spinning_top_sim.grade.grader import TOLERANCE
+from spinning_top_sim.grade.logs import own_attitudes, read_log
 from spinning_top_sim.grade.scenes import Body, Start
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.simulation import Simulation
 from spinning_top_sim.tools import cli, scene_file
-from spinning_top_sim.tools.report import Finding, Report
+from spinning_top_sim.tools.kinematics import Smoothed, stretches
+from spinning_top_sim.tools.report import Finding, Mark, Report
 
 START = 0.02            # angle to the start that is given, beyond which there is another [rad]
-# Faults that the parameters of a log of this package declare as errors of its device.
-DECLARED = {'bias': ('bias', 'random_walk'), 'matrix': ('_M', '_A'), 'mounting': ('_M',),
-            'reading_scale': ('_M',), 'late': ('stamp_', 'bandwidth', 'clock_drift', 'sampling'),
-            'held': ('duplicate', 'drop_rate'), 'inaccurate': ('range', 'vibration', 'bandwidth')}
-DECLARED['early'] = DECLARED['late']
+NOISES = 5.0            # standard deviations of noise by which an attitude may be off besides
+EXACT = 1e-6            # noise of attitudes from which rates cannot tell causes [rad]
+# Errors of a device in our parameters, and faults that they are in the readings of its logs.
+DECLARED = {'bias': {'bias'}, 'random_walk': {'bias'}, 'drop': {'held'}, 'duplicate': {'held'},
+            **{name: {'matrix', 'mounting', 'reading_scale', 'sign'} for name in ('_M', '_A')},
+            **{name: {'late', 'early', 'inaccurate', 'noise_scale'} for name in (
+                'stamp', 'clock', 'bandwidth', 'sampling', 'vibration', 'range', 'resolution')}}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    add = parser.add_argument
+    add('file', type=Path, help='.mcap, .csv, .tum, .parquet or .npz; a folder of a bag or EuRoC')
+    add('--columns', help='columns and units of a table, such as "t=stamp:ns, gx=gyro_x:deg/s", '
+        'or a file with such a text')
+    add('--topic', action='append', default=[], help='a topic of a log to read, of transforms '
+        'TOPIC:CHILD; may be repeated; default: the only one of each kind')
+    add('--lever-arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+        help='position of the IMU in the body [m]; default: found')
+    scene_file.add_parameters(parser)
+    add('--json', action='store_true', help='print everything as JSON')
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    path, log = arguments.file, arguments.file.suffix == '.mcap'
+    if path.is_dir():
+        log = not (path / 'imu0').is_dir()
+    if (arguments.columns if log else arguments.topic):
+        raise ValueError('--columns is for tables' if log else '--topic is for logs')
+    recorded = read_log(path, arguments.topic) if log else files.read_table(
+        path, arguments.columns)
+    given = scene_file.given(arguments)
+    known = None if arguments.scene or arguments.params else recorded.run
+    values = parameters.checked({**(known.values_in_effect if known else {}), **given})
+    of_top = bool(known) or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
+    imu, gravity = _imu(arguments, given, values, of_top)
+    report = grade_readings(recorded.parts, imu, subject=path.name, exact_gravity=of_top,
+                            gravity=gravity, covariance=recorded.covariance)
+    if known:
+        report = _without_declared(report, known.values_in_effect)
+    if of_top:
+        report = _with_motion(report, recorded, values, known)
+    report = replace(report, notes=[*recorded.notes, *report.notes])
+    if arguments.json:
+        print(report.as_json())
+    else:
+        for line in str(report).splitlines():
+            cli.print_line(line)
+    return cli.OK if report.passed else cli.FAILED
+
+
+def _imu(arguments: argparse.Namespace, given: Mapping[str, Any], values: Mapping[str, Any],
+         of_top: bool) -> tuple[Imu, float]:
+    """Return what is known of the IMU, and gravity."""
+    arm = arguments.lever_arm or (
+        values['imu.lever_arm'] if of_top or 'imu.lever_arm' in given else None)
+    field = values['mag.field'] if of_top or 'mag.field' in given else None
+    return Imu(
+        lever_arm=arm and tuple(arm), field=field and tuple(field),
+        mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
+        **{name: given.get(f'imu.{name}') for name in (
+            'gyroscope_noise_density', 'accelerometer_noise_density')}), (
+                values['top.gravity'] if of_top else STANDARD_GRAVITY)
+
+
+def _without_declared(report: Report, values: Mapping[str, Any]) -> Report:
+    """Return a report without the errors that the parameters of a log give its device."""
+    defaults = parameters.checked({})
+    ours = {name for name, value in values.items()
+            if name.startswith(('imu.', 'mag.')) and value != defaults[name]}
+    known = set().union(*(faults for part, faults in DECLARED.items()
+                          if any(part in name for name in ours)))
+    return replace(report, found=[one for one in report.found if one.name not in known], notes=[
+        *report.notes, *(f'{one.name}, as the parameters of the log say: {one.evidence}'
+                         for one in report.found if one.name in known)])
+
+
+def _with_motion(report: Report, recorded: files.Recorded, values: Mapping[str, Any],
+                 run: Any) -> Report:
+    """Return a report with the motion of a top beside the exact one."""
+    bodies, _ = stretches({'attitudes': recorded.parts['attitudes']})
+    body = max(bodies, key=lambda one: len(one.t))
+    noise = body.sigma['attitudes']
+    if run is not None:
+        truth = own_attitudes(run, 1e9 * body.t + recorded.origin_ns - run.epoch_ns)
+        worst = float(np.max((Rotation.from_quat(truth).inv() * body.rotation).magnitude()))
+        return replace(report, found=[*report.found, *_inaccurate(worst, noise)], marks={
+            **report.marks, 'total_error_deg': Mark(math.degrees(worst),
+                                                    math.degrees(TOLERANCE))})
+    top, start = Body.of(parameters.top_of(values)), parameters.start_state(values)
+    first, notes = Start.of(top, start), list(report.notes)
+    begin = recorded.first_s if 0.0 <= recorded.first_s < 1.0 else 0.0
+    told = body.rotation.as_quat()
+    q = Rotation.from_quat(told[0])
+    if begin == 0.0 and (Rotation.from_quat(first.attitude).inv() * q).magnitude() > START and (
+            not any(one.name == 'convention' for one in report.found)):
+        smoothed = Smoothed(body, 1)
+        at = smoothed.inner.start
+        first = Start.at(top, told[at], smoothed.rates[0])
+        begin = -float(body.t[at])
+        notes.append('another start than the one that is given: it is read off the first samples')
+    found = grade_trajectory({'attitudes': told}, top, first, times=body.t + begin,
+                             tolerance=TOLERANCE + NOISES * noise, subject='the motion')
+    faults = found.found if noise < EXACT else [*_inaccurate(math.radians(
+        found.measures['total_error_deg: the motion']), noise)]
+    names = {one.name for one in report.found}
+    return replace(report, notes=notes, marks={**found.marks, **report.marks}, found=[
+        *report.found, *(one for one in faults if one.name != 'convention' or one.name not in
+                         names)])
+
+
+def _inaccurate(worst: float, noise: float) -> list[Finding]:
+    return [Finding('inaccurate', f'the attitude is up to {math.degrees(worst):.3g} deg off',
+                    math.degrees(worst))] if worst > TOLERANCE + NOISES * noise else []
+
+
+main = partial(cli.run, 'grade', __doc__, add_arguments, _run)

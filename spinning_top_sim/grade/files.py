@@ -73,12 +73,15 @@ class Recorded:
     parts : times (n,), ascending [s], and values (n, k) by names of KINDS, SI; attitudes are
         q(world <- body) as x, y, z, w
     covariance : (3, 3) that the first message of an IMU tells, by name
+    first_s, origin_ns : the first stamp, of a table [s] and of a log [ns]
     run : of a log of this package, as `recorded_run` describes it
     notes : what was read, and what was not
     """
 
     parts: dict[str, tuple[Reals, Reals]] = field(default_factory=dict)
     covariance: dict[str, Reals] = field(default_factory=dict)
+    first_s: float = 0.0
+    origin_ns: int = 0
     run: Any = None
     notes: list[str] = field(default_factory=list)
 
@@ -291,7 +294,7 @@ def _add(recorded: Recorded, table: Table, said: Mapping[str, list[tuple[str, st
         column for columns in chosen.values() for column, _ in columns}]
     _need(chosen, 't', ('t',), unused)
     where = 'row {}'
-    times, clock = _times(chosen['t'], table)
+    times, recorded.first_s, clock = _times(chosen['t'], table)
     if not recorded.parts:
         recorded.notes.append(clock)
     for kind, (names, units, _) in KINDS.items():
@@ -375,14 +378,15 @@ def _alike(kind: str, names: Sequence[str], unused: Sequence[str]) -> str:
     return f"if it is {', '.join(of)}: --columns '{', '.join(named)}'{units}"
 
 
-def _times(columns: Sequence[tuple[str, str]], table: Table) -> tuple[Reals, str]:
-    """Return times from the first stamp [s], and a note about the clock."""
+def _times(columns: Sequence[tuple[str, str]], table: Table) -> tuple[Reals, float, str]:
+    """Return times from the first stamp [s], this stamp, and a note about the clock."""
     total: Any = 0
     for column, unit in columns:
         total = total + TIMES[unit] * np.array([*_decimals(column, unit, table)], object)
     first = min((one for one in total if one.is_finite()), default=Decimal(0))
     text = ' + '.join(f'{column} [{unit}]' for column, unit in columns)
-    return (total - first).astype(float), f'times of {text}: the first is {float(first):.12g} s'
+    return (total - first).astype(float), float(first), (
+        f'times of {text}: the first is {float(first):.12g} s')
 
 
 def _decimals(column: str, unit: str, table: Table) -> Iterator[Decimal]:
