@@ -26,13 +26,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim import solve
 from spinning_top_sim.grade import files, grade_readings, grade_trajectory
 from spinning_top_sim.grade.effects import STANDARD_GRAVITY, Imu
-from spinning_top_sim.grade.grader import TOLERANCE
+from spinning_top_sim.grade.grader import EARLY, TOLERANCE
 from spinning_top_sim.grade.logs import own_attitudes, read_log
 from spinning_top_sim.grade.scenes import Body, Start
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools import cli, scene_file
+from spinning_top_sim.tools import cli, conventions, scene_file
 from spinning_top_sim.tools.kinematics import Smoothed, stretches
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
@@ -42,7 +43,8 @@ EXACT = 1e-6            # noise of attitudes from which rates cannot tell causes
 # Errors of a device in our parameters, and faults that they are in the readings of its logs.
 DECLARED = {'bias': {'bias'}, 'random_walk': {'bias'}, 'drop': {'held'}, 'duplicate': {'held'},
             **{name: {'matrix', 'mounting', 'reading_scale', 'sign'} for name in ('_M', '_A')},
-            **{name: {'late', 'early', 'inaccurate', 'noise_scale'} for name in (
+            **{name: {'late', 'early', 'inaccurate', 'noise_scale', 'acceleration_scale',
+                      'reading_scale', 'matrix', 'finite_differences'} for name in (
                 'stamp', 'clock', 'bandwidth', 'sampling', 'vibration', 'range', 'resolution')}}
 
 
@@ -72,6 +74,10 @@ def _run(arguments: argparse.Namespace) -> int:
     known = None if arguments.scene or arguments.params else recorded.run
     values = parameters.checked({**(known.values_in_effect if known else {}), **given})
     of_top = bool(known) or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
+    if not of_top and recorded.parts.keys() <= {'positions', 'attitudes'}:
+        raise ValueError(f'{path}: there are no readings, and no top is known (--scene): '
+                         'nothing to grade' + ''.join(f'; {note}' for note in recorded.notes
+                                                      if '--columns' in note))
     imu, gravity = _imu(arguments, given, values, of_top)
     report = grade_readings(recorded.parts, imu, subject=path.name, exact_gravity=of_top,
                             gravity=gravity, covariance=recorded.covariance)
@@ -127,16 +133,13 @@ def _with_motion(report: Report, recorded: files.Recorded, values: Mapping[str, 
             **report.marks, 'total_error_deg': Mark(math.degrees(worst),
                                                     math.degrees(TOLERANCE))})
     top, start = Body.of(parameters.top_of(values)), parameters.start_state(values)
-    first, notes = Start.of(top, start), list(report.notes)
+    first, notes, told = Start.of(top, start), list(report.notes), body.rotation.as_quat()
     begin = recorded.first_s if 0.0 <= recorded.first_s < 1.0 else 0.0
-    told = body.rotation.as_quat()
-    q = Rotation.from_quat(told[0])
-    if begin == 0.0 and (Rotation.from_quat(first.attitude).inv() * q).magnitude() > START and (
-            not any(one.name == 'convention' for one in report.found)):
+    truth = solve(top, first, body.t[:EARLY] + begin).quaternion
+    if conventions.best(told[:EARLY], truth).after > START:
         smoothed = Smoothed(body, 1)
         at = smoothed.inner.start
-        first = Start.at(top, told[at], smoothed.rates[0])
-        begin = -float(body.t[at])
+        first, begin = Start.at(top, told[at], smoothed.rates[0]), -float(body.t[at])
         notes.append('another start than the one that is given: it is read off the first samples')
     found = grade_trajectory({'attitudes': told}, top, first, times=body.t + begin,
                              tolerance=TOLERANCE + NOISES * noise, subject='the motion')

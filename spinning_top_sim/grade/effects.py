@@ -28,6 +28,8 @@ ENTRIES = [(i, j) for i in range(3) for j in range(3)]
 STANDARD_GRAVITY = 9.80665
 CLEAR = 0.03            # noise of what is differentiated, relative to it, that is small
 NOISY = 1e-3            # the same, that counts
+# Errors of samples that are left out, over the median; they are few, and more than rounding.
+OUTLIER, FEW, ROUNDING = 20.0, 0.1, 1e-6
 # Signed permutations of axes but for the identity; those that change the fewest axes first.
 PERMUTATIONS = sorted((
     np.eye(3)[list(order)] * np.array(signs)[:, np.newaxis]
@@ -127,6 +129,7 @@ class Comparison:
         self.reading_noise = max((one.sigma.get(kind, 0.0) for one in stretches), default=0.0)
         self.share, self.smoothed = self._clear(stretches)
         self.counts = [len(one.rates) for one in self.smoothed]
+        self.good = [np.ones(count, bool) for count in self.counts]     # samples to compare
         self.sizes = np.array([rms(one) or 1.0 for one in self.readings])
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
         self.steps = stretches[0].step / self.own_step if stretches else 1.0
@@ -176,6 +179,20 @@ class Comparison:
         return [(one.rate if self.kind in ANGLES else one.vector)(np.roll(reading, -lag, axis=0))
                 for one, reading in zip(self.smoothed, self.readings, strict=True)]
 
+    def leave_out(self, lag: int, designs: Sequence[Reals]) -> None:
+        """
+        Compare no samples that a design does not fit by far, if they are few.
+
+        Where a force sets in, a derivative of samples does not hold.
+        """
+        for k, (design, reading) in enumerate(zip(designs, self.read_at(lag), strict=True)):
+            good = np.ones(len(reading), bool)
+            for _ in range(3):
+                found = np.linalg.lstsq(design[good], reading[good], rcond=1e-9)[0]
+                error = np.linalg.norm(reading - design @ found, axis=1)
+                good = error <= OUTLIER * np.median(error[good]) + ROUNDING * self.sizes[k]
+            self.good[k] = good if np.mean(good) > 1.0 - FEW else np.ones(len(reading), bool)
+
     def compare(self, lag: int) -> Compared:
         """Return what is compared, of readings that are `lag` samples late."""
         found = self._compared(lag)
@@ -190,12 +207,13 @@ class Comparison:
 
     def _compared(self, lag: int) -> Compared:
         keep = slice(abs(lag), -abs(lag) or None)       # what a roll has not wrapped
-        self.counts = [len(one.rates) - 2 * abs(lag) for one in self.smoothed]
+        rows = [np.flatnonzero(good[keep]) + abs(lag) for good in self.good]
+        self.counts = [len(one) for one in rows]
         every = [self.effects(one) for one in self.smoothed]
-        effects = {name: np.concatenate([one[name][keep] / size for one, size in zip(
-            every, self.sizes, strict=True)]) for name in every[0]}
-        readings = np.concatenate([one[keep] / size for one, size in zip(
-            self.read_at(lag), self.sizes, strict=True)])
+        effects = {name: np.concatenate([one[name][part] / size for one, part, size in zip(
+            every, rows, self.sizes, strict=True)]) for name in every[0]}
+        readings = np.concatenate([one[part] / size for one, part, size in zip(
+            self.read_at(lag), rows, self.sizes, strict=True)])
         noises = [self._noises(one) for one in self.smoothed]
         noise = {name: rms(np.array([one[name] for one in noises]) / self.sizes)
                  for name in noises[0]}

@@ -84,10 +84,10 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
     comparison, judged = Comparison(kind, stretches, imu, gravity), Judged([], {}, [])
     if not comparison.smoothed:
         return judged
-    lag, late, sigma = _lag(comparison)
+    lag, late, sigma, clear = _lag(comparison)
     late, sigma = late * comparison.steps, sigma * comparison.steps
     judged.marks[f'{kind}_lag_steps'] = Mark(late, LATE, _interval(sigma))
-    if abs(late) > max(LATE, SURE * sigma):
+    if clear and abs(late) > max(LATE, SURE * sigma):
         judged.faults.append(Finding(
             'late' if late > 0.0 else 'early', f'the readings belong to the motion of '
             f'{abs(late):.3g} steps ({1e3 * abs(late) * comparison.own_step:.3g} ms) '
@@ -114,47 +114,62 @@ def _interval(sigma: float) -> str:
     return f'+- {1.96 * sigma:.2g}'
 
 
-def _lag(comparison: Comparison) -> tuple[int, float, float]:
+def _lag(comparison: Comparison) -> tuple[int, float, float, bool]:
     """
-    Return by how many samples readings are late: as whole, with its fraction, and its deviation.
+    Return by how many samples readings are late: as whole, with its fraction, and its deviation;
+    and whether that explains much.
 
     The reading is fitted by all terms, of all axes, at each lag: what else is wrong does not
     count.
     """
-    unknown = math.nan, math.inf
+    unknown = 0, math.nan, math.inf, False
     lags = [lag for lag in LAGS if 4 * abs(lag) < min(comparison.counts)]
-    part, bases = slice(-lags[0], -lags[-1] or None), []
+    part, designs = slice(-lags[0], -lags[-1] or None), []
     for smoothed in comparison.smoothed:
         effects = comparison.effects(smoothed)
         names = {*effects} & {'tangential', 'centripetal', 'gravity', 'linear', 'world', *(
             f'{name} {k}' for name in ('arm', 'field') for k in range(3))}
         columns = [effects[name] for name in sorted(names if len(names) > 1 else {*names, 'total'})]
-        design = np.hstack([*columns, np.ones((len(columns[0]), 1))])[part]
-        left, sizes, _ = np.linalg.svd(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300),
-                                       full_matrices=False)
-        bases.append(left[:, sizes > 1e-9 * sizes[0]])
-
-    def left_at(lag: int) -> float:
-        readings = [reading[part] for reading in comparison.read_at(lag)]
-        return sum(float(np.sum((reading - basis @ (basis.T @ reading)) ** 2))
-                   for basis, reading in zip(bases, readings, strict=True))
-
-    found = {lag: left_at(lag) for lag in lags}
-    best = min(found, key=lambda lag: found[lag])
-    count, size = 3 * sum(map(len, bases)), rms(comparison.sizes)
+        design = np.hstack([*columns, np.ones((len(columns[0]), 1))])
+        designs.append(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300))
+    best = 0
+    for _ in range(2):
+        comparison.leave_out(best, designs)
+        found = _misfits(comparison, lags, designs, part)
+        best = min(found, key=lambda lag: found[lag])
+    count, size = 3 * sum(np.count_nonzero(good[part]) for good in comparison.good), rms(
+        comparison.sizes)
     if best in (lags[0], lags[-1]) or found[0] < count * (ROUNDING * size) ** 2:
-        return 0, *unknown                      # every lag explains it
+        return unknown                          # every lag explains it
     # Around its minimum the sum of squares is a parabola.
     now, least, before, after = (found[lag] for lag in (0, best, best - 1, best + 1))
     curvature = before - 2.0 * least + after
     if curvature <= 0.0:
-        return 0, *unknown
+        return unknown
     late = best + 0.5 * (before - after) / curvature
-    variance = least / count * 2.0 * comparison.smoothed[0].width       # of correlated noise
-    small = 1.5 * (comparison.compare(0).floor * size) ** 2 + (STRANGE * size) ** 2
-    clear = best == 0 or least < 0.25 * now or (
-        least < count * small and now - least > SURE ** 2 * variance)
-    return (best, late, math.sqrt(2.0 * variance / curvature)) if clear else (0, late, math.inf)
+    least -= 0.125 * (before - after) ** 2 / curvature
+    variance = max(least, 0.0) / count * 2.0 * comparison.smoothed[0].width   # correlated noise
+    noise = count * (comparison.compare(0).floor * size) ** 2
+    clear = least < 0.25 * now or (
+        least < 1.5 * noise and now - least > SURE ** 2 * variance)
+    sigma = math.sqrt(2.0 * variance / curvature) if clear or best == 0 else math.inf
+    return best if clear else 0, late, sigma, clear
+
+
+def _misfits(comparison: Comparison, lags: Sequence[int], designs: Sequence[Reals],
+             part: slice) -> dict[int, float]:
+    """Return the sums of squares that designs leave of readings by their lag."""
+    rows = [np.flatnonzero(good[part]) + (part.start or 0) for good in comparison.good]
+    bases = []
+    for design, chosen in zip(designs, rows, strict=True):
+        left, sizes, _ = np.linalg.svd(design[chosen], full_matrices=False)
+        bases.append(left[:, sizes > 1e-9 * sizes[0]])
+    found = dict.fromkeys(lags, 0.0)
+    for lag in lags:
+        for basis, chosen, reading in zip(bases, rows, comparison.read_at(lag), strict=True):
+            left = reading[chosen] - basis @ (basis.T @ reading[chosen])
+            found[lag] += float(np.sum(left ** 2))
+    return found
 
 
 class Causes:
@@ -266,8 +281,8 @@ class Causes:
 
     def _axes(self, k: int, arms: int, found: Reals) -> Finding | None:
         less, factor = found[len(found) - arms - 2:len(found) - arms].tolist()
-        if arms and less == factor == 0.0:      # weightless: the arm alone is seen
-            less, factor = -1.0, 1.0
+        if arms and rms(self.compared.effects['free']) <= 10.0 * self.compared.noise['free']:
+            less, factor = -1.0, 1.0            # weightless: the arm alone is seen
         sizes = {unit: times for unit, times in UNITS[self.kind].items()
                  if abs(factor / times - 1.0) < 0.05}
         if abs(less + 1.0) > NEAR or (not sizes and abs(factor - 1.0) > NEAR):
@@ -319,6 +334,9 @@ class Causes:
                 return Finding('', text)
             if share > NEAR:
                 return Finding('gravity', f'gravity is {share:.4g} times what it should be', share)
+        for unit, factor in (('mm', 1e-3), ('cm', 1e-2)) if term == 'linear' else ():
+            if abs(share / factor - 1.0) < 0.05:
+                return Finding('units', f'{text}: positions are in {unit}', share)
         if abs(share) < NEAR:
             return Finding(missing, text, share) if self.known or term != 'motion' else None
         return Finding('acceleration_scale' if share > 0.0 else
