@@ -133,7 +133,9 @@ class Comparison:
         self.sizes = np.array([rms(one) or 1.0 for one in self.readings])
         self.own_step = max((one.intervals.get(kind, one.step) for one in stretches), default=1.0)
         self.steps = stretches[0].step / self.own_step if stretches else 1.0
-        self.noisy = self.share > NOISY or any(one.width > 1 for one in self.smoothed)
+        self.noisy = self.share > NOISY or any(
+            one.width > 1 or (kind == 'magnetometer' and one.body.noise(1)[0] > ROUNDING)
+            for one in self.smoothed)
 
     def _clear(self, stretches: Sequence[Stretch]) -> tuple[float, list[Smoothed]]:
         """Return the share of noise, and the motions smoothed so that it is small."""
@@ -179,19 +181,22 @@ class Comparison:
         return [(one.rate if self.kind in ANGLES else one.vector)(np.roll(reading, -lag, axis=0))
                 for one, reading in zip(self.smoothed, self.readings, strict=True)]
 
-    def leave_out(self, lag: int, designs: Sequence[Reals]) -> None:
+    def leave_out(self, lag: int, designs: Sequence[Reals]) -> bool:
         """
-        Compare no samples that a design does not fit by far, if they are few.
+        Compare no samples that a design does not fit by far, if they are few; return whether.
 
         Where a force sets in, a derivative of samples does not hold.
         """
+        before = self.good.copy()
         for k, (design, reading) in enumerate(zip(designs, self.read_at(lag), strict=True)):
             good = np.ones(len(reading), bool)
             for _ in range(3):
-                found = np.linalg.lstsq(design[good], reading[good], rcond=1e-9)[0]
-                error = np.linalg.norm(reading - design @ found, axis=1)
+                gram = np.linalg.pinv(design[good].T @ design[good], 1e-12, hermitian=True)
+                error = np.linalg.norm(
+                    reading - design @ (gram @ (design[good].T @ reading[good])), axis=1)
                 good = error <= OUTLIER * np.median(error[good]) + ROUNDING * self.sizes[k]
             self.good[k] = good if np.mean(good) > 1.0 - FEW else np.ones(len(reading), bool)
+        return any(np.any(one != other) for one, other in zip(before, self.good, strict=True))
 
     def compare(self, lag: int) -> Compared:
         """Return what is compared, of readings that are `lag` samples late."""

@@ -50,6 +50,7 @@ SURE = 5.0                  # standard deviations from which on a number is not 
 # the middle of a step; a real device, where poses have noise, has errors that no simulator needs.
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
 UNEXPLAINED, ROUGH = 0.5, 0.3   # shares of a discrepancy, and with noise of a reading, left at most
+CLEARLY = 10.0              # by which a term must exceed its noise to be missed
 MISSING = 0.05              # share of a whole reading that is none
 GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
 EARTH_FIELD = 15e-6, 90e-6  # [T]
@@ -101,7 +102,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
         if not undone:
             break
         comparison.undo(causes.undo[undone[0].evidence])
-    judged.marks.update(_marks(comparison, compared))
+    judged.marks.update(_marks(comparison, compared, lag))
     if kind in DENSITIES:
         if {'reading_scale', 'inaccurate', 'matrix'}.isdisjoint(fault.name for fault in found):
             judged.faults.extend(_noise_faults(comparison, residual, covariance))
@@ -127,19 +128,22 @@ def _lag(comparison: Comparison) -> tuple[int, float, float, bool]:
     part, designs = slice(-lags[0], -lags[-1] or None), []
     for smoothed in comparison.smoothed:
         effects = comparison.effects(smoothed)
-        names = {*effects} & {'tangential', 'centripetal', 'gravity', 'linear', 'world', *(
-            f'{name} {k}' for name in ('arm', 'field') for k in range(3))}
+        names = {*effects} & {'gravity', 'linear', 'world', *(
+            f'{name} {k}' for name in ('arm', 'turned arm', 'field') for k in range(3))}
         columns = [effects[name] for name in sorted(names if len(names) > 1 else {*names, 'total'})]
         design = np.hstack([*columns, np.ones((len(columns[0]), 1))])
         designs.append(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300))
-    best = 0
-    for _ in range(2):
-        comparison.leave_out(best, designs)
+    best, found = 0, dict[int, float]()
+    while comparison.leave_out(best, designs) or not found:
         found = _misfits(comparison, lags, designs, part)
-        best = min(found, key=lambda lag: found[lag])
+        before, best = best, min(found, key=lambda lag: found[lag])
+        if best == before:
+            break
     count, size = 3 * sum(np.count_nonzero(good[part]) for good in comparison.good), rms(
         comparison.sizes)
-    if best in (lags[0], lags[-1]) or found[0] < count * (ROUNDING * size) ** 2:
+    compared = comparison.compare(0)
+    if best in (lags[0], lags[-1]) or found[0] < count * (ROUNDING * size) ** 2 or rms(
+            compared.effects['total']) < CLEARLY * compared.noise['total']:
         return unknown                          # every lag explains it
     # Around its minimum the sum of squares is a parabola.
     now, least, before, after = (found[lag] for lag in (0, best, best - 1, best + 1))
@@ -149,11 +153,10 @@ def _lag(comparison: Comparison) -> tuple[int, float, float, bool]:
     late = best + 0.5 * (before - after) / curvature
     least -= 0.125 * (before - after) ** 2 / curvature
     variance = max(least, 0.0) / count * 2.0 * comparison.smoothed[0].width   # correlated noise
-    noise = count * (comparison.compare(0).floor * size) ** 2
+    noise = count * (compared.floor * size) ** 2
     clear = least < 0.25 * now or (
         least < 1.5 * noise and now - least > SURE ** 2 * variance)
-    sigma = math.sqrt(2.0 * variance / curvature) if clear or best == 0 else math.inf
-    return best if clear else 0, late, sigma, clear
+    return best if clear else 0, late, math.sqrt(2.0 * variance / curvature), clear
 
 
 def _misfits(comparison: Comparison, lags: Sequence[int], designs: Sequence[Reals],
@@ -186,6 +189,9 @@ class Causes:
         self.known = comparison.imu.lever_arm is not None       # where the IMU is
         self.least = (OF_STEPS if self.kind == 'rates' else STRANGE) + slack
         self.strange = max(self.least, REAL * comparison.noisy)
+        # Where w x (w x r) is not known its mean seems to be a bias.
+        self.coarse = comparison.noisy and 'centripetal' in compared.effects and (
+            SURE * compared.fit(['centripetal', *compared.always]).sigma[0] > TELLS)
 
     def find(self) -> tuple[list[Finding], Reals]:
         """Return the faults, and what they leave of the discrepancy."""
@@ -201,8 +207,8 @@ class Causes:
         pairs, _ = explain(*compared.compressed(), [*self._causes()], math.hypot(
             compared.floor, 0.5 * self.least), always)
         while True:                             # without what may be chance
-            names = [*always, *(name for cause, _ in pairs for name in cause.effects)]
-            found, sigma, residual = compared.fit(names)
+            names = [name for cause, _ in pairs for name in cause.effects]
+            found, sigma, residual = compared.fit(names := [*always, *names])
             sure, end = np.abs(found) > SURE * sigma, len(names)
             for k in reversed(range(len(pairs))):
                 first = end - len(pairs[k][0].effects)
@@ -214,7 +220,7 @@ class Causes:
                 break
         rest = beyond(residual, most)
         if rest > max(UNEXPLAINED * before, self.strange, 2.0 * compared.floor,
-                      ROUGH * self.comparison.noisy):
+                      (ROUGH + 2.0 * compared.floor) * self.comparison.noisy):
             return [Finding('inaccurate', f'{100.0 * rest:.3g} % of the reading is not that of '
                             'the motion', rest)], residual
         return [fault for _, fault in pairs], residual
@@ -251,8 +257,14 @@ class Causes:
         yield Cause([f'arm {k}' for k in range(3)], self._arm) if self.known else Cause(
             [f'turned arm {k}' for k in range(3)], self._split_arm)
 
+    def _clear(self, name: str) -> bool:
+        """Return whether an effect is much larger than its noise."""
+        return rms(self.compared.effects[name]) > ROUNDING + CLEARLY * self.compared.noise.get(
+            name, 0.0)
+
     def _undone(self, matrix: Reals, name: str, evidence: str, number: float) -> Finding:
-        self.undo[evidence] = matrix
+        if name:
+            self.undo[evidence] = matrix
         return Finding(name, evidence, number)
 
     def _scale(self, found: Reals) -> Finding | None:
@@ -276,13 +288,13 @@ class Causes:
         if len(found) > 3 and self.kind == 'magnetometer' and np.linalg.norm(
                 found[:3] + field) < NEAR * np.linalg.norm(field):
             return Finding('reading_in_world', 'the field does not turn with the IMU')
-        return Finding('bias', f'a constant ({listed(offset)}) {SI.get(self.kind, "rad/s")} is '
+        return Finding('bias' * (not self.coarse), f'a constant ({listed(offset)}) {SI.get(self.kind, "rad/s")} is '
                        'added', float(np.linalg.norm(offset)))
 
     def _axes(self, k: int, arms: int, found: Reals) -> Finding | None:
         less, factor = found[len(found) - arms - 2:len(found) - arms].tolist()
-        if arms and rms(self.compared.effects['free']) <= 10.0 * self.compared.noise['free']:
-            less, factor = -1.0, 1.0            # weightless: the arm alone is seen
+        if arms and not self._clear('free'):    # weightless: the arm alone is seen
+            less, factor = (0.0, 0.0) if self.comparison.noisy else (-1.0, 1.0)
         sizes = {unit: times for unit, times in UNITS[self.kind].items()
                  if abs(factor / times - 1.0) < 0.05}
         if abs(less + 1.0) > NEAR or (not sizes and abs(factor - 1.0) > NEAR):
@@ -296,7 +308,7 @@ class Causes:
             'sign' if np.array_equal(np.abs(matrix), np.eye(3)) else 'axes',
             words + ''.join(f', in {unit}' for unit in sizes), factor)
 
-    def _matrix(self, arms: int, found: Reals) -> Finding:
+    def _matrix(self, arms: int, found: Reals) -> Finding | None:
         matrix = np.eye(3) + found[len(found) - arms - 9:len(found) - arms].reshape(3, 3)
         left, _, right = np.linalg.svd(matrix)
         turn, change = left @ right, float(np.max(np.abs(matrix - np.eye(3))))
@@ -306,6 +318,9 @@ class Causes:
             return self._undone(turn, 'mounting' * (angle > self.strange), 'the readings are in '
                                 f'axes that are turned by ({listed(vector)}) rad from those of '
                                 'the IMU', angle)
+        near = [k for k, one in enumerate(PERMUTATIONS) if np.max(np.abs(matrix - one)) < 0.1]
+        if near:
+            return self._axes(near[0], 0, np.array((-1.0, 1.0)))
         rows = '; '.join(map(listed, matrix))
         return Finding('matrix' * (change > self.strange), f'the readings are the matrix [{rows}] '
                        'times what they should be', change)
@@ -323,8 +338,7 @@ class Causes:
         share, (what, missing) = 1.0 + float(found[-1]), TERMS[term]
         if term == 'motion' and self.known and 'linear' not in self.compared.effects:
             missing = 'no_lever_arm'
-        noise = self.compared.noise.get(term, 0.0)
-        if self.comparison.noisy and rms(self.compared.effects[term]) < 10.0 * noise:
+        if self.comparison.noisy and not self._clear(term):
             return None                         # a term of noise seems to be missing
         text = f'the term of {what} has {share:.3g} times its size'
         if term == 'gravity':
@@ -339,6 +353,8 @@ class Causes:
                 return Finding('units', f'{text}: positions are in {unit}', share)
         if abs(share) < NEAR:
             return Finding(missing, text, share) if self.known or term != 'motion' else None
+        if self.comparison.noisy and share > 0.0:       # noise that is not white makes it smaller
+            return Finding('', text)
         return Finding('acceleration_scale' if share > 0.0 else
                        'gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
 
@@ -373,25 +389,29 @@ class Causes:
         return None
 
 
-def _marks(comparison: Comparison, compared: Compared) -> dict[str, Mark]:
+def _marks(comparison: Comparison, compared: Compared, lag: int) -> dict[str, Mark]:
     """Return what the sensor is found to be, with intervals of 95 %."""
     kind, always = comparison.kind, compared.always
     marks = {f'{kind}_discrepancy': Mark(beyond(compared.target, compared.floor)),
              f'{kind}_noise': Mark(comparison.reading_noise)}
-    if kind in DENSITIES:
-        found, sigma, _ = compared.fit([*always, *(f'matrix {i}{j}' for i, j in ENTRIES), *OFFSETS])
-        names = [f'matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES] + [
-            f'bias_{axis}' for axis in 'xyz']
-        for name, value, deviation in zip(names, found[len(always):], sigma[len(always):],
-                                          strict=True):
-            one = name in ('matrix_xx', 'matrix_yy', 'matrix_zz')
-            marks[f'{kind}_{name}'] = Mark(float(value) + one, meaning=_interval(deviation))
     if always:
         what, values = ('field', comparison.field) if kind == 'magnetometer' else (
             'lever_arm', comparison.arm)
         marks.update({f'{what}_{axis}': Mark(float(value), meaning=_interval(deviation))
                       for axis, value, deviation in zip(
                           'xyz', values, compared.fit(always).sigma, strict=True)})
+    if kind in DENSITIES:
+        names = [f'matrix {i}{j}' for i, j in ENTRIES]
+        found, sigma, _ = compared.fit([*always, *names, *OFFSETS])
+        first, matrix = len(always), np.eye(3)
+        if kind == 'gyroscope' and np.all(sigma < np.inf):  # undone, it is smoothed as the motion
+            matrix = matrix + found[first:first + 9].reshape(3, 3)
+            comparison.undo(matrix)
+            found, sigma, _ = comparison.compare(lag).fit([*always, *names, *OFFSETS])
+        matrix = matrix @ (np.eye(3) + found[first:first + 9].reshape(3, 3))
+        for k, value in enumerate([*matrix.ravel(), *found[first + 9:]]):
+            name = f'matrix_{"xyz"[k // 3]}{"xyz"[k % 3]}' if k < 9 else f'bias_{"xyz"[k - 9]}'
+            marks[f'{kind}_{name}'] = Mark(float(value), meaning=_interval(sigma[first + k]))
     return marks
 
 

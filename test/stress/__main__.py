@@ -5,7 +5,6 @@ Stress tests: random inputs and faults, for so long or so many.
     python test/stress tops --count 100000      both solvers on random tops
     python test/stress logs --seconds 600       damaged logs, and what reads them
     python test/stress nodes --seconds 600      extreme parameters and commands at a real node
-    python test/stress fit --count 1000         fits of logs with noise: their errors
     python test/stress grade --count 100        simulators with a defect, and right ones
     python test/stress wrong --count 94         the exam of filters that are wrong, or right
 
