@@ -70,7 +70,7 @@ def test_columns_and_units_are_said_by_name_also_in_a_file(tmp_path):
         recorded = read_table(table(tmp_path / 'a.csv', foreign), text)
         same(recorded, ('attitudes', 'gyroscope', 'accelerations'))
         assert recorded.notes[-1] == 'not used: frame, time, ax'
-    assert 'gyro_x [deg/s], gyro_y [deg/s], gyro_z [deg/s]: 600 rows, 200 Hz' in str(recorded.notes)
+    assert 'gyro_x [deg/s], gyro_y [deg/s], gyro_z [deg/s]: 600 rows, 200' in str(recorded.notes)
     dates = {'stamp': [f'{np.datetime64(ns, "ns")}Z' for ns in NS.tolist()], **VALUES}
     same(read_table(table(tmp_path / 'b.csv', dates), 't=stamp:iso'))
 
@@ -112,8 +112,8 @@ LATER = np.append(T[:300], T[:300])
     ({**ROWS, 't': LATER}, None, 'line 302: the time goes back from 1.495 to 0 s'),
     ({**ROWS, 't': np.round(T, 2)}, None, 'another row of attitudes at the time 0 s'),
     ({**ROWS, 'qw': 1.5 * POSES['qw']}, None, 'line 2: |q| = '),
-    ({**ROWS, 'gx [rad]': T}, None, "gx [rad]: say which column is gx, in rad/s"),
-    ({**ROWS, 'gx [deg/s]': T}, None, "gx [deg/s]: say which column is gx"),
+    ({**ROWS, 'gx [rad]': T}, None, 'gx [rad]: say which column is gx, in rad/s'),
+    ({**ROWS, 'gx [deg/s]': T}, None, 'gx [deg/s]: say which column is gx'),
     ({**ROWS, 'gx': ['1_0'] * len(T)}, None, "line 2: gx = '1_0' is no number"),
     ({**ROWS, 'gx': ['rest'] * len(T)}, None, "line 2: gx = 'rest' is no number"),
     ({**ROWS, 't': ['2026-01-01T00:00:00'] * len(T)}, None, "say --columns 't=t:iso'"),

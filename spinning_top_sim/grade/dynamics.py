@@ -41,7 +41,8 @@ def faults_of(motions: Sequence[Motion], dt: float) -> list[Finding]:
         Cause(['damping', 'axis damping'], _damping),
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
         Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
-    return [fault for _, fault in pairs if fault.name] if rms(residual) < EXPLAINED * rms(target) else []
+    explained = rms(residual) < EXPLAINED * rms(target)
+    return [fault for _, fault in pairs if fault.name and explained]
 
 
 def _terms(motion: Motion, dt: float) -> tuple[Reals, Mapping[str, Reals]]:

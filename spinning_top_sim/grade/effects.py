@@ -146,7 +146,7 @@ class Comparison:
             smoothed = [Smoothed(one, width) for one in stretches]
             noise = max(self._noises(one)['total'] for one in smoothed)
             size = rms(np.array([rms(one.rates) if self.kind in ANGLES else math.hypot(
-                rms(one.acceleration), rms(one.second) * max(np.linalg.norm(self.arm), 0.1))
+                rms(one.acceleration), rms(one.second) * max(float(np.linalg.norm(self.arm)), 0.1))
                 for one in smoothed]))
             share = noise / max(math.sqrt(max(size ** 2 - noise ** 2, 0.0)), 1e-12)
             best = min(best, (share, smoothed), key=lambda one: one[0])

@@ -326,8 +326,8 @@ def _hint(kind: str, names: Sequence[str], unused: Sequence[str]) -> str:
         flat = re.sub('[^a-z0-9]+', '_', column.lower())
         matched = re.search(f'({KINDS[kind].words}|^t$)' if kind == 't' else
                             f'(?:^|_)(?:{KINDS[kind].words})_?([wxyz0-9])(?:_|$)', flat)
-        for name in names if matched else ():
-            if kind == 't' or matched[1] in (name[-1], *'0123456789'):
+        for name in names:
+            if matched and (kind == 't' or matched[1] in (name[-1], *'0123456789')):
                 found[name].append(column)
     if not all(found.values()):
         return ''

@@ -65,29 +65,21 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
         raise ValueError(f'dt = {dt!r} s: must be in (0, 1]')
     if not scenes:
         raise ValueError(f'scenes = {scenes!r}: must have one at least')
-    name = one_line(subject or getattr(run, '__name__', type(run).__name__))
-    judgement = Judgement(name, dt, tolerance)
-    motions, faults = judgement.motions, judgement.faults
-    for scene in scenes:
-        start = scene.start_of(body, seed)
-        if dt * max(*map(abs, start.rates), abs(start.l3) / body.lambda1) > MOST:
-            judgement.notes.append(f'{scene.name}: the top turns by more than {MOST:g} rad in a '
-                                   'step: not graded')
-            continue
-        times: Reals = np.arange(math.floor(scene.duration / dt + 1e-9) + 1.0) * dt
-        try:
-            same = [judgement.motion(scene.name, body, start, _run(
-                run, body, start, times, dt / divided)) for divided in scene.divided]
-            motions.append(same[0])
-            judgement.orders[scene.name] = _order(scene.divided, [one.worst for one in same])
-            if len(motions) == 1:
-                again = _run(run, body, start, times, dt).attitudes
-                if not np.array_equal(again, judgement.first):
-                    faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of '
-                                          'the same run twice differ'))
-        except InvalidTrajectoryError as error:
-            faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
-    if not motions and not faults:
+    judgement = Judgement(one_line(subject or getattr(run, '__name__', type(run).__name__)), dt,
+                          tolerance)
+    with progress('graded', len(scenes), 'scenes') as show:
+        for number, scene in enumerate(scenes):
+            show(number)
+            start = scene.start_of(body, seed)
+            if dt * max(*map(abs, start.rates), abs(start.l3) / body.lambda1) > MOST:
+                judgement.notes.append(f'{scene.name}: the top turns by more than {MOST:g} rad in '
+                                       'a step: not graded')
+                continue
+            try:
+                _run_scene(run, judgement, scene, body, start)
+            except InvalidTrajectoryError as error:
+                judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
+    if not judgement.motions and not judgement.faults:
         raise ValueError(f'dt = {dt!r} s: the top turns by more than {MOST:g} rad in a step')
     return judgement.report()
 
@@ -122,37 +114,40 @@ def grade_trajectory(trajectory: Any, top: Top, start: State, *,
     """
     if dt is not None and not 0.0 < dt < math.inf:
         raise ValueError(f'dt = {dt!r} s: must be > 0, or None')
-    body = Body.of(top, **imu)
-    start = start if isinstance(start, Start) else Start.of(body, start)
     told = Trajectory.of(trajectory, times)
     judgement = Judgement(subject, dt or told.step, tolerance)
-    judgement.motions.append(judgement.motion(subject, body, start, told))
+    judgement.motions.append(judgement.motion(subject, Body.of(top, **imu), start, told))
     return judgement.report()
 
 
-def _run(run: Simulate, body: Body, start: Start, times: Reals, dt: float) -> Trajectory:
-    """Return the motion.  Raises InvalidTrajectoryError."""
-    try:
-        said = run(body, start, times.copy(), dt)
-    except (Exception, SystemExit) as error:
-        raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
-                                     f'{one_line(error)}') from error
-    return Trajectory.of(said, times)
+def _run_scene(run: Simulate, judgement: 'Judgement', scene: Scene, body: Body,
+               start: Start) -> None:
+    """Add the motions of a scene.  Raises InvalidTrajectoryError."""
+    dt = judgement.dt
+    times: Reals = np.arange(math.floor(scene.duration / dt + 1e-9) + 1.0) * dt
 
+    def motion_of(step: float) -> Trajectory:
+        try:
+            said = run(body, start, times.copy(), step)
+        except (Exception, SystemExit) as error:
+            raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
+                                         f'{one_line(error)}') from error
+        return Trajectory.of(said, times)
 
-def _order(divided: Sequence[int], errors: Sequence[float]) -> float:
-    """Return p where errors fall as dt^p; NaN for one dt or errors of rounding size."""
-    if len(divided) < 2 or min(errors) < 1e-9:
-        return math.nan
-    return float(-np.polyfit(np.log(divided), np.log(errors), 1)[0])
+    told = [motion_of(dt / divided) for divided in scene.divided]
+    if not judgement.motions and not np.array_equal(told[0].attitudes, motion_of(dt).attitudes):
+        judgement.faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of the '
+                                        'same run twice differ'))
+    same = [judgement.motion(scene.name, body, start, one) for one in told]
+    judgement.motions.append(same[0])
+    errors = [one.worst for one in same]
+    if len(same) > 1 and min(errors) > 1e-9:        # beyond rounding: errors ~ dt^p
+        judgement.orders[scene.name] = -float(np.polyfit(
+            np.log(scene.divided), np.log(errors), 1)[0])
 
 
 class Judgement:
-    """
-    What is found of motions beside exact ones; `report` judges them.
-
-    first : attitudes of the first one, as they were told
-    """
+    """What is found of motions beside exact ones; `report` judges them."""
 
     def __init__(self, subject: str, dt: float, tolerance: float) -> None:
         self.subject, self.dt, self.tolerance = subject, dt, tolerance
@@ -160,25 +155,18 @@ class Judgement:
         self.faults: list[Finding] = []
         self.notes: list[str] = []
         self.orders: dict[str, float] = {}
-        self.first: Reals = np.empty((0, 4))
 
     def motion(self, name: str, body: Body, start: State, told: Trajectory) -> Motion:
         """Return a motion; a convention of its attitudes, or a step, is told and undone."""
-        if not len(self.first):
-            self.first = told.attitudes.copy()
-        motion = Motion(name, body, start, told)
-        early = slice(0, EARLY)
+        motion, early = Motion(name, body, start, told), slice(0, EARLY)
         error = float(np.max(motion.errors[early]))
-        if error > min(WRONG, 2.0 * self.tolerance):
-            for steps in (1, -1):
-                other = Motion(name, body, start, replace(told, t=told.t + steps * self.dt))
-                if np.max(other.errors[early]) < RIGHT * error and (
-                        np.median(other.errors)
-                        < RIGHT * np.median(motion.errors)):
-                    self._tell('early' if steps > 0 else 'late', f'{name}: the attitudes are '
-                               f'those of one step {"after" if steps > 0 else "before"}',
-                               -float(steps))
-                    return other
+        for steps in (1, -1) if error > min(WRONG, 2.0 * self.tolerance) else ():
+            other = Motion(name, body, start, replace(told, t=told.t + steps * self.dt))
+            if np.max(other.errors[early]) < RIGHT * error and (
+                    np.median(other.errors) < RIGHT * np.median(motion.errors)):
+                self._tell('early' if steps > 0 else 'late', f'{name}: the attitudes are those of '
+                           f'one step {"after" if steps > 0 else "before"}', -float(steps))
+                return other
         if error > WRONG:
             found = conventions.best(told.attitudes[early], motion.truth[early])
             if found.convention.parts and found.after < RIGHT * found.before:
@@ -194,32 +182,30 @@ class Judgement:
 
     def report(self) -> Report:
         """Return the report on the motions."""
-        motions, faults = self.motions, self.faults
-        if not motions:
-            return Report(self.subject, faults, {}, self.notes)
-        body = motions[0].body
-        of_rates = self._readings('rates', body)
-        first = of_rates.faults[0].name if of_rates.faults else ''
-        for motion in motions:
+        if not self.motions:
+            return Report(self.subject, self.faults, {}, self.notes)
+        of_rates = self._readings('rates').faults
+        first = of_rates[0].name if of_rates else ''
+        for motion in self.motions:
             motion.use_rates(told=first in ('', 'rates_scale', 'rates_in_world'),
                              in_world=first == 'rates_in_world')
-        faults += of_rates.faults
         marks = {f'{measure}: {motion.name}': Mark(value, math.degrees(self.tolerance) if (
             measure == 'total_error_deg') else math.nan)
-            for motion in motions for measure, value in motion.marks.items()}
-        marks.update({f'order: {scene}': Mark(order) for scene, order in self.orders.items()})
-        known = any(fault.name == 'rates_scale' for fault in faults)
-        faults += [fault for fault in self._of_motions()
-                   if not (known and fault.name == 'inaccurate')]
+            for motion in self.motions for measure, value in motion.marks.items()}
+        marks.update({f'order: {motion.name}': Mark(self.orders.get(motion.name, math.nan))
+                      for motion in self.motions})
+        faults = [*self.faults, *of_rates, *(fault for fault in self._of_motions() if not (
+            first == 'rates_scale' and fault.name == 'inaccurate'))]
         for kind in READINGS[1:]:
-            found = self._readings(kind, body)
+            found = self._readings(kind)
             faults, marks = [*faults, *found.faults], {**marks, **found.marks}
             self.notes.extend(found.notes)
-        if not {*motions[0].stretch.readings} - {'rates'}:
+        if not {*self.motions[0].stretch.readings} - {'rates'}:
             self.notes.append('no readings: the IMU is not graded')
         return Report(self.subject, faults, marks, self.notes)
 
-    def _readings(self, kind: str, body: Body) -> sensors.Judged:
+    def _readings(self, kind: str) -> sensors.Judged:
+        body = self.motions[0].body
         return sensors.judge(
             kind, [motion.stretch for motion in self.motions], body, body.gravity,
             covariance=self.motions[0].trajectory.covariance.get(kind),
@@ -231,9 +217,8 @@ class Judgement:
         if worst.worst <= self.tolerance:
             return
         text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
-        first = {scene: order for scene, order in self.orders.items() if 0.5 < order < 1.5}
-        if first:
-            scene, order = next(iter(first.items()))
+        first = [(scene, order) for scene, order in self.orders.items() if 0.5 < order < 1.5][:1]
+        for scene, order in first:
             yield Finding('first_order', f'{text}; {scene}: the error falls as dt^{order:.2f}',
                           order)
         causes = [fault for fault in dynamics.faults_of(self.motions, self.dt)

@@ -66,7 +66,8 @@ def _choose(recorded: Recorded, found: Mapping[str, Mapping[str, list[Sample]]],
         named = [one for one in names if one in wanted] or (ours if recorded.run else names)
         if len(named) > 1:
             raise ValueError(f'{kind} are in {", ".join(named)}: choose by --topic {named[0]}')
-        chosen.update({kind: every[source] for source in named})
+        if named:
+            chosen[kind] = every[named[0]]
     origin = min((rows[0].stamp_ns or rows[0].log_ns for rows in chosen.values()), default=0)
     recorded.origin_ns = origin
     recorded.notes.append(f'times of headers: the first is {1e-9 * origin:.9f} s')

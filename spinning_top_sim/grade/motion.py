@@ -127,7 +127,8 @@ class Motion:
         self.name, self.body, self.start, self.trajectory = name, body, start, trajectory
         self.solution = ExactSolution(body, start)
         self.truth: Reals = self.solution.states_at_seconds(trajectory.t).quaternion
-        self.use_rates(told=False, in_world=False)
+        self.stretch: Stretch = trajectory.stretch()
+        self.smoothed = Smoothed(self.stretch, 1)
         rotation = self.stretch.rotation
         self.errors: Reals = (Rotation.from_quat(self.truth).inv() * rotation).magnitude()
 

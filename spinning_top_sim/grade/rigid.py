@@ -19,7 +19,7 @@ from spinning_top_sim.tools.report import Finding, Report
 READINGS = 'gyroscope', 'accelerations', 'magnetometer'
 WORLDS = 'east-up-south', 'north-up-east'       # with y up; a z that is down is a sign of gravity
 EXCERPT = 3000                  # samples by which a convention is found
-WRONG, RIGHT = 0.2, 0.3         # share left of a reading in ours, and of that in another convention
+WRONG, RIGHT = 0.2, 0.3         # share of a reading left in ours, of that in another convention
 HELD_RUNS, HELD_SHARE = 20, 0.9     # runs of equal readings that are a hold, and as long as usual
 
 

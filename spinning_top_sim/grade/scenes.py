@@ -16,7 +16,6 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.tools.kinematics import Reals
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class Body(Imu, Top):
     """

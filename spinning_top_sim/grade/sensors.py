@@ -25,7 +25,7 @@ from spinning_top_sim.grade.effects import (
     Comparison,
     Imu,
 )
-from spinning_top_sim.tools.identify import NEAR, Cause, beyond, explain, instead, rms
+from spinning_top_sim.tools.identify import NEAR, Cause, Judge, beyond, explain, instead, rms
 from spinning_top_sim.tools.kinematics import Reals, Stretch
 from spinning_top_sim.tools.report import Finding, Mark
 
@@ -38,7 +38,8 @@ DENSITIES = {'gyroscope': 'gyroscope_noise_density',
              'accelerations': 'accelerometer_noise_density'}
 # Terms of a specific force: what each is, and the fault where it is missing.
 TERMS = {'tangential': ('a x r', 'no_tangential_term'),
-         'centripetal': ('w x (w x r)', 'no_centripetal_term'), 'gravity': ('gravity', 'no_gravity'),
+         'centripetal': ('w x (w x r)', 'no_centripetal_term'),
+         'gravity': ('gravity', 'no_gravity'),
          'linear': ('the acceleration of the origin', 'no_linear_acceleration'),
          'lever': ('the lever arm', 'no_lever_arm'), 'motion': ('motion', 'no_acceleration')}
 OFFSETS = 'offset 0', 'offset 1', 'offset 2'
@@ -49,7 +50,7 @@ SURE = 5.0                  # standard deviations from which on a number is not 
 # Share of a reading from which on a discrepancy is strange: rates that are told may be those of
 # the middle of a step; a real device, where poses have noise, has errors that no simulator needs.
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
-UNEXPLAINED, ROUGH = 0.5, 0.3   # shares of a discrepancy, and with noise of a reading, left at most
+UNEXPLAINED, ROUGH = 0.5, 0.3   # shares of a discrepancy, with noise of a reading, left at most
 CLEARLY = 10.0              # by which a term must exceed its noise to be missed
 MISSING = 0.05              # share of a whole reading that is none
 GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
@@ -130,10 +131,12 @@ def _lag(comparison: Comparison) -> tuple[int, float, float, bool]:
         effects = comparison.effects(smoothed)
         names = {*effects} & {'gravity', 'linear', 'world', *(
             f'{name} {k}' for name in ('arm', 'turned arm', 'field') for k in range(3))}
-        columns = [effects[name] for name in sorted(names if len(names) > 1 else {*names, 'total'})]
+        names |= {'total'} if comparison.kind in ANGLES else set()
+        columns = [effects[name] for name in sorted(names)]
         design = np.hstack([*columns, np.ones((len(columns[0]), 1))])
         designs.append(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300))
-    best, found = 0, dict[int, float]()
+    best = 0
+    found: dict[int, float] = {}
     while comparison.leave_out(best, designs) or not found:
         found = _misfits(comparison, lags, designs, part)
         before, best = best, min(found, key=lambda lag: found[lag])
@@ -146,12 +149,12 @@ def _lag(comparison: Comparison) -> tuple[int, float, float, bool]:
             compared.effects['total']) < CLEARLY * compared.noise['total']:
         return unknown                          # every lag explains it
     # Around its minimum the sum of squares is a parabola.
-    now, least, before, after = (found[lag] for lag in (0, best, best - 1, best + 1))
-    curvature = before - 2.0 * least + after
+    now, least, sooner, later = (found[lag] for lag in (0, best, best - 1, best + 1))
+    curvature = sooner - 2.0 * least + later
     if curvature <= 0.0:
         return unknown
-    late = best + 0.5 * (before - after) / curvature
-    least -= 0.125 * (before - after) ** 2 / curvature
+    late = best + 0.5 * (sooner - later) / curvature
+    least -= 0.125 * (sooner - later) ** 2 / curvature
     variance = max(least, 0.0) / count * 2.0 * comparison.smoothed[0].width   # correlated noise
     noise = count * (compared.floor * size) ** 2
     clear = least < 0.25 * now or (
@@ -235,8 +238,8 @@ class Causes:
                 ('world', 'rates_in_world' if self.kind in ANGLES else 'reading_in_world',
                  'the world, not of the IMU'),
                 ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
-            swap = instead(name, f'the readings are in axes of {text}')
-            yield Cause(['total', effect], lambda found, swap=swap: swap(found[-2:]))
+            yield Cause(['total', effect], partial(_swapped, instead(
+                name, f'the readings are in axes of {text}')))
         arms = [name for name in self.compared.always if name.startswith('arm')]
         for k in range(len(PERMUTATIONS)):
             yield Cause(['free', f'axes {k}', *(f'axes {k} {arm}' for arm in arms)],
@@ -288,8 +291,8 @@ class Causes:
         if len(found) > 3 and self.kind == 'magnetometer' and np.linalg.norm(
                 found[:3] + field) < NEAR * np.linalg.norm(field):
             return Finding('reading_in_world', 'the field does not turn with the IMU')
-        return Finding('bias' * (not self.coarse), f'a constant ({listed(offset)}) {SI.get(self.kind, "rad/s")} is '
-                       'added', float(np.linalg.norm(offset)))
+        text = f'a constant ({listed(offset)}) {SI.get(self.kind, "rad/s")} is added'
+        return Finding('bias' * (not self.coarse), text, float(np.linalg.norm(offset)))
 
     def _axes(self, k: int, arms: int, found: Reals) -> Finding | None:
         less, factor = found[len(found) - arms - 2:len(found) - arms].tolist()
@@ -387,6 +390,10 @@ class Causes:
             if small < NEAR * large:
                 return self._term(term, np.array([float(small / large) - 1.0]))
         return None
+
+
+def _swapped(judge: Judge, found: Reals) -> Finding | None:
+    return judge(found[-2:])
 
 
 def _marks(comparison: Comparison, compared: Compared, lag: int) -> dict[str, Mark]:

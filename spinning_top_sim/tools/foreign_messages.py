@@ -39,7 +39,7 @@ PLACES = {
 
 
 class Sample(NamedTuple):
-    """Numbers in a message: their kind, as in PLACES, source and stamp [ns]; 0 where it has none."""
+    """Numbers in a message: their kind, as in PLACES, source and stamp [ns], 0: it has none."""
 
     kind: str
     source: str             # topic, of transforms TOPIC:CHILD

@@ -100,8 +100,8 @@ def affine(read: Reals, should: Reals, lags: Iterable[int] = (0,)) -> Affine:
     rest = (target - flat @ solution).reshape(3, n)
     scale = rms(rest) * math.sqrt(autocorrelation_time(rest) * 3 * n / max(3 * n - 13, 1))
     sigma = scale * np.sqrt(np.maximum(np.diag(np.linalg.pinv(flat.T @ flat)), 0.0))
-    entries: Reals = solution[:12].reshape(3, 4)
-    spread: Reals = sigma[:12].reshape(3, 4)
+    entries = np.asarray(solution[:12], dtype=np.float64).reshape(3, 4)
+    spread = np.asarray(sigma[:12], dtype=np.float64).reshape(3, 4)
     return Affine(entries[:, :3], entries[:, 3], lag + float(solution[12]), spread[:, :3],
                   spread[:, 3], float(sigma[12]), rms(rest), rms(read - should))
 
@@ -245,8 +245,8 @@ def fit(target: Reals, columns: Sequence[Reals], noise: Sequence[float] | None =
 
 def compressed(target: Reals, effects: Mapping[str, Reals]) -> tuple[Reals, dict[str, Reals]]:
     """Return a target and effects with few rows, whose least squares and rms are the same."""
-    rows = np.linalg.qr(np.stack([*(effect.ravel() for effect in effects.values()),
-                                  target.ravel()], axis=1), mode='r')
+    columns = [*(effect.ravel() for effect in effects.values()), target.ravel()]
+    rows = np.asarray(np.linalg.qr(np.stack(columns, axis=1), mode='r'), dtype=np.float64)
     rows = rows * math.sqrt(len(rows) / target.size)
     return rows[:, -1, np.newaxis], {name: rows[:, k, np.newaxis]
                                      for k, name in enumerate(effects)}

@@ -200,7 +200,7 @@ def stretches(parts: Parts) -> tuple[list[Stretch], float]:
         if count < LEAST:
             left_out += end - begin
             continue
-        even = first + step * np.arange(count)
+        even: Reals = first + step * np.arange(count, dtype=float)
         at_even = {name: _at(even, values[name][0][rows], values[name][1][rows])
                    for name, rows in inside.items()}
         rotation = Rotation.from_quat(at_even.pop('attitudes'))

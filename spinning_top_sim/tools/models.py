@@ -79,7 +79,8 @@ def _mjcf(values: Mapping[str, Any], name: str) -> str:
          qvel=_text(*start.angular_velocity[0]))
     return _document(root, [
         'Reset to the keyframe start: mj_resetDataKeyframe(model, data, 0).',
-        'RK4 is of fourth order; the default, Euler, adds energy to a fast spin.', *_facts(values)])
+        'RK4 is of fourth order; the default, Euler, adds energy to a fast spin.',
+        *_facts(values)])
 
 
 def _urdf(values: Mapping[str, Any], name: str) -> str:

@@ -27,7 +27,7 @@ class Moving:
 
     def force(self, gravity=1.0, centripetal=1.0, arm=None):
         arm = self.arm if arm is None else arm
-        return (self.rotation.inv().apply(self.a + (0.0, 0.0, gravity * GRAVITY))
+        return (self.rotation.inv().apply(self.a + gravity * np.array((0.0, 0.0, GRAVITY)))
                 + np.cross(self.alpha, arm)
                 + centripetal * np.cross(self.w, np.cross(self.w, arm)))
 

@@ -4,7 +4,7 @@
 from dataclasses import replace
 
 import numpy as np
-from helpers.bodies import FAULTS, NAMES, body, told
+from helpers.bodies import FAULTS, NAMES, told
 from helpers.faulty_simulators import NOISY, OTHER, PUBLISHED, RIGHT, STEPPED, Imu, exact
 
 from spinning_top_sim.grade import Imu as Known
