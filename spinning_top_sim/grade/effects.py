@@ -144,7 +144,7 @@ class Comparison:
             if any(len(one.t) < 4 * margin(width) for one in stretches) or not stretches:
                 break
             smoothed = [Smoothed(one, width) for one in stretches]
-            noise = max(self._noises(one)['total'] for one in smoothed)
+            noise = max(self.noises(one)['total'] for one in smoothed)
             size = rms(np.array([rms(one.rates) if self.kind in ANGLES else math.hypot(
                 rms(one.acceleration), rms(one.second) * max(float(np.linalg.norm(self.arm)), 0.1))
                 for one in smoothed]))
@@ -154,7 +154,7 @@ class Comparison:
                 break
         return best
 
-    def _noises(self, smoothed: Smoothed) -> dict[str, float]:
+    def noises(self, smoothed: Smoothed) -> dict[str, float]:
         """Return the noise of a component of what the motion says, by terms."""
         turns, rates, second, linear = smoothed.body.noise(smoothed.width)
         if self.kind in ANGLES:
@@ -168,7 +168,7 @@ class Comparison:
         whole = free if self.imu.lever_arm is None else total
         return {'total': total, 'free': whole, 'matrix': whole / math.sqrt(3.0), 'linear': linear,
                 'lever': arm, 'tangential': arm, 'centripetal': arm, 'arm': across * second,
-                'motion': math.hypot(linear, arm)}
+                'motion': math.hypot(linear, arm), 'turn': second}
 
     def undo(self, matrix: Reals) -> None:
         """Make the readings those of a sensor without a matrix (3, 3)."""
@@ -219,7 +219,7 @@ class Comparison:
             every, rows, self.sizes, strict=True)]) for name in every[0]}
         readings = np.concatenate([one[part] / size for one, part, size in zip(
             self.read_at(lag), rows, self.sizes, strict=True)])
-        noises = [self._noises(one) for one in self.smoothed]
+        noises = [self.noises(one) for one in self.smoothed]
         noise = {name: rms(np.array([one[name] for one in noises]) / self.sizes)
                  for name in noises[0]}
         reading = self.reading_noise * rms(gain(self.smoothed[0].width) / self.sizes)

@@ -35,10 +35,10 @@ class Kind(NamedTuple):
 KINDS = {
     't': Kind('t', {'s': Decimal(1), 'ms': Decimal('1e-3'), 'us': Decimal('1e-6'),
                     'ns': Decimal('1e-9'), 'iso': Decimal('1e-9')}, 'time|stamp|sec|date|clock'),
-    'positions': Kind(('px', 'py', 'pz'), {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3},
-                      'position|pos|translation|p|t'),
     'attitudes': Kind(('qx', 'qy', 'qz', 'qw'), {'1': 1.0},
                       'quaternion|quat|qpos|rotation|rot|orientation|attitude|q'),
+    'positions': Kind(('px', 'py', 'pz'), {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3},
+                      'position|pos|translation|p|t'),
     'gyroscope': Kind(('gx', 'gy', 'gz'), {
         'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': math.pi / 180.0, 'dps': math.pi / 180.0,
         'rpm': math.pi / 30.0}, 'gyroscope|gyro|gyr|omega|velocity|rates|rate|g|w'),
@@ -354,6 +354,7 @@ def _decimals(column: str, unit: str, table: Table) -> Iterator[Decimal]:
             time = Decimal('NaN')
         if not time.is_finite():
             raise ValueError(f'{_place(table, row)}: {column} = {text[:40]!r} is no time' + (
+                ': write decimal points' if re.fullmatch(r'-?\d+,\d+', text) else
                 f": cut a row of units off, and say --columns 't={column}:{text}'"
                 if text in UNITS['t'] else f"; of a date say --columns 't={column}:iso'"))
         yield time

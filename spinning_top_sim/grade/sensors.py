@@ -26,7 +26,7 @@ from spinning_top_sim.grade.effects import (
     Imu,
 )
 from spinning_top_sim.tools.identify import NEAR, Cause, Judge, beyond, explain, instead, rms
-from spinning_top_sim.tools.kinematics import Reals, Stretch
+from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch
 from spinning_top_sim.tools.report import Finding, Mark
 
 _ANGLE = {'deg/s': 180.0 / math.pi, 'rad/s, taken for deg/s': math.pi / 180.0}
@@ -44,6 +44,7 @@ TERMS = {'tangential': ('a x r', 'no_tangential_term'),
          'lever': ('the lever arm', 'no_lever_arm'), 'motion': ('motion', 'no_acceleration')}
 OFFSETS = 'offset 0', 'offset 1', 'offset 2'
 LAGS = range(-5, 41)        # lags that are tried [samples]
+ENOUGH = 3                  # independent samples a column, from which on a lag can be told
 LATE = 0.75                 # lag from which on it is a fault [samples of the sensor]
 ROUNDING = 1e-5             # share of a reading from which on a lag is looked for
 SURE = 5.0                  # standard deviations from which on a number is not chance
@@ -126,55 +127,83 @@ def _lag(comparison: Comparison) -> tuple[int, float, float, bool]:
     """
     unknown = 0, math.nan, math.inf, False
     lags = [lag for lag in LAGS if 4 * abs(lag) < min(comparison.counts)]
-    part, designs = slice(-lags[0], -lags[-1] or None), []
+    part, designs, noises = slice(-lags[0], -lags[-1] or None), [], []
     for smoothed in comparison.smoothed:
-        effects = comparison.effects(smoothed)
-        names = {*effects} & {'gravity', 'linear', 'world', *(
-            f'{name} {k}' for name in ('arm', 'turned arm', 'field') for k in range(3))}
-        names |= {'total'} if comparison.kind in ANGLES else set()
-        columns = [effects[name] for name in sorted(names)]
-        design = np.hstack([*columns, np.ones((len(columns[0]), 1))])
-        designs.append(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300))
+        design, noise = _design(comparison, smoothed)
+        designs.append(design)
+        noises.append(noise)
     best = 0
-    found: dict[int, float] = {}
+    found: dict[int, tuple[float, float]] = {}
     while comparison.leave_out(best, designs) or not found:
-        found = _misfits(comparison, lags, designs, part)
-        before, best = best, min(found, key=lambda lag: found[lag])
+        found = _misfits(comparison, lags, designs, noises, part)
+        before, best = best, min(found, key=lambda lag: found[lag][0])
         if best == before:
             break
     count, size = 3 * sum(np.count_nonzero(good[part]) for good in comparison.good), rms(
         comparison.sizes)
-    compared = comparison.compare(0)
-    if best in (lags[0], lags[-1]) or found[0] < count * (ROUNDING * size) ** 2 or rms(
+    compared, width = comparison.compare(0), comparison.smoothed[0].width
+    # Of smoothed samples fewer are independent: they must be more than the columns.
+    if count < ENOUGH * 3 * width * designs[0].shape[1] or best in (lags[0], lags[-1]) or found[0][1] < count * (ROUNDING * size) ** 2 or rms(
             compared.effects['total']) < CLEARLY * compared.noise['total']:
         return unknown                          # every lag explains it
     # Around its minimum the sum of squares is a parabola.
-    now, least, sooner, later = (found[lag] for lag in (0, best, best - 1, best + 1))
+    now, least, sooner, later = (found[lag][0] for lag in (0, best, best - 1, best + 1))
     curvature = sooner - 2.0 * least + later
     if curvature <= 0.0:
         return unknown
     late = best + 0.5 * (sooner - later) / curvature
-    least -= 0.125 * (sooner - later) ** 2 / curvature
-    variance = max(least, 0.0) / count * 2.0 * comparison.smoothed[0].width   # correlated noise
+    less = 0.125 * (sooner - later) ** 2 / curvature
+    rest = max(found[best][1] - less, 0.0)
+    variance = rest / count * 2.0 * width       # of correlated noise
     noise = count * (compared.floor * size) ** 2
-    clear = least < 0.25 * now or (
-        least < 1.5 * noise and now - least > SURE ** 2 * variance)
+    clear = rest < 0.25 * found[0][1] or (
+        rest < 1.5 * noise and now - least + less > SURE ** 2 * variance)
     return best if clear else 0, late, math.sqrt(2.0 * variance / curvature), clear
 
 
+def _design(comparison: Comparison, smoothed: Smoothed) -> tuple[Reals, Reals]:
+    """Return columns of unit size that any reading may have, and how noise is in them."""
+    effects, noise = comparison.effects(smoothed), comparison.noises(smoothed)
+    names = [name for name in ('gravity', 'linear', 'world', *(
+        f'{name} {k}' for name in ('arm', 'turned arm', 'field') for k in range(3)))
+        if name in effects] + ['total'] * (comparison.kind in ANGLES)
+    design = np.hstack([*map(effects.__getitem__, names), np.ones((len(smoothed.rates), 1))])
+    sizes = np.linalg.norm(design, axis=0)
+    sizes[sizes == 0.0] = np.inf                # such as the part of a x r along r
+    # By axes: noise of the angular acceleration, as of any a x r, and of the others.
+    every = np.zeros((6, len(sizes)))
+    for k, name in enumerate(names):
+        columns = slice(3 * k, 3 * k + 3)
+        if name.endswith(('arm 0', 'arm 1', 'arm 2')):
+            every[:3, columns] = noise['turn'] * np.cross(np.eye(3), np.eye(3)[int(name[-1])])
+        else:
+            every[3:, columns] = noise.get(name, 0.0) * np.eye(3)
+    return design / sizes, every / sizes
+
+
 def _misfits(comparison: Comparison, lags: Sequence[int], designs: Sequence[Reals],
-             part: slice) -> dict[int, float]:
-    """Return the sums of squares that designs leave of readings by their lag."""
+             noises: Sequence[Reals], part: slice) -> dict[int, tuple[float, float]]:
+    """
+    Return the sums of squares that designs leave of readings by their lag.
+
+    The first is without what noise of the columns leaves: it would draw the lag to where the
+    columns are small.
+    """
     rows = [np.flatnonzero(good[part]) + (part.start or 0) for good in comparison.good]
     bases = []
-    for design, chosen in zip(designs, rows, strict=True):
-        left, sizes, _ = np.linalg.svd(design[chosen], full_matrices=False)
-        bases.append(left[:, sizes > 1e-9 * sizes[0]])
-    found = dict.fromkeys(lags, 0.0)
+    for design, noise, chosen in zip(designs, noises, rows, strict=True):
+        left, sizes, right = np.linalg.svd(design[chosen], full_matrices=False)
+        known = sizes > 1e-9 * sizes[0]
+        bases.append((left[:, known], noise @ (right[known].T / sizes[known])))
+    found = {}
     for lag in lags:
-        for basis, chosen, reading in zip(bases, rows, comparison.read_at(lag), strict=True):
-            left = reading[chosen] - basis @ (basis.T @ reading[chosen])
-            found[lag] += float(np.sum(left ** 2))
+        whole = noisy = 0.0
+        for (basis, noise), chosen, reading in zip(bases, rows, comparison.read_at(lag),
+                                                   strict=True):
+            sizes = basis.T @ reading[chosen]
+            whole += float(np.sum((reading[chosen] - basis @ sizes) ** 2))
+            noisy += len(chosen) * float(np.sum((noise @ sizes) ** 2))
+        found[lag] = whole - noisy, whole
     return found
 
 
@@ -224,6 +253,8 @@ class Causes:
         rest = beyond(residual, most)
         if rest > max(UNEXPLAINED * before, self.strange, 2.0 * compared.floor,
                       (ROUGH + 2.0 * compared.floor) * self.comparison.noisy):
+            if self.comparison.noisy and not self._clear('free'):     # weightless: noise is seen
+                return [], residual
             return [Finding('inaccurate', f'{100.0 * rest:.3g} % of the reading is not that of '
                             'the motion', rest)], residual
         return [fault for _, fault in pairs], residual
@@ -262,8 +293,8 @@ class Causes:
 
     def _clear(self, name: str) -> bool:
         """Return whether an effect is much larger than its noise."""
-        return rms(self.compared.effects[name]) > ROUNDING + CLEARLY * self.compared.noise.get(
-            name, 0.0)
+        return self.kind != 'accelerations' or rms(self.compared.effects[name]) > (
+            ROUNDING + CLEARLY * self.compared.noise.get(name, 0.0))
 
     def _undone(self, matrix: Reals, name: str, evidence: str, number: float) -> Finding:
         if name:
