@@ -119,7 +119,7 @@ LATER = np.append(T[:300], T[:300])
     ({**ROWS, 't': ['2026-01-01T00:00:00'] * len(T)}, None, "say --columns 't=t:iso'"),
     (ROWS, 'gx=gyro_x', '--columns gyro_x: the file has t, qx'),
     (ROWS, 'gx=gx:rpm/s', 'the unit must be rad/s, mrad/s, deg/s, dps, rpm'),
-    (ROWS, 'speed=gx', 'must be NAME=COLUMN:UNIT, with each NAME once, of t, px'),
+    (ROWS, 'speed=gx', 'must be NAME=COLUMN:UNIT, with each NAME once, of t, qx'),
     (ROWS, 'gx=', 'no column gx; '),
     ({'t': T, **POSES, **{f'gyro_{a}_dps': T for a in 'xyz'}}, None, 'nothing to grade; '
      "gyroscope: none; if it is gyro_x_dps, gyro_y_dps, gyro_z_dps: --columns 'gx=gyro_x_dps:")])

@@ -155,9 +155,11 @@ def _lag(comparison: Comparison) -> tuple[int, float, float, bool]:
     less = 0.125 * (sooner - later) ** 2 / curvature
     rest = max(found[best][1] - less, 0.0)
     variance = rest / count * 2.0 * width       # of correlated noise
-    noise = count * (compared.floor * size) ** 2
-    clear = rest < 0.25 * found[0][1] or (
-        rest < 1.5 * noise and now - least + less > SURE ** 2 * variance)
+    most = 1.5 * count * (compared.floor * size) ** 2
+    gained = now - least + less                 # which is that of a parabola, about
+    clear = bool(rest < 0.25 * found[0][1] or (
+        rest < most and gained > max((2.0 * SURE) ** 2 * variance,
+                                     0.05 * curvature * late ** 2)))
     return best if clear else 0, late, math.sqrt(2.0 * variance / curvature), clear
 
 
