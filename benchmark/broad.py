@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 import report
 from scipy.stats import spearmanr
+from spinning_top_sim.exam.reference import ReferenceFilter
+from spinning_top_sim.exam.trial import InvalidOutputError, feed
 
 from spinning_top_sim.exam import broad, field
 from spinning_top_sim.exam.adapters import Ahrs, Imufusion, Vqf
 from spinning_top_sim.exam.measures import Rmse, rmse
-from spinning_top_sim.exam.reference import ReferenceFilter
 from spinning_top_sim.exam.scored import ScoredRun
-from spinning_top_sim.exam.trial import InvalidOutputError, feed
 from spinning_top_sim.tools.cli import progress
 
 PACKAGES = ('numpy', 'scipy', 'vqf', 'ahrs', 'imufusion')

@@ -130,12 +130,12 @@ def measured(entry: Entry) -> dict[str, Any]:
     scenes = SCENES if entry.whole else [replace(SCENES[0], divided=(1,))]
     found = grade(run, dt=entry.dt, scenes=scenes, subject=entry.key)
     first = SCENES[0].name
-    marks = {name: found.marks.get(f'{name}: {first}', math.nan) for name in (
+    marks = {name: found.measures.get(f'{name}: {first}', math.nan) for name in (
         'total_error_deg', 'energy_drift', 'order')}
     if not entry.options.keys().isdisjoint({'accuracy', 'rtol'}) or entry.setting == 'default':
         marks['order'] = math.nan           # the step is not dt
     return {**marks, 'cost': run.spent / run.simulated if run.simulated else math.nan,
-            'faults': found.names, 'text': str(found)}
+            'faults': found.faults, 'text': str(found)}
 
 
 def row(entry: Entry) -> tuple[str, ...]:
@@ -181,7 +181,7 @@ finer one, 1/{FINER} of it.
 Every engine runs as its documentation shows. The first step is the default where there is one,
 else that of its examples. Damping that is on by default is switched off, as the top has none. A
 first-order step is no mistake of an engine: it is chosen for robustness with contacts, which this
-page does not measure, and a finer step or another integrator is the remedy. `imu_one_step_late`
+page does not measure, and a finer step or another integrator is the remedy. `late`
 means that readings belong to the state before the step: they are consistent with that pose.
 Tolerances hold for one step of an integrator, so that the error after 10 s is larger."""
 NOTES = """\

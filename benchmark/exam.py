@@ -25,10 +25,10 @@ from cases import ROOT
 sys.path.insert(0, str(ROOT / 'test'))
 
 from helpers.faulty_filters import FAULTY
+from spinning_top_sim.exam.reference import ReferenceFilter
 
 from spinning_top_sim.exam import examine
 from spinning_top_sim.exam.adapters import FILTERS, Vqf
-from spinning_top_sim.exam.reference import ReferenceFilter
 
 PACKAGES = ('numpy', 'scipy', 'vqf', 'ahrs', 'imufusion')
 SEEDS = 3                       # of an exam

@@ -18,7 +18,7 @@ MAY_IMPORT = {
     'recording': set(),
     'tools': {'physics', 'solvers', 'streams', 'recording'},
     'exam': {'physics', 'solvers', 'streams', 'recording', 'tools'},
-    'grade': {'physics', 'solvers', 'streams', 'recording', 'tools', 'exam'},
+    'grade': {'physics', 'solvers', 'streams', 'recording', 'tools'},
     'nodes': {'physics', 'solvers', 'streams', 'recording', 'tools'},
     'view': {'physics', 'solvers', 'streams', 'recording', 'tools', 'nodes'},
 }

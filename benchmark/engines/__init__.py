@@ -20,19 +20,18 @@ from spinning_top_sim.tools import models
 
 def model(top: Any, start: Any, file_format: str) -> str:
     """Return the top, its start and its IMU as `spinning-top export --model` writes them."""
-    state = start.state_of(top)
     values = {f'top.{name}': getattr(top, name) for name in (
         'lambda1', 'lambda3', 'mass', 'com_distance', 'gravity')}
-    values |= {f'initial.{name}': getattr(state, name) for name in (
+    values |= {f'initial.{name}': getattr(start, name) for name in (
         'theta', 'theta_dot', 'phi', 'psi')}
-    values |= {'spin.l3': state.l3, 'spin.lz': state.lz, 'imu.lever_arm': top.lever_arm,
+    values |= {'spin.l3': start.l3, 'spin.lz': start.lz, 'imu.lever_arm': top.lever_arm,
                'imu.rpy': tuple(mounting(top).as_euler('xyz'))}
     return models.model(parameters.checked(values), file_format, 'top')
 
 
 def mounting(top: Any) -> Rotation:
     """Return the rotation body <- IMU."""
-    return Rotation.from_quat(np.roll(top.mounting, -1))
+    return Rotation.from_quat(top.mounting)
 
 
 def recorded(times: np.ndarray, dt: float, advance: Callable[[int], object],

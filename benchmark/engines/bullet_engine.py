@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pybullet as p
 from scipy.spatial.transform import Rotation
 
@@ -26,7 +25,7 @@ def run(top, start, times, dt):
         p.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
         p.setJointMotorControlMultiDof(body, 0, p.POSITION_CONTROL, [0.0, 0.0, 0.0, 1.0],
                                        force=[0.0, 0.0, 0.0])
-        p.resetJointStateMultiDof(body, 0, np.roll(start.attitude, -1), start.rates)
+        p.resetJointStateMultiDof(body, 0, start.attitude, start.rates)
 
         def advance(n):
             for _ in range(n):
@@ -35,7 +34,7 @@ def run(top, start, times, dt):
         def read():
             state = p.getLinkState(body, 0, computeLinkVelocity=1, computeForwardKinematics=1)
             turned = Rotation.from_quat(state[5])
-            return {'attitudes': np.roll(state[5], 1), 'rates': turned.inv().apply(state[7])}
+            return {'attitudes': state[5], 'rates': turned.inv().apply(state[7])}
 
         return recorded(times, dt, advance, read)
     finally:

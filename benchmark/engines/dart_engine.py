@@ -19,7 +19,7 @@ def run(top, start, times, dt):
     world.setGravity([0.0, 0.0, -top.gravity])
     world.setTimeStep(dt)
     world.addSkeleton(skeleton)
-    attitude = Rotation.from_quat(np.roll(start.attitude, -1))
+    attitude = Rotation.from_quat(start.attitude)
     joint.setPositions(dart.dynamics.BallJoint.convertToPositions(attitude.as_matrix()))
     joint.setVelocities(start.rates)
     imu = mounting(top).inv()
@@ -35,7 +35,7 @@ def run(top, start, times, dt):
         force = body.getLinearAcceleration(
             np.array(top.lever_arm), dart.dynamics.Frame.World(), body) \
             + turned.inv().apply([0.0, 0.0, top.gravity])
-        return {'attitudes': turned.as_quat()[[3, 0, 1, 2]], 'rates': rates,
+        return {'attitudes': turned.as_quat(), 'rates': rates,
                 'gyroscope': imu.apply(rates), 'accelerations': imu.apply(force)}
 
     return recorded(times, dt, advance, read)

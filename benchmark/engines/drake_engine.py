@@ -50,7 +50,8 @@ def run(top, start, times, dt, accuracy=None):
     def read():
         turned = plant.EvalBodyPoseInWorld(inside, body).rotation()
         rates = plant.EvalBodySpatialVelocityInWorld(inside, body).rotational()
-        return {'attitudes': turned.ToQuaternion().wxyz(), 'rates': turned.inverse() @ rates,
+        return {'attitudes': np.roll(turned.ToQuaternion().wxyz(), -1),
+                'rates': turned.inverse() @ rates,
                 **{name: sensor.get_output_port().Eval(sensor.GetMyContextFromRoot(context))
                    for name, sensor in zip(('gyroscope', 'accelerations'), sensors, strict=True)}}
 

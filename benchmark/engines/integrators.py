@@ -17,14 +17,19 @@ def _rates(top, y, stack):
                   -turn * w1 - pull * (2.0 * (x * z - w * yy)), 0.0 * w3])
 
 
+def _first(start):
+    x, y, z, w = start.attitude
+    return [w, x, y, z, *start.rates]
+
+
 def _told(states):
-    return {'attitudes': states[:, :4], 'rates': states[:, 4:]}
+    return {'attitudes': states[:, [1, 2, 3, 0]], 'rates': states[:, 4:]}
 
 
 def scipy(top, start, times, dt, method, **tolerances):
     from scipy.integrate import solve_ivp
     result = solve_ivp(lambda t, y: _rates(top, y.tolist(), list), (0.0, times[-1]),
-                       [*start.attitude, *start.rates], method, times, **tolerances)
+                       _first(start), method, times, **tolerances)
     return _told(result.y.T)
 
 
@@ -32,7 +37,7 @@ def heyoka(top, start, times, dt, **tolerances):
     import heyoka as hy
     y = hy.make_vars('w', 'x', 'y', 'z', 'w1', 'w2', 'w3')
     taylor = hy.taylor_adaptive(list(zip(y, _rates(top, y, list), strict=True)),
-                                [*start.attitude, *start.rates], **tolerances)
+                                _first(start), **tolerances)
     return _told(taylor.propagate_grid(times)[-1])
 
 
@@ -58,4 +63,4 @@ class Diffrax:
 
     def __call__(self, top, start, times, dt):
         return _told(np.asarray(self._solve(
-            top, np.array([*start.attitude, *start.rates]), times, dt)))
+            top, np.array(_first(start)), times, dt)))

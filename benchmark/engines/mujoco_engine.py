@@ -20,8 +20,8 @@ def _loaded(top, start, dt, integrator):
 
 
 def _read(data):
-    return {'attitudes': data.qpos, 'rates': data.qvel, 'gyroscope': data.sensordata[:3],
-            'accelerations': data.sensordata[3:]}
+    return {'attitudes': data.qpos[[1, 2, 3, 0]], 'rates': data.qvel,
+            'gyroscope': data.sensordata[:3], 'accelerations': data.sensordata[3:]}
 
 
 def run(top, start, times, dt, integrator):
@@ -54,5 +54,5 @@ class Mjx:
                           round((times[1] - times[0]) / dt), len(times))
         rows = np.array(rows, float)[:len(times)]
         rows[0] = np.concatenate((data.qpos, data.qvel, data.sensordata))
-        return {'attitudes': rows[:, :4], 'rates': rows[:, 4:7], 'gyroscope': rows[:, 7:10],
-                'accelerations': rows[:, 10:]}
+        return {'attitudes': rows[:, [1, 2, 3, 0]], 'rates': rows[:, 4:7],
+                'gyroscope': rows[:, 7:10], 'accelerations': rows[:, 10:]}

@@ -20,8 +20,8 @@ def run(top, start, times, dt, solver):
                             inertia=wp.mat33(np.diag(top.inertia_at_com)), lock_inertia=True)
     joint = builder.add_joint_ball(parent=-1, child=body)
     builder.add_articulation([joint])
-    builder.joint_q[:4] = np.roll(start.attitude, -1).tolist()
-    attitude = Rotation.from_quat(np.roll(start.attitude, -1))
+    builder.joint_q[:4] = list(start.attitude)
+    attitude = Rotation.from_quat(start.attitude)
     builder.joint_qd[:3] = attitude.apply(start.rates).tolist()
     model = builder.finalize()
     stepper = getattr(newton.solvers, f'Solver{solver}')(model)
@@ -39,7 +39,7 @@ def run(top, start, times, dt, solver):
     def read():
         x, y, z, w = now.body_q.numpy()[0][3:].astype(float)
         rates = now.body_qd.numpy()[0][3:]
-        return {'attitudes': (w, x, y, z),
+        return {'attitudes': (x, y, z, w),
                 'rates': Rotation.from_quat((x, y, z, w)).inv().apply(rates)}
 
     return recorded(times, dt, advance, read)

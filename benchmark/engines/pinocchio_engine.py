@@ -18,7 +18,7 @@ def run(top, start, times, dt):
     imu = model.addFrame(pin.Frame('imu', joint, 0, pin.SE3(
         mounting(top).as_matrix(), np.array(top.lever_arm)), pin.FrameType.SENSOR))
     data, torque = model.createData(), np.zeros(3)
-    q, v = np.roll(start.attitude, -1), np.array(start.rates)
+    q, v = np.array(start.attitude), np.array(start.rates)
 
     def advance(n):
         nonlocal q, v
@@ -30,7 +30,7 @@ def run(top, start, times, dt):
         pin.forwardKinematics(model, data, q, v, pin.aba(model, data, q, v, torque))
         down = pin.updateFramePlacement(model, data, imu).rotation.T @ model.gravity.linear
         force = pin.getFrameClassicalAcceleration(model, data, imu, pin.LOCAL).linear - down
-        return {'attitudes': np.roll(q, 1), 'rates': v, 'accelerations': force,
+        return {'attitudes': q.copy(), 'rates': v, 'accelerations': force,
                 'gyroscope': pin.getFrameVelocity(model, data, imu, pin.LOCAL).angular}
 
     return recorded(times, dt, advance, read)

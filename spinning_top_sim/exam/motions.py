@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.inertial_sensor import Sensor
+from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.magnetometer import Magnetometer
 
 Reals = NDArray[np.float64]
@@ -183,14 +183,15 @@ def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: 
     run = Motion(euler(NEAR)).rest(lead_s).top(seconds, seed).run(name)
     values = parameters.checked({'mag.field': FIELD, **imu, 'seed': seed})
     period_ns = round(1e9 / RATE)
-    times = range(period_ns, (len(run.dt) + 1) * period_ns, period_ns)
+    times = period_ns * np.arange(1, len(run.dt) + 1)
     # North is magnetic north.
     east, north, up = values['mag.field']
     field: Any = Rotation.from_quat(run.truth).inv().apply((0.0, math.hypot(east, north), up))
     true: Any = tuple(run.gyroscope.T), tuple(run.accelerometer.T)
+    magnetometer = Magnetometer(values, period_ns)
     rates, force, field = (np.stack(columns, axis=1) for columns in (
-        *Sensor(values, period_ns).read(true, times),
-        Magnetometer(values, period_ns).read(tuple(field.T), times)))
+        *Imu(values, period_ns).read(true, times),
+        magnetometer.read(tuple(field.T), magnetometer.errors(times))))
     return replace(run, gyroscope=rates, accelerometer=force, magnetometer=field)
 
 

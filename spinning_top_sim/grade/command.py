@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Grade the trajectory of a simulator: its motion beside the exact one, its IMU
-beside its motion.
+Grade a recording: is this IMU that of this motion?  Of a top, is this motion right?
 
-  spinning-top grade run.mcap                       # a log of this package
-  spinning-top grade poses.csv --scene looping      # top and start as given
-  spinning-top grade poses.csv --fit                # top and start are fitted
+  spinning-top grade run.mcap                       # poses and readings of any body
+  spinning-top grade run.csv --lever-arm 0.1 0 0.2
+  spinning-top grade run.csv --columns 't=stamp:ns, gx=gyro_x:deg/s, ...'
+  spinning-top grade run.csv --scene looping        # also the motion of a top that is known
 
 exit codes:
   0    no fault was found
-  1    the simulator has faults, or the file cannot be read
-  2    wrong arguments, or a file without what is needed
+  1    there are faults, or the file cannot be read
+  2    wrong arguments, or a file that is not understood
   130  interrupted
-What a file may contain is in docs/grade_files.md.
+docs/grade.md says what a file may contain.
 """
 
 import argparse
-import json
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -24,162 +24,136 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import fit as fitting
-from spinning_top_sim.grade.grader import grade_trajectory
-from spinning_top_sim.grade.motion import LEAST_SAMPLES, Trajectory
-from spinning_top_sim.grade.scenes import Body, Reals, rotation_of
-from spinning_top_sim.physics.top import State
-from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim import solve
+from spinning_top_sim.grade import files, grade_readings, grade_trajectory
+from spinning_top_sim.grade.effects import STANDARD_GRAVITY, Imu
+from spinning_top_sim.grade.grader import EARLY, TOLERANCE
+from spinning_top_sim.grade.logs import own_attitudes, read_log
+from spinning_top_sim.grade.scenes import Body, Start
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools import cli, motion_files, scene_file
-from spinning_top_sim.tools.motion_files import Recorded
+from spinning_top_sim.tools import cli, conventions, scene_file
+from spinning_top_sim.tools.kinematics import Smoothed, stretches
+from spinning_top_sim.tools.report import Finding, Mark, Report
 
-SAME_S = 1e-6               # between two stamps of one time
-EVEN = 1e-4                 # share of the interval by which evenly spaced samples may be off
-GAP = 2.5                   # intervals that are a gap
-DEGREE = 5                  # of the splines between samples
-COARSE = 0.5                # turned from one sample to the next [rad]: splines fail
+START = 0.02            # angle to the start that is given, beyond which there is another [rad]
+NOISES = 5.0            # standard deviations of noise by which an attitude may be off besides
+EXACT = 1e-6            # noise of attitudes from which rates cannot tell causes [rad]
+# Errors of a device in our parameters, and faults that they are in the readings of its logs.
+DECLARED = {'bias': {'bias'}, 'random_walk': {'bias'}, 'drop': {'held'}, 'duplicate': {'held'},
+            **{name: {'matrix', 'mounting', 'reading_scale', 'sign'} for name in ('_M', '_A')},
+            **{name: {'late', 'early', 'inaccurate', 'noise_scale', 'acceleration_scale',
+                      'reading_scale', 'matrix', 'finite_differences'} for name in (
+                'stamp', 'clock', 'bandwidth', 'sampling', 'vibration', 'range', 'resolution')}}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add = parser.add_argument
-    add('file', type=Path, help='.mcap, .csv, .parquet or .npz')
-    scene_file.add_parameters(parser)
-    add('--fit', action='store_true', help='fit top and start to the attitudes, or only the start '
-        'of a top that is given; the default where neither arguments nor file tell them')
-    add('--fit-imu', action='store_true', help='the same, and mounting, place and stamps of the '
-        'IMU to its readings')
+    add('file', type=Path, help='.mcap, .csv, .tum, .parquet or .npz; a folder of a bag or EuRoC')
+    add('--columns', help='columns and units of a table, such as "t=stamp:ns, gx=gyro_x:deg/s", '
+        'or a file with such a text')
+    add('--topic', action='append', default=[], help='a topic of a log to read, of transforms '
+        'TOPIC:CHILD; may be repeated; default: the only one of each kind')
     add('--lever-arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
-        help='position of the IMU in the body [m]; default: 0 0 0, or as the parameters tell')
-    add('--topic', help='topic of the attitudes in a log; default: the first that has some')
+        help='position of the IMU in the body [m]; default: found')
+    scene_file.add_parameters(parser)
     add('--json', action='store_true', help='print everything as JSON')
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    recorded = motion_files.read(arguments.file, arguments.topic)
-    body, state, found = _motion(arguments, recorded)
-    trajectory = trajectory_of(recorded, ExactSolution(body, state),
-                               recorded.parts['attitudes'][0][0] if found else 0.0)
-    report = grade_trajectory(trajectory, body, state, subject=arguments.file.name)
+    path, log = arguments.file, arguments.file.suffix == '.mcap'
+    if path.is_dir():
+        log = not (path / 'imu0').is_dir()
+    if (arguments.columns if log else arguments.topic):
+        raise ValueError('--columns is for tables' if log else '--topic is for logs')
+    recorded = read_log(path, arguments.topic) if log else files.read_table(
+        path, arguments.columns)
+    given = scene_file.given(arguments)
+    known = None if arguments.scene or arguments.params else recorded.run
+    values = parameters.checked({**(known.values_in_effect if known else {}), **given})
+    of_top = bool(known) or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
+    if not of_top and recorded.parts.keys() <= {'positions', 'attitudes'}:
+        raise ValueError(f'{path}: there are no readings, and no top is known (--scene): '
+                         'nothing to grade' + ''.join(f'; {note}' for note in recorded.notes
+                                                      if '--columns' in note))
+    imu, gravity = _imu(arguments, given, values, of_top)
+    report = grade_readings(recorded.parts, imu, subject=path.name, exact_gravity=of_top,
+                            gravity=gravity, covariance=recorded.covariance)
+    if known:
+        report = _without_declared(report, known.values_in_effect)
+    if of_top:
+        report = _with_motion(report, recorded, values, known)
+    report = replace(report, notes=[*recorded.notes, *report.notes])
     if arguments.json:
-        print(json.dumps({**report.as_dict(), 'notes': recorded.notes,
-                          'fit': found and found.as_dict()}, indent=2))
+        print(report.as_json())
     else:
-        for line in (*recorded.notes, *(found.lines() if found else ()),
-                     *str(report).splitlines()):
+        for line in str(report).splitlines():
             cli.print_line(line)
     return cli.OK if report.passed else cli.FAILED
 
 
-def _motion(arguments: argparse.Namespace,
-            recorded: Recorded) -> tuple[Body, State, fitting.Fit | None]:
-    """Return top with IMU and start, as given or as fitted, and the fit."""
-    given, fits = scene_file.given(arguments), arguments.fit or arguments.fit_imu
-    if fits and (starts := [name for name in given if name.startswith(('initial.', 'spin.'))]):
-        raise ValueError(f'--fit finds the start: {", ".join(starts)} must not be given')
-    # A scene is another top and start; anything else changes what the file tells.
-    known = None if arguments.scene or arguments.params else recorded.parameters
-    values = parameters.checked({**(known or {}), **given})
-    x, y, z, w = Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()
-    top, start = parameters.top_of(values), parameters.start_state(values)
-    body = Body.of(
-        top, lever_arm=tuple(arguments.lever_arm or values['imu.lever_arm']),
-        mounting=(w, x, y, z), field=tuple(values['mag.field']),
+def _imu(arguments: argparse.Namespace, given: Mapping[str, Any], values: Mapping[str, Any],
+         of_top: bool) -> tuple[Imu, float]:
+    """Return what is known of the IMU, and gravity."""
+    arm = arguments.lever_arm or (
+        values['imu.lever_arm'] if of_top or 'imu.lever_arm' in given else None)
+    field = values['mag.field'] if of_top or 'mag.field' in given else None
+    return Imu(
+        lever_arm=arm and tuple(arm), field=field and tuple(field),
+        mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
         **{name: given.get(f'imu.{name}') for name in (
-            'gyroscope_noise_density', 'accelerometer_noise_density')})
-    about_motion = known or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
-    if fits or not about_motion:
-        return _motion_by_fit(arguments, recorded, given, body)
-    if off := fitting.far_start(recorded.parts, top, start):
-        raise ValueError(f'{arguments.file}: the parameters do not fit the trajectory: {off}; '
-                         '--fit finds top and start')
-    return body, start, None
+            'gyroscope_noise_density', 'accelerometer_noise_density')}), (
+                values['top.gravity'] if of_top else STANDARD_GRAVITY)
 
 
-def _motion_by_fit(arguments: argparse.Namespace, recorded: Recorded, given: Mapping[str, Any],
-                   body: Body) -> tuple[Body, State, fitting.Fit]:
-    """Return the same as fitted, but for the parts of `body` that are given."""
-    try:
-        found = fitting.fit(recorded.parts, lambda1=body.lambda1, gravity=body.gravity,
-                            imu=arguments.fit_imu)
-    except ValueError as error:
-        raise ValueError(f'{arguments.file}: {error}') from error
-    if arguments.fit_imu:
-        body = replace(body, mounting=found.mounting, lever_arm=body.lever_arm if (
-            arguments.lever_arm or 'imu.lever_arm' in given) else found.lever_arm)
-    if any(name.startswith('top.') for name in given):
-        return body, fitting.state_of_known_top(found, recorded.parts, body), found
-    return replace(body, **vars(found.top)), found.start, found
+def _without_declared(report: Report, values: Mapping[str, Any]) -> Report:
+    """Return a report without the errors that the parameters of a log give its device."""
+    defaults = parameters.checked({})
+    ours = {name for name, value in values.items()
+            if name.startswith(('imu.', 'mag.')) and value != defaults[name]}
+    known = set().union(*(faults for part, faults in DECLARED.items()
+                          if any(part in name for name in ours)))
+    return replace(report, found=[one for one in report.found if one.name not in known], notes=[
+        *report.notes, *(f'{one.name}, as the parameters of the log say: {one.evidence}'
+                         for one in report.found if one.name in known)])
 
 
-def trajectory_of(recorded: Recorded, motion: ExactSolution, begin: float = 0.0) -> Trajectory:
-    """
-    Return all parts at the times of the IMU, else of the attitudes, made evenly spaced.
-
-    motion : about which attitudes are interpolated; white noise about it is taken away
-    begin : time of its start; times are counted from there [s]
-    """
-    def turns(times: Reals) -> Rotation:
-        return Rotation.from_quat(motion.states_at_seconds(times).quaternion)
-
-    notes = recorded.notes
-    parts = {name: _longest(name, at - begin, values, notes)
-             for name, (at, values) in recorded.parts.items()}
-    times, attitudes = parts.pop('attitudes')
-    sensors = [name for name in ('gyroscope', 'accelerations') if name in parts]
-    begin, end = times[0] - SAME_S, times[-1] + SAME_S
-    for name in dict.fromkeys([*sensors, *parts]):
-        at = parts[name][0]
-        both = max(at[0] - SAME_S, begin), min(at[-1] + SAME_S, end)
-        if both[1] - both[0] < 0.5 * np.ptp(times):
-            notes.append(f'{name}: not at the times of the others, left out')
-            del parts[name]
-        else:
-            begin, end = both
-    every = next((parts[name][0] for name in sensors if name in parts), times)
-    even = _evenly(every[(every >= begin) & (every <= end)], notes)
-    error = turns(times).inv() * rotation_of(attitudes)
-    level, white = fitting.whiteness(error.as_rotvec().T)
-    found = turns(even)
-    if white and fitting.EXACT < level < fitting.LARGEST:
-        notes.append(f'the attitudes are exact but for noise of {level:.3g} rad: graded without '
-                     'it')
-    else:
-        found = found * RotationSpline(times, error)(even)
-    angle = float(abs(motion.start.l3 / motion.top.lambda3)) * (even[1] - even[0])
-    readings = {'attitudes': np.roll(found.as_quat(), 1, axis=1)}
-    for name, (at, values) in parts.items():
-        if angle < COARSE or (len(at) == len(even) and np.max(np.abs(at - even)) < SAME_S):
-            readings[name] = make_interp_spline(at, values, DEGREE)(even)
-        else:
-            notes.append(f'{name}: not at the times of the attitudes, and the spin is '
-                         f'{angle:.2g} rad from one sample to the next: not compared')
-    return Trajectory.of({**readings, 'covariance': recorded.covariance}, even)
+def _with_motion(report: Report, recorded: files.Recorded, values: Mapping[str, Any],
+                 run: Any) -> Report:
+    """Return a report with the motion of a top beside the exact one."""
+    bodies, _ = stretches({'attitudes': recorded.parts['attitudes']})
+    body = max(bodies, key=lambda one: len(one.t))
+    noise = body.sigma['attitudes']
+    if run is not None:
+        truth = own_attitudes(run, 1e9 * body.t + recorded.origin_ns - run.epoch_ns)
+        worst = float(np.max((Rotation.from_quat(truth).inv() * body.rotation).magnitude()))
+        return replace(report, found=[*report.found, *_inaccurate(worst, noise)], marks={
+            **report.marks, 'total_error_deg': Mark(math.degrees(worst),
+                                                    math.degrees(TOLERANCE))})
+    top, start = Body.of(parameters.top_of(values)), parameters.start_state(values)
+    first, notes, told = Start.of(top, start), list(report.notes), body.rotation.as_quat()
+    begin = recorded.first_s if 0.0 <= recorded.first_s < 1.0 else 0.0
+    truth = solve(top, first, body.t[:EARLY] + begin).quaternion
+    if conventions.best(told[:EARLY], truth).after > START:
+        smoothed = Smoothed(body, 1)
+        at = smoothed.inner.start
+        first, begin = Start.at(top, told[at], smoothed.rates[0]), -float(body.t[at])
+        notes.append('another start than the one that is given: it is read off the first samples')
+    found = grade_trajectory({'attitudes': told}, top, first, times=body.t + begin,
+                             tolerance=TOLERANCE + NOISES * noise, subject='the motion')
+    faults = found.found if noise < EXACT else [*_inaccurate(math.radians(
+        found.measures['total_error_deg: the motion']), noise)]
+    names = {one.name for one in report.found}
+    return replace(report, notes=notes, marks={**found.marks, **report.marks}, found=[
+        *report.found, *(one for one in faults if one.name != 'convention' or one.name not in
+                         names)])
 
 
-def _evenly(grid: Reals, notes: list[str]) -> Reals:
-    """Return times, made evenly spaced.  Raises ValueError if they are too few."""
-    if len(grid) < LEAST_SAMPLES:
-        raise ValueError(f'{len(grid)} times at which there are attitudes and readings: must be '
-                         f'{LEAST_SAMPLES} at least')
-    even: Reals = np.linspace(grid[0], grid[-1], len(grid))
-    if np.max(np.abs(even - grid)) < EVEN * (even[1] - even[0]):
-        return grid
-    notes.append('stamps are not evenly spaced: interpolated')
-    return even
-
-
-def _longest(name: str, at: Reals, values: Reals, notes: list[str]) -> tuple[Reals, Reals]:
-    """Return the longest part without a gap."""
-    gaps = np.flatnonzero(np.diff(at) > GAP * np.median(np.diff(at))) + 1
-    if len(gaps):
-        notes.append(f'{name}: the longest part without a gap is used')
-    chosen = max(np.split(np.arange(len(at)), gaps), key=len)
-    return at[chosen], values[chosen]
+def _inaccurate(worst: float, noise: float) -> list[Finding]:
+    return [Finding('inaccurate', f'the attitude is up to {math.degrees(worst):.3g} deg off',
+                    math.degrees(worst))] if worst > TOLERANCE + NOISES * noise else []
 
 
 main = partial(cli.run, 'grade', __doc__, add_arguments, _run)

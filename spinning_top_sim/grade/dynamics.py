@@ -7,31 +7,33 @@ its own attitudes and rates, would cause.  Errors do not add up there, so that t
 every motion, and for every size of the error.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
-from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.grade.motion import MARGIN, Motion
-from spinning_top_sim.grade.regression import NEAR, Cause, explain, instead, listed, pooled
+from spinning_top_sim.grade.effects import STANDARD_GRAVITY
+from spinning_top_sim.grade.motion import Motion
 from spinning_top_sim.grade.scenes import Body, Reals
-from spinning_top_sim.tools.verdict import Fault
+from spinning_top_sim.grade.sensors import GRAVITY_BAND, listed
+from spinning_top_sim.tools.identify import NEAR, Cause, explain, instead, pooled, rms
+from spinning_top_sim.tools.report import Finding
 
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
 UNIMPORTANT = 1e-4  # of the angular acceleration: its error is in the attitudes
 EXPLAINED = 0.25    # of the discrepancy is left at most
-WRONG_ENERGY = 0.1  # of the change of the potential energy
+SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 
 
-def faults_of(motions: Sequence[Motion], dt: float) -> list[Fault]:
+def faults_of(motions: Sequence[Motion], dt: float) -> list[Finding]:
     """Return the causes of the error of motions."""
     body = motions[0].body
     target, effects = pooled(_terms(motion, dt) for motion in motions)
     if rms(target) < UNIMPORTANT:
         return []
-    faults, residual = explain(target, effects, [
+    pairs, residual = explain(target, effects, [
         Cause(['gyroscopic'], _gyroscopic), Cause(['gyroscopic step', 'gravity step'], _step),
         Cause(['gyroscopic', 'in world'], instead(
             'inertia_frame', 'the gyroscopic term is that of moments of inertia about axes of the '
@@ -39,26 +41,15 @@ def faults_of(motions: Sequence[Motion], dt: float) -> list[Fault]:
         Cause(['damping', 'axis damping'], _damping),
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
         Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
-    return faults if rms(residual) < EXPLAINED * rms(target) else []
-
-
-def energy_fault(motion: Motion) -> Iterator[Fault]:
-    """Yield a fault if the energy that is told, but for a constant, is not that of the motion."""
-    told, data = motion.trajectory.energy, motion.data
-    if told is None or (constants := data.constants(motion.body)) is None:
-        return
-    potential = motion.body.gravity_torque * data.height
-    share = float(np.ptp(told[MARGIN:-MARGIN] - constants[0]) / (np.ptp(potential) or 1.0))
-    if share > WRONG_ENERGY:
-        yield Fault('energy', f'{motion.name}: the energy told differs from that of attitude and '
-                    f'rates by up to {100.0 * share:.3g} % of the change of the potential energy',
-                    share)
+    explained = rms(residual) < EXPLAINED * rms(target)
+    return [fault for _, fault in pairs if fault.name and explained]
 
 
 def _terms(motion: Motion, dt: float) -> tuple[Reals, Mapping[str, Reals]]:
     """Return the angular acceleration that is not explained (N, 3), and effects of causes."""
-    body, step, w = motion.body, motion.trajectory.step, motion.rates
-    rotation, inertia, axes = motion.trajectory.rotation[MARGIN:-MARGIN], body.inertia, np.eye(3)
+    body, step, w = motion.body, motion.trajectory.step, motion.smoothed.rates
+    rotation, inertia = motion.stretch.rotation[motion.smoothed.inner], body.inertia
+    axes = np.eye(3)
     z, world = rotation.inv().apply((0.0, 0.0, 1.0)), rotation.apply(w)
     gyroscopic = -np.cross(w, w * inertia) / inertia
     arms = [-body.mass * body.gravity * np.cross(axis, z) / inertia for axis in axes]
@@ -81,41 +72,46 @@ def _terms(motion: Motion, dt: float) -> tuple[Reals, Mapping[str, Reals]]:
         name: size * effect for name, effect in effects.items()}
 
 
-def _gyroscopic(found: Reals) -> Fault | None:
+def _gyroscopic(found: Reals) -> Finding | None:
     share = 1.0 + float(found[0])
     if share >= NEAR:               # `_inertia` tells the moments
         return None
-    return Fault('no_gyroscopic_term' if share > -NEAR else 'coriolis_sign',
+    return Finding('no_gyroscopic_term' if share > -NEAR else 'coriolis_sign',
                  f'the gyroscopic term w x I w has {share:.3g} times its size', share)
 
 
-def _step(found: Reals) -> Fault:
+def _step(found: Reals) -> Finding:
     at, gravity_at = (0.5 + found).tolist()
     name, means = (('first_order', f'gravity at {gravity_at:.3g}') if
                    abs(found[0]) < 0.5 * abs(found[1]) else
                    ('implicit_damping', 'it removes energy') if at > 0.5 else
                    ('explicit_gyroscopic_term', 'it adds energy') if at > -0.5 else
                    ('coriolis_sign', 'its derivative in an implicit step has the wrong sign'))
-    return Fault(name, f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right '
+    return Finding(name, f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right '
                  f'is 0.5: {means}', at)
 
 
-def _damping(found: Reals) -> Fault:
+def _damping(found: Reals) -> Finding:
     across, along = found.tolist()
-    return Fault('damping', f'a torque against the rates, {across:.3g} 1/s of them across the '
+    return Finding('damping', f'a torque against the rates, {across:.3g} 1/s of them across the '
                  f'axis and {along:.3g} 1/s about it', across)
 
 
-def _com(body: Body, found: Reals) -> Fault:
+def _com(body: Body, found: Reals) -> Finding:
     com = found + body.com
     text = f'the torque of gravity is that of a centre of mass at ({listed(com)}) m, not at ' \
         f'({listed(body.com)}) m'
+    gravity = body.gravity * com[2] / (body.com_distance or math.inf)
+    if abs(gravity / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND and np.linalg.norm(com[:2]) < (
+            SIDEWAYS * np.linalg.norm(found)):
+        return Finding('gravity', f'the torque is that of gravity of {gravity:.5g} m/s^2, not '
+                       f'{body.gravity:.5g} m/s^2', float(gravity))
     if np.linalg.norm(com + body.com) < 0.1 * abs(body.com_distance):
-        return Fault('gravity_sign', f'{text}: gravity points upwards', -1.0)
-    return Fault('com_offset', text, float(np.linalg.norm(found)))
+        return Finding('gravity_sign', f'{text}: gravity points upwards', -1.0)
+    return Finding('com_offset', text, float(np.linalg.norm(found)))
 
 
-def _inertia(body: Body, found: Reals) -> Fault | None:
+def _inertia(body: Body, found: Reals) -> Finding | None:
     shares = 1.0 + found[:2]
     if np.any(shares <= 0.0):
         return None
@@ -123,6 +119,6 @@ def _inertia(body: Body, found: Reals) -> Fault | None:
     # The others are changes of (I2 - I3)/I1 and (I3 - I1)/I2; each of them tells I3.
     right = (body.lambda1 - body.lambda3) / body.lambda1
     third = 0.5 * (second - first * (right + found[2]) + first + second * (found[3] - right))
-    return Fault('inertia', 'the motion is that of moments of inertia '
+    return Finding('inertia', 'the motion is that of moments of inertia '
                  f'{listed((first, second, third))} kg m^2, not {listed(body.inertia)}',
                  float(first))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a simulator returns, checked, beside the exact motion: errors, drifts, rates."""
+"""What a simulator returns, checked, beside the exact motion."""
 
 import math
 from collections.abc import Mapping
@@ -7,21 +7,17 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
-from scipy.ndimage import correlate1d
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.scenes import Body, Reals, Start, rotation_of
-from spinning_top_sim.physics.states import States, relative_drift
+from spinning_top_sim.grade.scenes import Body
+from spinning_top_sim.physics.states import relative_drift
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.tools.analysis import Attitudes, measure
+from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, white
 
-# Columns of each part.
-_PARTS = {'attitudes': (4,), 'rates': (3,), 'accelerations': (3,), 'gyroscope': (3,),
-          'magnetometer': (3,), 'increments': (6,), 'energy': ()}
-LEAST_SAMPLES = 20
-# Sixth-order central differences, for samples -3 .. 3.
-_WEIGHTS = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
-MARGIN = 3
+READINGS = 'rates', 'gyroscope', 'accelerations', 'magnetometer'
+LEAST_SAMPLES = 30
+NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 
 
 class InvalidTrajectoryError(ValueError):
@@ -38,16 +34,11 @@ class Trajectory:
     t : (n,) array
         Times [s].
     attitudes : (n, 4) array
-        q(world <- body) as w, x, y, z.
+        q(world <- body) as x, y, z, w.
     rates : (n, 3) array, optional
         Angular velocity in the body frame [rad/s].
-    accelerations, gyroscope, magnetometer : (n, 3) array, optional
-        Readings in the frame of the IMU [m/s^2, +g upwards at rest], [rad/s], [T].
-    increments : (n, 6) array, optional
-        Rotation [rad] and velocity [m/s] in the frame of the IMU over the interval that ends at
-        each time; the first row is not used.
-    energy : (n,) array, optional
-        Kinetic and potential energy, but for a constant [J].
+    gyroscope, accelerations, magnetometer : (n, 3) array, optional
+        Readings in the frame of the IMU [rad/s], [m/s^2, +g upwards at rest], [T].
     covariance : mapping, optional
         Covariances (3, 3) that the simulator tells of 'gyroscope' and 'accelerations'; a single
         matrix is meant for both.
@@ -56,22 +47,17 @@ class Trajectory:
     t: Reals
     attitudes: Reals
     rates: Reals | None = None
-    accelerations: Reals | None = None
     gyroscope: Reals | None = None
+    accelerations: Reals | None = None
     magnetometer: Reals | None = None
-    increments: Reals | None = None
-    energy: Reals | None = None
     covariance: Mapping[str, Reals] = field(default_factory=dict)
-    step: float = field(init=False)             # [s]
-    rotation: Rotation = field(init=False)      # world <- body
 
     @classmethod
     def of(cls, said: Any, times: Any = None) -> Self:
         """Return what a run has said, by default at its `t`.  Raises InvalidTrajectoryError."""
-        if hasattr(said, 'attitudes'):
-            said = {name: getattr(said, name, None) for name in (*_PARTS, 't', 'covariance')}
-        elif not isinstance(said, Mapping):
-            said = {'attitudes': said}
+        if not isinstance(said, Mapping):
+            said = {name: getattr(said, name, None) for name in cls.__dataclass_fields__} if (
+                hasattr(said, 'attitudes')) else {'attitudes': said}
         said = {str(name): part for name, part in said.items() if part is not None}
         if 'attitudes' not in said:
             raise InvalidTrajectoryError(f'what is returned has {sorted(said) or "nothing"}: must '
@@ -86,26 +72,34 @@ class Trajectory:
         for at in np.flatnonzero(~(np.abs(steps - usual) <= 1e-3 * usual) | (steps <= 0.0))[:1]:
             raise InvalidTrajectoryError(f'times[{at + 1}] - times[{at}] = {steps[at]:g} s where '
                                          f'{usual:g} s is usual: must be equally spaced, > 0')
-        parts = {name: _numbers(name, said[name], (len(t), *columns))
-                 for name, columns in _PARTS.items() if name in said}
-        attitudes = parts.pop('attitudes')
+        attitudes = _numbers('attitudes', said['attitudes'], (len(t), 4))
         norms = np.linalg.norm(attitudes, axis=1, keepdims=True)
-        for at in np.flatnonzero(~(np.abs(norms - 1.0) < 1e-2)):
+        for at in np.flatnonzero(~(np.abs(norms - 1.0) < NORM))[:1]:
             raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
                                          'must be 1')
-        told = said.get('covariance')
+        told = said.get('covariance', {})
         if not isinstance(told, Mapping):
-            told = {} if told is None else {'gyroscope': told, 'accelerations': told}
+            told = {'gyroscope': told, 'accelerations': told}
         if others := [*map(str, told.keys() - {'gyroscope', 'accelerations'})]:
             raise InvalidTrajectoryError(f'covariance of {", ".join(others)}: must be of gyroscope'
                                          ' or accelerations')
-        return cls(t, attitudes / norms, **parts, covariance={
-            name: _numbers(f'covariance of {name}', matrix, (3, 3))
-            for name, matrix in told.items()})
+        return cls(t, attitudes / norms, **{
+            name: _numbers(name, said[name], (len(t), 3)) for name in READINGS if name in said},
+            covariance={name: _numbers(f'covariance of {name}', matrix, (3, 3))
+                        for name, matrix in told.items()})
 
-    def __post_init__(self) -> None:
-        self.step = float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
-        self.rotation = rotation_of(self.attitudes)
+    @property
+    def step(self) -> float:
+        """Interval between samples [s]."""
+        return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
+
+    def stretch(self, rates: Reals | None = None) -> Stretch:
+        """Return the motion with its readings; `rates` are those of the motion if not None."""
+        readings = {name: values for name in READINGS
+                    if (values := getattr(self, name)) is not None}
+        return Stretch(self.t, Rotation.from_quat(self.attitudes), np.zeros((len(self.t), 3)),
+                       readings, {name: white(values, jumps=False)
+                                  for name, values in readings.items()}, rates=rates)
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
@@ -121,86 +115,53 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
     return numbers
 
 
-def errors_by_angle(rotation: Rotation, truth: Rotation) -> dict[str, Reals]:
-    """
-    Return the angle between attitudes world <- body (n,), and its parts [rad].
-
-    precession : about the vertical, times sin(theta); nutation : of theta; spin : about the axis
-    """
-    axes = [one.apply((0.0, 0.0, 1.0)).T for one in (rotation, truth)]
-    tip, right = (x + 1j * y for x, y, _ in axes)
-    tilt, right_tilt = (np.arctan2(np.hypot(x, y), z) for x, y, z in axes)
-    between = truth.inv() * rotation
-    _, _, z, w = between.as_quat().T
-    return {'total': between.magnitude(),
-            'precession': np.unwrap(np.angle(tip * np.conj(right))) * np.abs(right),
-            'nutation': tilt - right_tilt, 'spin': np.unwrap(2.0 * np.arctan2(z, w))}
-
-
-@dataclass
 class Motion:
-    """A motion beside the exact one from the same state."""
+    """
+    A motion beside the exact one from the same state.
 
-    name: str
-    body: Body
-    start: Start
-    trajectory: Trajectory
-    derived: bool = True        # the rates are from the attitudes, as before `use_told_rates`
-    solution: ExactSolution = field(init=False)
-    truth: States = field(init=False)               # of it, at the times of the trajectory
-    errors: Mapping[str, Reals] = field(init=False)     # as of `errors_by_angle`
-    worst: float = field(init=False)                # total error [rad]
-    # In the body, at all samples but MARGIN at each end (n - 6, 3) [rad/s].
-    rates: Reals = field(init=False)
+    errors : angles to the exact attitudes (n,) [rad]
+    smoothed : what the body does, by its attitudes or by the rates told
+    """
 
-    def __post_init__(self) -> None:
-        self.solution = ExactSolution(self.body, self.start.state_of(self.body))
-        self.truth = self.solution.states_at_seconds(self.trajectory.t)
-        right = Rotation.from_quat(self.truth.quaternion)
-        self.errors = errors_by_angle(self.trajectory.rotation, right)
-        self.worst = float(np.max(self.errors['total']))
-        # The rotation from the exact attitudes turns slowly.
-        error, n = right.inv() * self.trajectory.rotation, len(self.trajectory.t) - 2 * MARGIN
-        here = error[MARGIN:-MARGIN].inv()
-        total = sum(weight * (here * error[at:at + n]).as_rotvec()
-                    for at, weight in enumerate(_WEIGHTS) if weight)
-        self.rates = total / self.trajectory.step + here.apply(
-            self.truth.angular_velocity[MARGIN:-MARGIN])
-
-    def use_told_rates(self, in_world: bool) -> None:
-        """Make the rates told those of the motion; `in_world` : they are in axes of the world."""
-        told = self.trajectory.rates
-        if told is not None:
-            rates = self.trajectory.rotation.inv().apply(told) if in_world else told
-            self.derived, self.rates = False, rates[MARGIN:-MARGIN]
+    def __init__(self, name: str, body: Body, start: State, trajectory: Trajectory) -> None:
+        self.name, self.body, self.start, self.trajectory = name, body, start, trajectory
+        self.solution = ExactSolution(body, start)
+        self.truth: Reals = self.solution.states_at_seconds(trajectory.t).quaternion
+        self.stretch: Stretch = trajectory.stretch()
+        self.smoothed = Smoothed(self.stretch, 1)
+        rotation = self.stretch.rotation
+        self.errors: Reals = (Rotation.from_quat(self.truth).inv() * rotation).magnitude()
 
     @property
-    def angular_accelerations(self) -> Reals:
-        """In the body (n - 12, 3) [rad/s^2]."""
-        inner = slice(MARGIN, -MARGIN)
-        total = correlate1d(self.rates - self.truth.angular_velocity[inner], _WEIGHTS, axis=0)
-        return (total / self.trajectory.step + self.truth.angular_acceleration[inner])[inner]
+    def worst(self) -> float:
+        """The largest error [rad]."""
+        return float(np.max(self.errors))
+
+    def use_rates(self, told: bool, in_world: bool) -> None:
+        """Take rates from the attitudes, or those told; `in_world` : these are in its axes."""
+        rates = self.trajectory.rates if told else None
+        if rates is not None and in_world:
+            rates = self.stretch.rotation.inv().apply(rates)
+        self.stretch = self.trajectory.stretch(rates)
+        self.smoothed = Smoothed(self.stretch, 1)
 
     @property
-    def data(self) -> Attitudes:
-        """Attitudes and rates."""
-        part = self.trajectory.rotation[MARGIN:-MARGIN].as_quat()
-        stamps = np.rint(1e9 * self.trajectory.t[MARGIN:-MARGIN]).astype(np.int64)
-        return Attitudes(stamps, np.vstack((part.T, self.rates.T)))
+    def slack(self) -> float:
+        """By how much readings may differ from attitudes: half a step may be between them."""
+        first, second = self.stretch.rotation[0], self.stretch.rotation[1]
+        told = self.stretch.rates is not None
+        return 0.0 if told else float(0.5 * (first.inv() * second).magnitude()) ** 2
 
     @property
     def marks(self) -> dict[str, float]:
-        """The measures; docs/grade.md defines them."""
-        marks = {f'{name}_error_deg': math.degrees(float(np.max(np.abs(values))))
-                 for name, values in self.errors.items()}
+        """The largest error, and the largest relative changes of the constants of the motion."""
+        body, w = self.body, self.smoothed.rates
+        up = self.smoothed.turn[:, 2]
+        momenta = w * body.inertia
+        values = {'energy': 0.5 * np.sum(momenta * w, axis=1) + body.gravity_torque * up[:, 2],
+                  'l3': momenta[:, 2], 'lz': np.sum(momenta * up, axis=1)}
         first = self.solution.states_at_seconds(np.zeros(1))
-        for name, values in zip(('energy', 'l3', 'lz'), self.data.constants(self.body) or (),
-                                strict=True):
-            marks[f'{name}_drift'] = float(np.max(np.abs(relative_drift(
-                values, float(getattr(first, name)[0])))))
-        exact = self.solution.describe()
-        found = measure(self.data, exact.nutation_period)
-        for name in ('nutation_period', 'mean_precession_rate'):
-            value, right = getattr(found, name), getattr(exact, name)
-            marks[f'{name}_error'] = value / right - 1.0 if value and right else math.nan
-        return marks
+        return {'total_error_deg': math.degrees(self.worst), **{
+            f'{name}_drift': float(np.max(np.abs(relative_drift(
+                value, float(getattr(first, name)[0]))))) for name, value in values.items()}}
+

@@ -6,8 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from spinning_top_sim.grade.grader import grade
-from spinning_top_sim.grade.report import Report
-from spinning_top_sim.tools.verdict import passing
+from spinning_top_sim.tools.report import Report, passing
 
 
 @pytest.fixture

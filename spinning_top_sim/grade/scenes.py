@@ -3,54 +3,32 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim import solve
+from spinning_top_sim.grade.effects import Imu
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.vertical import state_of
-
-Reals = NDArray[np.float64]
-
-
-def rotation_of(quaternions: ArrayLike) -> Rotation:
-    """Return the rotation of quaternions (4,) or (n, 4) as w, x, y, z, the order of this room."""
-    return Rotation.from_quat(np.roll(quaternions, -1, axis=-1))
+from spinning_top_sim.tools.kinematics import Reals
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body(Top):
+class Body(Imu, Top):
     """
     A top with an IMU on it.  The pivot is the origin of the body frame, e3 the axis.
 
-    Parameters
-    ----------
-    lambda1, lambda3, mass, com_distance, gravity : float
-        As of `Top`.
-    lever_arm : (3,) float
-        Position of the IMU in the body frame [m].
-    mounting : (4,) float
-        q(body <- IMU) as w, x, y, z.
-    field : (3,) float
-        Magnetic field in the world [T].
-    gyroscope_noise_density, accelerometer_noise_density : float
-        Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
-        sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
+    It has the parameters of `Top` and of `Imu`; lever arm and field are known here.
     """
 
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    mounting: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     field: tuple[float, float, float] = (0.0, 20e-6, -43e-6)
-    gyroscope_noise_density: float | None = None
-    accelerometer_noise_density: float | None = None
 
     def __post_init__(self) -> None:
-        top = Top(**{one.name: getattr(self, one.name) for one in fields(Top)})
-        vars(self).update(vars(top))        # numbers that were given as text
+        vars(self).update(vars(Top(**{one.name: getattr(self, one.name) for one in fields(Top)})))
         for name, length in (('lever_arm', 3), ('mounting', 4), ('field', 3)):
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (length,) or not np.all(np.isfinite(value)):
@@ -65,7 +43,7 @@ class Body(Top):
 
     @classmethod
     def of(cls, top: Top, **imu: object) -> Self:
-        """Return the body of a top; `imu` are the other parameters, by default those above."""
+        """Return the body of a top; `imu` are the parameters of `Imu`, by default those above."""
         return top if isinstance(top, cls) and not imu else cls(**{**vars(top), **imu})
 
     @property
@@ -84,38 +62,38 @@ class Body(Top):
         return 0.0, 0.0, self.com_distance
 
 
-@dataclass(frozen=True)
-class Start:
+@dataclass(frozen=True, kw_only=True)
+class Start(State):
     """
-    How the top starts.
+    A start state with what engines need.
 
     Parameters
     ----------
     attitude : (4,) float
-        q(world <- body) as w, x, y, z; z of the world points up.
+        q(world <- body) as x, y, z, w; z of the world points up.
     rates : (3,) float
         Angular velocity in the body frame [rad/s].
-    state : State, optional
-        The same in Euler angles and momenta; `of` and `state_of` convert.
     """
 
     attitude: tuple[float, float, float, float]
     rates: tuple[float, float, float]
-    state: State | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        State(**{one.name: getattr(self, one.name) for one in fields(State)})
 
     @classmethod
     def of(cls, top: Top, state: State) -> Self:
         """Return the start of a state."""
-        first = ExactSolution(top, state).states_at_seconds(np.zeros(1))
-        return cls(tuple(np.roll(first.quaternion[0], 1).tolist()),
-                   tuple(first.angular_velocity[0].tolist()), state)
+        first = solve(top, state, np.zeros(1))
+        return cls(**{one.name: getattr(state, one.name) for one in fields(State)},
+                   attitude=tuple(first.quaternion[0].tolist()),
+                   rates=tuple(first.angular_velocity[0].tolist()))
 
-    def state_of(self, top: Top) -> State:
-        """Return `state`, or else the start as a state of `top`."""
-        if self.state is not None:
-            return self.state
-        turn = rotation_of(self.attitude)
-        return state_of(top, turn.as_quat(), turn.apply(self.rates))
+    @classmethod
+    def at(cls, top: Top, attitude: Reals, rates: Reals) -> Self:
+        """Return the start of an attitude x, y, z, w and rates in the body."""
+        world = Rotation.from_quat(attitude).apply(rates)
+        return cls.of(top, state_of(top, np.asarray(attitude), world))
 
 
 @dataclass(frozen=True)
@@ -148,7 +126,7 @@ class Scene:
 
 # The bicycle wheel of config/cusp.yaml, with an IMU off its axis.
 WHEEL = Body(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665,
-             lever_arm=(0.12, -0.05, 0.2), mounting=(0.8, 0.4, -0.2, 0.4),
+             lever_arm=(0.12, -0.05, 0.2), mounting=(0.4, -0.2, 0.4, 0.8),
              gyroscope_noise_density=0.0, accelerometer_noise_density=0.0)
 TILT = math.radians(30.0)
 # As in config/, but for the last two: one passes the upward vertical, one spins at 60 rad/s.

@@ -1,245 +1,510 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Compares readings of an IMU with the motion that the same simulator tells.
+Compares readings with the motion of the same simulator or recording, and names what is wrong.
 
-A reading is fitted with its physical terms: for the accelerometer gravity, a x r and w x (w x r).
-The error of the motion does not matter.  What remains is the discrepancy.  Its white noise is
-measured by sixth differences, in which motions vanish: `floor` is its rms in all motions together,
-and `most` what it may be at most.
+A reading is fitted with its physical terms: for the accelerometer gravity, the acceleration of the
+origin, a x r and w x (w x r).  As few causes as possible explain what remains, by least squares.
+What is found and can be undone without a loss (a delay, other axes, another unit) is undone, and
+the rest is looked for again.
 """
 
 import math
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam.measures import rms
-from spinning_top_sim.grade import regression
-from spinning_top_sim.grade.motion import Motion
-from spinning_top_sim.grade.readings import FORCES, Readings, readings_of
-from spinning_top_sim.grade.regression import NEAR, Cause, beyond, fitted, instead, listed, pooled
-from spinning_top_sim.grade.scenes import Body, Reals
-from spinning_top_sim.tools.verdict import Fault
+from spinning_top_sim.grade.effects import (
+    ANGLES,
+    ENTRIES,
+    PERMUTATIONS,
+    STANDARD_GRAVITY,
+    Compared,
+    Comparison,
+    Imu,
+)
+from spinning_top_sim.tools.identify import NEAR, Cause, Judge, beyond, explain, instead, rms
+from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch
+from spinning_top_sim.tools.report import Finding, Mark
 
-
-class Kind(NamedTuple):
-    """A kind of readings."""
-
-    units: Sequence[float]          # factors of other units
-    strange: float = 2e-3           # discrepancy beyond the noise for which a cause is looked for
-    in_world: str = 'reading_in_world'      # faults in axes of the world, of size and of sign
-    scale: str = 'reading_scale'
-    sign: str = 'reading_sign'
-    density: str = ''               # parameter of the body: the density of the noise
-
-
-_DEGREES, _G = (180.0 / math.pi, math.pi / 180.0), (1.0 / 9.80665,)
-# Rates may be those of the middle of a step; velocities are means over a step, compared with those
-# of its ends: a larger discrepancy is not strange.
-KINDS = {
-    'rates': Kind(_DEGREES, 2e-2, 'rates_in_world', 'rates_scale', 'rates_scale'),
-    'gyroscope': Kind(_DEGREES, in_world='rates_in_world', density='gyroscope_noise_density'),
-    'accelerations': Kind(
-        _G, scale='acceleration_scale', density='accelerometer_noise_density'),
-    'magnetometer': Kind((1e4, 1e6, 1e9)),
-    'rotations': Kind(_DEGREES),
-    'velocities': Kind(_G, 5e-2)}
-# Discrepancies and noise are relative to the rms of the reading.
-_SIXTH = math.comb(12, 6)   # sum of the squares of the coefficients of a sixth difference
-# The rms of white noise by n of them has this over sqrt(n) as its relative standard deviation:
-# neighbours are correlated by math.comb(12, 6 + k) / _SIXTH.
-_SPREAD = math.sqrt(0.5 * math.comb(24, 12)) / _SIXTH
-SAME_POWER = 1.05           # of the noise, by which it may be larger besides
-LAGS = range(-3, 31)        # lags that are tried [samples]
-LATE = 0.75                 # lag from which on it is a fault [steps]
-CONSISTENT = 1e-3           # discrepancy below which no lag is looked for
-# A turn of the axes leaves at most these shares of the discrepancy, and of what causes leave.
-TURNED, TURNED_RATHER = 0.02, 0.1
-UNEXPLAINED = 0.5           # share that causes leave where they explain nothing
-NOISY = 1e-4                # smaller noise is rounding
-NOISE_BAND = 0.05           # share by which noise may differ from what is declared
-FOUR_SIGMA = 4.0            # standard deviations by which its measurement may differ besides
+_ANGLE = {'deg/s': 180.0 / math.pi, 'rad/s, taken for deg/s': math.pi / 180.0}
+# By kind: the factors of other units by name; the unit of a reading.
+UNITS = {'rates': _ANGLE, 'gyroscope': _ANGLE, 'accelerations': {'g': 1.0 / STANDARD_GRAVITY},
+         'magnetometer': {'gauss': 1e4, 'mT': 1e3, 'uT': 1e6, 'nT': 1e9}}
+SI = {'gyroscope': 'rad/s', 'accelerations': 'm/s^2', 'magnetometer': 'T'}
+DENSITIES = {'gyroscope': 'gyroscope_noise_density',
+             'accelerations': 'accelerometer_noise_density'}
+# Terms of a specific force: what each is, and the fault where it is missing.
+TERMS = {'tangential': ('a x r', 'no_tangential_term'),
+         'centripetal': ('w x (w x r)', 'no_centripetal_term'),
+         'gravity': ('gravity', 'no_gravity'),
+         'linear': ('the acceleration of the origin', 'no_linear_acceleration'),
+         'lever': ('the lever arm', 'no_lever_arm'), 'motion': ('motion', 'no_acceleration')}
+OFFSETS = 'offset 0', 'offset 1', 'offset 2'
+LAGS = range(-5, 41)        # lags that are tried [samples]
+ENOUGH = 3                  # independent samples a column, from which on a lag can be told
+LATE = 0.75                 # lag from which on it is a fault [samples of the sensor]
+ROUNDING = 1e-5             # share of a reading from which on a lag is looked for
+SURE = 5.0                  # standard deviations from which on a number is not chance
+# Share of a reading from which on a discrepancy is strange: rates that are told may be those of
+# the middle of a step; a real device, where poses have noise, has errors that no simulator needs.
+STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
+UNEXPLAINED, ROUGH = 0.5, 0.3   # shares of a discrepancy, with noise of a reading, left at most
+CLEARLY = 10.0              # by which a term must exceed its noise to be missed
+MISSING = 0.05              # share of a whole reading that is none
+GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
+EARTH_FIELD = 15e-6, 90e-6  # [T]
+SAME_POWER = 1.05           # of noise, by which it may be larger besides
+NOISE_BAND, NOISY = 0.05, 1e-4  # by which noise may differ from what is declared; is rounding
 LEAST_KURTOSIS = 2.4        # of normal noise; it is 3, and 1.8 of uniform noise
+FOUR_SIGMA = 4.0            # standard deviations by which a measured noise may differ besides
+TELLS = 0.5                 # uncertainty of a share of a term up to which its fault can be told
+SIXTH = 6                   # order of the differences by which noise is judged
+# The relative standard deviation of white noise by n of them, times sqrt(n).
+_SPREAD = math.sqrt(0.5 * math.comb(4 * SIXTH, 2 * SIXTH)) / math.comb(2 * SIXTH, SIXTH)
 
 
-def judge(kind: str, motions: Sequence[Motion]) -> tuple[list[Fault], dict[str, float]]:
-    """Return faults and measures of the readings of one of KINDS."""
-    runs = [run for motion in motions if (run := readings_of(kind, motion))]
-    if not runs:
-        return [], {}
-    # Velocities are means over a step.
-    lag, late = (0, 0.0) if kind == 'velocities' else _lag(runs)
-    wrong, effects = zip(*(run.at_lag(lag) for run in runs), strict=True)
-    target, sizes = np.concatenate(wrong), np.array([run.size for run in runs])
-    noise, floor = np.array([*map(_white, wrong)]), _white(*wrong)
-    doubt = FOUR_SIGMA * _SPREAD / math.sqrt(target.size)       # the relative error of the noise
-    most = floor * math.sqrt(SAME_POWER + 2.0 * doubt)
-    marks = {f'{kind}_lag_steps': late, f'{kind}_noise': float(np.mean(sizes * noise)),
-             f'{kind}_discrepancy': beyond(target, most)}
-    faults = []
-    if abs(late) > LATE:
-        faults.append(Fault('imu_one_step_late', 'readings belong to the motion of '
-                            f'{abs(late):.3g} steps {"before" if late > 0.0 else "after"}', late))
-    found, residual, explained = _find_causes(
-        kind, motions, *pooled(zip(wrong, effects, strict=True)), floor, most)
-    faults += found
-    if explained and KINDS[kind].density and not any(
-            fault.name in ('units', 'reading_scale') for fault in faults):
-        noises = [size * rest for size, rest in zip(
-            sizes, np.split(residual, np.cumsum([*map(len, wrong)])[:-1]), strict=True)]
-        # A cause that is found has taken fast motion away, or has left some.
-        level = float(np.mean(np.minimum(sizes * noise, [*map(_white, noises)])))
-        faults += _noise_faults(kind, motions[0], level, level > NOISY * sizes[0],
-                                np.concatenate(noises), NOISE_BAND + doubt)
-    return [fault._replace(evidence=f'{kind}: {fault.evidence}') for fault in faults], marks
+class Judged(NamedTuple):
+    """Faults, marks by name, and notes on what could not be told."""
+
+    faults: list[Finding]
+    marks: dict[str, Mark]
+    notes: list[str]
 
 
-def _find_causes(kind: str, motions: Sequence[Motion], target: Reals, effects: Mapping[str, Reals],
-                 floor: float, most: float) -> tuple[list[Fault], Reals, bool]:
-    """Return the causes of a discrepancy, what they leave of it, and whether that is noise."""
-    before, strange = beyond(target, most), KINDS[kind].strange
-    if motions[0].derived and kind != 'rates':
-        # Rates of the attitudes may be half a step apart from those of the simulator.
-        firsts = (motion.trajectory.rotation[:2] for motion in motions)
-        strange += max(float(0.5 * (a.inv() * b).magnitude()) ** 2 for a, b in firsts)
-    if before <= strange:
-        return [], target, True
-    faults, residual = regression.explain(target, effects, _causes(kind, motions[0].body),
-                                          math.hypot(floor, 0.5 * strange))
-    mounted, left = _mounted(target, effects['total'])
-    if beyond(left, most) < min(TURNED * before, TURNED_RATHER * beyond(residual, most)):
-        faults, residual = mounted, left
-    rest = beyond(residual, most)
-    if explained := rest <= max(UNEXPLAINED * before, strange):
-        return faults, residual, explained
-    name = 'rates_scale' if kind == 'rates' else 'inconsistent_reading'
-    text = f'{100.0 * rest:.3g} % of the reading is not that of the motion'
-    return [*faults, Fault(name, text, rest)], residual, explained
+def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
+          exact_gravity: bool = True, covariance: Reals | None = None,
+          slack: float = 0.0) -> Judged:
+    """
+    Return what is wrong with the readings of a kind.
+
+    exact_gravity : whether that of another place on Earth is a fault
+    covariance : (3, 3) that is declared
+    slack : share by which readings may differ, since the motion is known no better
+    """
+    comparison, judged = Comparison(kind, stretches, imu, gravity), Judged([], {}, [])
+    if not comparison.smoothed:
+        return judged
+    lag, late, sigma, clear = _lag(comparison)
+    late, sigma = late * comparison.steps, sigma * comparison.steps
+    judged.marks[f'{kind}_lag_steps'] = Mark(late, LATE, _interval(sigma))
+    if clear and abs(late) > max(LATE, SURE * sigma):
+        judged.faults.append(Finding(
+            'late' if late > 0.0 else 'early', f'the readings belong to the motion of '
+            f'{abs(late):.3g} steps ({1e3 * abs(late) * comparison.own_step:.3g} ms) '
+            f'{"before" if late > 0.0 else "after"}', late))
+    for last in (False, False, True):
+        compared = comparison.compare(lag)
+        causes = Causes(comparison, compared, exact_gravity, slack)
+        found, residual = causes.find()
+        undone = [fault for fault in found if fault.evidence in causes.undo and not last]
+        judged.faults.extend(fault for fault in undone or found if fault.name)
+        if not undone:
+            break
+        comparison.undo(causes.undo[undone[0].evidence])
+    judged.marks.update(_marks(comparison, compared, lag))
+    if kind in DENSITIES:
+        if {'reading_scale', 'inaccurate', 'matrix'}.isdisjoint(fault.name for fault in found):
+            judged.faults.extend(_noise_faults(comparison, residual, covariance))
+        judged.notes.extend(_untold(comparison, compared))
+    return Judged([fault._replace(evidence=f'{kind}: {fault.evidence}')
+                   for fault in judged.faults], judged.marks, judged.notes)
 
 
-def _mounted(target: Reals, total: Reals) -> tuple[list[Fault], Reals]:
-    """Return the fault that the axes are not those of the IMU, and what it leaves (m, 3)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')     # vectors along one line allow many turns
-        turn, _ = Rotation.align_vectors(target + total, total)
-    text = f'the readings are in axes that are turned by ({listed(turn.inv().as_rotvec())}) rad'
-    return [Fault('mounting', f'{text} from those of the IMU', turn.magnitude())], (
-        target + total - turn.apply(total))
+def _interval(sigma: float) -> str:
+    return f'+- {1.96 * sigma:.2g}'
 
 
-def _noise_faults(kind: str, motion: Motion, noise: float, exists: bool, residual: Reals,
-                  band: float) -> Iterator[Fault]:
-    """Compare noise with what is declared and with normal noise; `band`: of the ratio to 1."""
-    density = getattr(motion.body, KINDS[kind].density)
-    covariance = motion.trajectory.covariance.get(kind)
-    root = math.sqrt(motion.trajectory.step)
+def _lag(comparison: Comparison) -> tuple[int, float, float, bool]:
+    """
+    Return by how many samples readings are late: as whole, with its fraction, and its deviation;
+    and whether that explains much.
+
+    The reading is fitted by all terms, of all axes, at each lag: what else is wrong does not
+    count.
+    """
+    unknown = 0, math.nan, math.inf, False
+    lags = [lag for lag in LAGS if 4 * abs(lag) < min(comparison.counts)]
+    part, designs, noises = slice(-lags[0], -lags[-1] or None), [], []
+    for smoothed in comparison.smoothed:
+        design, noise = _design(comparison, smoothed)
+        designs.append(design)
+        noises.append(noise)
+    best = 0
+    found: dict[int, tuple[float, float]] = {}
+    while comparison.leave_out(best, designs) or not found:
+        found = _misfits(comparison, lags, designs, noises, part)
+        before, best = best, min(found, key=lambda lag: found[lag][0])
+        if best == before:
+            break
+    count, size = 3 * sum(np.count_nonzero(good[part]) for good in comparison.good), rms(
+        comparison.sizes)
+    compared, width = comparison.compare(0), comparison.smoothed[0].width
+    # Of smoothed samples fewer are independent: they must be more than the columns.
+    if count < ENOUGH * 3 * width * designs[0].shape[1] or best in (lags[0], lags[-1]) or found[0][1] < count * (ROUNDING * size) ** 2 or rms(
+            compared.effects['total']) < CLEARLY * compared.noise['total']:
+        return unknown                          # every lag explains it
+    # Around its minimum the sum of squares is a parabola.
+    now, least, sooner, later = (found[lag][0] for lag in (0, best, best - 1, best + 1))
+    curvature = sooner - 2.0 * least + later
+    if curvature <= 0.0:
+        return unknown
+    late = best + 0.5 * (sooner - later) / curvature
+    less = 0.125 * (sooner - later) ** 2 / curvature
+    rest = max(found[best][1] - less, 0.0)
+    variance = rest / count * 2.0 * width       # of correlated noise
+    most = 1.5 * count * (compared.floor * size) ** 2
+    gained = now - least + less                 # which is that of a parabola, about
+    clear = bool(rest < 0.25 * found[0][1] or (
+        rest < most and gained > max((2.0 * SURE) ** 2 * variance,
+                                     0.05 * curvature * late ** 2)))
+    return best if clear else 0, late, math.sqrt(2.0 * variance / curvature), clear
+
+
+def _design(comparison: Comparison, smoothed: Smoothed) -> tuple[Reals, Reals]:
+    """Return columns of unit size that any reading may have, and how noise is in them."""
+    effects, noise = comparison.effects(smoothed), comparison.noises(smoothed)
+    names = [name for name in ('gravity', 'linear', 'world', *(
+        f'{name} {k}' for name in ('arm', 'turned arm', 'field') for k in range(3)))
+        if name in effects] + ['total'] * (comparison.kind in ANGLES)
+    design = np.hstack([*map(effects.__getitem__, names), np.ones((len(smoothed.rates), 1))])
+    sizes = np.linalg.norm(design, axis=0)
+    sizes[sizes == 0.0] = np.inf                # such as the part of a x r along r
+    # By axes: noise of the angular acceleration, as of any a x r, and of the others.
+    every = np.zeros((6, len(sizes)))
+    for k, name in enumerate(names):
+        columns = slice(3 * k, 3 * k + 3)
+        if name.endswith(('arm 0', 'arm 1', 'arm 2')):
+            every[:3, columns] = noise['turn'] * np.cross(np.eye(3), np.eye(3)[int(name[-1])])
+        else:
+            every[3:, columns] = noise.get(name, 0.0) * np.eye(3)
+    return design / sizes, every / sizes
+
+
+def _misfits(comparison: Comparison, lags: Sequence[int], designs: Sequence[Reals],
+             noises: Sequence[Reals], part: slice) -> dict[int, tuple[float, float]]:
+    """
+    Return the sums of squares that designs leave of readings by their lag.
+
+    The first is without what noise of the columns leaves: it would draw the lag to where the
+    columns are small.
+    """
+    rows = [np.flatnonzero(good[part]) + (part.start or 0) for good in comparison.good]
+    bases = []
+    for design, noise, chosen in zip(designs, noises, rows, strict=True):
+        left, sizes, right = np.linalg.svd(design[chosen], full_matrices=False)
+        known = sizes > 1e-9 * sizes[0]
+        bases.append((left[:, known], noise @ (right[known].T / sizes[known])))
+    found = {}
+    for lag in lags:
+        whole = noisy = 0.0
+        for (basis, noise), chosen, reading in zip(bases, rows, comparison.read_at(lag),
+                                                   strict=True):
+            sizes = basis.T @ reading[chosen]
+            whole += float(np.sum((reading[chosen] - basis @ sizes) ** 2))
+            noisy += len(chosen) * float(np.sum((noise @ sizes) ** 2))
+        found[lag] = whole - noisy, whole
+    return found
+
+
+class Causes:
+    """
+    What may be wrong with readings.
+
+    undo : by the evidence of a fault that can be undone, the matrix by which it multiplied
+    """
+
+    def __init__(self, comparison: Comparison, compared: Compared, exact_gravity: bool,
+                 slack: float) -> None:
+        self.comparison, self.compared, self.kind = comparison, compared, comparison.kind
+        self.exact_gravity, self.undo = exact_gravity, dict[str, Reals]()
+        self.known = comparison.imu.lever_arm is not None       # where the IMU is
+        self.least = (OF_STEPS if self.kind == 'rates' else STRANGE) + slack
+        self.strange = max(self.least, REAL * comparison.noisy)
+        # Where w x (w x r) is not known its mean seems to be a bias.
+        self.coarse = comparison.noisy and 'centripetal' in compared.effects and (
+            SURE * compared.fit(['centripetal', *compared.always]).sigma[0] > TELLS)
+
+    def find(self) -> tuple[list[Finding], Reals]:
+        """Return the faults, and what they leave of the discrepancy."""
+        compared, always = self.compared, self.compared.always
+        residual = compared.fit(always).residual
+        doubt = FOUR_SIGMA * _SPREAD / math.sqrt(residual.size)
+        most = compared.floor * math.sqrt(SAME_POWER + 2.0 * doubt)
+        before = beyond(residual, most)
+        if unit := [*self._field_unit()]:
+            return unit, residual
+        if before <= self.least:
+            return [], residual
+        pairs, _ = explain(*compared.compressed(), [*self._causes()], math.hypot(
+            compared.floor, 0.5 * self.least), always)
+        while True:                             # without what may be chance
+            names = [name for cause, _ in pairs for name in cause.effects]
+            found, sigma, residual = compared.fit(names := [*always, *names])
+            sure, end = np.abs(found) > SURE * sigma, len(names)
+            for k in reversed(range(len(pairs))):
+                first = end - len(pairs[k][0].effects)
+                if not np.any(sure[first:end]):
+                    del pairs[k]
+                    break
+                end = first
+            else:
+                break
+        rest = beyond(residual, most)
+        if rest > max(UNEXPLAINED * before, self.strange, 2.0 * compared.floor,
+                      (ROUGH + 2.0 * compared.floor) * self.comparison.noisy):
+            if self.comparison.noisy and not self._clear('free'):     # weightless: noise is seen
+                return [], residual
+            return [Finding('inaccurate', f'{100.0 * rest:.3g} % of the reading is not that of '
+                            'the motion', rest)], residual
+        return [fault for _, fault in pairs], residual
+
+    def _causes(self) -> Iterator[Cause]:
+        if self.kind == 'accelerations':
+            yield from self._causes_of_forces()
+        yield Cause(['total'], self._scale)
+        yield Cause(['step'])
+        yield Cause(OFFSETS, self._bias)
+        for effect, name, text in (
+                ('world', 'rates_in_world' if self.kind in ANGLES else 'reading_in_world',
+                 'the world, not of the IMU'),
+                ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
+            yield Cause(['total', effect], partial(_swapped, instead(
+                name, f'the readings are in axes of {text}')))
+        arms = [name for name in self.compared.always if name.startswith('arm')]
+        for k in range(len(PERMUTATIONS)):
+            yield Cause(['free', f'axes {k}', *(f'axes {k} {arm}' for arm in arms)],
+                        partial(self._axes, k, len(arms)))
+        entries = [f'matrix {i}{j}' for i, j in ENTRIES]
+        yield Cause([*entries, *(f'{entry} {arm}' for arm in arms for entry in entries)],
+                    partial(self._matrix, 9 * len(arms)))
+
+    def _causes_of_forces(self) -> Iterator[Cause]:
+        for name in TERMS:
+            if name in self.compared.effects and (self.known or name in (
+                    'gravity', 'linear', 'motion')):
+                yield Cause([name], partial(self._term, name))
+        yield Cause(['difference'], self._difference)
+        yield Cause(['tangential step'])
+        yield Cause(['axes late'])
+        yield Cause(['gravity', *OFFSETS], self._gravity_frame)
+        yield Cause([f'arm {k}' for k in range(3)], self._arm) if self.known else Cause(
+            [f'turned arm {k}' for k in range(3)], self._split_arm)
+
+    def _clear(self, name: str) -> bool:
+        """Return whether an effect is much larger than its noise."""
+        return self.kind != 'accelerations' or rms(self.compared.effects[name]) > (
+            ROUNDING + CLEARLY * self.compared.noise.get(name, 0.0))
+
+    def _undone(self, matrix: Reals, name: str, evidence: str, number: float) -> Finding:
+        if name:
+            self.undo[evidence] = matrix
+        return Finding(name, evidence, number)
+
+    def _scale(self, found: Reals) -> Finding | None:
+        factor = 1.0 + float(found[-1])
+        text = f'the readings are {factor:.4g} times what they should be'
+        for unit, times in UNITS[self.kind].items():
+            if abs(abs(factor) / times - 1.0) < 0.01:
+                return self._undone(math.copysign(times, factor) * np.eye(3), 'units',
+                                    f'{text}: they are in {unit}', factor)
+        if abs(factor) < MISSING:
+            return None
+        if factor < 0.0:
+            return self._undone(factor * np.eye(3), 'reading_sign', text, factor)
+        small = self.strange if self.exact_gravity or self.kind != 'accelerations' else max(
+            self.strange, GRAVITY_BAND)
+        name = 'rates_scale' if self.kind == 'rates' else 'reading_scale'
+        return Finding(name * (abs(factor - 1.0) > small), text, factor)
+
+    def _bias(self, found: Reals) -> Finding:
+        offset, field = found[-3:], self.comparison.field
+        if len(found) > 3 and self.kind == 'magnetometer' and np.linalg.norm(
+                found[:3] + field) < NEAR * np.linalg.norm(field):
+            return Finding('reading_in_world', 'the field does not turn with the IMU')
+        text = f'a constant ({listed(offset)}) {SI.get(self.kind, "rad/s")} is added'
+        return Finding('bias' * (not self.coarse), text, float(np.linalg.norm(offset)))
+
+    def _axes(self, k: int, arms: int, found: Reals) -> Finding | None:
+        less, factor = found[len(found) - arms - 2:len(found) - arms].tolist()
+        if arms and not self._clear('free'):    # weightless: the arm alone is seen
+            less, factor = (0.0, 0.0) if self.comparison.noisy else (-1.0, 1.0)
+        sizes = {unit: times for unit, times in UNITS[self.kind].items()
+                 if abs(factor / times - 1.0) < 0.05}
+        if abs(less + 1.0) > NEAR or (not sizes and abs(factor - 1.0) > NEAR):
+            return None
+        matrix = PERMUTATIONS[k]
+        words = ', '.join(f'{axis} reads {"-" * bool(np.sum(row) < 0.0)}'
+                          f'{"xyz"[int(np.argmax(np.abs(row)))]}'
+                          for axis, row in zip('xyz', matrix, strict=True))
+        return self._undone(
+            next(iter(sizes.values()), 1.0) * matrix,
+            'sign' if np.array_equal(np.abs(matrix), np.eye(3)) else 'axes',
+            words + ''.join(f', in {unit}' for unit in sizes), factor)
+
+    def _matrix(self, arms: int, found: Reals) -> Finding | None:
+        matrix = np.eye(3) + found[len(found) - arms - 9:len(found) - arms].reshape(3, 3)
+        left, _, right = np.linalg.svd(matrix)
+        turn, change = left @ right, float(np.max(np.abs(matrix - np.eye(3))))
+        if np.linalg.det(turn) > 0.0 and np.max(np.abs(matrix - turn)) < max(0.02, 0.1 * change):
+            vector = Rotation.from_matrix(turn).inv().as_rotvec()
+            angle = float(np.linalg.norm(vector))
+            return self._undone(turn, 'mounting' * (angle > self.strange), 'the readings are in '
+                                f'axes that are turned by ({listed(vector)}) rad from those of '
+                                'the IMU', angle)
+        near = [k for k, one in enumerate(PERMUTATIONS) if np.max(np.abs(matrix - one)) < 0.1]
+        if near:
+            return self._axes(near[0], 0, np.array((-1.0, 1.0)))
+        rows = '; '.join(map(listed, matrix))
+        return Finding('matrix' * (change > self.strange), f'the readings are the matrix [{rows}] '
+                       'times what they should be', change)
+
+    def _field_unit(self) -> Iterator[Finding]:
+        """Yield the unit of a field that is not known, if it is not that of the Earth in T."""
+        size, (low, high) = float(np.linalg.norm(self.comparison.field)), EARTH_FIELD
+        if self.kind == 'magnetometer' and self.compared.always and not low < size < high:
+            for unit, times in UNITS[self.kind].items():
+                if low < size / times < high:
+                    yield self._undone(times * np.eye(3), 'units', f'the field is {size:.4g}: it '
+                                       f'is in {unit}, not in T', times)
+
+    def _term(self, term: str, found: Reals) -> Finding | None:
+        share, (what, missing) = 1.0 + float(found[-1]), TERMS[term]
+        if term == 'motion' and self.known and 'linear' not in self.compared.effects:
+            missing = 'no_lever_arm'
+        if self.comparison.noisy and not self._clear(term):
+            return None                         # a term of noise seems to be missing
+        text = f'the term of {what} has {share:.3g} times its size'
+        if term == 'gravity':
+            if not self.known and abs(share * STANDARD_GRAVITY - 1.0) < 0.01:
+                return None                     # in g: the arm is as much smaller
+            if abs(share - 1.0) < GRAVITY_BAND and not self.exact_gravity:
+                return Finding('', text)
+            if share > NEAR:
+                return Finding('gravity', f'gravity is {share:.4g} times what it should be', share)
+        for unit, factor in (('mm', 1e-3), ('cm', 1e-2)) if term == 'linear' else ():
+            if abs(share / factor - 1.0) < 0.05:
+                return Finding('units', f'{text}: positions are in {unit}', share)
+        if abs(share) < NEAR:
+            return Finding(missing, text, share) if self.known or term != 'motion' else None
+        if self.comparison.noisy and share > 0.0:       # noise that is not white makes it smaller
+            return Finding('', text)
+        return Finding('acceleration_scale' if share > 0.0 else
+                       'gravity_sign' if term == 'gravity' else 'reading_sign', text, share)
+
+    def _gravity_frame(self, found: Reals) -> Finding | None:
+        fixed, gravity = float(np.linalg.norm(found[-3:])), self.comparison.gravity
+        there = abs(found[-4] + 1.0) <= NEAR and abs(fixed / gravity - 1.0) <= NEAR
+        text = f'gravity, {fixed:.4g} m/s^2, does not turn with the IMU'
+        return Finding('gravity_frame', text, fixed) if there else None
+
+    def _difference(self, found: Reals) -> Finding | None:
+        delay = -float(found[-1])
+        return None if not 0.25 < delay < 0.8 else Finding(
+            'finite_differences', f'the acceleration, without gravity, is that of {delay:.3g} '
+            'steps before, as a difference of two velocities', delay)
+
+    def _arm(self, found: Reals) -> Finding | None:
+        arm = self.comparison.arm
+        point, size = found[-3:] + arm, float(np.linalg.norm(arm))
+        share = float(point @ arm) / (size * size or 1.0)
+        if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * share * size:
+            return self._term('lever', np.array([share - 1.0]))
+        return Finding('no_lever_arm', f'the readings are those at ({listed(point)}) m, not at '
+                       f'({listed(arm)}) m', float(np.linalg.norm(found[-3:])))
+
+    def _split_arm(self, found: Reals) -> Finding | None:
+        """Judge by the arms that a x r and w x (w x r) have, where none is given."""
+        centripetal = self.comparison.arm + found[:3]
+        sizes = np.linalg.norm(centripetal), np.linalg.norm(centripetal + found[-3:])
+        for (small, large), term in ((sizes, 'centripetal'), (sizes[::-1], 'tangential')):
+            if small < NEAR * large:
+                return self._term(term, np.array([float(small / large) - 1.0]))
+        return None
+
+
+def _swapped(judge: Judge, found: Reals) -> Finding | None:
+    return judge(found[-2:])
+
+
+def _marks(comparison: Comparison, compared: Compared, lag: int) -> dict[str, Mark]:
+    """Return what the sensor is found to be, with intervals of 95 %."""
+    kind, always = comparison.kind, compared.always
+    marks = {f'{kind}_discrepancy': Mark(beyond(compared.target, compared.floor)),
+             f'{kind}_noise': Mark(comparison.reading_noise)}
+    if always:
+        what, values = ('field', comparison.field) if kind == 'magnetometer' else (
+            'lever_arm', comparison.arm)
+        marks.update({f'{what}_{axis}': Mark(float(value), meaning=_interval(deviation))
+                      for axis, value, deviation in zip(
+                          'xyz', values, compared.fit(always).sigma, strict=True)})
+    if kind in DENSITIES:
+        names = [f'matrix {i}{j}' for i, j in ENTRIES]
+        found, sigma, _ = compared.fit([*always, *names, *OFFSETS])
+        first, matrix = len(always), np.eye(3)
+        if kind == 'gyroscope' and np.all(sigma < np.inf):  # undone, it is smoothed as the motion
+            matrix = matrix + found[first:first + 9].reshape(3, 3)
+            comparison.undo(matrix)
+            found, sigma, _ = comparison.compare(lag).fit([*always, *names, *OFFSETS])
+        matrix = matrix @ (np.eye(3) + found[first:first + 9].reshape(3, 3))
+        for k, value in enumerate([*matrix.ravel(), *found[first + 9:]]):
+            name = f'matrix_{"xyz"[k // 3]}{"xyz"[k % 3]}' if k < 9 else f'bias_{"xyz"[k - 9]}'
+            marks[f'{kind}_{name}'] = Mark(float(value), meaning=_interval(sigma[first + k]))
+    return marks
+
+
+def _untold(comparison: Comparison, compared: Compared) -> Iterator[str]:
+    """Yield what cannot be told of the readings, and the poses that could tell it."""
+    # What is not known is the arm, of both terms together.
+    terms = [name for name in ('total', *TERMS) if name in compared.effects and (
+        name in ('centripetal', 'linear') or (name == 'total' and comparison.kind in ANGLES))]
+    terms = [name for name in terms if rms(compared.effects[name]) > 0.0]
+    _, sigma, _ = compared.fit([*terms, *compared.always])
+    turns, places = (max(one.body.sigma.get(name, 0.0) for one in comparison.smoothed)
+                     for name in ('attitudes', 'positions'))
+    for name, deviation in zip(terms, sigma.tolist(), strict=False):
+        if (worse := SURE * deviation / TELLS) > 1.0:
+            yield (f'{comparison.kind}: the size of the term {name} is known to '
+                   f'+- {196.0 * deviation:.2g} % only: its faults are not told' + (
+                       f'; poses with noise of {turns / worse:.2g} rad, {places / worse:.2g} m '
+                       'would tell' if comparison.noisy and worse < math.inf else ''))
+
+
+def _noise_faults(comparison: Comparison, residual: Reals,
+                  covariance: Reals | None) -> Iterator[Finding]:
+    """Compare noise with what is declared, and with normal noise."""
+    density, size = getattr(comparison.imu, DENSITIES[comparison.kind]), rms(comparison.sizes)
+    noise, root = comparison.reading_noise, math.sqrt(comparison.own_step)
+    if not comparison.noisy:            # all that is left is noise of the readings
+        parts = [part * one for part, one in zip(np.split(
+            residual, np.cumsum(comparison.counts)[:-1]), comparison.sizes, strict=True)]
+        noise = rms(np.array([rms(np.diff(part, SIXTH, axis=0)) for part in parts])) / math.sqrt(
+            math.comb(2 * SIXTH, SIXTH))
+        residual = np.concatenate(parts)
+    exists = noise > NOISY * size
+    band = NOISE_BAND + FOUR_SIGMA * _SPREAD / math.sqrt(residual.size)
     text = f'the noise has a standard deviation of {noise:.4g}'
     told = math.nan if covariance is None else math.sqrt(abs(np.trace(covariance)) / 3.0)
     if told == 0.0 and exists:
-        yield Fault('covariance_zero', f'{text}, its covariance is told as 0', noise)
+        yield Finding('covariance_zero', f'{text}, its covariance is told as 0', noise)
     declared = (told or math.nan) if density is None else density / root
     ratio = noise / declared if declared else math.inf if exists else 1.0
     if abs(ratio - 1.0) > band:
-        factors = {'sqrt(2)': math.sqrt(2.0), '1/sqrt(2)': math.sqrt(0.5), 'sqrt(dt)': root,
-                   '1/sqrt(dt)': 1.0 / root}
-        as_if = min(factors, key=lambda name: abs(ratio / factors[name] - 1.0))
-        named = f' ({as_if})' if abs(ratio / factors[as_if] - 1.0) < band else ''
-        yield Fault('noise_scale', f'{text}, {ratio:.4g}{named} times what is declared, '
-                    f'{declared:.4g}', ratio)
-    if exists and noise > rms(residual) / (1.0 + band):
+        factors: Mapping[str, float] = {'sqrt(2)': math.sqrt(2.0), '1/sqrt(2)': math.sqrt(0.5),
+                                        'sqrt(dt)': root, '1/sqrt(dt)': 1.0 / root}
+        as_if = ''.join(f' ({name})' for name, factor in factors.items()
+                        if abs(ratio / factor - 1.0) < band)
+        yield Finding('noise_scale', f'{text}, {ratio:.4g}{as_if} times what is declared, '
+                      f'{declared:.4g}', ratio)
+    if exists and not comparison.noisy and noise > rms(residual) / (1.0 + band):
         kurtosis = float(np.mean(residual ** 4)) / rms(residual) ** 4
-        doubt = FOUR_SIGMA * math.sqrt(24.0 / residual.size)
-        if kurtosis < min(LEAST_KURTOSIS, 3.0 - doubt):
-            yield Fault('uniform_noise', f'the noise has a kurtosis of {kurtosis:.3g}; normal '
-                        'noise has 3, uniform noise 1.8', kurtosis)
+        if kurtosis < min(LEAST_KURTOSIS, 3.0 - FOUR_SIGMA * math.sqrt(24.0 / residual.size)):
+            yield Finding('uniform_noise', f'the noise has a kurtosis of {kurtosis:.3g}; normal '
+                          'noise has 3, uniform noise 1.8', kurtosis)
 
 
-def _lag(runs: Sequence[Readings]) -> tuple[int, float]:
-    """Return by how many samples readings are late, with any size of their terms, and by what."""
-    def left(lag: int) -> float:
-        target, effects = pooled(run.at_lag(lag, (*run.terms, 'step')) for run in runs)
-        return rms(fitted(target, [*effects.values()])[1])
-
-    floor, now, best = _white(*(run.at_lag(0)[0] for run in runs)), left(0), 0
-    if now ** 2 >= 1.1 * floor ** 2 + CONSISTENT ** 2:
-        most = len(runs[0].effects['total']) // 4
-        found = {lag: left(lag) for lag in LAGS if lag < most}
-        best = min(found, key=lambda lag: found[lag])
-        best = best if found[best] < 0.5 * now else 0
-    target, effects = pooled(run.at_lag(best) for run in runs)
-    # The acceleration of a step may be that of its begin, without a lag of the reading.
-    steps, rest = fitted(target, [effects[name] for name in (
-        'step', 'tangential step') if name in effects])
-    return best, best - (float(steps[0]) if rms(target) > max(1e-6, 2.0 * rms(rest)) else 0.0)
-
-
-def _white(*runs: Reals) -> float:
-    """Return the standard deviation of white noise, by differences in which motions vanish."""
-    return rms(np.concatenate([np.diff(rows, 6, axis=0) for rows in runs])) / math.sqrt(_SIXTH)
-
-
-def _causes(kind: str, body: Body) -> list[Cause]:
-    """Return what may be wrong with the readings of a sensor."""
-    text = 'the readings are in axes of '
-    causes = [Cause(['total'], partial(_scale, KINDS[kind])), Cause(['step']),
-              Cause(['total', 'world'], instead(
-                  KINDS[kind].in_world, f'{text}the world, not of the IMU')),
-              Cause(['total', 'reversed'], instead(
-                  'rotation_reversed', f'{text}a sensor that turns against the IMU'))]
-    if kind not in FORCES:
-        return causes
-    return [*causes, *(Cause([name], partial(_term, name)) for name in _TERMS),
-            Cause(['gravity', 'fixed 0', 'fixed 1', 'fixed 2'], partial(_gravity_frame, body)),
-            Cause(['difference'], _difference), Cause(['tangential step']), Cause(['axes late']),
-            Cause(['arm 0', 'arm 1', 'arm 2'], partial(_arm, body))]
-
-
-def _scale(kind: Kind, found: Reals) -> Fault:
-    factor = 1.0 + float(found[0])
-    unit = any(abs(abs(factor) / unit - 1.0) < 0.01 for unit in kind.units)
-    return Fault('units' if unit else kind.sign if factor < 0.0 else kind.scale,
-                 f'the readings are {factor:.4g} times what they should be', factor)
-
-
-# Terms of a specific force: what each is, and the fault where it is missing.
-_TERMS = {'gravity': ('gravity', 'no_gravity'), 'tangential': ('a x r', 'no_tangential_term'),
-          'centripetal': ('w x (w x r)', 'no_centripetal_term'),
-          'kinematic': ('motion', 'no_lever_arm')}
-
-
-def _term(term: str, found: Reals) -> Fault:
-    share = 1.0 + float(found[0])
-    what, missing = _TERMS[term]
-    return Fault(missing if abs(share) < NEAR else 'acceleration_scale' if share > 0.0 else
-                 'gravity_sign' if term == 'gravity' else 'reading_sign',
-                 f'the term of {what} has {share:.3g} times its size', share)
-
-
-def _gravity_frame(body: Body, found: Reals) -> Fault | None:
-    fixed = float(np.linalg.norm(found[1:]))
-    there = abs(found[0] + 1.0) <= NEAR and abs(fixed / body.gravity - 1.0) <= NEAR
-    text = f'gravity, {fixed:.4g} m/s^2, does not turn with the IMU'
-    return Fault('gravity_frame', text, fixed) if there else None
-
-
-def _difference(found: Reals) -> Fault | None:
-    delay = -float(found[0])
-    return None if not 0.25 < delay < 0.8 else Fault(
-        'finite_differences', f'the acceleration, without gravity, is that of {delay:.3g} steps '
-        'before, as a difference of two velocities', delay)
-
-
-def _arm(body: Body, found: Reals) -> Fault:
-    arm, point = np.array(body.lever_arm), found + body.lever_arm
-    size = float(np.linalg.norm(arm))
-    share = float(point @ arm) / (size * size or 1.0)
-    if share > NEAR and np.linalg.norm(point - share * arm) < 0.1 * share * size:
-        return _term('kinematic', np.array([share - 1.0]))
-    of = ', the centre of mass' if np.linalg.norm(point - body.com) < 0.1 * max(
-        size, abs(body.com_distance)) else ''
-    return Fault('no_lever_arm', f'the readings are those at ({listed(point)}) m{of}, not at '
-                 f'({listed(arm)}) m', float(np.linalg.norm(found)))
+def listed(values: Iterable[float]) -> str:
+    """Return numbers for a reader."""
+    return ', '.join(f'{value:.4g}' for value in values)

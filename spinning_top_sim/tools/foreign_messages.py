@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the messages of other programs, and the attitude in them, by rosbags."""
+"""Reads the messages of other programs, and poses and readings in them, by rosbags."""
 
 import math
+from collections.abc import Iterator, Mapping
 from functools import cache
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
 
@@ -22,6 +25,28 @@ LAYOUTS = {
     'geometry_msgs/msg/PoseStamped': ('pose.orientation', ''),
     'geometry_msgs/msg/PoseWithCovarianceStamped': ('pose.pose.orientation', 'pose.covariance'),
     'nav_msgs/msg/Odometry': ('pose.pose.orientation', 'pose.covariance')}
+# By type: where positions and attitudes are; of readings also their covariances.
+_POSE = {'positions': 'pose.pose.position', 'attitudes': 'pose.pose.orientation'}
+_TRANSFORM = {'positions': 'transform.translation', 'attitudes': 'transform.rotation'}
+PLACES = {
+    'geometry_msgs/msg/PoseStamped': {'positions': 'pose.position',
+                                      'attitudes': 'pose.orientation'},
+    'geometry_msgs/msg/PoseWithCovarianceStamped': _POSE, 'nav_msgs/msg/Odometry': _POSE,
+    'geometry_msgs/msg/TransformStamped': _TRANSFORM, 'tf2_msgs/msg/TFMessage': _TRANSFORM,
+    'sensor_msgs/msg/Imu': {'gyroscope': 'angular_velocity',
+                            'accelerations': 'linear_acceleration'},
+    'sensor_msgs/msg/MagneticField': {'magnetometer': 'magnetic_field'}}
+
+
+class Sample(NamedTuple):
+    """Numbers in a message: their kind, as in PLACES, source and stamp [ns], 0: it has none."""
+
+    kind: str
+    source: str             # topic, of transforms TOPIC:CHILD
+    stamp_ns: int
+    log_ns: int
+    values: list[float]
+    covariance: NDArray[np.float64] | None
 
 
 class Attitude(NamedTuple):
@@ -64,3 +89,28 @@ def decode(data: bytes, type_name: str) -> Attitude:
             covariance = matrix
     return Attitude(stamp.sec * NANOSECONDS + stamp.nanosec, np.array((q.x, q.y, q.z, q.w)),
                     covariance)
+
+
+def samples(reader: LogReader, types: Mapping[str, str], end_ns: int) -> Iterator[Sample]:
+    """
+    Yield poses and readings of topics by their types, of PLACES, up to a log time.
+
+    Raises LogError.
+    """
+    for message in reader.messages(types, end=end_ns):
+        kind = types[message.topic]
+        try:
+            content = deserialized(message.data, kind)
+        except ValueError as error:
+            raise LogError(f'cannot read {reader.path}: a message of {message.topic} is '
+                           f'{error}') from error
+        for one in getattr(content, 'transforms', [content]):
+            source = message.topic + (f':{one.child_frame_id}' if one is not content else '')
+            stamp = one.header.stamp.sec * NANOSECONDS + one.header.stamp.nanosec
+            for part, place in PLACES[kind].items():
+                covariance = getattr(one, f'{place}_covariance', None)
+                if covariance is None or covariance[0] != NO_ORIENTATION:   # there is a reading
+                    vector = attrgetter(place)(one)
+                    yield Sample(part, source, stamp, message.log_time, [
+                        getattr(vector, axis) for axis in 'xyzw' if hasattr(vector, axis)],
+                        covariance)

@@ -25,6 +25,8 @@ MOST_CAUSES = 3
 ENOUGH, ENOUGH_OF_NOISE = 0.2, 0.1
 WORTHWHILE = 0.8        # share of what remains that another cause leaves at most
 TINY = 1e-6             # rms of an effect that cannot be seen
+BLOCKS = 20             # into which residuals are split, to know their correlation
+HIDDEN = 1e-3           # share of a coefficient in what cannot be told, from which on it cannot
 NEAR = 0.25             # distance of a coefficient from the value that it has for a fault
 # Causes count as equally good if they leave at most AS_GOOD times what the best one leaves, or at
 # most AS_GOOD_SHARE of what there was, but no more than the noise.
@@ -148,35 +150,53 @@ def pooled(parts: Iterable[tuple[Reals, Mapping[str, Reals]]]) -> tuple[Reals, d
 
 
 def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause],
-            floor: float = 0.0) -> tuple[list[Finding], Reals]:
+            floor: float = 0.0, always: Sequence[str] = (),
+            ) -> tuple[list[tuple[Cause, Finding]], Reals]:
     """
-    Explain a discrepancy (N, 3) by causes, the best one first; return faults and what is left.
+    Explain a discrepancy (N, 3) by causes, the best one first.
 
     effects : by name, change of what is compared by an effect of size 1 (N, 3)
     floor : rms of the noise in the target, 0 if it is not known
+    always : names of effects of a size that is not known; their coefficients come before those of
+        the cause in what a judge gets
+
+    Returns the causes with their faults, and what is left.  A fault without a name is none: it
+    explains, as a known property does.
     """
     chosen: list[Cause] = []
-    residual, found, others = target, np.empty(0), [*causes]
-    enough = max(ENOUGH * beyond(target, floor), ENOUGH_OF_NOISE * floor)
+    found, residual = fitted(target, [effects[name] for name in always]) if always else (
+        np.empty(0), target)
+    first, others = len(always), [*causes]
+    enough = max(ENOUGH * beyond(residual, floor), ENOUGH_OF_NOISE * floor)
+
+    def judged(cause: Cause, part: Reals) -> Finding | None:
+        assert cause.judge is not None
+        return cause.judge(np.append(part[:first], part[-len(cause.effects):]))
+
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
-        tried = [fitted(target, [effects[name] for known in (*chosen, cause)
-                                 for name in known.effects]) for cause in others]
+        tried = [fitted(target, [effects[name] for name in (*always, *(
+            name for known in (*chosen, cause) for name in known.effects))]) for cause in others]
         # A cause with a judge that names no fault explains nothing.
-        after = [np.inf if cause.judge and cause.judge(part[-len(cause.effects):]) is None else
-                 beyond(left, floor) for cause, (part, left) in zip(others, tried, strict=True)]
+        after = [np.inf if cause.judge and judged(cause, part) is None else beyond(left, floor)
+                 for cause, (part, left) in zip(others, tried, strict=True)]
         good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * before, floor or np.inf))
-        # Of equally good causes the one with the fewest columns wins: more columns always fit
-        # better.
-        _, left, best = min((len(cause.effects), left, k) for k, (cause, left) in enumerate(
-            zip(others, after, strict=True)) if left <= good)
+        # Of equally good causes the one with the fewest columns wins, for more columns always fit
+        # better, then the one that is named first.
+        _, _, best = min((len(cause.effects), max(left, good / AS_GOOD), k) for k, (
+            cause, left) in enumerate(zip(others, after, strict=True)) if left <= good)
+        left = after[best]
         if left > WORTHWHILE * before:
             break
         found, residual = tried[best]
         chosen.append(others.pop(best))
-    # Without causes `split` gives one part.
-    ends = np.cumsum([len(cause.effects) for cause in chosen], dtype=int)[:-1]
-    return [fault for cause, part in zip(chosen, np.split(found, ends), strict=False)
-            if cause.judge and (fault := cause.judge(part))], residual
+    pairs = []
+    for cause in chosen:
+        width = len(cause.effects)
+        fault = cause.judge(np.append(found[:len(always)], found[first:first + width])) \
+            if cause.judge else None
+        pairs.append((cause, fault or Finding('', 'no fault')))
+        first += width
+    return pairs, residual
 
 
 def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
@@ -186,6 +206,50 @@ def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
     size[size <= TINY * np.sqrt(len(matrix))] = np.inf
     found = np.linalg.lstsq(matrix / size, target.ravel(), rcond=1e-9)[0] / size
     return found, target - (matrix @ found).reshape(target.shape)
+
+
+class Fit(NamedTuple):
+    """Coefficients (k,), their standard deviations, inf: cannot be told, and what is left."""
+
+    found: Reals
+    sigma: Reals
+    residual: Reals
+
+
+def fit(target: Reals, columns: Sequence[Reals], noise: Sequence[float] | None = None,
+        own: Sequence[bool] | None = None) -> Fit:
+    """
+    Fit columns (N, 3) that have noise of their own.
+
+    noise : rms of the noise in each column, which makes it larger than it is
+    own : whether the target is what is measured less this column, and so has its noise
+
+    The deviations are those of the residual in blocks: its noise may be correlated in time.
+    """
+    matrix = np.stack([column.ravel() for column in columns], axis=1)
+    size = np.maximum(np.linalg.norm(matrix, axis=0), TINY * math.sqrt(len(matrix)))
+    matrix = matrix / size
+    excess = np.square(noise or np.zeros(len(columns))) * len(matrix) / size ** 2
+    values, vectors = np.linalg.eigh(matrix.T @ matrix - np.diag(excess))
+    known = values > np.maximum(1e-9, vectors.T ** 2 @ excess)
+    inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
+    found = inverse @ (matrix.T @ target.ravel() + excess * size * (own if own is not None else 0))
+    residual = target - (matrix @ found).reshape(target.shape)
+    scores = np.array([part.T @ left for part, left in zip(
+        np.array_split(matrix, BLOCKS), np.array_split(residual.ravel(), BLOCKS), strict=True)])
+    variance = np.maximum(np.diag(inverse @ scores.T @ scores @ inverse),
+                          np.diag(inverse) * rms(residual) ** 2)
+    hidden = np.any(np.abs(vectors[:, ~known]) > HIDDEN, axis=1)
+    return Fit(found / size, np.where(hidden, np.inf, np.sqrt(variance)) / size, residual)
+
+
+def compressed(target: Reals, effects: Mapping[str, Reals]) -> tuple[Reals, dict[str, Reals]]:
+    """Return a target and effects with few rows, whose least squares and rms are the same."""
+    columns = [*(effect.ravel() for effect in effects.values()), target.ravel()]
+    rows = np.asarray(np.linalg.qr(np.stack(columns, axis=1), mode='r'), dtype=np.float64)
+    rows = rows * math.sqrt(len(rows) / target.size)
+    return rows[:, -1, np.newaxis], {name: rows[:, k, np.newaxis]
+                                     for k, name in enumerate(effects)}
 
 
 def beyond(values: Reals, floor: float) -> float:

@@ -4,7 +4,8 @@ The top of a scene as a model for physics engines.
 
 MJCF (mujoco.readthedocs.io, "XML Reference"), URDF (wiki.ros.org/urdf/XML) and SDF 1.9
 (sdformat.org/spec).  All have the body frame at the pivot with z along the symmetry axis, the
-inertia about the centre of mass, and the IMU.  No file chooses a step or an integrator.
+inertia about the centre of mass, and the IMU.  MJCF chooses a step and an integrator: by default
+MuJoCo's method is of first order.
 """
 
 import re
@@ -23,6 +24,7 @@ from spinning_top_sim.solvers.solve import solve
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import urdf as robot
 
+MJCF_STEP = 0.002       # [s], the default of MuJoCo
 # Pieces of the path of a pivot that are listed.
 MOST_PIECES = 20
 
@@ -55,7 +57,8 @@ def _mjcf(values: Mapping[str, Any], name: str) -> str:
     shape, imu = Shape(top), values['imu.frame_id']
     root = ElementTree.Element('mujoco', model=name)
     _add(root, 'compiler', angle='radian', eulerseq='XYZ', balanceinertia='false')
-    _add(root, 'option', gravity=_text(0.0, 0.0, -top.gravity))
+    _add(root, 'option', gravity=_text(0.0, 0.0, -top.gravity), integrator='RK4',
+         timestep=_text(MJCF_STEP))
     body = _add(_add(root, 'worldbody'), 'body', name=values['body_frame'])
     _add(body, 'joint', name='pivot', type='ball')
     across = top.lambda1_at_com
@@ -75,7 +78,9 @@ def _mjcf(values: Mapping[str, Any], name: str) -> str:
     _add(_add(root, 'keyframe'), 'key', name='start', qpos=_text(w, x, y, z),
          qvel=_text(*start.angular_velocity[0]))
     return _document(root, [
-        'Reset to the keyframe start: mj_resetDataKeyframe(model, data, 0).', *_facts(values)])
+        'Reset to the keyframe start: mj_resetDataKeyframe(model, data, 0).',
+        'RK4 is of fourth order; the default, Euler, adds energy to a fast spin.',
+        *_facts(values)])
 
 
 def _urdf(values: Mapping[str, Any], name: str) -> str:

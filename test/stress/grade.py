@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The grade of simulators with random IMUs, noise, steps and starts: each defect is named."""
+"""The grade of random simulators and bodies: each defect is named, no right one is blamed."""
 
 from dataclasses import replace
 
 import numpy as np
+from helpers.bodies import FAULTS, NAMES, told
 from helpers.faulty_simulators import NOISY, OTHER, PUBLISHED, RIGHT, STEPPED, Imu, exact
 
-from spinning_top_sim.grade import grade
+from spinning_top_sim.grade import Imu as Known
+from spinning_top_sim.grade import grade, grade_readings
 from spinning_top_sim.grade.scenes import SCENES, WHEEL
 
 PATIENCE_S = 600.0
@@ -33,12 +35,21 @@ def check(seed, folder):
         report = grade(Imu(simulator, 'covariance_right', seed), seed=seed, scenes=SHORT,
                        body=_body(random, bool((seed + len(name)) % 2)))
         wrong += _judged(name, report, ())
+    for fault in (None, *FAULTS):
+        moving = body(seed, seconds=10.0)
+        parts = told(moving, fault)
+        known = Known(lever_arm=tuple(moving.arm) if seed % 2 or fault == 'no lever arm' else None)
+        report = grade_readings(parts, known)
+        # What the poses are too coarse to tell may be missing, or stay unexplained.
+        allowed = {NAMES[fault], 'inaccurate'} if fault else set()
+        if not set(report.faults) <= allowed:
+            wrong.append(f'body, {fault}: {report}')
     assert not wrong, '\n'.join(wrong)
-    return f'{len(PUBLISHED) + len(OTHER) + len(STEPPED)} defects, {len(RIGHT)} right simulators'
+    return f'{len(PUBLISHED) + len(OTHER) + len(STEPPED) + len(FAULTS)} defects'
 
 
 def _judged(name, report, faults):
-    if report.names == list(faults):
+    if report.faults == list(faults):
         return []
     return [f'{name}: {", ".join(faults) or "passed"} expected\n{report}']
 

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a rigid body does, by its poses at evenly spaced times: rates and accelerations.
+
+Poses are smoothed by a kernel and then differentiated.  Whatever is compared with them is taken to
+the world, smoothed by the same kernel, and taken back: as a convolution commutes with a
+derivative, smoothing makes no reading wrong, however wide it is.  A smoothing spline would, by its
+own bias.  The noise of what comes out follows from the white noise of the poses.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.ndimage import correlate1d
+from scipy.spatial.transform import Rotation
+
+Reals = NDArray[np.float64]
+Parts = Mapping[str, tuple[Reals, Reals]]       # times (n,) [s] and values (n, k) by name
+# Central differences of tenth order, for samples 0 .. 5: they are exact to (angle/step)^10/3000.
+_FIRST = np.array([0.0, 5.0 / 6, -5.0 / 21, 5.0 / 84, -5.0 / 504, 1.0 / 1260])
+_SECOND = np.array([-5269.0 / 1800, 5.0 / 3, -5.0 / 21, 5.0 / 126, -5.0 / 1008, 1.0 / 3150])
+FIRST, SECOND = np.append(-_FIRST[:0:-1], _FIRST), np.append(_SECOND[:0:-1], _SECOND)
+SIDE = 5                        # samples that a derivative needs on each side
+WIDTHS = 1, 3, 5, 9, 15, 25, 41, 65     # of kernels [samples]
+ORDER = 10                      # of the differences in which motions vanish and noise does not
+MEDIAN = 0.6745                 # of the absolute values of normal noise, in standard deviations
+GAP = 2.5                       # intervals that are a gap
+EVEN = 1e-4                     # share of the interval by which stamps may be uneven
+DEGREE = 5                      # of the splines between samples
+LEAST = 60                      # samples of a stretch
+
+
+@cache
+def kernel(width: int) -> Reals:
+    """Return three boxes of a width, one after another: a quadratic spline of unit sum."""
+    box = np.full(width, 1.0 / width)
+    return np.convolve(np.convolve(box, box), box)
+
+
+def gain(width: int, derivative: Sequence[float] | Reals = (1.0,)) -> float:
+    """Return by how much a kernel, and a derivative by samples, multiply white noise."""
+    return float(np.linalg.norm(np.convolve(kernel(width), derivative)))
+
+
+def margin(width: int) -> int:
+    """Return how many samples a kernel and a derivative need on each side."""
+    return len(kernel(width)) // 2 + SIDE
+
+
+def white(values: Reals, jumps: bool = True) -> float:
+    """Return the deviation of white noise by high differences; `jumps` : these count, too."""
+    differences = np.abs(np.diff(values, ORDER, axis=0))
+    level = np.sqrt(np.mean(differences ** 2)) if jumps else np.median(differences) / MEDIAN
+    return float(level) / math.sqrt(math.comb(2 * ORDER, ORDER))
+
+
+def _hat(vectors: Reals) -> Reals:
+    """Return the matrices (n, 3, 3) of cross products with vectors (n, 3)."""
+    matrices: Reals = np.cross(vectors[:, np.newaxis, :], np.eye(3)).transpose(0, 2, 1)
+    return matrices
+
+
+def _vee(matrices: Reals) -> Reals:
+    """Return the vectors (n, 3) of the antisymmetric parts of matrices (n, 3, 3)."""
+    upper, lower = matrices[:, [1, 2, 0], [2, 0, 1]], matrices[:, [2, 0, 1], [1, 2, 0]]
+    vectors: Reals = 0.5 * (lower - upper)
+    return vectors
+
+
+def along(matrices: Reals, vectors: Reals) -> Reals:
+    """Return the products of matrices (n, 3, 3) and vectors (n, 3)."""
+    products: Reals = np.einsum('nij,nj->ni', matrices, vectors)
+    return products
+
+
+@dataclass
+class Stretch:
+    """
+    A motion without gaps.
+
+    t : (n,) evenly spaced [s]
+    rotation : world <- body
+    positions : (n, 3) of the origin of the body in the world [m]
+    readings : (n, 3) of sensors by name
+    sigma : white noise of the attitudes about each axis [rad], of positions [m], of readings
+    intervals : between the samples of each, as they were read [s]
+    rates : (n, 3) in the body, where they are known better than by the attitudes [rad/s]
+    """
+
+    t: Reals
+    rotation: Rotation
+    positions: Reals
+    readings: Mapping[str, Reals] = field(default_factory=dict)
+    sigma: Mapping[str, float] = field(default_factory=dict)
+    intervals: Mapping[str, float] = field(default_factory=dict)
+    rates: Reals | None = None
+
+    @property
+    def step(self) -> float:
+        """Interval between samples [s]."""
+        return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
+
+    @cached_property
+    def matrices(self) -> Reals:
+        """The rotations (n, 3, 3)."""
+        matrices: Reals = self.rotation.as_matrix()
+        return matrices
+
+    def noise(self, width: int) -> tuple[float, float, float, float]:
+        """Return the noise of turns, of rates, of R^T R'' and of accelerations of the origin."""
+        turns, places = self.sigma.get('attitudes', 0.0), self.sigma.get('positions', 0.0)
+        first, second = (gain(width, weights) / self.step ** k
+                         for k, weights in ((1, FIRST), (2, SECOND)))
+        return turns * gain(width), turns * first, turns * second, places * second
+
+
+class Smoothed:
+    """
+    A motion smoothed by a kernel, where a derivative is known: `inner` of its samples.
+
+    turn, back : smoothed rotation matrices, and their transposes (m, 3, 3)
+    rates : angular velocity in the body (m, 3) [rad/s]
+    second : R^T R'' (m, 3, 3): its antisymmetric part is that of the angular acceleration, its
+        symmetric part that of w x (w x ..) [1/s^2]
+    acceleration : of the origin, along axes of the body (m, 3) [m/s^2]
+    """
+
+    def __init__(self, body: Stretch, width: int) -> None:
+        self.body, self.width, edge = body, width, margin(width)
+        self.inner = slice(edge, len(body.t) - edge)
+        smooth = self._convolved(body.matrices.reshape(-1, 9))
+        self.turn, first, second = (
+            correlate1d(smooth, weights, axis=0)[self.inner].reshape(-1, 3, 3) / body.step ** k
+            for k, weights in enumerate((np.ones(1), FIRST, SECOND)))
+        self.back = self.turn.transpose(0, 2, 1)
+        self.rates, self.second = _vee(self.back @ first), self.back @ second
+        if body.rates is not None:
+            change = correlate1d(body.rates, FIRST, axis=0)[self.inner] / body.step
+            self.rates, turning = body.rates[self.inner], _hat(body.rates[self.inner])
+            self.second = _hat(change) + turning @ turning
+        places = correlate1d(self._convolved(body.positions), SECOND, axis=0)[self.inner]
+        self.acceleration = along(self.back, places / body.step ** 2)
+
+    def _convolved(self, values: Reals) -> Reals:
+        if self.width == 1:
+            return values
+        smooth: Reals = correlate1d(values, kernel(self.width), axis=0)
+        return smooth
+
+    def rate(self, values: Reals) -> Reals:
+        """Return rates in the body (n, 3), smoothed as `rates` are (m, 3)."""
+        if self.width == 1:
+            return values[self.inner]
+        matrices = self._convolved((self.body.matrices @ _hat(values)).reshape(-1, 9))
+        return _vee(self.back @ matrices[self.inner].reshape(-1, 3, 3))
+
+    def vector(self, values: Reals) -> Reals:
+        """Return vectors in the body (n, 3), smoothed as those of the world are (m, 3)."""
+        if self.width == 1:
+            return values[self.inner]
+        return along(self.back, self._convolved(along(self.body.matrices, values))[self.inner])
+
+
+def stretches(parts: Parts) -> tuple[list[Stretch], float]:
+    """
+    Return the motions between gaps, with the readings at the same times, and what is left out [s].
+
+    parts : with 'attitudes', q(world <- body) as x, y, z, w; also 'positions', and readings
+
+    The interval is that of the attitudes or of the readings, whichever is longer.
+    """
+    times, q = parts['attitudes']
+    signs = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0)
+    values = {**parts, 'attitudes': (times, q * np.cumprod([1.0, *signs])[:, np.newaxis])}
+    intervals = {name: float(np.median(np.diff(at))) for name, (at, _) in values.items()}
+    step, sigma = max(intervals.values()), {}
+    for name, (at, rows) in values.items():
+        squares = [(white(part, name in ('attitudes', 'positions')) ** 2, len(part))
+                   for part in np.split(rows, _gaps(at) + 1) if len(part) > 2 * ORDER]
+        sigma[name] = math.sqrt(sum(one * n for one, n in squares)
+                                / max(sum(n for _, n in squares), 1))
+    sigma['attitudes'] *= 4.0 / math.sqrt(3.0)      # four components of half an angle
+    edges = sorted({float(edge) for at, _ in values.values() for edge in (
+        at[0], *at[_gaps(at)], *at[_gaps(at) + 1], at[-1])})
+    found, left_out = [], 0.0
+    for begin, end in pairwise(edges):
+        inside = {name: np.flatnonzero((at >= begin - 1e-9) & (at <= end + 1e-9))
+                  for name, (at, _) in values.items()}
+        covered = all(len(rows) > 1 and len(rows) > 0.5 * (end - begin) / intervals[name]
+                      for name, rows in inside.items())
+        first, last = (pick([float(values[name][0][rows[k]]) for name, rows in inside.items()])
+                       if covered else begin for k, pick in ((0, max), (-1, min)))
+        count = int((last - first) / step + 1e-6) + 1
+        if count < LEAST:
+            left_out += end - begin
+            continue
+        even: Reals = first + step * np.arange(count, dtype=float)
+        at_even = {name: _at(even, values[name][0][rows], values[name][1][rows])
+                   for name, rows in inside.items()}
+        rotation = Rotation.from_quat(at_even.pop('attitudes'))
+        positions = at_even.pop('positions', np.zeros((count, 3)))
+        found.append(Stretch(even, rotation, positions - positions[0], at_even, sigma, intervals))
+    return found, left_out
+
+
+def _gaps(times: Reals) -> NDArray[np.intp]:
+    return np.flatnonzero(np.diff(times) > GAP * np.median(np.diff(times)))
+
+
+def _at(even: Reals, times: Reals, values: Reals) -> Reals:
+    """Return values at times, by splines where they are not there already."""
+    if len(times) == len(even) and np.max(np.abs(times - even)) < EVEN * (even[1] - even[0]):
+        return values
+    spline: Reals = make_interp_spline(times, values, min(DEGREE, len(times) - 1))(even)
+    return spline

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The IMU of any rigid body against its poses: right ones pass, each fault is named, no other."""
+
+import numpy as np
+import pytest
+from helpers.bodies import FAULTS, NAMES, SWAPPED, body, rolled, told
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.grade import Imu, grade_readings
+
+SEEDS = range(4)
+
+
+@pytest.mark.parametrize('noisy', [False, True])
+@pytest.mark.parametrize('kind', ['free', 'forced'])
+def test_a_right_body_passes_and_its_lever_arm_is_found(kind, noisy):
+    for seed in SEEDS:
+        moving = body(seed, noisy=noisy, seconds=5.0, kind=kind)
+        report = grade_readings(told(moving))
+        assert report.passed, (seed, report)
+        for axis, right in zip('xyz', moving.arm, strict=True):
+            mark = report.marks[f'lever_arm_{axis}']
+            doubt = float(mark.meaning.removeprefix('+- '))
+            assert abs(mark.value - right) <= max(3.0 * doubt, 1e-6), (seed, mark, right)
+        assert grade_readings(told(moving), Imu(lever_arm=tuple(moving.arm))).passed, seed
+
+
+@pytest.mark.parametrize('fault', FAULTS)
+def test_a_fault_is_named_and_no_other(fault):
+    for seed in SEEDS:
+        moving = body(seed, noisy=False, seconds=3.0, kind='forced')
+        known = Imu(lever_arm=tuple(moving.arm) if seed % 2 or fault == 'no lever arm' else None)
+        report = grade_readings(told(moving, fault), known)
+        assert set(report.faults) == {NAMES[fault]}, (seed, report)
+
+
+@pytest.mark.parametrize('fault', FAULTS)
+def test_noise_of_the_poses_hides_faults_but_makes_none(fault):
+    named = 0
+    for seed in SEEDS:
+        moving = body(seed, noisy=True, seconds=10.0, kind='forced', rate=200.0)
+        report = grade_readings(told(moving, fault), Imu(lever_arm=tuple(moving.arm)))
+        assert set(report.faults) <= {NAMES[fault]}, (seed, report)
+        named += bool(report.faults)
+    assert named >= len(SEEDS) - 1
+
+
+def test_two_faults_are_told_as_both():
+    """Mounting ignored, or axes exchanged in degrees, and readings a step late, at any rate."""
+    turn = Rotation.from_rotvec((0.3, -0.2, 1.1))
+    for rate in (50.0, 200.0, 1000.0):
+        parts = told(body(3, noisy=False, seconds=5.0, kind='forced', rate=rate))
+        t, w = parts['gyroscope']
+        _, f = parts['accelerations']
+        mounted = {**parts, 'gyroscope': (t, rolled(turn.inv().apply(w))),
+                   'accelerations': (t, rolled(turn.inv().apply(f)))}
+        assert set(grade_readings(mounted).faults) == {'late', 'mounting'}, rate
+        assert set(grade_readings(mounted, Imu(mounting=tuple(turn.as_quat()))).faults) == {'late'}
+        both = {**parts, 'gyroscope': (t, np.degrees(rolled(w, 2)) @ SWAPPED)}
+        report = grade_readings(both)
+        assert report.faults == ['late', 'axes'] and 'in deg/s' in str(report), report
+
+
+def test_numbers_have_intervals_that_hold():
+    """Of the matrix and the bias of a gyroscope with errors, where poses have noise."""
+    matrix = np.array([[1.02, 0.01, 0.0], [-0.01, 0.99, 0.005], [0.0, 0.01, 1.01]])
+    within = []
+    for seed in range(5):
+        moving = body(seed, noisy=True, seconds=10.0, kind='forced', rate=200.0)
+        parts = told(moving)
+        t, w = parts['gyroscope']
+        marks = grade_readings({**parts, 'gyroscope': (t, w @ matrix.T + 0.01)}).marks
+        for name, right in [(f'matrix_{"xyz"[i]}{"xyz"[j]}', matrix[i, j])
+                            for i in range(3) for j in range(3)] + [('bias_x', 0.01)]:
+            mark = marks[f'gyroscope_{name}']
+            within.append(abs(mark.value - right) <= float(mark.meaning.removeprefix('+- ')))
+    assert np.mean(within) >= 0.95
+
+
+def test_what_poses_are_too_coarse_to_tell_is_told_with_the_noise_that_would_do():
+    moving = body(4, noisy=False, seconds=20.0, kind='forced', rate=30.0)
+    moving.noise = {'attitudes': 0.02, 'positions': 1e-3}
+    report = grade_readings(told(moving, 'no centripetal'))
+    assert set(report.faults) <= {'no_centripetal_term'}
+    if not report.faults:
+        assert any('centripetal' in note and 'would tell' in note for note in report.notes)
+
+
+def test_gravity_elsewhere_and_gaps_and_rates_of_each_sensor_are_no_faults():
+    parts = told(body(1, noisy=False, seconds=8.0, kind='forced', rate=400.0))
+    t, f = parts['accelerations']
+    up = parts['attitudes'][1]
+    parts['accelerations'] = t, f + 0.05 * Rotation.from_quat(up).inv().apply((0.0, 0.0, 1.0))
+    assert grade_readings(parts).passed
+    assert grade_readings(parts, exact_gravity=True).faults == ['gravity']
+    for name, every in (('attitudes', 4), ('positions', 4), ('gyroscope', 2)):
+        parts[name] = tuple(one[(t < 3.0) | (t > 3.5)][::every] for one in parts[name])
+    report = grade_readings(parts)
+    assert report.passed and any('in gaps' in note for note in report.notes), report
+
+
+def test_a_magnetometer_needs_no_field_and_its_unit_is_told():
+    moving = body(2, noisy=False, seconds=5.0, kind='forced', rate=200.0)
+    field = moving.rotation.inv().apply((0.0, 20e-6, -43e-6))
+    parts = {**told(moving), 'magnetometer': (moving.t, field)}
+    report = grade_readings(parts)
+    assert report.passed and abs(report.marks['field_y'].value - 20e-6) < 1e-9, report
+    assert grade_readings({**parts, 'magnetometer': (moving.t, 1e6 * field)}).faults == ['units']
