@@ -397,8 +397,11 @@ def test_a_fault_stops_the_recording_with_its_reason(tmp_path, monkeypatch, reas
     assert recorder.room and summary.messages + summary.lost == 3 and summary.lost >= 1
     if path.exists():
         assert is_indexed(path) and numbers_in(path) == list(range(summary.messages))
+
+
+def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_path):
     recorder = Recorder(f'{tmp_path}/b.mcap', TOPICS, METADATA, min_free_bytes=0)
-    write(recorder, len(TOPICS), 0, b'')        # there is no such topic
+    write(recorder, len(TOPICS), 0, b'')
     summary = recorder.close()
     assert recorder.state == 'failed' and 'stopped: IndexError:' in (summary.error or '')
     assert (is_indexed(summary.path), summary.lost) == (True, 1)

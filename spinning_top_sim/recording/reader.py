@@ -37,7 +37,8 @@ MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are grouped together
 HEAD = struct.Struct('<BQ')     # of every record: opcode, length of what follows
 # Where log times stand: the earliest and the latest in a chunk, and that of a message
-TIMES = {Opcode.CHUNK: struct.Struct('<9xQQ'), Opcode.MESSAGE: struct.Struct('<15xQ')}
+TIMES: dict[int, struct.Struct] = {
+    Opcode.CHUNK: struct.Struct('<9xQQ'), Opcode.MESSAGE: struct.Struct('<15xQ')}
 COMPRESSED = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}     # as a whole
 # What is raised for bytes that are not as they should be.
 UNREADABLE = (McapError, ValueError, OverflowError, struct.error)
@@ -140,8 +141,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for schema in [self.schemas.get(channel.schema_id)])
 
     @property
-    def compression(self) -> rosbag2.Compression:
-        """How rosbag2 has compressed the messages, by its record or the bag's metadata.yaml."""
+    def compression(self) -> tuple[str, str]:
+        """Mode, such as 'MESSAGE', and format of compression, if rosbag2 has compressed more."""
         text = self.metadata.get(rosbag2.BAG_METADATA, {}).get('serialized_metadata', '')
         beside = self.path.with_name('metadata.yaml')
         if not text and beside.is_file():

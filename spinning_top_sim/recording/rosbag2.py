@@ -58,16 +58,6 @@ class RecordedTopic(NamedTuple):
     qos: Qos = MappingProxyType({})     # offered; what is left out is as in DEFAULT_QOS
 
 
-class Compression(NamedTuple):
-    """How rosbag2 has compressed a bag beyond MCAP's chunks."""
-
-    mode: str       # '', 'MESSAGE' or 'FILE'
-    format: str     # '', or such as 'zstd'
-
-
-NOT_COMPRESSED = Compression('', '')
-
-
 def find_definition(type_name: str) -> tuple[str, str]:
     """
     Return schema (`ros2msg`) and type hash (REP-2011) of a type of ROS 2 Jazzy.
@@ -125,16 +115,21 @@ def _number(value: Any, default: int) -> int:
     return value if type(value) is type(default) and -1 << 63 <= value < 1 << 63 else default
 
 
-def compression_of(text: str) -> Compression:
-    """Return what the text of a `rosbag2` record, or of a bag's metadata.yaml, says."""
+def compression_of(text: str) -> tuple[str, str]:
+    """
+    Return how rosbag2 has compressed a bag beyond MCAP's chunks: mode and format.
+
+    text : of a `rosbag2` record, or of a bag's metadata.yaml
+    """
     mode, form = (re.search(rf'^\s*compression_{key}:[ \t]*["\']?([\w.-]*)', text, re.MULTILINE)
                   for key in ('mode', 'format'))
-    found = Compression(mode[1].upper() if mode else '', form[1] if form else '')
-    return NOT_COMPRESSED if found.mode in ('', 'NONE') else found
+    if not mode or mode[1].upper() in ('', 'NONE'):
+        return '', ''
+    return mode[1].upper(), form[1] if form else ''
 
 
 def bag_metadata(topics: Sequence[tuple[Channel, str, int]], file_name: str, start_ns: int,
-                 end_ns: int, compression: Compression = NOT_COMPRESSED) -> dict[str, str]:
+                 end_ns: int, compression: tuple[str, str] = ('', '')) -> dict[str, str]:
     """Return the `rosbag2` record; `topics` are channels, types and message counts."""
     # A file name may hold bytes that are no text: they must not spoil the closing of a log.
     file_name = file_name.encode(errors='replace').decode()
@@ -155,8 +150,8 @@ def bag_metadata(topics: Sequence[tuple[Channel, str, int]], file_name: str, sta
                      for key, value in qos.items()} for qos in qos_profiles(channel)],
                 'type_description_hash': channel.metadata.get('topic_type_hash', '')},
              'message_count': messages} for channel, type_name, messages in topics],
-        'compression_format': compression.format,
-        'compression_mode': compression.mode,
+        'compression_format': compression[1],
+        'compression_mode': compression[0],
         'relative_file_paths': [file_name],
         'files': [{'path': file_name, **numbers}],
         'custom_data': None,

@@ -134,19 +134,19 @@ class McapWriter:
         self._rows, self._chunk_bytes = [], 0
 
     def _write_chunk(self) -> None:
-        plain, offset, counts = np.empty(self._chunk_bytes, np.uint8), 0, [*self.message_counts]
+        plain, offset, counts = bytearray(self._chunk_bytes), 0, [*self.message_counts]
         # By topic, log times and offsets in the chunk (n, 2), as they stand in message indexes
         entries: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
         for (topic, size), alike in itertools.groupby(
                 sorted(self._rows, key=itemgetter(0)), lambda rows: (rows[0], rows[2].shape[1])):
-            _, times, data = zip(*alike, strict=True)
+            _, times, parts = zip(*alike, strict=True)
             times_ns, record = np.concatenate(times), _message_type(size)
             numbers = np.arange(len(times_ns))
-            messages = plain[offset:offset + len(numbers) * record.itemsize].view(record)
+            messages = np.frombuffer(plain, record, len(numbers), offset)
             messages['opcode'], messages['length'] = Opcode.MESSAGE, record.itemsize - 9
             messages['channel'], messages['sequence'] = topic + 1, numbers + counts[topic]
             messages['log_time'] = messages['publish_time'] = times_ns
-            messages['data'] = np.concatenate(data)
+            messages['data'] = np.concatenate(parts)
             entries[topic].append(np.stack(
                 [times_ns, numbers * record.itemsize + offset], axis=1).astype(np.uint64))
             counts[topic] += len(numbers)
@@ -154,6 +154,7 @@ class McapWriter:
         indexes = {topic + 1: np.concatenate(parts) for topic, parts in entries.items()}
         times_ns = np.concatenate([index[:, 0] for index in indexes.values()])
         span = {'message_start_time': int(times_ns.min()), 'message_end_time': int(times_ns.max())}
+        # A tenth of the time of `simulate` is all of this: not worth a thread.
         data = (zstandard.ZstdCompressor(compression_params=ZSTD).compress(plain)
                 if self._compression == 'zstd' else
                 lz4.frame.compress(plain) if self._compression else bytes(plain))
