@@ -21,8 +21,8 @@ from spinning_top_sim.exam.measures import increments
 from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.tools.identify import in_words
 
-# Kicks [rad]: that lead away, that show the use of the rates, and how a step is integrated.
-TINY, SMALL, LARGE = 0.02, 0.1, 0.3
+# Kicks [rad]; the large one shows how a step is integrated.
+SMALL, LARGE = 0.02, 0.3
 # Step of a kick, when filters have no high gains of a start, and longest delay of its answer.
 EARLY, LATEST = 360, 30
 LEAST = 1e-6                    # share of an error that is corrected, if any
@@ -136,7 +136,7 @@ def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
 
 
 def kicked_starts(runs: Sequence[Run], axis: Sequence[float], attitudes: Sequence[Reals],
-                  size: float = TINY) -> list[Run]:
+                  size: float = SMALL) -> list[Run]:
     """Return runs with a kick about an axis of the world, in attitudes there, to and fro."""
     turns = [Rotation.from_quat(one[EARLY - 1]).inv().apply(axis) for one in attitudes]
     return [with_kicks(run, [Kick(EARLY, size * (-1) ** k * turn)])
