@@ -216,9 +216,9 @@ def reported_bias(exam: 'Exam') -> Measured | None:
     said, none = map(said_bias, (outcome, exam.outcomes('excitation')[0]))
     if np.isnan(said[0]) or np.isnan(none[0]):
         return None
-    shares = said / BIAS
+    shares, before = said / BIAS, said_bias(outcome.part(slice(len(outcome.run.dt) * 3 // 4)))
     # What is still being learned may be anything from nothing to a little too much.
-    learns = any(one.left > LEFT for one in effects)
+    learns = any(one.left > LEFT for one in effects) | (shares > 1.02 * before / BIAS)
     off = np.where(learns & (shares > -0.05) & (shares < 1.3), 0.0, np.abs(shares - 1.0))
     text, report, without = (', '.join(f'{rate:.2g}' for rate in np.degrees(rates))
                              for rates in (BIAS, said, none))
