@@ -11,21 +11,29 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 import report
+from cases import ROOT
 from scipy.stats import spearmanr
 from spinning_top_sim.exam.reference import ReferenceFilter
 from spinning_top_sim.exam.trial import InvalidOutputError, feed
 
-from spinning_top_sim.exam import broad, field
+from spinning_top_sim.exam import broad
+from spinning_top_sim.exam import scenes as field
 from spinning_top_sim.exam.adapters import Ahrs, Imufusion, Vqf
+from spinning_top_sim.exam.feeding import InvalidOutputError, feed
 from spinning_top_sim.exam.measures import Rmse, rmse
 from spinning_top_sim.exam.scored import ScoredRun
 from spinning_top_sim.tools.cli import progress
+
+sys.path.insert(0, str(ROOT / 'examples'))
+
+from reference_filter import ReferenceFilter
 
 PACKAGES = ('numpy', 'scipy', 'vqf', 'ahrs', 'imufusion')
 FILTERS = {
@@ -55,7 +63,8 @@ def trial_of(what: Path | tuple[int, int]) -> ScoredRun:
 def error_of(job: tuple[str, Path | tuple[int, int]]) -> Rmse:
     name, what = job
     try:
-        outcome = trial_of(what).follow(FILTERS[name], feed)
+        run, counts, _ = trial_of(what)
+        outcome = feed(FILTERS[name], [run])[0].part(counts)
     except InvalidOutputError as error:
         print(f'{name}: {error}')
         return WORST

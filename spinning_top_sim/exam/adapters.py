@@ -32,20 +32,18 @@ class Vqf:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """See `feeding.Filter`."""
         if not self._period:
             self._filter, self._period = self._make(dt), dt
         uses_field = self._magnetic and magnetometer is not None
         for _ in range(max(1, round(dt / self._period))):
             self._filter.update(gyroscope, accelerometer, *([magnetometer] * uses_field))
-        said: Reals = (self._filter.getQuat9D() if uses_field else self._filter.getQuat6D())
-        return said[W_LAST]
+        said = self._filter.getQuat9D() if uses_field else self._filter.getQuat6D()
+        return np.asarray(said)[W_LAST]
 
     @property
     def bias(self) -> Reals:
         """Gyroscope bias [rad/s]."""
-        bias: Reals = self._filter.getBiasEstimate()[0]
-        return bias
+        return np.asarray(self._filter.getBiasEstimate()[0])
 
 
 class Ahrs:
@@ -71,7 +69,6 @@ class Ahrs:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """See `feeding.Filter`."""
         uses_field = self._magnetic and magnetometer is not None
         readings = [gyroscope, accelerometer, *([magnetometer] * uses_field)]
         if self._attitude is None:
@@ -84,8 +81,7 @@ class Ahrs:
                       'updateMARG' if uses_field else 'updateIMU')
             self._attitude = getattr(self._filter, update)(self._attitude, *readings, dt=dt)
         attitude = Rotation.from_quat(np.asarray(self._attitude)[W_LAST])
-        turned: Reals = (self._turn * attitude).as_quat()
-        return turned
+        return np.asarray((self._turn * attitude).as_quat())
 
 
 class Imufusion:
@@ -104,7 +100,6 @@ class Imufusion:
 
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
-        """See `feeding.Filter`."""
         self._filter.set_sample_period(dt)
         rates, force = np.degrees(gyroscope), accelerometer / GRAVITY
         if self._magnetic and magnetometer is not None:

@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import increments
-from spinning_top_sim.exam.motions import Reals, Run
+from spinning_top_sim.exam.motions import RATE, Reals, Run
 from spinning_top_sim.tools.identify import in_words
 
-# Kicks [rad]: that lead away, that show the use of the rates, and how a step is integrated.
-TINY, SMALL, LARGE = 0.02, 0.1, 0.3
+# Kicks [rad]; the large one shows how a step is integrated.
+SMALL, LARGE = 0.02, 0.3
 # Step of a kick, when filters have no high gains of a start, and longest delay of its answer.
 EARLY, LATEST = 360, 30
 LEAST = 1e-6                    # share of an error that is corrected, if any
@@ -120,10 +120,9 @@ def kicked_steps(still: Outcome) -> Run:
     """Return a run of uneven steps with kicks about what the filter takes for the vertical."""
     lengths, run = still.run.dt.round(6), still.run
     up = Rotation.from_quat(still.estimates[SETTLED]).inv().apply((0.0, 0.0, 1.0))
-    # In a later step of each length.
-    return with_kicks(run, [Kick(SETTLED + 20 * k + int(np.argmax(
-        lengths[SETTLED + 20 * k:] == length)), SMALL * up)
-        for k, length in enumerate(np.unique(lengths))])
+    places = [SETTLED + 20 * k + int(np.argmax(lengths[SETTLED + 20 * k:] == length))
+              for k, length in enumerate(np.unique(lengths))]      # one of each length
+    return with_kicks(run, [Kick(k, SMALL * RATE * run.dt[k] * up) for k in places])
 
 
 def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
@@ -131,12 +130,12 @@ def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
     turns = (moved.run.gyroscope - still.run.gyroscope) * still.run.dt[:, np.newaxis]
     steps = np.flatnonzero(np.any(turns, axis=1))
     answers = (increments(moved.estimates) - increments(still.estimates))[steps]
-    gains = np.sum(answers * turns[steps], axis=1) / SMALL ** 2
+    gains = np.sum(answers * turns[steps], axis=1) / np.sum(turns[steps] ** 2, axis=1)
     return dict(sorted(zip(still.run.dt[steps].round(6).tolist(), gains.tolist(), strict=True)))
 
 
 def kicked_starts(runs: Sequence[Run], axis: Sequence[float], attitudes: Sequence[Reals],
-                  size: float = TINY) -> list[Run]:
+                  size: float = SMALL) -> list[Run]:
     """Return runs with a kick about an axis of the world, in attitudes there, to and fro."""
     turns = [Rotation.from_quat(one[EARLY - 1]).inv().apply(axis) for one in attitudes]
     return [with_kicks(run, [Kick(EARLY, size * (-1) ** k * turn)])

@@ -2,8 +2,8 @@
 """
 Whether a filter learns a bias of the gyroscope, and what it says of it.
 
-The bias comes when the filter has settled in a rest.  Its effect on the attitude grows, and falls
-again if it is learned.  After a turn, the axis that was vertical is level.
+The bias comes in a rest with the x axis up, when the filter has settled.  Its effect on the
+attitude grows, and falls again if it is learned.  Then the sensor is turned: x is level.
 """
 
 from dataclasses import replace
@@ -29,7 +29,7 @@ MOVES = 0.002
 
 
 class Effect(NamedTuple):
-    """An effect about one axis of the sensor: what is left, and whether it still moves."""
+    """An effect about an axis of the sensor: what is left of the largest one, whether it moves."""
 
     axis: int
     left: float
@@ -40,32 +40,32 @@ class Effect(NamedTuple):
 def effects(exam: 'Exam') -> tuple[Outcome, list[Effect]]:
     """Return the outcome with a bias, and its effects, in rests as long as the filter needs."""
     for seconds in RESTS_S:
-        motion = Motion(euler(NEAR)).rest(exam.lead_s).rest(seconds)
-        motion.turn(euler(X_UP)).rest(seconds)
-        (lead, *rests), run = motion.of('rest'), motion.run('bias')
+        motion = Motion(euler(NEAR)).rest(exam.lead_s).turn(euler(X_UP)).rest(seconds)
+        motion.turn(euler(NEAR)).rest(seconds)
+        (_, *rests), run = motion.of('rest'), motion.run('bias')
         rates = run.gyroscope.copy()
-        rates[lead.end:] += BIAS
+        rates[rests[0].begin:] += BIAS
         (outcome,) = exam.fed([replace(run, gyroscope=rates)])
-        found = []
-        # Of the axes that are level; the vertical one where the heading is known.
-        for part, axes in zip(rests, ((0, 1, 2), (1, 2)), strict=True):
+        sizes = []              # of the effects about axes, level or of a known heading
+        for part, axes in zip(rests, (range(1 - exam.heading, 3), (0, 1)), strict=True):
             rows = slice(part.begin, part.end)
             truth = Rotation.from_quat(run.truth[rows])
             error = (truth.inv() * Rotation.from_quat(outcome.estimates[rows])).as_rotvec()
             if not exam.heading:
                 up = truth[0].inv().apply((0.0, 0.0, 1.0))
                 error = error - np.outer(error @ up, up)
-            found += [_effect(axis, np.abs(error[:, axis])) for axis in axes
-                      if exam.heading or axis != 2 or part is rests[1]]
+            sizes += [(axis, np.abs(error[:, axis])) for axis in axes]
+        largest = max(float(np.max(size)) for _, size in sizes)
+        found = [_effect(axis, size, largest) for axis, size in sizes]
         if not any(one.left > LEFT and (one.falls or one.rises) for one in found):
             break
     return outcome, found
 
 
-def _effect(axis: int, size: Reals) -> Effect:
-    largest, last, before = float(np.max(size)), float(size[-1]), float(size[-len(size) // 4])
+def _effect(axis: int, size: Reals, largest: float) -> Effect:
     if largest < NO_EFFECT:
         return Effect(axis, 0.0, False, False)
+    last, before = float(size[-1]), float(size[-len(size) // 4])
     return Effect(axis, last / largest, last < before - MOVES * largest,
                   last > before + MOVES * largest)
 

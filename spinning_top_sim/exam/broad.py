@@ -28,25 +28,11 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
                  feed: Feed = feed_apart,
                  show: Callable[[float, float], object] = lambda done, total: None) -> Report:
     """
-    Examine a filter with the trials in a folder.
+    Examine a filter with the trials of BROAD in a folder: .mat, or .hdf5, which need h5py.
 
     The filter gets each trial from its first sample on.  The measures are the root mean squares
-    of the errors in motion, of each trial and their means.  `accuracy` and `invalid_output` are
-    the faults that can be found.
-
-    Parameters
-    ----------
-    make_filter, feed, show : optional
-        As of `examine`.
-    folder : path
-        With files of BROAD: .mat, or .hdf5, which need h5py.
-    subject : str, optional
-        Name in the report.  The default is the name of the filter's class.
-
-    Raises
-    ------
-    ValueError
-        If there is no folder, no trial in it, or a file is none.
+    of the errors in motion, of each trial and their means.  The other arguments are those of
+    `examine`.  Raises ValueError if there is no folder, no trial in it, or a file is none.
     """
     paths = trials_in(folder)
     return report_of(make_filter, map(read_trial, paths), len(paths), 'data', one_line(

@@ -24,7 +24,7 @@ import contextlib
 import runpy
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,13 +38,10 @@ from spinning_top_sim.installation import needed
 from spinning_top_sim.tools import cli, scene_file
 from spinning_top_sim.tools.report import Report
 
-# What is examined, with the options that it needs and those that it may have.
-KINDS = {'log': (('topic',), ('truth', 'heading')),
-         'node': (('topic',), ('level', 'imu', 'seeds')),
-         'filter': ((), ('level', 'imu', 'seeds', 'data')),
-         'command': ((), ('level', 'imu', 'seeds', 'data'))}
-# With --data there is nothing to choose.
-CHOSEN = 'level', 'imu', 'seeds'
+# What is examined, and the options that it takes; log and node need the first one.
+OF_FILTER = 'level', 'imu', 'seeds', 'data'
+KINDS = {'log': ('topic', 'truth', 'heading'), 'node': ('topic', 'level', 'imu', 'seeds'),
+         'filter': OF_FILTER, 'command': OF_FILTER}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,9 +75,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.page is not None:
         with needed('a page', 'plot'):
             from spinning_top_sim.exam.page import draw_page  # noqa: PLC0415
-    subject = getattr(arguments, kind)
     with _interruptible(), _progress() as show:
-        report = EXAMS[kind](subject, options, show)
+        report = _report(kind, getattr(arguments, kind), options, show)
     if arguments.json:
         print(report.as_json())
     else:
@@ -93,31 +89,51 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _options(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Return what is examined, a key of KINDS, and its options.  Raises ValueError."""
-    given = [kind for kind in KINDS if getattr(arguments, kind) is not None]
-    if len(given) != 1:
+    kinds = [kind for kind in KINDS if getattr(arguments, kind) is not None]
+    if len(kinds) != 1:
         raise ValueError('give one of a log, --filter, --command and --node, not '
-                         f'{" and ".join(given) or "none"}')
-    (kind,), names = given, dict.fromkeys(name for pair in KINDS.values() for part in pair
-                                          for name in part)
-    needed_names, others = KINDS[kind]
-    options = {name: value for name in names if (value := getattr(arguments, name)) is not None}
-    shown = kind if kind == 'log' else f'--{kind}'
-    for name in needed_names:
-        if name not in options:
-            raise ValueError(f'{shown} needs --{name}')
-    taken = [*needed_names, *(name for name in others if name not in CHOSEN
-                              or 'data' not in options)]
+                         f'{" and ".join(kinds) or "none"}')
+    (kind,) = kinds
+    options = {name: value for name in dict.fromkeys(sum(KINDS.values(), ()))
+               if (value := getattr(arguments, name)) is not None}
+    shown, taken = kind if kind == 'log' else f'--{kind}', KINDS[kind]
+    if 'topic' in taken and 'topic' not in options:
+        raise ValueError(f'{shown} needs --topic')
+    if 'data' in options and kind in ('filter', 'command'):
+        shown, taken = '--data', ('data',)
     for name in options:
         if name not in taken:
-            raise ValueError(f'--{name} cannot be given with '
-                             f'{"--data" if name in others else shown}'
-                             + f': must be {", ".join(f"--{one}" for one in taken)}' * bool(taken))
+            raise ValueError(f'--{name} cannot be given with {shown}: must be '
+                             f'{", ".join(f"--{one}" for one in taken)}')
     if 'imu' in options:
         options['imu'] = scene_file.file_of('imu', options['imu'])
         checked_imu(options['imu'], options.get('level', 'quick'))
     if 'data' in options:
         trials_in(options['data'])
     return kind, options
+
+
+def _report(kind: str, subject: Any, options: dict[str, Any], show: Any) -> Report:
+    if kind == 'log':
+        with needed('it'):
+            from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
+        return examine_log(subject, options['topic'], options.get('truth'),
+                           options.get('heading'))
+    if kind == 'node':
+        with needed('the exam of a node', 'ros'):
+            from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415
+        return examine_node(subject, show=show, **options)
+    make_filter: Callable[[], Filter] = partial(Program, subject)
+    how, name = feed, subject
+    if kind == 'filter' and subject in FILTERS:
+        with needed(f'the filter {subject}'):
+            FILTERS[subject]()          # imports its package before the exam
+        make_filter = FILTERS[subject]
+    elif kind == 'filter':
+        make_filter, how, name = _own_filter(subject), feed_apart, None
+    if 'data' in options:
+        return examine_data(make_filter, options['data'], subject=name, feed=how, show=show)
+    return examine(make_filter, subject=name, feed=how, show=show, **options)
 
 
 @contextlib.contextmanager
@@ -145,43 +161,9 @@ def _progress() -> Iterator[Callable[[float, float], None]]:
 
         def show(done: float, total: float) -> None:
             if not bars:
-                bars.append(stack.enter_context(cli.progress('examined', total, 'checks')))
+                bars.append(stack.enter_context(cli.progress('examined', total, 'parts')))
             bars[0](done)
         yield show
-
-
-def _of_log(path: Path, options: dict[str, Any], show: Any) -> Report:
-    with needed('it'):
-        from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
-
-    options['north'] = options.pop('heading', None)
-    return examine_log(path, **options)
-
-
-def _of_node(command: str, options: dict[str, Any], show: Any) -> Report:
-    with needed('the exam of a node', 'ros'):
-        from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415
-    return examine_node(command, show=show, **options)
-
-
-def _of_filter(name: str, options: dict[str, Any], show: Any) -> Report:
-    if name in FILTERS:
-        with needed(f'the filter {name}'):
-            FILTERS[name]()         # imports its package once, before the runs fork
-        # Published filters neither crash nor hang: without processes, the exam is faster.
-        return _of(FILTERS[name], name, feed, options, show)
-    return _of(_own_filter(name), None, feed_apart, options, show)
-
-
-def _of_program(command: str, options: dict[str, Any], show: Any) -> Report:
-    return _of(partial(Program, command), command, feed, options, show)
-
-
-def _of(make_filter: Callable[[], Filter], subject: str | None, how: Any,
-        options: dict[str, Any], show: Any) -> Report:
-    if 'data' in options:
-        return examine_data(make_filter, options['data'], subject=subject, feed=how, show=show)
-    return examine(make_filter, subject=subject, feed=how, show=show, **options)
 
 
 def _own_filter(given: str) -> Callable[[], Filter]:
@@ -202,6 +184,4 @@ def _own_filter(given: str) -> Callable[[], Filter]:
     return made
 
 
-EXAMS: Mapping[str, Callable[..., Report]] = {
-    'log': _of_log, 'node': _of_node, 'filter': _of_filter, 'command': _of_program}
 main = partial(cli.run, 'examine', __doc__, add_arguments, _run)

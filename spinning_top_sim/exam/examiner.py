@@ -54,24 +54,20 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     Parameters
     ----------
     make_filter : callable
-        Returns a new filter: its class, a function, or one of `adapters.FILTERS`.  It is called
-        for every run.
+        Returns a new filter for every run: its class, a function, or one of `adapters.FILTERS`.
     level : {'quick', 'full', 'field'}
         'full' has more seeds, and a seed of the scenes of 'field'.
     imu : mapping or path, optional
         Parameters imu.* and mag.* that replace those of the noisy runs and of the scenes, or the
         path of a parameter file such as those in config/imu.
     seeds : int or iterable of int, optional
-        Seeds of the noisy runs, or their number.  The default, SEEDS, depends on the level.
+        Seeds of the noisy runs, or their number; default: SEEDS.
     subject : str, optional
-        Name in the report.  The default is the name of the filter's class.
+        Name in the report; default: that of the filter's class.
     isolated : bool, optional
-        If False, the filter runs in this process, where a debugger can reach it.  A filter that
-        crashes or never returns then ends the exam.
-    feed : callable, optional
-        What feeds a filter, instead of `feeding.feed`.
-    show : callable, optional
-        Is called with what is done and what there is to do.
+        If False, the filter runs in this process, where a debugger can reach it.
+    feed, show : callable, optional
+        What feeds a filter, as `feeding.feed`; what takes the number of parts done and to do.
 
     Returns
     -------

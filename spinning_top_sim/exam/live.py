@@ -52,21 +52,12 @@ def examine_node(command: str, topic: str, level: str = 'quick',
                  seeds: int | Iterable[int] | None = None,
                  show: Callable[[float, float], object] | None = None) -> Report:
     """
-    Examine a ROS node.
+    Examine a ROS node that `command` starts for each run, without a shell.
 
-    Parameters
-    ----------
-    command : str
-        Command that starts the node for each run, without a shell.
-    topic : str
-        Topic of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
-    level, imu, seeds, show : optional
-        As for `examine`.
+    topic : of its attitudes, sensor_msgs/Imu, each with the stamp of its sample
 
-    Raises
-    ------
-    NodeError
-        If other nodes publish on its topics, or messages are lost.
+    The other arguments are those of `examine`.  Raises NodeError if other nodes publish on its
+    topics, or messages are lost.
     """
     with NodeExam(command, topic) as node:
         return examine(node.start, level, imu, seeds, subject=command, feed=node.feed, show=show)

@@ -52,23 +52,13 @@ class Stamped(NamedTuple):
 def examine_log(path: str | Path, topic: str, truth: str | None = None,
                 north: str | None = None) -> Report:
     """
-    Examine the attitudes of a topic.
+    Examine the attitudes q(world <- sensor) of a topic of an MCAP file.
 
-    Parameters
-    ----------
-    path : path
-        An MCAP file.
-    topic : str
-        Topic of the attitudes q(world <- sensor); its type must be one of LAYOUTS.
-    truth : str, optional
-        Topic of the truth; default: the first of TRUTHS.
-    north : {'true', 'magnetic'}, optional
-        From which the heading counts; by default it needs only be steady.
+    topic : its type must be one of LAYOUTS
+    truth : topic of the truth; default: the first of TRUTHS
+    north : 'true' or 'magnetic', from which the heading counts; default: it must be steady
 
-    Raises
-    ------
-    LogError, ValueError
-        If the file is no log, or lacks what the exam needs.
+    Raises LogError or ValueError if the file is no log, or lacks what the exam needs.
     """
     with LogReader(path) as reader:
         examined = _topic(reader, topic)

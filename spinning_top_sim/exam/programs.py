@@ -3,6 +3,7 @@
 
 import contextlib
 import os
+import re
 import selectors
 import shlex
 import subprocess
@@ -17,8 +18,8 @@ from spinning_top_sim.tools.cli import one_line
 
 ANSWER_S = 5.0                  # within which a line must come
 LONGEST_LINE = 4096             # bytes; an answer has less than a tenth of that
-# Numbers behind a word of an answer.
-WORDS = {'bias': 3, 'covariance': 9}
+# Of the numbers of an answer.
+SHAPES = {'attitude': 4, 'bias': 3, 'covariance': (3, 3)}
 
 
 class Program:
@@ -49,19 +50,14 @@ class Program:
         """Send the readings, and wait for the attitude."""
         if self._text or self._selector.select(0.0):
             self._text = self._text or self._read()
-            raise InvalidOutputError('answers more than a line: '
-                                     f'{one_line(self._text[:80].decode(errors="replace"))!r}')
+            text = self._text[:80].decode(errors='replace')
+            raise InvalidOutputError(f'answers more than a line: {one_line(text)!r}')
         field = np.full(3, np.nan) if magnetometer is None else magnetometer
         numbers = (*gyroscope.tolist(), *accelerometer.tolist(), *field.tolist(), dt)
         try:
             self._to.write((' '.join(map(repr, numbers)) + '\n').encode())
-        except BrokenPipeError:
-            self._fail_ended()
-        except OSError as error:
-            raise InvalidOutputError(f'the program takes no line: {error.strerror}') from error
-        return self._parsed(self._line())
-
-    def _line(self) -> str:
+        except OSError:
+            self._fail()
         end = time.monotonic() + ANSWER_S
         while b'\n' not in self._text:
             if not self._selector.select(max(0.0, end - time.monotonic())):
@@ -70,41 +66,31 @@ class Program:
             if len(self._text) > LONGEST_LINE:
                 raise InvalidOutputError(f'answers more than {LONGEST_LINE} bytes')
         line, _, self._text = self._text.partition(b'\n')
-        return line.decode(errors='replace')
+        return self._parsed(line.decode(errors='replace'))
 
     def _read(self) -> bytes:
-        more = os.read(self._from.fileno(), LONGEST_LINE)
-        if not more:
-            self._fail_ended()
-        return more
+        return os.read(self._from.fileno(), LONGEST_LINE) or self._fail()
 
     def _parsed(self, line: str) -> Reals:
-        said = line.split()
+        attitude, *others = re.split('(bias|covariance)', line)
         try:
-            attitude = np.array(said[:4], dtype=float)
-            rest, found = said[4:], {}
-            while rest:
-                count = WORDS[rest[0]]
-                found[rest[0]] = np.array(rest[1:1 + count], dtype=float)
-                if len(found[rest[0]]) != count:
-                    raise ValueError(rest[0])
-                rest = rest[1 + count:]
-        except (KeyError, ValueError):
-            attitude = np.empty(0)
-        if attitude.shape != (4,):
-            raise InvalidOutputError(f'answers {one_line(line)[:80]!r}: must be x y z w, and may '
-                                     'go on with bias and 3 numbers, covariance and 9')
-        self.bias = found.get('bias')
-        self.covariance = found['covariance'].reshape(3, 3) if 'covariance' in found else None
-        return attitude
+            found = {name: np.array(text.split(), dtype=float).reshape(SHAPES[name])
+                     for name, text in zip(['attitude', *others[::2]], [attitude, *others[1::2]],
+                                           strict=True)}
+        except ValueError:
+            raise InvalidOutputError(
+                f'answers {one_line(line)[:80]!r}: must be x y z w, and may go on with bias and 3 '
+                'numbers, covariance and 9') from None
+        self.bias, self.covariance = found.get('bias'), found.get('covariance')
+        return found['attitude']
 
-    def _fail_ended(self) -> NoReturn:
+    def _fail(self) -> NoReturn:
         try:
             code = self._process.wait(ANSWER_S)
         except subprocess.TimeoutExpired:
-            raise InvalidOutputError('the program has closed its output') from None
+            raise InvalidOutputError('the program has closed its input or output') from None
         raise InvalidOutputError(f'the program has ended, {"signal" if code < 0 else "exit code"} '
-                           f'{abs(code)}')
+                                 f'{abs(code)}')
 
     def close(self) -> None:
         """End the process."""
