@@ -43,8 +43,10 @@ def lag_of(comparison: Comparison) -> tuple[int, float, float, bool]:
         comparison.sizes)
     compared, width = comparison.compare(0), comparison.smoothed[0].width
     # Of smoothed samples fewer are independent: they must be more than the columns.
-    if count < ENOUGH * 3 * width * designs[0].shape[1] or best in (lags[0], lags[-1]) or found[0][1] < count * (ROUNDING * size) ** 2 or rms(
-            compared.effects['total']) < CLEARLY * compared.noise['total']:
+    few = count < ENOUGH * 3 * width * designs[0].shape[1]
+    weak = rms(compared.effects['total']) < CLEARLY * compared.noise['total']
+    still = found[0][1] < count * (ROUNDING * size) ** 2
+    if few or weak or still or best in (lags[0], lags[-1]):
         return unknown                          # every lag explains it
     # Around its minimum the sum of squares is a parabola.
     now, least, sooner, later = (found[lag][0] for lag in (0, best, best - 1, best + 1))

@@ -102,7 +102,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
         comparison.undo(causes.undo[undone[0].evidence])
     judged.marks.update(_marks(comparison, compared, lag))
     if kind in DENSITIES:
-        if {'reading_scale', 'inaccurate', 'matrix'}.isdisjoint(fault.name for fault in found):
+        if {'reading_scale', 'inaccurate', 'matrix', 'rates_in_world'}.isdisjoint(fault.name for fault in found):
             judged.faults.extend(_noise_faults(comparison, residual, covariance))
         judged.notes.extend(_untold(comparison, compared))
     return Judged([fault._replace(evidence=f'{kind}: {fault.evidence}')
@@ -379,13 +379,16 @@ def _untold(comparison: Comparison, compared: Compared) -> Iterator[str]:
 def _noise_faults(comparison: Comparison, residual: Reals,
                   covariance: Reals | None) -> Iterator[Finding]:
     """Compare noise with what is declared, and with normal noise."""
-    density, size = getattr(comparison.imu, DENSITIES[comparison.kind]), rms(comparison.sizes)
+    density = getattr(comparison.imu, DENSITIES[comparison.kind])
+    size = float(np.min(comparison.sizes))
     noise, root = comparison.reading_noise, math.sqrt(comparison.own_step)
     if not comparison.noisy:            # all that is left is noise of the readings
         parts = [part * one for part, one in zip(np.split(
             residual, np.cumsum(comparison.counts)[:-1]), comparison.sizes, strict=True)]
-        noise = rms(np.array([rms(np.diff(part, SIXTH, axis=0)) for part in parts])) / math.sqrt(
+        left = rms(np.array([rms(np.diff(part, SIXTH, axis=0)) for part in parts])) / math.sqrt(
             math.comb(2 * SIXTH, SIXTH))
+        # A cause that is found may have left some fast motion.
+        noise = left if left < 1.2 * noise else noise
         residual = np.concatenate(parts)
     exists = noise > NOISY * size
     band = NOISE_BAND + FOUR_SIGMA * _SPREAD / math.sqrt(residual.size)
