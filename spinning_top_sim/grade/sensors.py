@@ -102,7 +102,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
         comparison.undo(causes.undo[undone[0].evidence])
     judged.marks.update(_marks(comparison, compared, lag))
     if kind in DENSITIES:
-        if {'reading_scale', 'inaccurate', 'matrix', 'rates_in_world'}.isdisjoint(fault.name for fault in found):
+        unknown = {'reading_scale', 'inaccurate', 'matrix', 'rates_in_world'}
+        if unknown.isdisjoint(fault.name for fault in found):
             judged.faults.extend(_noise_faults(comparison, residual, covariance))
         judged.notes.extend(_untold(comparison, compared))
     return Judged([fault._replace(evidence=f'{kind}: {fault.evidence}')
