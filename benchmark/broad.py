@@ -20,8 +20,6 @@ import numpy as np
 import report
 from cases import ROOT
 from scipy.stats import spearmanr
-from spinning_top_sim.exam.reference import ReferenceFilter
-from spinning_top_sim.exam.trial import InvalidOutputError, feed
 
 from spinning_top_sim.exam import broad
 from spinning_top_sim.exam import scenes as field

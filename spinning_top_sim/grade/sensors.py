@@ -25,8 +25,9 @@ from spinning_top_sim.grade.effects import (
     Comparison,
     Imu,
 )
+from spinning_top_sim.grade.lag import CLEARLY, ROUNDING, SURE, lag_of
 from spinning_top_sim.tools.identify import NEAR, Cause, Judge, beyond, explain, instead, rms
-from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch
+from spinning_top_sim.tools.kinematics import Reals, Stretch
 from spinning_top_sim.tools.report import Finding, Mark
 
 _ANGLE = {'deg/s': 180.0 / math.pi, 'rad/s, taken for deg/s': math.pi / 180.0}
@@ -43,16 +44,11 @@ TERMS = {'tangential': ('a x r', 'no_tangential_term'),
          'linear': ('the acceleration of the origin', 'no_linear_acceleration'),
          'lever': ('the lever arm', 'no_lever_arm'), 'motion': ('motion', 'no_acceleration')}
 OFFSETS = 'offset 0', 'offset 1', 'offset 2'
-LAGS = range(-5, 41)        # lags that are tried [samples]
-ENOUGH = 3                  # independent samples a column, from which on a lag can be told
 LATE = 0.75                 # lag from which on it is a fault [samples of the sensor]
-ROUNDING = 1e-5             # share of a reading from which on a lag is looked for
-SURE = 5.0                  # standard deviations from which on a number is not chance
 # Share of a reading from which on a discrepancy is strange: rates that are told may be those of
 # the middle of a step; a real device, where poses have noise, has errors that no simulator needs.
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
 UNEXPLAINED, ROUGH = 0.5, 0.3   # shares of a discrepancy, with noise of a reading, left at most
-CLEARLY = 10.0              # by which a term must exceed its noise to be missed
 MISSING = 0.05              # share of a whole reading that is none
 GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
 EARTH_FIELD = 15e-6, 90e-6  # [T]
@@ -87,7 +83,7 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
     comparison, judged = Comparison(kind, stretches, imu, gravity), Judged([], {}, [])
     if not comparison.smoothed:
         return judged
-    lag, late, sigma, clear = _lag(comparison)
+    lag, late, sigma, clear = lag_of(comparison)
     late, sigma = late * comparison.steps, sigma * comparison.steps
     judged.marks[f'{kind}_lag_steps'] = Mark(late, LATE, _interval(sigma))
     if clear and abs(late) > max(LATE, SURE * sigma):
@@ -106,7 +102,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
         comparison.undo(causes.undo[undone[0].evidence])
     judged.marks.update(_marks(comparison, compared, lag))
     if kind in DENSITIES:
-        if {'reading_scale', 'inaccurate', 'matrix'}.isdisjoint(fault.name for fault in found):
+        unknown = {'reading_scale', 'inaccurate', 'matrix', 'rates_in_world'}
+        if unknown.isdisjoint(fault.name for fault in found):
             judged.faults.extend(_noise_faults(comparison, residual, covariance))
         judged.notes.extend(_untold(comparison, compared))
     return Judged([fault._replace(evidence=f'{kind}: {fault.evidence}')
@@ -115,98 +112,6 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
 
 def _interval(sigma: float) -> str:
     return f'+- {1.96 * sigma:.2g}'
-
-
-def _lag(comparison: Comparison) -> tuple[int, float, float, bool]:
-    """
-    Return by how many samples readings are late: as whole, with its fraction, and its deviation;
-    and whether that explains much.
-
-    The reading is fitted by all terms, of all axes, at each lag: what else is wrong does not
-    count.
-    """
-    unknown = 0, math.nan, math.inf, False
-    lags = [lag for lag in LAGS if 4 * abs(lag) < min(comparison.counts)]
-    part, designs, noises = slice(-lags[0], -lags[-1] or None), [], []
-    for smoothed in comparison.smoothed:
-        design, noise = _design(comparison, smoothed)
-        designs.append(design)
-        noises.append(noise)
-    best = 0
-    found: dict[int, tuple[float, float]] = {}
-    while comparison.leave_out(best, designs) or not found:
-        found = _misfits(comparison, lags, designs, noises, part)
-        before, best = best, min(found, key=lambda lag: found[lag][0])
-        if best == before:
-            break
-    count, size = 3 * sum(np.count_nonzero(good[part]) for good in comparison.good), rms(
-        comparison.sizes)
-    compared, width = comparison.compare(0), comparison.smoothed[0].width
-    # Of smoothed samples fewer are independent: they must be more than the columns.
-    if count < ENOUGH * 3 * width * designs[0].shape[1] or best in (lags[0], lags[-1]) or found[0][1] < count * (ROUNDING * size) ** 2 or rms(
-            compared.effects['total']) < CLEARLY * compared.noise['total']:
-        return unknown                          # every lag explains it
-    # Around its minimum the sum of squares is a parabola.
-    now, least, sooner, later = (found[lag][0] for lag in (0, best, best - 1, best + 1))
-    curvature = sooner - 2.0 * least + later
-    if curvature <= 0.0:
-        return unknown
-    late = best + 0.5 * (sooner - later) / curvature
-    less = 0.125 * (sooner - later) ** 2 / curvature
-    rest = max(found[best][1] - less, 0.0)
-    variance = rest / count * 2.0 * width       # of correlated noise
-    most = 1.5 * count * (compared.floor * size) ** 2
-    gained = now - least + less                 # which is that of a parabola, about
-    clear = bool(rest < 0.25 * found[0][1] or (
-        rest < most and gained > max((2.0 * SURE) ** 2 * variance,
-                                     0.05 * curvature * late ** 2)))
-    return best if clear else 0, late, math.sqrt(2.0 * variance / curvature), clear
-
-
-def _design(comparison: Comparison, smoothed: Smoothed) -> tuple[Reals, Reals]:
-    """Return columns of unit size that any reading may have, and how noise is in them."""
-    effects, noise = comparison.effects(smoothed), comparison.noises(smoothed)
-    names = [name for name in ('gravity', 'linear', 'world', *(
-        f'{name} {k}' for name in ('arm', 'turned arm', 'field') for k in range(3)))
-        if name in effects] + ['total'] * (comparison.kind in ANGLES)
-    design = np.hstack([*map(effects.__getitem__, names), np.ones((len(smoothed.rates), 1))])
-    sizes = np.linalg.norm(design, axis=0)
-    sizes[sizes == 0.0] = np.inf                # such as the part of a x r along r
-    # By axes: noise of the angular acceleration, as of any a x r, and of the others.
-    every = np.zeros((6, len(sizes)))
-    for k, name in enumerate(names):
-        columns = slice(3 * k, 3 * k + 3)
-        if name.endswith(('arm 0', 'arm 1', 'arm 2')):
-            every[:3, columns] = noise['turn'] * np.cross(np.eye(3), np.eye(3)[int(name[-1])])
-        else:
-            every[3:, columns] = noise.get(name, 0.0) * np.eye(3)
-    return design / sizes, every / sizes
-
-
-def _misfits(comparison: Comparison, lags: Sequence[int], designs: Sequence[Reals],
-             noises: Sequence[Reals], part: slice) -> dict[int, tuple[float, float]]:
-    """
-    Return the sums of squares that designs leave of readings by their lag.
-
-    The first is without what noise of the columns leaves: it would draw the lag to where the
-    columns are small.
-    """
-    rows = [np.flatnonzero(good[part]) + (part.start or 0) for good in comparison.good]
-    bases = []
-    for design, noise, chosen in zip(designs, noises, rows, strict=True):
-        left, sizes, right = np.linalg.svd(design[chosen], full_matrices=False)
-        known = sizes > 1e-9 * sizes[0]
-        bases.append((left[:, known], noise @ (right[known].T / sizes[known])))
-    found = {}
-    for lag in lags:
-        whole = noisy = 0.0
-        for (basis, noise), chosen, reading in zip(bases, rows, comparison.read_at(lag),
-                                                   strict=True):
-            sizes = basis.T @ reading[chosen]
-            whole += float(np.sum((reading[chosen] - basis @ sizes) ** 2))
-            noisy += len(chosen) * float(np.sum((noise @ sizes) ** 2))
-        found[lag] = whole - noisy, whole
-    return found
 
 
 class Causes:
@@ -475,13 +380,16 @@ def _untold(comparison: Comparison, compared: Compared) -> Iterator[str]:
 def _noise_faults(comparison: Comparison, residual: Reals,
                   covariance: Reals | None) -> Iterator[Finding]:
     """Compare noise with what is declared, and with normal noise."""
-    density, size = getattr(comparison.imu, DENSITIES[comparison.kind]), rms(comparison.sizes)
+    density = getattr(comparison.imu, DENSITIES[comparison.kind])
+    size = float(np.min(comparison.sizes))
     noise, root = comparison.reading_noise, math.sqrt(comparison.own_step)
     if not comparison.noisy:            # all that is left is noise of the readings
         parts = [part * one for part, one in zip(np.split(
             residual, np.cumsum(comparison.counts)[:-1]), comparison.sizes, strict=True)]
-        noise = rms(np.array([rms(np.diff(part, SIXTH, axis=0)) for part in parts])) / math.sqrt(
+        left = rms(np.array([rms(np.diff(part, SIXTH, axis=0)) for part in parts])) / math.sqrt(
             math.comb(2 * SIXTH, SIXTH))
+        # A cause that is found may have left some fast motion.
+        noise = left if left < 1.2 * noise else noise
         residual = np.concatenate(parts)
     exists = noise > NOISY * size
     band = NOISE_BAND + FOUR_SIGMA * _SPREAD / math.sqrt(residual.size)

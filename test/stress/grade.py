@@ -4,6 +4,7 @@
 from dataclasses import replace
 
 import numpy as np
+from helpers import bodies
 from helpers.bodies import FAULTS, NAMES, told
 from helpers.faulty_simulators import NOISY, OTHER, PUBLISHED, RIGHT, STEPPED, Imu, exact
 
@@ -36,7 +37,7 @@ def check(seed, folder):
                        body=_body(random, bool((seed + len(name)) % 2)))
         wrong += _judged(name, report, ())
     for fault in (None, *FAULTS):
-        moving = body(seed, seconds=10.0)
+        moving = bodies.body(seed, seconds=10.0)
         parts = told(moving, fault)
         known = Known(lever_arm=tuple(moving.arm) if seed % 2 or fault == 'no lever arm' else None)
         report = grade_readings(parts, known)
