@@ -220,11 +220,8 @@ class ThetaValues:
         self._cos /= square
         tangent += tangent
         self._sin = np.divide(tangent, square, out=tangent)
-        self._evaluate()
-
-    def _evaluate(self) -> None:
-        """Compute R and s J of alpha and beta, (2, n) each."""
-        arrays, quarters = self._arrays, self._whole[0]
+        # R and s J of alpha and beta, (2, n) each
+        quarters = self._whole[0]
         sin = np.sinh(arrays.stretch * self._offset) if arrays.stretch else self._sin[0]
         xi = -sin * sin if arrays.stretch else sin * sin
         cos = np.sqrt(1.0 - xi)

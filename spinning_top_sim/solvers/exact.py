@@ -95,6 +95,7 @@ class ExactSolution:
                 abs(float(motion.quarter_rate)), 1e-290,
                 (abs(self.mean_precession_rate) + abs(self.mean_spin_rate)) / (4.0 * math.pi))
             self.arrays = ThetaArrays(motion)
+        self.theta_min, self.theta_max = self.arrays.bounds
         if gravity is None:
             self._check_start()
 
@@ -116,14 +117,6 @@ class ExactSolution:
                                  f'the constants of {self.top} and {start} are too far apart in '
                                  'size')
 
-    @property
-    def theta_min(self) -> float:
-        return self.arrays.bounds[0]
-
-    @property
-    def theta_max(self) -> float:
-        return self.arrays.bounds[1]
-
     def describe(self, coincide: float = COINCIDE) -> Description:
         """
         Return the motion in numbers.
@@ -131,8 +124,8 @@ class ExactSolution:
         coincide : relative distance below which two turning points are one
         """
         top, start = self.top, self.start
-        rests, (low, high) = axis_rests(top, start), self.arrays.bounds
-        high = low if rests else high
+        low, rests = self.theta_min, axis_rests(top, start)
+        high = low if rests else self.theta_max
         slowest, fastest = precession_extremes(top, start, low, high)
         weight = 4.0 * top.lambda1 * abs(top.gravity_torque)
         return Description(
