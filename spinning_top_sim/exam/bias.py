@@ -24,8 +24,8 @@ RESTS_S = 20.0, 160.0           # slow filters get a longer time
 LEFT = 0.3                      # of the largest effect, where a bias counts as learned
 # An effect of 0.1 deg for 1 deg/s does not matter [rad].
 NO_EFFECT = 0.1 * SIZE
-# Share of its largest value by which an effect rises or falls in the last quarter, if it does.
-MOVES = 0.002
+# Share of the largest effect by which one rises or falls in the last quarter, if it does.
+MOVES = 0.01
 
 
 class Effect(NamedTuple):
@@ -35,6 +35,7 @@ class Effect(NamedTuple):
     left: float
     falls: bool
     rises: bool
+    samples: int        # of the rest
 
 
 def effects(exam: 'Exam') -> tuple[Outcome, list[Effect]]:
@@ -57,17 +58,17 @@ def effects(exam: 'Exam') -> tuple[Outcome, list[Effect]]:
             sizes += [(axis, np.abs(error[:, axis])) for axis in axes]
         largest = max(float(np.max(size)) for _, size in sizes)
         found = [_effect(axis, size, largest) for axis, size in sizes]
-        if not any(one.left > LEFT and (one.falls or one.rises) for one in found):
+        if not any(one.left > LEFT for one in found):
             break
     return outcome, found
 
 
 def _effect(axis: int, size: Reals, largest: float) -> Effect:
     if largest < NO_EFFECT:
-        return Effect(axis, 0.0, False, False)
+        return Effect(axis, 0.0, False, False, len(size))
     last, before = float(size[-1]), float(size[-len(size) // 4])
     return Effect(axis, last / largest, last < before - MOVES * largest,
-                  last > before + MOVES * largest)
+                  last > before + MOVES * largest, len(size))
 
 
 def said_bias(outcome: Outcome) -> Reals:

@@ -201,7 +201,8 @@ def effect_of_bias(exam: 'Exam') -> Measured:
     """Give the gyroscope a bias: its effect on the attitude must fall."""
     outcome, effects = exam.bias
     # An effect may still grow that is taken for a bias of the accelerometer.
-    known = float(np.max(np.abs(said_bias(outcome) / BIAS - 1.0))) < LEFT
+    first = outcome.part(slice(len(outcome.run.dt) - effects[0].samples))
+    known = all(np.max(np.abs(said_bias(one) / BIAS - 1.0)) < LEFT for one in (first, outcome))
     left = [one.left * (not one.falls) * (not (known and one.rises)) for one in effects]
     worst = effects[int(np.argmax(left))]
     return Measured(max(left), f'a bias of {math.degrees(SIZE):.2g} deg/s is '
