@@ -17,7 +17,7 @@ from spinning_top_sim.exam.log import examine_log
 from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.streams import journal
+from spinning_top_sim.streams.events import Event
 from spinning_top_sim.tools.simulate import main as simulate
 
 IMU, QUATERNION, POSE, POSE_COVARIANCE, ODOMETRY = TYPES = (
@@ -137,8 +137,8 @@ def test_a_reset_that_turns_the_sensor_on_the_body_is_refused(log, tmp_path):
         rows = [(0, one.log_time, one.data) for one in reader.messages(['/pose'])]
     epoch_ns = int(metadata['epoch_ns'])
     values = {**json.loads(metadata['parameters']), 'imu.rpy': [-1.0, 0.5, 2.0]}
-    rows.append((1, epoch_ns + 10 ** 9, journal.event(
-        'reset', 0, 10 ** 9 - 1, epoch_ns=epoch_ns, parameters=values)))
+    rows.append((1, epoch_ns + 10 ** 9, Event('reset', 0, 10 ** 9 - 1, {
+        'epoch_ns': epoch_ns, 'parameters': values}).encoded()))
     path = write_rows(tmp_path / 'reset.mcap', [RecordedTopic('/pose', POSE),
                                                 RecordedTopic('/events', STRING)], rows,
                       metadata=metadata)

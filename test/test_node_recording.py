@@ -68,7 +68,7 @@ def test_ticks_and_commands_go_on_while_a_log_is_being_opened_or_closed(tmp_path
 
 def test_a_recording_that_fails_is_told_once_and_gives_way_to_the_next(
         tmp_path, monkeypatch, capfd):
-    def full(_):
+    def full(*_, **__):
         raise OSError(errno.ENOSPC, 'No space left on device')
 
     precious = tmp_path / 'run.mcap'

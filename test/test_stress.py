@@ -96,6 +96,4 @@ def test_a_seed_of_a_part_of_make_stress(tmp_path, monkeypatch, request, part, s
     if part == 'nodes':
         peer = request.getfixturevalue('peer')
         monkeypatch.setattr(module, 'shared_peer', lambda: peer)
-    if part == 'wrong':
-        seed = [*module.TABLE].index(seed)
     assert module.check(seed, tmp_path)

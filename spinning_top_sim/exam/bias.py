@@ -6,17 +6,15 @@ The bias comes in a rest with the x axis up, when the filter has settled.  Its e
 attitude grows, and falls again if it is learned.  Then the sensor is turned: x is level.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
-from spinning_top_sim.exam.motions import NEAR, X_UP, Motion, Reals, euler
-
-if TYPE_CHECKING:
-    from spinning_top_sim.exam.examiner import Exam
+from spinning_top_sim.exam.motions import NEAR, X_UP, Motion, Reals, Run, euler
 
 BIAS = np.array((0.012, -0.011, 0.018))     # of the gyroscope [rad/s]
 SIZE = float(np.linalg.norm(BIAS))
@@ -38,21 +36,22 @@ class Effect(NamedTuple):
     samples: int        # of the rest
 
 
-def effects(exam: 'Exam') -> tuple[Outcome, list[Effect]]:
+def effects(feed: Callable[[Sequence[Run]], list[Outcome]], lead_s: float, heading: bool,
+            ) -> tuple[Outcome, list[Effect]]:
     """Return the outcome with a bias, and its effects, in rests as long as the filter needs."""
     for seconds in RESTS_S:
-        motion = Motion(euler(NEAR)).rest(exam.lead_s).turn(euler(X_UP)).rest(seconds)
+        motion = Motion(euler(NEAR)).rest(lead_s).turn(euler(X_UP)).rest(seconds)
         motion.turn(euler(NEAR)).rest(seconds)
         (_, *rests), run = motion.of('rest'), motion.run('bias')
         rates = run.gyroscope.copy()
         rates[rests[0].begin:] += BIAS
-        (outcome,) = exam.fed([replace(run, gyroscope=rates)])
+        (outcome,) = feed([replace(run, gyroscope=rates)])
         sizes = []              # of the effects about axes, level or of a known heading
-        for part, axes in zip(rests, (range(1 - exam.heading, 3), (0, 1)), strict=True):
+        for part, axes in zip(rests, (range(1 - heading, 3), (0, 1)), strict=True):
             rows = slice(part.begin, part.end)
             truth = Rotation.from_quat(run.truth[rows])
             error = (truth.inv() * Rotation.from_quat(outcome.estimates[rows])).as_rotvec()
-            if not exam.heading:
+            if not heading:
                 up = truth[0].inv().apply((0.0, 0.0, 1.0))
                 error = error - np.outer(error @ up, up)
             sizes += [(axis, np.abs(error[:, axis])) for axis in axes]

@@ -8,7 +8,7 @@ out where one of the faults in `needs` has been found, and the report says so.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,12 +17,10 @@ from spinning_top_sim.exam import answers, measures
 from spinning_top_sim.exam.bias import BIAS, LEFT, SIZE, said_bias
 from spinning_top_sim.exam.measures import degrees, errors_of
 from spinning_top_sim.exam.motions import RATE, Reals
+from spinning_top_sim.exam.runs import Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.identify import rms
 from spinning_top_sim.tools.report import Mark
-
-if TYPE_CHECKING:
-    from spinning_top_sim.exam.examiner import Exam
 
 # Without noise a right filter has no error; what is left is its own rounding and settling.
 CLEAN_DEG = 0.3
@@ -56,11 +54,11 @@ class Check(NamedTuple):
     mark: str
     limit: float
     meaning: str
-    measure: Callable[['Exam'], Measured | None]    # None: there is nothing to judge
+    measure: Callable[[Exam], Measured | None]    # None: there is nothing to judge
     needs: Sequence[str] = ()
 
 
-def repeat(exam: 'Exam') -> Measured:
+def repeat(exam: Exam) -> Measured:
     """Feed two filters of one process with the same readings."""
     one, other = (Rotation.from_quat(outcome.estimates) for outcome in exam.outcomes('twice'))
     apart = float(np.max((one.inv() * other).magnitude()))
@@ -68,7 +66,7 @@ def repeat(exam: 'Exam') -> Measured:
                     f'{degrees(apart)} apart: they are random, or share state')
 
 
-def convention(exam: 'Exam') -> Measured:
+def convention(exam: Exam) -> Measured:
     """Read the attitudes at the rests in every convention; undo the one that fits."""
     told, rests = exam.outcomes('excitation')[0].estimates, _rests(exam)
     truth, heading = exam.run.truth[rests], 'absolute' if exam.heading else 'any'
@@ -87,7 +85,7 @@ def convention(exam: 'Exam') -> Measured:
                     f'{after:.2g} deg; the other checks undo it', limit=None if name else math.inf)
 
 
-def gyroscope(exam: 'Exam') -> Measured:
+def gyroscope(exam: Exam) -> Measured:
     """Identify the matrix from turns that the gyroscope reads to those of the attitude."""
     found = _rates(exam)
     off = found.off_identity
@@ -102,14 +100,14 @@ def gyroscope(exam: 'Exam') -> Measured:
 DELAY = 0.25            # samples; the half of a trapezoid is found
 
 
-def delay(exam: 'Exam') -> Measured:
+def delay(exam: Exam) -> Measured:
     """Identify the delay with which the attitude follows the gyroscope."""
     found = _rates(exam).delay
     return Measured(abs(found), f'the attitude follows the gyroscope {abs(found):.3g} samples '
                     f'{"late" if found > 0.0 else "ahead"}')
 
 
-def steps(exam: 'Exam') -> Measured:
+def steps(exam: Exam) -> Measured:
     """Compare turns in steps of different lengths."""
     gains = answers.gains_of_steps(*exam.outcomes('uneven'), *exam.outcomes('uneven turns'))
     return Measured(max(abs(gain - 1.0) for gain in gains.values()),
@@ -118,7 +116,7 @@ def steps(exam: 'Exam') -> Measured:
                     'far: the length of the step is misused')
 
 
-def large_turns(exam: 'Exam') -> Measured:
+def large_turns(exam: Exam) -> Measured:
     """Compare large turns in one step with the closed form of the rotation."""
     off = answers.off_rotation(exam.outcomes('starts'), exam.outcomes('large turns'))
     turn = f'a turn of {answers.LARGE:g} rad in one step'
@@ -129,7 +127,7 @@ def large_turns(exam: 'Exam') -> Measured:
                     f'{answers.LARGE ** 2 / 12:.2%} off')
 
 
-def way_of_tilt(exam: 'Exam') -> Measured:
+def way_of_tilt(exam: Exam) -> Measured:
     """Turn the gyroscope alone: gravity leads the tilt back, straight and in every attitude."""
     right = answers.pull(exam.outcomes('tilts'), slice(2))
     tilt = float(np.max(exam.clean.tilt[_rests(exam)]))
@@ -138,7 +136,7 @@ def way_of_tilt(exam: 'Exam') -> Measured:
                         'rest_tilt_deg': Mark(math.degrees(tilt), CLEAN_DEG, 'without noise')})
 
 
-def errors_by_field(exam: 'Exam') -> Measured | None:
+def errors_by_field(exam: Exam) -> Measured | None:
     """Judge the heading at rest, and a tilt that the field causes."""
     if not exam.heading:
         return None
@@ -158,7 +156,7 @@ def errors_by_field(exam: 'Exam') -> Measured | None:
                     'accuracy' if right > SURE else '')
 
 
-def heading_answer(exam: 'Exam') -> Measured | None:
+def heading_answer(exam: Exam) -> Measured | None:
     """Turn the field to one side and to the other: the heading follows."""
     if not exam.heading:
         return None
@@ -170,7 +168,7 @@ def heading_answer(exam: 'Exam') -> Measured | None:
                     f'{share:.2g} within {len(moved) / 2.0 / RATE:.0f} s')
 
 
-def clean(exam: 'Exam') -> Measured:
+def clean(exam: Exam) -> Measured:
     """Judge what is left without noise."""
     whole, settled = np.degrees(exam.clean.whole), round(exam.lead_s * RATE)
     names = {'at rest': 'rest', 'in turns': 'turn', 'in fast turns': 'fast', 'in a slow turn':
@@ -181,7 +179,7 @@ def clean(exam: 'Exam') -> Measured:
         f'{value:.2g} deg {text}' for text, value in worst.items()))
 
 
-def lever_arm(exam: 'Exam') -> Measured:
+def lever_arm(exam: Exam) -> Measured:
     """Move the IMU off the axis: the tilt must not follow the specific force."""
     (part,) = exam.motion.of('top')
     (with_arm,) = exam.outcomes('arm')
@@ -197,7 +195,7 @@ def lever_arm(exam: 'Exam') -> Measured:
                     others={'lever_arm_deg': Mark(math.degrees(tilt), meaning='by 10 cm')})
 
 
-def effect_of_bias(exam: 'Exam') -> Measured:
+def effect_of_bias(exam: Exam) -> Measured:
     """Give the gyroscope a bias: its effect on the attitude must fall."""
     outcome, effects = exam.bias
     # An effect may still grow that is taken for a bias of the accelerometer.
@@ -211,7 +209,7 @@ def effect_of_bias(exam: 'Exam') -> Measured:
                     limit=0.95 if known else None)
 
 
-def reported_bias(exam: 'Exam') -> Measured | None:
+def reported_bias(exam: Exam) -> Measured | None:
     """Compare the reported bias with the true one, and with none."""
     outcome, effects = exam.bias
     said, none = map(said_bias, (outcome, exam.outcomes('excitation')[0]))
@@ -229,7 +227,7 @@ def reported_bias(exam: 'Exam') -> Measured | None:
                         float(said @ BIAS) / SIZE ** 2, meaning='share in the estimate')})
 
 
-def noisy(exam: 'Exam') -> Measured:
+def noisy(exam: Exam) -> Measured:
     """Judge errors with noise by those of attitudes from single samples."""
     errors, single = [], []
     for outcome in exam.outcomes('noise'):
@@ -248,7 +246,7 @@ def noisy(exam: 'Exam') -> Measured:
                                                 else 'with noise, about its mean')})
 
 
-def covariance(exam: 'Exam') -> Measured | None:
+def covariance(exam: Exam) -> Measured | None:
     """Compare the squared error with the covariance."""
     nees = measures.nees_of(exam.outcomes('noise'))
     if nees is None or not any(exam.imu[f'imu.{sensor}_noise_density'] for sensor in (
@@ -260,17 +258,17 @@ def covariance(exam: 'Exam') -> Measured | None:
                     limit=nees.high)
 
 
-def _rests(exam: 'Exam') -> list[int]:
+def _rests(exam: Exam) -> list[int]:
     """Return the last sample of each rest."""
     return [part.end - 1 for part in exam.motion.of('rest')]
 
 
-def _attitudes(exam: 'Exam', name: str) -> tuple[Reals, Reals]:
+def _attitudes(exam: Exam, name: str) -> tuple[Reals, Reals]:
     """Return the attitudes of the excitation as it is, and as it is varied."""
     return exam.outcomes('excitation')[0].estimates, exam.outcomes(name)[0].estimates
 
 
-def _rates(exam: 'Exam') -> answers.Rates:
+def _rates(exam: Exam) -> answers.Rates:
     return answers.rates(exam.outcomes('starts'), exam.outcomes('turns'))
 
 

@@ -34,8 +34,8 @@ def read_log(path: Path, wanted: Sequence[str] = ()) -> Recorded:
     with LogReader(path) as reader:
         with contextlib.suppress(recorded_run.ForeignLogError):
             recorded.run = recorded_run.read_run_description(reader)
-            end_ns = next((one.stamp_ns for one in recorded.run.events if one.name != 'start'),
-                          end_ns)
+            end_ns = next((one.stamp_ns for one in recorded.run.events
+                           if one.event.kind != 'start'), end_ns)
         if not reader.whole:
             recorded.notes.append('the log is truncated: read as far as it goes')
         types = {topic.name: topic.type_name for topic in reader.topics}

@@ -221,6 +221,7 @@ class Recorder:
                 rows, size = self._queue.popleft()
                 for one in rows:
                     file.add(*one)
+                file.flush(if_full=True)
                 self._bytes_out += size
             if self.room:
                 self._taken.set()

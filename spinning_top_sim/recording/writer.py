@@ -47,7 +47,7 @@ class McapWriter:
     """
     A new log, used by one thread at a time; its head is on the disk at once.
 
-    `add` collects messages for a chunk and writes it when it is full, `flush` writes it now.
+    `add` collects messages for a chunk, `flush` writes it.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
@@ -116,18 +116,18 @@ class McapWriter:
         """
         self._rows.append((topic_index, log_times_ns, rows))
         self._chunk_bytes += len(rows) * _message_type(rows.shape[1]).itemsize
-        if self._chunk_bytes >= CHUNK_BYTES:
-            self.flush()
 
-    def flush(self) -> None:
+    def flush(self, if_full: bool = False) -> None:
         """
-        Write the chunk in memory, if it holds anything.
+        Write the chunk in memory; or only if it is full.
 
-        An exception loses it, so that the file can be finished; an interrupt does not.
+        Call it where no topic lags behind another: a file that is torn there has no holes.
+        An exception loses the chunk, so that the file can be finished; an interrupt does not.
         """
+        if self._chunk_bytes < (CHUNK_BYTES if if_full else 1):
+            return
         try:
-            if self._rows:
-                self._write_chunk()
+            self._write_chunk()
         except Exception:
             self._rows, self._chunk_bytes = [], 0
             raise

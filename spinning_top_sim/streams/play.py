@@ -17,7 +17,7 @@ from spinning_top_sim.streams.imu import LONGEST_NS, Imu
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.streams.trajectory import Trajectory
 
-BLOCK_BYTES = 4 << 20                       # of a block offline
+BLOCK_BYTES = 1_000_000                     # of a block offline
 LONGEST_BLOCK_NS = 100 * NANOSECONDS        # for the sake of progress
 MOST_BLOCKS = 20_000                        # of a run; then they are longer
 

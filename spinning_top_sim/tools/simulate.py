@@ -183,6 +183,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
             if isinstance(done, Block):
                 for channel, t_ns, rows in done.messages:
                     file.add(channels.index(channel), epoch_ns + t_ns, rows)
+                file.flush()
             else:
                 add(done)
     except KeyboardInterrupt as interrupt:

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The runs of one exam: what the filter is fed with, and what it answers."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.exam import answers, bias, motions
+from spinning_top_sim.exam.feeding import Feed, MakeFilter, Outcome
+from spinning_top_sim.exam.measures import Errors, errors_of
+from spinning_top_sim.exam.motions import NEAR, RATE, Motion, Run
+from spinning_top_sim.tools.conventions import Convention
+
+# A filter is settled if it has turned by less than STILL [rad] in the second half of a rest at
+# the start; slow ones get longer ones.
+LEADS_S, STILL = (10.0, 40.0, 160.0), math.radians(0.05)
+ARM, ARM_AFTER_S = (0.1, 0.0, 0.0), 4.0     # of the IMU [m], and when it comes in the top's motion
+FIELD_TURN = math.radians(3.0)              # of the field about the vertical
+NOISE_LEAD_S, NOISE_S = 6.0, 20.0           # rest and motion of the noisy runs
+
+
+class Exam:
+    """
+    The runs of one exam, each fed when a check asks for it.
+
+    convention : of the attitudes; it is undone in all outcomes
+    done : outcomes by the name of their runs in RUNS
+    """
+
+    def __init__(self, make_filter: MakeFilter, feed: Feed, imu: Mapping[str, Any],
+                 seeds: Sequence[int]) -> None:
+        self._make_filter, self._feed = make_filter, feed
+        self.imu, self.seeds = imu, seeds
+        self.convention = Convention()
+        self.done: dict[str, list[Outcome]] = {}
+
+    def outcomes(self, name: str) -> list[Outcome]:
+        """Return the outcomes of a run by its name in RUNS, in our convention."""
+        if name not in self.done:
+            self.done[name] = self.fed(RUNS[name](self))
+        return self.done[name]
+
+    def fed(self, runs: Sequence[Run]) -> list[Outcome]:
+        """Return the outcomes of other runs, in our convention."""
+        told = self._feed(self._make_filter, runs)
+        return [replace(one, estimates=self.convention.undo(one.estimates)) for one in told
+                ] if self.convention.parts else told
+
+    def read_in(self, convention: Convention) -> None:
+        """Read the attitudes of all runs in another convention than before."""
+        self.done = {name: [replace(one, estimates=convention.undo(
+            self.convention.tell(one.estimates))) for one in outcomes]
+            for name, outcomes in self.done.items() if name != 'turns'}
+        self.convention = convention
+
+    @cached_property
+    def lead_s(self) -> float:
+        """How long the filter rests at the start until it is settled [s]."""
+        for seconds in LEADS_S[:-1]:
+            (outcome,) = self.fed([Motion(motions.euler(NEAR)).rest(seconds).run('rest')])
+            turns = Rotation.from_quat(outcome.estimates[len(outcome.estimates) // 2:])
+            if float(np.max((turns[0].inv() * turns).magnitude())) < STILL:
+                return seconds
+        return LEADS_S[-1]
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The excitation."""
+        return motions.excitation(self.lead_s)
+
+    @cached_property
+    def run(self) -> Run:
+        """The excitation as a perfect IMU reads it."""
+        return self.motion.run('excitation')
+
+    @cached_property
+    def heading(self) -> bool:
+        """Whether the field changes attitudes: only then the heading is judged against north."""
+        one, other = (self.outcomes(name)[0].estimates for name in ('excitation', 'field turned'))
+        return bool(np.max(np.abs(one - other)) > 1e-6)
+
+    @cached_property
+    def bias(self) -> tuple[Outcome, list[bias.Effect]]:
+        """The effects of a bias."""
+        return bias.effects(self.fed, self.lead_s, self.heading)
+
+    def errors(self, name: str = 'excitation') -> Errors:
+        """Return the errors in the excitation; without north, the heading from when settled on."""
+        errors = errors_of(self.outcomes(name)[0].estimates, self.run.truth)
+        if not self.heading:
+            turned = errors.heading - errors.heading[round(self.lead_s * RATE)]
+            errors = errors._replace(heading=(turned + math.pi) % math.tau - math.pi)
+        return errors
+
+    @cached_property
+    def clean(self) -> Errors:
+        """The errors in the excitation; filters may read force and field at the begin of steps."""
+        errors, settled = self.errors(), slice(round(self.lead_s * RATE), None)
+        if np.max(errors.whole[settled]) < STILL:
+            return errors
+        return min(errors, self.errors('force of the begin'),
+                   key=lambda one: float(np.max(one.whole[settled])))
+
+
+def _field_turned(exam: Exam) -> list[Run]:
+    """Turn the field about the vertical, to one side and then to the other."""
+    middle = len(exam.run.dt) // 2
+    turns = Rotation.from_quat(exam.run.truth)
+    west = np.where(np.arange(2 * middle + 1)[:len(turns)] < middle, FIELD_TURN, -FIELD_TURN)
+    field = turns.inv().apply(Rotation.from_euler('z', west[:, np.newaxis]).apply(
+        turns.apply(exam.run.magnetometer)))
+    return [replace(exam.run, name='field turned', magnetometer=field)]
+
+
+def _begin(exam: Exam) -> list[Run]:
+    """Read force and field at the begin of each step."""
+    force, field = (np.vstack((rows[:1], rows[:-1]))
+                    for rows in (exam.run.accelerometer, exam.run.magnetometer))
+    return [replace(exam.run, name='force of the begin', accelerometer=force, magnetometer=field)]
+
+
+def _starts() -> list[Run]:
+    return [run.without_field() for run in motions.starts()]
+
+
+def _turns(exam: Exam, size: float) -> list[Run]:
+    """Return starts with kicks about what the filter takes for the vertical."""
+    said = [one.estimates for one in exam.outcomes('starts')]
+    return answers.kicked_starts(_starts(), UPRIGHT, said, size)
+
+
+UPRIGHT, LEVEL = (0.0, 0.0, 1.0), (0.6, 0.8, 0.0)
+RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
+    'twice': lambda exam: 2 * [motions.noisy('twice', motions.CALIBRATED, 0, 1.0, 1.0)],
+    'excitation': lambda exam: [exam.run],
+    'force of the begin': _begin,
+    'field turned': _field_turned,
+    'no field': lambda exam: [exam.run.without_field()],
+    'uneven': lambda exam: [motions.uneven(1000).without_field()],
+    'uneven turns': lambda exam: [answers.kicked_steps(exam.outcomes('uneven')[0])],
+    'starts': lambda exam: _starts(),
+    'turns': lambda exam: _turns(exam, answers.SMALL),
+    'large turns': lambda exam: _turns(exam, answers.LARGE),
+    'tilts': lambda exam: answers.kicked_starts(_starts(), LEVEL, [
+        run.truth for run in motions.starts()]),
+    'turns with field': lambda exam: answers.kicked_starts(motions.starts(), UPRIGHT, [
+        run.truth for run in motions.starts()]),
+    'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM, ARM_AFTER_S)],
+    'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
+                                         NOISE_S) for seed in exam.seeds]}
