@@ -27,7 +27,7 @@ def run():
 
 
 def test_motion_is_not_taken_for_gravity(run):
-    """For 10 s the device is shaken along the east with 1 m/s^2: of 4.1 deg rms, a tenth is left."""
+    """For 10 s the device is shaken with 1 m/s^2: of 4.1 deg rms a tenth is left."""
     motion = np.zeros((len(run.t), 3))
     motion[1000:, 0] = np.sin(np.pi * (run.t[1000:] - run.t[1000]))
     force = run.accelerometer + Rotation.from_quat(run.truth).inv().apply(motion)
