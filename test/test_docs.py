@@ -23,7 +23,7 @@ NOT_RUN = {
     'the tests have a domain of their own': 1,
     'needs the command line tools of a ROS installation': 6,
     'runs until Ctrl-C, after it has installed packages': 3,
-    'takes minutes or hours': 1,
+    'takes minutes': 1,
     'needs data that are not part of the package': 1,
     'serves a page until Ctrl-C; test_view_browser.py opens one': 1,
     'a part of a configuration': 1,
