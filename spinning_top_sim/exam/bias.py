@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
@@ -24,6 +25,7 @@ LEFT = 0.3                      # of the largest effect, where a bias counts as 
 NO_EFFECT = 0.1 * SIZE
 # Share of the largest effect by which one rises or falls in the last quarter, if it does.
 MOVES = 0.01
+LEAST = 0.01                    # share of a bias in an estimate that learns it
 
 
 class Effect(NamedTuple):
@@ -75,3 +77,10 @@ def said_bias(outcome: Outcome) -> Reals:
     known = outcome.biases[np.isfinite(outcome.biases[:, 0])]
     last: Reals = known[-1] if len(known) else np.full(3, np.nan)
     return last
+
+
+def still_learned(outcome: Outcome) -> NDArray[np.bool_]:
+    """Return about which axes the bias that a filter tells still grows to the true one (3,)."""
+    shares = said_bias(outcome) / BIAS
+    before = said_bias(outcome.part(slice(len(outcome.run.dt) * 3 // 4))) / BIAS
+    return (shares > 1.02 * before) & (shares > LEAST) & (shares < 1.3)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, measures
-from spinning_top_sim.exam.bias import BIAS, LEFT, SIZE, said_bias
+from spinning_top_sim.exam.bias import BIAS, LEFT, SIZE, said_bias, still_learned
 from spinning_top_sim.exam.measures import degrees, errors_of
 from spinning_top_sim.exam.motions import RATE, Reals
 from spinning_top_sim.exam.runs import Exam
@@ -201,7 +201,9 @@ def effect_of_bias(exam: Exam) -> Measured:
     # An effect may still grow that is taken for a bias of the accelerometer.
     first = outcome.part(slice(len(outcome.run.dt) - effects[0].samples))
     known = all(np.max(np.abs(said_bias(one) / BIAS - 1.0)) < LEFT for one in (first, outcome))
-    left = [one.left * (not one.falls) * (not (known and one.rises)) for one in effects]
+    learns = still_learned(outcome)
+    left = [one.left * (not one.falls) * (not (known and one.rises)) * (not learns[one.axis])
+            for one in effects]
     worst = effects[int(np.argmax(left))]
     return Measured(max(left), f'a bias of {math.degrees(SIZE):.2g} deg/s is '
                     f'not learned about {"xyz"[worst.axis]}: {worst.left:.0%} of its largest '
@@ -215,10 +217,10 @@ def reported_bias(exam: Exam) -> Measured | None:
     said, none = map(said_bias, (outcome, exam.outcomes('excitation')[0]))
     if np.isnan(said[0]) or np.isnan(none[0]):
         return None
-    shares, before = said / BIAS, said_bias(outcome.part(slice(len(outcome.run.dt) * 3 // 4)))
+    shares = said / BIAS
     # What is still being learned may be anything from nothing to a little too much.
-    learns = any(one.left > LEFT for one in effects) | (shares > 1.02 * before / BIAS)
-    off = np.where(learns & (shares > -0.05) & (shares < 1.3), 0.0, np.abs(shares - 1.0))
+    learns = any(one.left > LEFT for one in effects) & (shares > -0.05) & (shares < 1.3)
+    off = np.where(learns | still_learned(outcome), 0.0, np.abs(shares - 1.0))
     text, report, without = (', '.join(f'{rate:.2g}' for rate in np.degrees(rates))
                              for rates in (BIAS, said, none))
     return Measured(max(float(np.max(off)), float(np.linalg.norm(none)) / SIZE),
@@ -255,7 +257,7 @@ def covariance(exam: Exam) -> Measured | None:
     off = max(nees.ratio, 1.0 / max(nees.ratio, 1e-300))
     return Measured(off, f'the squared error of the tilt is {nees.ratio:.3g} times what the '
                     f'covariance says; consistent are {nees.low:.3g} to {nees.high:.3g}',
-                    limit=nees.high)
+                    limit=nees.high if nees.ratio > 1.0 else 1.0 / nees.low)
 
 
 def _rests(exam: Exam) -> list[int]:

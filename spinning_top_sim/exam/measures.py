@@ -13,7 +13,9 @@ from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.tools.identify import autocorrelation_time, rms
 
-SIGMAS, TOLERATED = 4.0, 2.0    # of the band of a squared error; factor by which P may be off
+# Of the band of a squared error: standard deviations; factors by which a covariance may be too
+# small and, to be on the safe side, too large.
+SIGMAS, SMALL, LARGE = 4.0, 2.0, 10.0
 
 
 class Errors(NamedTuple):
@@ -106,10 +108,10 @@ def nees_of(outcomes: Sequence[Outcome]) -> Nees | None:
             continue
         mean = max(float(np.mean(np.concatenate(squares))), 1e-300)
         count = sum(len(one) / autocorrelation_time(one[np.newaxis]) for one in squares)
-        spread = TOLERATED * math.exp(SIGMAS / math.sqrt(count))
+        spread = math.exp(SIGMAS / math.sqrt(count))
         # Negative log-likelihood for the best common factor of the covariances.
         unlikely = 2.0 * math.log(mean) + float(np.mean(sizes))
-        found.append((unlikely, Nees(0.5 * mean, 1.0 / spread, spread)))
+        found.append((unlikely, Nees(0.5 * mean, 1.0 / (LARGE * spread), SMALL * spread)))
     return min(found)[1] if found else None
 
 
