@@ -54,8 +54,10 @@ numpydoc_show_class_members = False
 # Parameters and yields are described, with their types; what is returned, by the first sentence
 # or by a section.
 numpydoc_validation_checks = {'PR01', 'PR02', 'PR03', 'PR04', 'PR07', 'RT03', 'YD01'}
-# Made by solvers; a protocol, and its implementation.
-numpydoc_validation_exclude = {r'\.States$', r'\.Filter$', r'\.ReferenceFilter\.update$'}
+# Made by solvers; a protocol; what others describe or extend; fields that have comments.
+numpydoc_validation_exclude = {
+    r'\.States$', r'\.Filter$', r'\.Filter\.update$', r'\.Body$', r'\.Start$',
+    r'\.Description$', r'\.LogTopic$', r'\.LogMessage$', r'\.Damage$'}
 
 html_theme = 'furo' if installed('furo') else 'alabaster'
 html_title = f'{project} {release}'

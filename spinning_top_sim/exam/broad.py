@@ -31,8 +31,21 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     Examine a filter with the trials of BROAD in a folder: .mat, or .hdf5, which need h5py.
 
     The filter gets each trial from its first sample on.  The measures are the root mean squares
-    of the errors in motion, of each trial and their means.  The other arguments are those of
-    `examine`.  Raises ValueError if there is no folder, no trial in it, or a file is none.
+    of the errors in motion, of each trial and their means.
+
+    Parameters
+    ----------
+    make_filter : callable
+        As of `examine`.
+    folder : path
+        With the files.
+    subject, feed, show : optional
+        As of `examine`.
+
+    Raises
+    ------
+    ValueError
+        If there is no folder, no trial in it, or a file is none.
     """
     paths = trials_in(folder)
     return report_of(make_filter, map(read_trial, paths), len(paths), 'data', one_line(

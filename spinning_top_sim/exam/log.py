@@ -54,11 +54,21 @@ def examine_log(path: str | Path, topic: str, truth: str | None = None,
     """
     Examine the attitudes q(world <- sensor) of a topic of an MCAP file.
 
-    topic : its type must be one of LAYOUTS
-    truth : topic of the truth; default: the first of TRUTHS
-    north : 'true' or 'magnetic', from which the heading counts; default: it must be steady
+    Parameters
+    ----------
+    path : path
+        The file.
+    topic : str
+        Of the attitudes; its type must be one of LAYOUTS.
+    truth : str, optional
+        Topic of the truth; default: the first of TRUTHS.
+    north : {'true', 'magnetic'}, optional
+        From which the heading counts; by default it must be steady.
 
-    Raises LogError or ValueError if the file is no log, or lacks what the exam needs.
+    Raises
+    ------
+    LogError, ValueError
+        If the file is no log, or lacks what the exam needs.
     """
     with LogReader(path) as reader:
         examined = _topic(reader, topic)

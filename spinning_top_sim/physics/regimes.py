@@ -40,7 +40,7 @@ class Description:
     precession_max: float               #: Greatest precession rate.
     mean_spin_rate: float               #: Mean over a nutation.
     separatrix_distance: float          #: 1 - m; 0 is the motion that rises for ever.
-    gyroscopic_ratio: float             #: L3^2/(4 lambda1 |P|); an upright top sleeps above 1.
+    gyroscopic_ratio: float             #: L3^2/(4 lambda1 abs(P)); an upright top sleeps above 1.
 
 
 def axis_rests(top: Top, state: State) -> bool:

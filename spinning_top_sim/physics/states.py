@@ -223,7 +223,12 @@ class States:
         """
         Return the velocity omega x r of a point of the body relative to the pivot.
 
-        As three (n,) arrays in the body frame [m/s], in which `point` is r [m].
+        As three (n,) arrays in the body frame [m/s].
+
+        Parameters
+        ----------
+        point : three floats
+            From the pivot, in the body frame [m].
         """
         (w1, w2, w3), (r1, r2, r3) = self.rows_angular_velocity, point
         return w2 * r3 - w3 * r2, w3 * r1 - w1 * r3, w1 * r2 - w2 * r1
@@ -233,8 +238,12 @@ class States:
         Return what an ideal accelerometer at a point of the body measures.
 
         It is omega' x r + omega x (omega x r) + g z + a with the acceleration a of the pivot: at
-        rest +g upwards, as REP-145 has it.  As three (n,) arrays in the body frame [m/s^2], in
-        which `point` is r, from the pivot [m].
+        rest +g upwards, as REP-145 has it.  As three (n,) arrays in the body frame [m/s^2].
+
+        Parameters
+        ----------
+        point : three floats
+            From the pivot, in the body frame [m].
         """
         f1, f2, f3 = self._support
         if not any(point):          # the point is the pivot: no rate is needed
@@ -263,8 +272,12 @@ class States:
         """
         Return an animation of the body, its axis and the path of the tip; raises as `plot`.
 
-        fps : frames per second, > 0; each shows the newest sample: no others are computed
-        speed : simulated over real time, > 0
+        Parameters
+        ----------
+        fps : float
+            Frames per second, > 0; each shows the newest sample: no others are computed.
+        speed : float
+            Simulated over real time, > 0.
         """
         with needed('a picture', 'plot'):
             from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow

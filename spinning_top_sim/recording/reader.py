@@ -85,14 +85,20 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     What is damaged is left out.  A file that was not closed is read through at once.
 
-    path : the file, or a folder as `ros2 bag` makes it, which must hold exactly one
-    max_bytes : of the largest record, and the largest uncompressed chunk, that is read
+    Parameters
+    ----------
+    path : path
+        The file, or a folder as `ros2 bag` makes it, which must hold exactly one.
+    max_bytes : int
+        Of the largest record, and the largest uncompressed chunk, that is read.
 
-    Attributes: `path` and `size` [bytes] of the file when it was opened; `profile` and `library`,
-    which its header names; `whole`, whether it was closed and its summary, if any, is right;
-    `metadata`, the last of each name; `schemas` and `channels`, mcap's records by id; `span`, the
-    earliest and the latest log time [ns], both 0 without messages; `left_out`, the number of
-    damaged chunks that `messages` has skipped so far.
+    Notes
+    -----
+    Attributes are `path` and `size` [bytes] of the file when it was opened; `profile` and
+    `library`, which its header names; `whole`, whether it was closed and its summary, if any,
+    is right; `metadata`, the last of each name; `schemas` and `channels`, mcap's records by
+    id; `span`, the earliest and the latest log time [ns], both 0 without messages; `left_out`,
+    the number of damaged chunks that `messages` has skipped so far.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
@@ -159,14 +165,24 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
                  end: int | None = None) -> Iterator[LogMessage]:
         """
-        Yield the messages in the order of their log times, equal ones in file order.
+        Iterate over the messages in the order of their log times, equal ones in file order.
 
-        Those that rosbag2 has compressed one by one are decompressed.
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Names; default: all.
+        start, end : int, optional
+            Log times [ns]; `end` is exclusive.
 
-        topics : names; default: all
-        start, end : log times [ns]; `end` is exclusive
+        Yields
+        ------
+        LogMessage
+            Decompressed, where rosbag2 has compressed messages one by one.
 
-        Raises LogError for a message that cannot be decompressed.
+        Raises
+        ------
+        LogError
+            For a message that cannot be decompressed.
         """
         names = None if topics is None else frozenset(topics)
         wanted = {number: channel.topic for number, channel in self.channels.items()
@@ -211,7 +227,19 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def groups(self, topics: Iterable[str] | None = None,
                ) -> Iterator[tuple[str, list[LogMessage]]]:
-        """Yield some messages of a topic at a time, each topic's in the order of `messages`."""
+        """
+        Iterate over the messages, some of a topic at a time.
+
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Names; default: all.
+
+        Yields
+        ------
+        (str, list of LogMessage)
+            A topic, and messages in the order of `messages`.
+        """
         messages = self.messages(topics)
         while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
@@ -219,9 +247,12 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def parts(self) -> Iterator[tuple[int, list[McapRecord]]]:
         """
-        Yield (offset, records) of what can be read, in file order: a record, or those of a chunk.
+        Iterate over what can be read, in file order; then `damage` tells what cannot.
 
-        After that, `damage` tells what cannot be read.
+        Yields
+        ------
+        (int, list of McapRecord)
+            The offset, and the record there, or those of a chunk.
         """
         damage = Damage(not self.whole)
         damage.reasons += ['found: the file does not end as an MCAP file ends'] * damage.torn

@@ -57,7 +57,12 @@ class IntegrationError(RuntimeError):
     """
     The integration cannot go on; the message says where, why and what to do instead.
 
-    reached_ns : last time of which there are states [ns]
+    Parameters
+    ----------
+    text : str
+        The message.
+    reached_ns : int
+        Last time of which there are states [ns].
     """
 
     def __init__(self, text: str, *, reached_ns: int = 0) -> None:

@@ -51,6 +51,8 @@ class ExactSolution:
         The top to simulate.
     start : State
         The state at t = 0; of a `ContinuedState` theta may be any number.
+    gravity : mpfr, optional
+        In place of that of the top, for a motion about another vertical [m/s^2].
 
     Attributes
     ----------
@@ -121,7 +123,10 @@ class ExactSolution:
         """
         Return the motion in numbers.
 
-        coincide : relative distance below which two turning points are one
+        Parameters
+        ----------
+        coincide : float
+            Relative distance below which two turning points are one.
         """
         top, start = self.top, self.start
         low, rests = self.theta_min, axis_rests(top, start)
