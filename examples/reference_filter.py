@@ -4,22 +4,7 @@ An attitude filter that needs no settings: a filter to start from.
 
   spinning-top examine --filter examples/reference_filter.py:ReferenceFilter
 
-finds no fault.  Its errors with noise are 0.012 deg of tilt and 0.028 deg of heading, 2.5 deg in
-the scenes of the field.
-
-It is a Kalman filter of the error in the world frame (J. Sola, "Quaternion kinematics for the
-error-state Kalman filter", 2017, ch. 7) with the biases of gyroscope and accelerometer.  Its
-noise model also has what a data sheet does not say:
-
-- White noise is measured, by differences of rates and by residuals of force and field.
-- A force that changes by more than noise is that of a moving device.  As its velocity is bounded,
-  motion is noise of a low density (a low pass in D. Laidig, T. Seel, "VQF", Information Fusion
-  91, 2023, sect. 3.3).  Scale and alignment errors of the gyroscope are noise in motion.
-- The bias of the accelerometer is corrected while the device turns without such a motion.  At
-  rest nothing tells it from a tilt: it is considered in the covariance (S. F. Schmidt, 1966).
-- The field corrects only heading and gyroscope bias, by its horizontal part (VQF, 3.4).  A field
-  whose horizontal and vertical parts are not those of the last seconds is disturbed (VQF, 3.6).
-- At rest the gyroscope shows its bias (VQF, 3.5).
+finds no fault.
 """
 
 import math

@@ -25,7 +25,7 @@ LEFT = 0.3                      # of the largest effect, where a bias counts as 
 NO_EFFECT = 0.1 * SIZE
 # Share of the largest effect by which one rises or falls in the last quarter, if it does.
 MOVES = 0.01
-LEAST = 0.01                    # share of a bias in an estimate that learns it
+LEAST = 0.1                     # share of a bias in an estimate that learns it
 
 
 class Effect(NamedTuple):

@@ -6,8 +6,9 @@ import os
 import shlex
 import signal
 import subprocess
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,24 @@ def examine_node(command: str, topic: str, level: str = 'quick',
         return examine(node.start, level, imu, seeds, subject=command, feed=node.feed, show=show)
 
 
+@contextlib.contextmanager
+def _interrupts_put_off() -> Iterator[None]:
+    """Let signals wait: one within `Popen` would leave a process that nobody knows."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    late: list[int] = []
+    before = {number: signal.signal(number, lambda signum, _: late.append(signum))
+              for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for signum in late:
+        signal.raise_signal(signum)
+
+
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     """A node under examination, which is also a `feeding.Filter`; arguments as `examine_node`."""
 
@@ -115,7 +134,8 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         """Start the node anew; return it as a filter."""
         self._end_process()
         try:
-            self._process = subprocess.Popen(self._command, start_new_session=True)
+            with _interrupts_put_off():
+                self._process = subprocess.Popen(self._command, start_new_session=True)
         except OSError as error:
             raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
         if not self._wait(self.is_there, PATIENCE_S):
