@@ -63,8 +63,7 @@ TEXT = """\
 [The grade](../grade.md) of trials of [BROAD](https://doi.org/10.3390/data6070072): poses by
 cameras, a real IMU at 286 Hz. `matrix` is what the gyroscope reads of the rates of the poses,
 along each axis; intervals are those of 95 %, a dash is what the motion cannot tell. The gyroscope
-is late by 1.19 samples (4.2 ms) in every trial, as plain differences of the attitudes show, too:
-it is a property of the recording.
+lags behind the poses by the same time in every trial: it is a property of the recording.
 """
 
 

@@ -74,7 +74,7 @@ def run_node(name: str, argv: Sequence[str] | None,
             raise
         return _cannot_start(name, error) if rclpy.ok() else 0
     finally:
-        signals = signal.SIGINT, signal.SIGHUP, signal.SIGQUIT
+        signals = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT
         _handle(signal.SIG_IGN, *signals)
         if node is not None:
             node.stop()
@@ -84,12 +84,12 @@ def run_node(name: str, argv: Sequence[str] | None,
 
 
 def _initialize_ros(argv: list[str]) -> list[int]:
-    """Initialize rclpy; return the list to which a SIGINT from now on is appended."""
+    """Initialize rclpy; return the list to which SIGINT and SIGTERM are appended from now on."""
     import rclpy  # noqa: PLC0415
     # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
     # SIGINT twice, from the terminal and from launch.
     interrupts: list[int] = []
-    _handle(lambda number, _: interrupts.append(number), signal.SIGINT)
+    _handle(lambda number, _: interrupts.append(number), signal.SIGINT, signal.SIGTERM)
     _handle(lambda *_: signal.raise_signal(signal.SIGTERM), signal.SIGHUP, signal.SIGQUIT)
     rclpy.init(args=argv)
     return interrupts
