@@ -9,7 +9,6 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterator
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ FROM_APT = ('gmpy2', 'matplotlib', 'numpy', 'scipy', 'tqdm', 'yaml')
 
 def version(distribution: str = NAME) -> str:
     """Return the version of an installed distribution, or 'unknown'."""
+    from importlib import metadata  # noqa: PLC0415 - it takes 15 ms
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
@@ -73,6 +73,7 @@ def remedy(wanted: str) -> str:
 
     wanted : an extra of the package, or the name of one library that it requires
     """
+    from importlib import metadata  # noqa: PLC0415 - it takes 15 ms
     if wanted in FROM_APT and 'ROS_DISTRO' in os.environ and sys.prefix == sys.base_prefix:
         return f'sudo apt install python3-{wanted}'
     wanted = DISTRIBUTIONS.get(wanted, wanted)

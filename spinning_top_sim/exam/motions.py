@@ -188,9 +188,9 @@ def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: 
     east, north, up = values['mag.field']
     field: Any = Rotation.from_quat(run.truth).inv().apply((0.0, math.hypot(east, north), up))
     true: Any = tuple(run.gyroscope.T), tuple(run.accelerometer.T)
-    magnetometer = Magnetometer(values, period_ns)
+    device, magnetometer = Imu(values, period_ns), Magnetometer(values, period_ns)
     rates, force, field = (np.stack(columns, axis=1) for columns in (
-        *Imu(values, period_ns).read(true, times),
+        *device.read(true, device.errors(times)),
         magnetometer.read(tuple(field.T), magnetometer.errors(times))))
     return replace(run, gyroscope=rates, accelerometer=force, magnetometer=field)
 

@@ -180,9 +180,9 @@ def _readings(values: Mapping[str, Any], turns: Rotation, rates: Reals, force: R
         signals = lfilter(*low_pass, signals, zi=lfilter_zi(*low_pass) * signals[:, :1])[0]
     late = np.maximum(np.arange(1, len(t_ns), 2) - MAG_LATE, 0)
     x, y, z, w = turns[late].as_quat().T
-    magnetometer = Magnetometer(values, PERIOD_NS)
+    imu, magnetometer = Imu(values, PERIOD_NS), Magnetometer(values, PERIOD_NS)
     field = magnetometer.read(magnetometer.felt((x, y, z, w), t_ns[late]),
                               magnetometer.errors(np.array(steps)))
     felt: Any = signals[:3, 1::2], signals[3:, 1::2]
     return [np.stack(np.broadcast_arrays(*reading), axis=1) for reading in (
-        *Imu(values, PERIOD_NS).read(felt, np.array(steps)), field)]
+        *imu.read(felt, imu.errors(np.array(steps))), field)]

@@ -108,7 +108,7 @@ class PivotPath:
 
     @classmethod
     def through(cls, waypoints: Sequence[Given], *, speed: float, acceleration: float,
-                repeat: bool = False, start_ns: int = 0) -> PivotPath:
+                repeat: bool = False) -> PivotPath:
         """
         Return the path along straight lines; on each the pivot accelerates, cruises and brakes.
 
@@ -126,7 +126,7 @@ class PivotPath:
         for begin, end in zip(points, ends, strict=False):
             if begin != end:
                 pieces += _leg(_sum((1, end), (-1, begin)), speed, acceleration)
-        return cls(pieces, repeat=repeat, position=points[0], start_ns=start_ns)
+        return cls(pieces, repeat=repeat, position=points[0])
 
     @classmethod
     def to_velocity(cls, target: Given, *, most_acceleration: float, position: Given = ZERO,

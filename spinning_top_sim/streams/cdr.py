@@ -24,7 +24,6 @@ LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
 Values = NDArray[Any] | Sequence[NDArray[Any] | float]
 
 
-
 def stamp_text(time_ns: int) -> str:
     """Return a time in seconds, to the nanosecond."""
     return f'{time_ns // NANOSECONDS}.{time_ns % NANOSECONDS:09d}'

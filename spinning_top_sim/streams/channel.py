@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
+from spinning_top_sim.physics.pivot import ns_array
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.cdr import NANOSECONDS, Template, Values
 from spinning_top_sim.streams.imu import Imu, Readings
@@ -35,7 +36,7 @@ class Samples:
 
     @cached_property
     def t_ns(self) -> Stamps:
-        return np.arange(self.times.start, self.times.stop, self.times.step)
+        return ns_array(self.times)
 
     @cached_property
     def states(self) -> States:
@@ -117,9 +118,11 @@ class Channel:
             rows = self.encoder.encode(stamps, self.fields(samples))
         except ValueError as error:
             raise ValueError(f'fields of {self.topic}: {error}') from error
-        if self.copies is not None:
-            rows = np.repeat(rows, self.copies(samples.t_ns), axis=0)
-        return self.due(samples.t_ns), rows
+        due_ns = samples.t_ns + self.delay_ns
+        if self.copies is None:
+            return due_ns, rows
+        copies = self.copies(samples.t_ns)
+        return np.repeat(due_ns, copies), np.repeat(rows, copies, axis=0)
 
     def due(self, t_ns: Stamps) -> Stamps:
         """Return when the messages of samples at times (n,) are due [ns]."""

@@ -52,6 +52,11 @@ class Event:
     def begins_motion(self) -> bool:
         return self.kind in MOTIONS
 
+    @property
+    def begins_report(self) -> bool:
+        """Whether a motion begins: of a recording, by a change of it, or by a reset."""
+        return self.kind in (*MOTIONS, 'start', 'reset')
+
     def repeats(self, last: 'Event') -> bool:
         """Return whether this is a drive that puts off the end of another, and does no more."""
         return (self.kind == last.kind == 'drive' and self.t_ns < last.details['stop_ns']

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.integrals import Increments
+from spinning_top_sim.physics.pivot import ns_array
 from spinning_top_sim.physics.states import Point, States
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams import noise
@@ -25,7 +26,7 @@ from spinning_top_sim.streams.bandwidth import LowPass
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.noise import Kind, Part
 from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
-from spinning_top_sim.streams.sensor import Sensor, transformed
+from spinning_top_sim.streams.sensor import Errors, Sensor, transformed
 from spinning_top_sim.streams.trajectory import Trajectory
 from spinning_top_sim.streams.vibration import Vibration
 
@@ -108,14 +109,19 @@ class Imu:
         self.vibration = Vibration(
             values, self.low_pass.response if self.low_pass else np.ones_like)
 
-    def read(self, true: tuple[Vector, Vector], t_ns: NDArray[np.int64]) -> tuple[Vector, Vector]:
-        """Return the readings [rad/s], [m/s^2] of true rates and forces at times (n,) [ns]."""
+    def errors(self, t_ns: NDArray[np.int64]) -> tuple[Errors, Errors]:
+        """Return white noise and bias of rates and of forces at times (n,) [ns]."""
+        return self.gyroscope.errors(t_ns), self.accelerometer.errors(t_ns)
+
+    def read(self, true: tuple[Vector, Vector],
+             errors: tuple[Errors, Errors]) -> tuple[Vector, Vector]:
+        """Return the readings [rad/s], [m/s^2] of true rates and forces with these errors."""
         if self.is_perfect:
             return true
-        rates, force = true
+        (rates, force), (of_rates, of_force) = true, errors
         added = transformed(self._g_sensitivity, force) if any(self._g_sensitivity) else None
-        return (self.gyroscope.read(rates, self.gyroscope.errors(t_ns), added),
-                self.accelerometer.read(force, self.accelerometer.errors(t_ns)))
+        return (self.gyroscope.read(rates, of_rates, added),
+                self.accelerometer.read(force, of_force))
 
     def estimated(self, orientation: Quaternion, t_ns: NDArray[np.int64]) -> Quaternion:
         """Return an orientation at times (n,) [ns] as the IMU estimates it, with noise."""
@@ -157,7 +163,7 @@ class Readings:
 
     def __init__(self, imu: Imu, trajectory: Trajectory, times: range, states: States) -> None:
         self._imu, self._trajectory, self._times, self._states = imu, trajectory, times, states
-        self._t_ns = np.arange(times.start, times.stop, times.step)
+        self._t_ns = ns_array(times)
 
     @cached_property
     def orientation(self) -> Quaternion:
@@ -172,14 +178,17 @@ class Readings:
     @cached_property
     def read(self) -> tuple[Vector, Vector]:
         """Rates [rad/s] and forces [m/s^2] as the sensor reads them."""
-        return self._imu.read(self._felt, self._t_ns)
+        return self._imu.read(self._felt, self._errors)
 
     @cached_property
     def bias(self) -> tuple[Vector, Vector]:
         """The biases that are in `read`."""
-        (_, (a, b, c)), (_, (d, e, f)) = (sensor.errors(self._t_ns) for sensor in (
-            self._imu.gyroscope, self._imu.accelerometer))
+        (_, (a, b, c)), (_, (d, e, f)) = self._errors
         return (a, b, c), (d, e, f)
+
+    @cached_property
+    def _errors(self) -> tuple[Errors, Errors]:
+        return self._imu.errors(self._t_ns)
 
     @cached_property
     def estimated_orientation(self) -> Quaternion:
@@ -202,7 +211,8 @@ class Readings:
         v1, v2, v3 = imu.mounting.from_body((v1, v2, v3))
         if imu.is_perfect and imu.vibration.is_off:
             return (x, y, z, w), (v1, v2, v3)
-        readings = imu.read(imu.vibration.add(self._means, self._t_ns, self._seconds), self._t_ns)
+        readings = imu.read(imu.vibration.add(self._means, self._t_ns, self._seconds),
+                            self._errors)
         r1, r2, r3, *force = (self._seconds * (reading - mean) for reading, mean in zip(
             chain(*readings), chain(*self._means), strict=True))
         x, y, z = attitude.rotation_vector((x, y, z, w))

@@ -12,7 +12,7 @@ from spinning_top_sim.physics.attitude import Quaternion, Vector
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.imu import Mounting
 from spinning_top_sim.streams.noise import Kind
-from spinning_top_sim.streams.sensor import Sensor
+from spinning_top_sim.streams.sensor import Sensor, summed
 
 
 class Magnetometer(Sensor):
@@ -34,12 +34,8 @@ class Magnetometer(Sensor):
         true = self.true(orientation)
         world, body = (_at(events, t_ns) for events in self._events)
         if world is not None:
-            true = _sum(true, attitude.rotated_back(orientation, world))
-        return true if body is None else _sum(true, self._mounting.from_body(body))
-
-
-def _sum(one: Vector, other: Vector) -> Vector:
-    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
+            true = summed(true, attitude.rotated_back(orientation, world))
+        return true if body is None else summed(true, self._mounting.from_body(body))
 
 
 def _at(events: Sequence[Sequence[float]], t_ns: NDArray[np.int64]) -> Vector | None:

@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from spinning_top_sim.physics.pivot import NEVER_NS
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import parameters, trajectory
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.channel import Channel, Rows, Samples, Stamps, period_ns
 from spinning_top_sim.streams.events import Event
@@ -111,12 +112,18 @@ class Simulation:
         """
         Return the details of a drive to a velocity of the pivot in the world [m/s] from now on.
 
-        None if the pivot rests and is to rest.  Raises ValueError.
+        It lasts for `pivot.cmd_timeout`.  None if the pivot rests and is to rest.  Raises
+        ValueError.
         """
-        details = trajectory.drive_details(velocity, max(self.now_ns, 0),
-                                           self.values['pivot.cmd_timeout'])
-        is_rest = self.trajectory.pivot is None and not any(details[axis] for axis in 'xyz')
-        return None if is_rest else details
+        x, y, z = target = [float(part) for part in velocity]
+        if not all(abs(part) <= parameters.FASTEST for part in target):
+            raise ValueError(f'linear = {target!r} m/s: each must be finite and within '
+                             f'{parameters.FASTEST:g} m/s')
+        if self.trajectory.pivot is None and not any(target):
+            return None
+        timeout = self.values['pivot.cmd_timeout']      # 0: for ever
+        stop_ns = max(self.now_ns, 0) + round(timeout * NANOSECONDS) if timeout else NEVER_NS
+        return {'x': x, 'y': y, 'z': z, 'stop_ns': stop_ns}
 
     def state(self) -> States:
         """Return the state (n = 1) in which the motion goes on after `now_ns`."""

@@ -78,10 +78,15 @@ class Sensor:
         """Return the readings of true values; `added` comes behind the matrix."""
         seen = transformed(self._matrix, true)
         if added is not None:
-            seen = seen[0] + added[0], seen[1] + added[1], seen[2] + added[2]
+            seen = summed(seen, added)
         x, y, z = (converted(value + bias + white, self._resolution, self._range)
                    for value, white, bias in zip(seen, *errors, strict=True))
         return x, y, z
+
+
+def summed(one: Vector, other: Vector) -> Vector:
+    """Return the sum of two vectors, in columns (n,)."""
+    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
 def converted(value: Column, resolution: float, largest: float) -> Column:

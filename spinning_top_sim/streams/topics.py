@@ -92,7 +92,10 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
             one, stamps=faults.stamps, copies=faults.copies)
 
     of_imu = partial(channel, type_name=IMU)
-    noisy = imu_noise_covariances(imu)
+    # Covariances of orientation, angular velocity and specific force.
+    noisy = [messages.diagonal(*variances) for variances in (
+        imu.orientation_variances, 3 * (imu.gyroscope.variance,),
+        3 * (imu.accelerometer.variance,))]
     unknown = messages.UNKNOWN_ORIENTATION
     magnetometer = Magnetometer(values, period_ns(values['mag.rate']))
     increment = partial(channel, 'increments', rate='imu.rate')
@@ -138,13 +141,6 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
         channel('invariants', '~/invariants', ARRAY, messages.float64_multi_array(INVARIANTS),
                 _invariants),
         markers(values)]
-
-
-def imu_noise_covariances(imu: Imu) -> list[tuple[float, ...]]:
-    """Return the covariances of orientation, angular velocity and specific force."""
-    return [messages.diagonal(*variances) for variances in (
-        imu.orientation_variances, 3 * (imu.gyroscope.variance,),
-        3 * (imu.accelerometer.variance,))]
 
 
 def recorded(channels: Sequence[Channel], values: Mapping[str, Any]) -> list[Channel]:

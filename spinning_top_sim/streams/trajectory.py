@@ -4,7 +4,7 @@
 import contextlib
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import copy
 from functools import partial
 from operator import attrgetter
@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Vector
-from spinning_top_sim.physics.pivot import NEVER_NS, REST, Kinematics, PivotPath, kinematics
+from spinning_top_sim.physics.pivot import REST, Kinematics, PivotPath, kinematics
 from spinning_top_sim.physics.states import Point, States, joined
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.vertical import Posture
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.events import Event
-from spinning_top_sim.streams.parameters import FASTEST
 
 Times = NDArray[np.int64]       # (n,), ascending [ns]
 
@@ -210,17 +208,3 @@ def commanded(now: States, l3: float, lz: float) -> ContinuedState:
             f'rad), where lz must equal {pole!r}; command both together')
     return ContinuedState(theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
                           psi=float(now.psi[0]), l3=l3, lz=lz)
-
-
-def drive_details(velocity: Sequence[float], now_ns: int, timeout: float) -> dict[str, Any]:
-    """
-    Return the details of a drive: a velocity of the pivot in the world [m/s], and its end.
-
-    timeout : how long it lasts before the pivot brakes [s], 0 = for ever.  Raises ValueError.
-    """
-    x, y, z = target = [float(part) for part in velocity]
-    if not all(abs(part) <= FASTEST for part in target):
-        raise ValueError(f'linear = {target!r} m/s: each must be finite and within '
-                         f'{FASTEST:g} m/s')
-    stop_ns = now_ns + round(timeout * NANOSECONDS) if timeout else NEVER_NS
-    return {'x': x, 'y': y, 'z': z, 'stop_ns': stop_ns}

@@ -151,7 +151,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
             channels = {run.topics[channel.topic]: channel for channel in simulation.channels
                         if channel.topic in run.topics}
             # The velocities of the pivot belong to one motion.
-            if event.kind not in ('parameters', 'epoch') and not (
+            if event.begins_report and not (
                     event.kind == 'drive' and motions and motions[-1].cause == 'drive'):
                 piece = simulation.trajectory.after(max(simulation.now_ns, 0))
                 exact = piece.describe() if len(motions) < MOST_EXACT else None

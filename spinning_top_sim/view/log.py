@@ -124,7 +124,7 @@ def _read_foreign(reader: LogReader, name: str) -> Track:
 
 def _follow_run(tracks: Sequence[Track], run: recorded_run.RunDescription, end_ns: int) -> None:
     for simulation, done in recorded_run.rerun(run, end_ns):
-        if isinstance(done, Block) or done.event.kind in ('parameters', 'epoch'):
+        if isinstance(done, Block) or not done.event.begins_report:
             continue
         begin_ns = simulation.epoch_ns + max(simulation.now_ns, 0)
         track = _track_at(tracks, begin_ns)

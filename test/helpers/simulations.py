@@ -100,9 +100,11 @@ def read(imu, times_ns, exact=STILL):
     """
     imu = imu if isinstance(imu, Imu) else Imu(parameters.checked(imu), times_ns.step)
     t_ns = np.asarray(times_ns)
-    biases = [sensor.errors(t_ns)[1] for sensor in (imu.gyroscope, imu.accelerometer)]
+    errors = imu.errors(t_ns)
     return tuple(np.column_stack([np.broadcast_to(axis, len(t_ns)) for kind in found
-                                  for axis in kind]) for found in (imu.read(exact, t_ns), biases))
+                                  for axis in kind]) for found in (
+                                      imu.read(exact, errors),
+                                      [bias for _, bias in errors]))
 
 
 def calls_of(monkeypatch, owner, name, number=lambda *arguments: 1):
