@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.tools import conventions, identify
@@ -28,21 +27,12 @@ def test_a_convention_is_found_and_undone(one):
 def test_a_constant_heading_is_no_error_where_it_need_only_be_steady():
     turned = (Rotation.from_euler('z', 0.7) * TRUTH).as_quat()
     for heading, error in (('absolute', 0.7), ('steady', 0.0), ('any', 0.0)):
-        assert conventions.error_of(turned, TRUTH, heading) == pytest.approx(error, abs=1e-9)
+        assert conventions.error_of(turned, TRUTH.as_quat(), heading) == pytest.approx(
+            error, abs=1e-9)
 
 
-def test_matrix_offset_and_delay_of_a_sensor_are_found_within_their_uncertainty():
-    random = np.random.default_rng(1)
-    should = lfilter(*butter(2, 0.1), random.standard_normal((2000, 3)), axis=0)
-    matrix = np.eye(3) + 0.05 * random.standard_normal((3, 3))
-    read = np.roll(should, 4, axis=0) @ matrix.T + 0.1
-    read += 1e-3 * random.standard_normal(read.shape)
-    found = identify.affine(read[9:], should[9:], range(-3, 10))
-    assert np.all(np.abs(found.matrix - matrix) < 5.0 * found.matrix_sigma)
-    assert np.all(np.abs(found.offset - 0.1) < 5.0 * found.offset_sigma)
-    assert abs(found.delay - 4.0) < 5.0 * found.delay_sigma < 0.05
-    assert found.left == pytest.approx(1e-3, rel=0.05)
-    assert 'y turns it about x by' in identify.in_words(np.array(
+def test_a_matrix_is_told_by_its_columns():
+    assert 'y turns the attitude about x by' in identify.in_words(np.array(
         ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))))
 
 

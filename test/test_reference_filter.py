@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import motions
 from spinning_top_sim.exam.feeding import feed
-from spinning_top_sim.exam.measures import errors_of, nees_of
+from spinning_top_sim.exam.measures import nees_of
+from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import rms
 from spinning_top_sim.tools.scene_file import read_scene
 

@@ -57,7 +57,7 @@ class Rates(NamedTuple):
         return float(np.max(np.abs(self.matrix - np.eye(3)))) if not self.in_world else 1.0
 
     def __str__(self) -> str:
-        text = in_words(self.matrix, 'turns the attitude about')
+        text = in_words(self.matrix)
         return f'a rate about {text}' + (', axes of the world' if self.in_world else '')
 
 
@@ -134,10 +134,15 @@ def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
     return dict(sorted(zip(still.run.dt[steps].round(6).tolist(), gains.tolist(), strict=True)))
 
 
-def kicked_starts(runs: Sequence[Run], axis: Sequence[float], attitudes: Sequence[Reals],
-                  size: float = SMALL) -> list[Run]:
-    """Return runs with a kick about an axis of the world, in attitudes there, to and fro."""
-    turns = [Rotation.from_quat(one[EARLY - 1]).inv().apply(axis) for one in attitudes]
+def kicked_starts(runs: Sequence[Run], axis: Sequence[float],
+                  attitudes: Sequence[Reals] | None = None, size: float = SMALL) -> list[Run]:
+    """
+    Return runs with a kick about an axis of the world, to and fro.
+
+    attitudes : that say where this axis is; default: the true ones
+    """
+    turns = [Rotation.from_quat(one[EARLY - 1]).inv().apply(axis)
+             for one in attitudes or [run.truth for run in runs]]
     return [with_kicks(run, [Kick(EARLY, size * (-1) ** k * turn)])
             for k, (run, turn) in enumerate(zip(runs, turns, strict=True))]
 

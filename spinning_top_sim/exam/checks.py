@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, measures
 from spinning_top_sim.exam.bias import BIAS, LEFT, SIZE, said_bias, still_learned
-from spinning_top_sim.exam.measures import degrees, errors_of
-from spinning_top_sim.exam.motions import RATE, Reals
+from spinning_top_sim.exam.measures import degrees
+from spinning_top_sim.exam.motions import RATE
 from spinning_top_sim.exam.runs import Exam
 from spinning_top_sim.tools import conventions
+from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import rms
 from spinning_top_sim.tools.report import Mark
 
@@ -70,7 +71,7 @@ def convention(exam: Exam) -> Measured:
     """Read the attitudes at the rests in every convention; undo the one that fits."""
     told, rests = exam.outcomes('excitation')[0].estimates, _rests(exam)
     truth, heading = exam.run.truth[rests], 'absolute' if exam.heading else 'any'
-    before = math.degrees(conventions.error_of(told[rests], Rotation.from_quat(truth), heading))
+    before = math.degrees(conventions.error_of(told[rests], truth, heading))
     if before < GROSS_DEG:
         return Measured(before, '', limit=math.inf)
     found = conventions.best(told[rests], truth, heading)
@@ -160,8 +161,7 @@ def heading_answer(exam: Exam) -> Measured | None:
     """Turn the field to one side and to the other: the heading follows."""
     if not exam.heading:
         return None
-    one, other = (errors_of(told, exam.run.truth).heading
-                  for told in _attitudes(exam, 'field turned'))
+    one, other = (exam.errors(name).heading for name in ('excitation', 'field turned'))
     moved = np.angle(np.exp(1j * (other - one)))
     share = float(moved[-1] - moved[len(moved) // 2 - 1]) / math.radians(6.0)
     return Measured(1.0 - share, 'of a turn of the field by 6 deg the heading follows '
@@ -255,19 +255,12 @@ def covariance(exam: Exam) -> Measured | None:
             'gyroscope', 'accelerometer')):
         return None
     off = max(nees.ratio, 1.0 / max(nees.ratio, 1e-300))
-    return Measured(off, f'the squared error of the tilt is {nees.ratio:.3g} times what the '
-                    f'covariance says; consistent are {nees.low:.3g} to {nees.high:.3g}',
-                    limit=nees.high if nees.ratio > 1.0 else 1.0 / nees.low)
+    return Measured(off, str(nees), limit=nees.high if nees.ratio > 1.0 else 1.0 / nees.low)
 
 
 def _rests(exam: Exam) -> list[int]:
     """Return the last sample of each rest."""
     return [part.end - 1 for part in exam.motion.of('rest')]
-
-
-def _attitudes(exam: Exam, name: str) -> tuple[Reals, Reals]:
-    """Return the attitudes of the excitation as it is, and as it is varied."""
-    return exam.outcomes('excitation')[0].estimates, exam.outcomes(name)[0].estimates
 
 
 def _rates(exam: Exam) -> answers.Rates:

@@ -22,7 +22,6 @@ The faults and the measures are defined in docs/exam.md.
 import argparse
 import contextlib
 import runpy
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -36,7 +35,7 @@ from spinning_top_sim.exam.feeding import INTERRUPTED, Filter, feed, feed_apart
 from spinning_top_sim.exam.programs import Program
 from spinning_top_sim.installation import needed
 from spinning_top_sim.tools import cli, scene_file
-from spinning_top_sim.tools.report import Report
+from spinning_top_sim.tools.report import Report, printed
 
 # What is examined, and the options that it takes; log and node need the first one.
 OF_FILTER = 'level', 'imu', 'seeds', 'data'
@@ -77,14 +76,10 @@ def _run(arguments: argparse.Namespace) -> int:
             from spinning_top_sim.exam.page import draw_page  # noqa: PLC0415
     with _interruptible(), _progress() as show:
         report = _report(kind, getattr(arguments, kind), options, show)
-    if arguments.json:
-        print(report.as_json())
-    else:
-        for line in str(report).splitlines():
-            cli.print_line(line)
+    code = printed(report, arguments.json)
     if arguments.page is not None:
         draw_page(report, arguments.page)
-    return cli.OK if report.passed else cli.FAILED
+    return code
 
 
 def _options(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
@@ -143,13 +138,10 @@ def _interruptible() -> Iterator[None]:
         INTERRUPTED.set()
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt)
-              for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        with cli.handling(interrupt):
+            yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
         INTERRUPTED.clear()
 
 

@@ -47,7 +47,7 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
         Parameters imu.* and mag.* that replace those of the noisy runs and of the scenes, or the
         path of a parameter file such as those in config/imu.
     seeds : int or iterable of int, optional
-        Seeds of the noisy runs, or their number; default: SEEDS.
+        Seeds of the noisy runs, or their number; default: 3, of 'full' 10, of 'field' 1.
     subject : str, optional
         Name in the report; default: that of the filter's class.
     isolated : bool, optional

@@ -6,9 +6,8 @@ import os
 import shlex
 import signal
 import subprocess
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from spinning_top_sim.exam.examiner import examine
 from spinning_top_sim.exam.feeding import INTERRUPTED, MakeFilter, NodeError, Outcome, feed
 from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
 from spinning_top_sim.tools.report import Report
 
@@ -73,24 +73,6 @@ def examine_node(command: str, topic: str, level: str = 'quick',
         return examine(node.start, level, imu, seeds, subject=command, feed=node.feed, show=show)
 
 
-@contextlib.contextmanager
-def _interrupts_put_off() -> Iterator[None]:
-    """Let signals wait: one within `Popen` would leave a process that nobody knows."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    late: list[int] = []
-    before = {number: signal.signal(number, lambda signum, _: late.append(signum))
-              for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    for signum in late:
-        signal.raise_signal(signum)
-
-
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
     """A node under examination, which is also a `feeding.Filter`; arguments as `examine_node`."""
 
@@ -134,8 +116,12 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         """Start the node anew; return it as a filter."""
         self._end_process()
         try:
-            with _interrupts_put_off():
+            # A signal within `Popen` would leave a process that nobody knows.
+            late: list[int] = []
+            with cli.handling(lambda number, _: late.append(number)):
                 self._process = subprocess.Popen(self._command, start_new_session=True)
+            for number in late:
+                signal.raise_signal(number)
         except OSError as error:
             raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
         if not self._wait(self.is_there, PATIENCE_S):

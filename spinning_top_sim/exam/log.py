@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from spinning_top_sim.exam.feeding import Outcome, invalid
-from spinning_top_sim.exam.measures import degrees, errors_of, nees_of
+from spinning_top_sim.exam.measures import degrees, nees_of
 from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.cli import one_line
+from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
 from spinning_top_sim.tools.identify import rms
 from spinning_top_sim.tools.recorded_run import ForeignLogError, read_run_description
@@ -209,9 +210,7 @@ def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
     if not findings and value > USELESS:
         findings.append(Finding('accuracy', f'the error is {degrees(value)} rms'))
     if nees is not None:
-        text = f'consistent are {nees.low:.3g} to {nees.high:.3g}'
-        marks['nees'] = Mark(nees.ratio, nees.high, text)
+        marks['nees'] = Mark(nees.ratio, nees.high, nees.band)
         if not findings and not nees.low <= nees.ratio <= nees.high:
-            findings.append(Finding('covariance', 'the squared error of the tilt is '
-                                    f'{nees.ratio:.3g} times what the covariance says; {text}'))
+            findings.append(Finding('covariance', str(nees)))
     return Report(subject, findings, marks, (), [outcome])

@@ -11,39 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.motions import Reals, Run
+from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import autocorrelation_time, rms
 
 # Of the band of a squared error: standard deviations; factors by which a covariance may be too
 # small and, to be on the safe side, too large.
 SIGMAS, SMALL, LARGE = 4.0, 2.0, 10.0
-
-
-class Errors(NamedTuple):
-    """Attitude errors [rad]: tilt (n,) >= 0, and heading (n,) in [-pi, pi]."""
-
-    tilt: Reals
-    heading: Reals
-
-    def about_mean(self) -> 'Errors':
-        """Return the errors with the heading about its mean."""
-        phase = np.exp(1j * self.heading)
-        return self._replace(heading=np.angle(phase * np.conj(np.mean(phase))))
-
-    @property
-    def whole(self) -> Reals:
-        """Tilt and heading together (n,)."""
-        return np.hypot(self.tilt, self.heading)
-
-
-def errors_of(estimates: Reals, truth: Reals) -> Errors:
-    """
-    Split q_est q_true^-1 into heading and tilt (Laidig et al. 2021, eq. 2-4).
-
-    estimates, truth : q(world <- sensor) as x, y, z, w (n, 4)
-    """
-    x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat(
-        canonical=True).T
-    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), 2.0 * np.arctan2(z, w))
 
 
 class Rmse(NamedTuple):
@@ -88,6 +61,15 @@ class Nees(NamedTuple):
     low: float
     high: float
 
+    @property
+    def band(self) -> str:
+        """The band in words."""
+        return f'consistent are {self.low:.3g} to {self.high:.3g}'
+
+    def __str__(self) -> str:
+        return (f'the squared error of the tilt is {self.ratio:.3g} times what the covariance '
+                f'says; {self.band}')
+
 
 def nees_of(outcomes: Sequence[Outcome]) -> Nees | None:
     """
@@ -107,7 +89,7 @@ def nees_of(outcomes: Sequence[Outcome]) -> Nees | None:
         except (np.linalg.LinAlgError, ValueError):
             continue
         mean = max(float(np.mean(np.concatenate(squares))), 1e-300)
-        count = sum(len(one) / autocorrelation_time(one[np.newaxis]) for one in squares)
+        count = sum(len(one) / autocorrelation_time(one) for one in squares)
         spread = math.exp(SIGMAS / math.sqrt(count))
         # Negative log-likelihood for the best common factor of the covariances.
         unlikely = 2.0 * math.log(mean) + float(np.mean(sizes))

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from spinning_top_sim.exam.measures import errors_of
+from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.report import Report
 
 LEAST_DEG = 1e-4                # lower limit of the logarithmic axes

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, motions
 from spinning_top_sim.exam.feeding import Feed, MakeFilter, Outcome
-from spinning_top_sim.exam.measures import Errors, errors_of
 from spinning_top_sim.exam.motions import NEAR, RATE, Motion, Run
-from spinning_top_sim.tools.conventions import Convention
+from spinning_top_sim.tools.conventions import Convention, Errors, errors_of
 
 # A filter is settled if it has turned by less than STILL [rad] in the second half of a rest at
 # the start; slow ones get longer ones.
@@ -146,10 +145,8 @@ RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     'starts': lambda exam: _starts(),
     'turns': lambda exam: _turns(exam, answers.SMALL),
     'large turns': lambda exam: _turns(exam, answers.LARGE),
-    'tilts': lambda exam: answers.kicked_starts(_starts(), LEVEL, [
-        run.truth for run in motions.starts()]),
-    'turns with field': lambda exam: answers.kicked_starts(motions.starts(), UPRIGHT, [
-        run.truth for run in motions.starts()]),
+    'tilts': lambda exam: answers.kicked_starts(_starts(), LEVEL),
+    'turns with field': lambda exam: answers.kicked_starts(motions.starts(), UPRIGHT),
     'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM, ARM_AFTER_S)],
     'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
                                          NOISE_S) for seed in exam.seeds]}

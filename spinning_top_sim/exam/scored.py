@@ -35,7 +35,7 @@ def report_of(make_filter: MakeFilter, runs: Iterable[ScoredRun], total: int, ki
 
     The whole error is judged, of a filter that does not use the field the tilt.
     """
-    outcomes, failed, names, rows, whole = [], [], [], [], True
+    outcomes, failed, rows, whole = [], [], [], True
     for done, (run, counts, alone) in enumerate(runs):
         show(done, total)
         try:
@@ -49,7 +49,6 @@ def report_of(make_filter: MakeFilter, runs: Iterable[ScoredRun], total: int, ki
             failed.append(str(error))
             continue
         outcomes.append(outcome)
-        names.append(run.name)
         rows.append((rmse(outcome.estimates, outcome.run.truth), alone))
     show(total, total)
     faults = [Finding('invalid_output', '; '.join(failed))] if failed else []
@@ -65,6 +64,7 @@ def report_of(make_filter: MakeFilter, runs: Iterable[ScoredRun], total: int, ki
     marks = {f'{kind}_rms_deg': Mark(mean.total, limits[0], 'in motion, mean over the runs'),
              f'{kind}_heading_rms_deg': Mark(mean.heading, meaning='heading alone'),
              f'{kind}_tilt_rms_deg': Mark(mean.tilt, limits[1], 'tilt alone')}
+    names = [one.run.name for one in outcomes]
     for name in dict.fromkeys(names):
         of_filter, of_gyroscope = table[np.array(names) == name, :, 0].mean(axis=0).tolist()
         marks[f'{kind}_rms_{name}_deg'] = Mark(of_filter, meaning='' if math.isnan(of_gyroscope)

@@ -35,7 +35,7 @@ from spinning_top_sim.grade.scenes import Body, Start
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, conventions, scene_file
 from spinning_top_sim.tools.kinematics import Smoothed, stretches
-from spinning_top_sim.tools.report import Finding, Mark, Report
+from spinning_top_sim.tools.report import Finding, Mark, Report, printed
 
 START = 0.02            # angle to the start that is given, beyond which there is another [rad]
 NOISES = 5.0            # standard deviations of noise by which an attitude may be off besides
@@ -86,12 +86,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if of_top:
         report = _with_motion(report, recorded, values, known)
     report = replace(report, notes=[*recorded.notes, *report.notes])
-    if arguments.json:
-        print(report.as_json())
-    else:
-        for line in str(report).splitlines():
-            cli.print_line(line)
-    return cli.OK if report.passed else cli.FAILED
+    return printed(report, arguments.json)
 
 
 def _imu(arguments: argparse.Namespace, given: Mapping[str, Any], values: Mapping[str, Any],

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.tools.identify import Fit, compressed, fit, fitted, rms
+from spinning_top_sim.tools.identify import Fit, compressed, fit, fitted, pooled, rms
 from spinning_top_sim.tools.kinematics import (
     WIDTHS,
     Reals,
@@ -214,11 +214,10 @@ class Comparison:
         keep = slice(abs(lag), -abs(lag) or None)       # what a roll has not wrapped
         rows = [np.flatnonzero(good[keep]) + abs(lag) for good in self.good]
         self.counts = [len(one) for one in rows]
-        every = [self.effects(one) for one in self.smoothed]
-        effects = {name: np.concatenate([one[name][part] / size for one, part, size in zip(
-            every, rows, self.sizes, strict=True)]) for name in every[0]}
-        readings = np.concatenate([one[part] / size for one, part, size in zip(
-            self.read_at(lag), rows, self.sizes, strict=True)])
+        readings, effects = pooled((reading[part] / size, {
+            name: effect[part] / size for name, effect in self.effects(one).items()})
+            for one, reading, part, size in zip(
+                self.smoothed, self.read_at(lag), rows, self.sizes, strict=True))
         noises = [self.noises(one) for one in self.smoothed]
         noise = {name: rms(np.array([one[name] for one in noises]) / self.sizes)
                  for name in noises[0]}

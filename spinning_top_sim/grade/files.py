@@ -91,7 +91,7 @@ class Recorded:
         Raises ValueError.
         """
         def row(at: int) -> str:
-            return f'{where} {whole[at]}' if isinstance(where, str) else f'line {where[whole[at]]}'
+            return _place(where, whole[at])
 
         whole = np.flatnonzero(np.all(np.isfinite(values), axis=1) & np.isfinite(times))
         times, values = times[whole], values[whole]
@@ -339,8 +339,8 @@ def _hint(kind: str, names: Sequence[str], unused: Sequence[str]) -> str:
         f' with a UNIT of {", ".join(KINDS[kind].units)}' if unit == 'UNIT' else '')
 
 
-def _place(table: Table, row: int) -> str:
-    return f'{table.where} {row}' if isinstance(table.where, str) else f'line {table.where[row]}'
+def _place(where: str | Sequence[int], row: int) -> str:
+    return f'{where} {row}' if isinstance(where, str) else f'line {where[row]}'
 
 
 def _decimals(column: str, unit: str, table: Table) -> Iterator[Decimal]:
@@ -353,7 +353,7 @@ def _decimals(column: str, unit: str, table: Table) -> Iterator[Decimal]:
         except (InvalidOperation, ValueError):
             time = Decimal('NaN')
         if not time.is_finite():
-            raise ValueError(f'{_place(table, row)}: {column} = {text[:40]!r} is no time' + (
+            raise ValueError(f'{_place(table.where, row)}: {column} = {text[:40]!r} is no time' + (
                 ': write decimal points' if re.fullmatch(r'-?\d+,\d+', text) else
                 f": cut a row of units off, and say --columns 't={column}:{text}'"
                 if text in UNITS['t'] else f"; of a date say --columns 't={column}:iso'"))
@@ -369,6 +369,6 @@ def _numbers(column: str, table: Table) -> Iterator[float]:
         except ValueError:
             value = math.inf
         if math.isinf(value) or '_' in text:
-            raise ValueError(f'{_place(table, row)}: {column} = {text[:40]!r} is no number: '
+            raise ValueError(f'{_place(table.where, row)}: {column} = {text[:40]!r} is no number: '
                              'correct it, leave it empty, or cut the line off')
         yield value

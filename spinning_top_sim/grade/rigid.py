@@ -87,7 +87,7 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
 
     Axes of the sensor are left to the readings.
     """
-    ours, *others = [one for one in conventions.group(WORLDS) if not any(
+    ours, *others = [one for one in conventions.group() if not any(
         part.startswith('sensor') for part in one.parts)]
     body = excerpt(max(bodies, key=lambda one: len(one.t)))
     present = [name for name in READINGS[:2] if name in body.readings]

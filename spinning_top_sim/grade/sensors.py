@@ -26,7 +26,8 @@ from spinning_top_sim.grade.effects import (
     Imu,
 )
 from spinning_top_sim.grade.lag import CLEARLY, ROUNDING, SURE, lag_of
-from spinning_top_sim.tools.identify import NEAR, Cause, Judge, beyond, explain, instead, rms
+from spinning_top_sim.tools.conventions import axes
+from spinning_top_sim.tools.identify import NEAR, Cause, beyond, explain, instead, rms
 from spinning_top_sim.tools.kinematics import Reals, Stretch
 from spinning_top_sim.tools.report import Finding, Mark
 
@@ -146,8 +147,8 @@ class Causes:
         pairs, _ = explain(*compared.compressed(), [*self._causes()], math.hypot(
             compared.floor, 0.5 * self.least), always)
         while True:                             # without what may be chance
-            names = [name for cause, _ in pairs for name in cause.effects]
-            found, sigma, residual = compared.fit(names := [*always, *names])
+            names = [*always, *(name for cause, _ in pairs for name in cause.effects)]
+            found, sigma, residual = compared.fit(names)
             sure, end = np.abs(found) > SURE * sigma, len(names)
             for k in reversed(range(len(pairs))):
                 first = end - len(pairs[k][0].effects)
@@ -176,8 +177,8 @@ class Causes:
                 ('world', 'rates_in_world' if self.kind in ANGLES else 'reading_in_world',
                  'the world, not of the IMU'),
                 ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
-            yield Cause(['total', effect], partial(_swapped, instead(
-                name, f'the readings are in axes of {text}')))
+            yield Cause(['total', effect], instead(
+                name, f'the readings are in axes of {text}'))
         arms = [name for name in self.compared.always if name.startswith('arm')]
         for k in range(len(PERMUTATIONS)):
             yield Cause(['free', f'axes {k}', *(f'axes {k} {arm}' for arm in arms)],
@@ -241,9 +242,8 @@ class Causes:
         if abs(less + 1.0) > NEAR or (not sizes and abs(factor - 1.0) > NEAR):
             return None
         matrix = PERMUTATIONS[k]
-        words = ', '.join(f'{axis} reads {"-" * bool(np.sum(row) < 0.0)}'
-                          f'{"xyz"[int(np.argmax(np.abs(row)))]}'
-                          for axis, row in zip('xyz', matrix, strict=True))
+        words = ', '.join(f'{axis} reads {one}' for axis, one in zip(
+            'xyz', axes(matrix).split(', '), strict=True))
         return self._undone(
             next(iter(sizes.values()), 1.0) * matrix,
             'sign' if np.array_equal(np.abs(matrix), np.eye(3)) else 'axes',
@@ -328,10 +328,6 @@ class Causes:
             if small < NEAR * large:
                 return self._term(term, np.array([float(small / large) - 1.0]))
         return None
-
-
-def _swapped(judge: Judge, found: Reals) -> Finding | None:
-    return judge(found[-2:])
 
 
 def _marks(comparison: Comparison, compared: Compared, lag: int) -> dict[str, Mark]:

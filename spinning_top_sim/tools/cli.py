@@ -5,10 +5,12 @@ import argparse
 import contextlib
 import io
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import text_of, why_not_written
@@ -54,6 +56,19 @@ def run(name: str, help_text: str | None,
         print_line(f'{parser.prog}: interrupted{what}', sys.stderr)
         return INTERRUPTED
     return code
+
+
+@contextlib.contextmanager
+def handling(handler: Callable[[int, Any], object]) -> Iterator[None]:
+    """Call `handler` at SIGINT and SIGTERM; outside of the main thread nothing can."""
+    numbers = (signal.SIGINT, signal.SIGTERM) if (
+        threading.current_thread() is threading.main_thread()) else ()
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, former in before.items():
+            signal.signal(number, former)
 
 
 @contextlib.contextmanager

@@ -9,17 +9,14 @@ left-handed program changes world and sensor at once.
 
 import itertools
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Reals = NDArray[np.float64]
+from spinning_top_sim.tools.identify import AXES, Reals, rms
 
-AXES = 'xyz'
 # Directions of the axes x, y, z of worlds that programs use, in ours.
 _DIRECTIONS = {'east': (1, 0, 0), 'north': (0, 1, 0), 'up': (0, 0, 1),
                'west': (-1, 0, 0), 'south': (0, -1, 0), 'down': (0, 0, -1)}
@@ -27,6 +24,7 @@ WORLDS = 'north-east-down', 'north-west-up', 'east-up-south', 'north-up-east', '
 TURNS = Rotation.create_group('O')          # the 24 right-handed signed permutations
 # A simpler convention is preferred to one that leaves up to this factor, or angle [rad], less.
 AS_GOOD, SAME = 1.5, math.radians(0.1)
+MOST = 3                # parts of a convention
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,6 @@ class Convention:
                        * Rotation.from_quat(self.sensor).inv()).as_quat()
         return ours
 
-
     def tell(self, ours: Reals) -> Reals:
         """Return attitudes (n, 4) as they are told; the inverse of `undo`."""
         q = Rotation.from_quat(self.world) * Rotation.from_quat(ours) * Rotation.from_quat(
@@ -84,17 +81,17 @@ class Found:
     after: float
 
 
-def group(worlds: Iterable[str] = WORLDS, most: int = 3) -> list[Convention]:
-    """Return the conventions with at most so many parts, those with the fewest first."""
+def group() -> list[Convention]:
+    """Return the conventions with at most MOST parts, those with the fewest first."""
     lefts = [((), Rotation.identity()), *(((f'world {name}',), Rotation.from_matrix(
-        [_DIRECTIONS[word] for word in name.split('-')])) for name in worlds)]
+        [_DIRECTIONS[word] for word in name.split('-')])) for name in WORLDS)]
     rights = [(() if turn.magnitude() < SAME else (f'sensor axes {axes(turn.as_matrix())}',), turn)
               for turn in TURNS]
     found = []
     for (said, left), (felt, right), w_first, conjugate in itertools.product(
             lefts, rights, (False, True), (False, True)):
         parts = (('w, x, y, z',) * w_first + ('conjugated',) * conjugate + said + felt)
-        if len(parts) <= most:
+        if len(parts) <= MOST:
             found.append(Convention(w_first, conjugate, left.as_quat(), right.as_quat(), parts))
     # Other axes of world and sensor at once are another order or sign of the vector part.
     for turn, w_first, conjugate in itertools.product(TURNS, (False, True), (False, True)):
@@ -110,8 +107,7 @@ def axes(matrix: Any) -> str:
                      for row in matrix)
 
 
-def best(told: Reals, truth: Reals, heading: str = 'absolute',
-         candidates: Iterable[Convention] | None = None) -> Found:
+def best(told: Reals, truth: Reals, heading: str = 'absolute') -> Found:
     """
     Return the convention in which attitudes agree best with the truth.
 
@@ -121,22 +117,44 @@ def best(told: Reals, truth: Reals, heading: str = 'absolute',
 
     Some dozen attitudes that differ from each other by large turns suffice.
     """
-    true = Rotation.from_quat(truth)
-    found = [(error_of(one.undo(told), true, heading), one)
-             for one in (group() if candidates is None else candidates)]
+    found = [(error_of(one.undo(told), truth, heading), one) for one in group()]
     least = min(error for error, _ in found)
     # The first has the fewest parts.
     error, chosen = next(pair for pair in found if pair[0] <= max(AS_GOOD * least, SAME))
     return Found(chosen, found[0][0], error)
 
 
-def error_of(ours: Reals, truth: Any, heading: str = 'absolute') -> float:
+def error_of(ours: Reals, truth: Reals, heading: str = 'absolute') -> float:
     """Return the rms error [rad] of attitudes (n, 4); `heading` as for `best`."""
-    error = Rotation.from_quat(ours) * truth.inv()
-    x, y, z, w = error.as_quat().T
-    tilt = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w))
-    turn = np.exp(2j * np.arctan2(z, w))
+    errors = errors_of(ours, truth)
     if heading == 'steady':
-        turn = turn * np.conj(np.mean(turn))
-    about = np.angle(turn) if heading != 'any' else np.zeros(len(tilt))
-    return float(np.sqrt(np.mean(tilt ** 2 + about ** 2)))
+        errors = errors.about_mean()
+    return rms(errors.tilt if heading == 'any' else errors.whole)
+
+
+class Errors(NamedTuple):
+    """Attitude errors [rad]: tilt (n,) >= 0, and heading (n,) in [-pi, pi]."""
+
+    tilt: Reals
+    heading: Reals
+
+    def about_mean(self) -> 'Errors':
+        """Return the errors with the heading about its mean."""
+        phase = np.exp(1j * self.heading)
+        return self._replace(heading=np.angle(phase * np.conj(np.mean(phase))))
+
+    @property
+    def whole(self) -> Reals:
+        """Tilt and heading together (n,)."""
+        return np.hypot(self.tilt, self.heading)
+
+
+def errors_of(estimates: Reals, truth: Reals) -> Errors:
+    """
+    Split q_est q_true^-1 into heading and tilt (Laidig et al. 2021, eq. 2-4).
+
+    estimates, truth : q(world <- sensor) as x, y, z, w (n, 4)
+    """
+    x, y, z, w = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).as_quat(
+        canonical=True).T
+    return Errors(2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w)), 2.0 * np.arctan2(z, w))

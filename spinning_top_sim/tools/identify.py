@@ -2,8 +2,8 @@
 """
 Identifies a sensor by least squares: what it reads beside what it should read.
 
-`affine` finds matrix, offset and delay with their uncertainty; `explain` explains what is left by
-as few columns of physical effects as possible.
+`explain` explains a discrepancy by as few columns of physical effects as possible, `fit` finds the
+coefficients of columns and their uncertainty.
 """
 
 import math
@@ -35,23 +35,6 @@ AS_GOOD, AS_GOOD_SHARE = 2.0, 0.02
 Judge = Callable[[Reals], Finding | None]   # of the coefficients of a cause; None: no fault
 
 
-class Affine(NamedTuple):
-    """
-    The model: read(t) = matrix should(t - delay) + offset; `_sigma` are standard deviations.
-
-    left, before : rms of what is left, and of the difference without any model
-    """
-
-    matrix: Reals               # (3, 3)
-    offset: Reals               # (3,)
-    delay: float                # in steps; positive: late
-    matrix_sigma: Reals
-    offset_sigma: Reals
-    delay_sigma: float
-    left: float
-    before: float
-
-
 class Cause(NamedTuple):
     """Names of the effects of a possible cause, and what names its fault; None: it is no fault."""
 
@@ -64,53 +47,11 @@ def rms(values: Reals) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def affine(read: Reals, should: Reals, lags: Iterable[int] = (0,)) -> Affine:
-    """
-    Fit matrix, offset and delay of a sensor by least squares.
-
-    read, should : readings and what they should be (n, 3), in equal steps
-    lags : whole delays that are tried [steps]; the rest of the delay is fitted to first order
-
-    The standard deviations take what is left for noise with its own correlation in time.
-    """
-    tried = [*lags]
-    early, late = max(0, -min(tried)) + 1, max(0, *tried) + 1
-    inner = slice(late, len(read) - early)
-    if inner.stop - inner.start < 16:
-        raise ValueError(f'{len(read)} readings: must be {early + late + 16} at least')
-    fits = []
-    for lag in tried:
-        moved = should[inner.start - lag:inner.stop - lag]
-        # To first order in the delay: d/dt of `should`, turned by the matrix of this lag.
-        columns = np.hstack((moved, np.ones((len(moved), 1))))
-        first = np.linalg.lstsq(columns, read[inner], rcond=None)[0]
-        slope = 0.5 * (should[inner.start - lag + 1:inner.stop - lag + 1]
-                       - should[inner.start - lag - 1:inner.stop - lag - 1])
-        fits.append((rms(read[inner] - columns @ first), lag, columns, first, slope))
-    _, lag, columns, found, slope = min(fits, key=lambda fit: fit[0])
-    # Matrix, offset and the rest of the delay together: their columns for all three axes.
-    n = len(columns)
-    joint = np.zeros((3, n, 13))
-    for k in range(3):
-        joint[k, :, 4 * k:4 * k + 4] = columns
-        joint[k, :, 12] = -slope @ found[:3, k]
-    flat = joint.reshape(3 * n, 13)
-    target = read[inner].T.ravel()
-    solution, _, _, _ = np.linalg.lstsq(flat, target, rcond=None)
-    rest = (target - flat @ solution).reshape(3, n)
-    scale = rms(rest) * math.sqrt(autocorrelation_time(rest) * 3 * n / max(3 * n - 13, 1))
-    sigma = scale * np.sqrt(np.maximum(np.diag(np.linalg.pinv(flat.T @ flat)), 0.0))
-    entries = np.asarray(solution[:12], dtype=np.float64).reshape(3, 4)
-    spread = np.asarray(sigma[:12], dtype=np.float64).reshape(3, 4)
-    return Affine(entries[:, :3], entries[:, 3], lag + float(solution[12]), spread[:, :3],
-                  spread[:, 3], float(sigma[12]), rms(rest), rms(read - should))
-
-
-def in_words(matrix: Reals, verb: str = 'turns it about') -> str:
+def in_words(matrix: Reals) -> str:
     """Return in words how a matrix (3, 3) differs from the identity, by its columns."""
     large = 0.5 * np.max(np.abs(matrix - np.eye(3)))
     return '; '.join(
-        f'{AXES[k]} {verb} ' + (' and '.join(
+        f'{AXES[k]} turns the attitude about ' + (' and '.join(
             f'{AXES[j]} by {column[j]:.3g}' for j in range(3)
             if abs(column[j]) >= min(large, 0.5)) or 'nothing')
         for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) >= large)
@@ -118,7 +59,7 @@ def in_words(matrix: Reals, verb: str = 'turns it about') -> str:
 
 def autocorrelation_time(values: Reals) -> float:
     """
-    Return the integrated autocorrelation time of rows (runs, n) [samples], at least 1.
+    Return the integrated autocorrelation time of values (n,) [samples], at least 1.
 
     The sum ends at the first lag of at least WINDOW times its present value (Sokal 1997, sect. 3).
     """
@@ -126,9 +67,9 @@ def autocorrelation_time(values: Reals) -> float:
     largest = float(np.max(np.abs(centred)))
     if not largest > 0.0:
         return 1.0
-    n = values.shape[1]
+    n = len(values)
     # Zero padding makes the circular correlation of the transform a linear one.
-    power = np.mean(np.abs(np.fft.rfft(centred / largest, 2 * n)) ** 2, axis=0)     # no overflow
+    power = np.abs(np.fft.rfft(centred / largest, 2 * n)) ** 2      # no overflow
     correlations = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
     times = 2.0 * np.cumsum(correlations / correlations[0]) - 1.0
     ends = np.flatnonzero(np.arange(n) >= WINDOW * times)
@@ -136,9 +77,9 @@ def autocorrelation_time(values: Reals) -> float:
 
 
 def instead(name: str, evidence: str) -> Judge:
-    """Return a judge of two columns: the second effect is there instead of the first."""
+    """Return a judge of the last two columns: the second effect is there instead of the first."""
     def judge(found: Reals) -> Finding | None:
-        return Finding(name, evidence) if np.allclose(found, (-1.0, 1.0), atol=NEAR) else None
+        return Finding(name, evidence) if np.allclose(found[-2:], (-1.0, 1.0), atol=NEAR) else None
     return judge
 
 
@@ -216,8 +157,8 @@ class Fit(NamedTuple):
     residual: Reals
 
 
-def fit(target: Reals, columns: Sequence[Reals], noise: Sequence[float] | None = None,
-        own: Sequence[bool] | None = None) -> Fit:
+def fit(target: Reals, columns: Sequence[Reals], noise: Sequence[float],
+        own: Sequence[bool]) -> Fit:
     """
     Fit columns (N, 3) that have noise of their own.
 
@@ -229,11 +170,11 @@ def fit(target: Reals, columns: Sequence[Reals], noise: Sequence[float] | None =
     matrix = np.stack([column.ravel() for column in columns], axis=1)
     size = np.maximum(np.linalg.norm(matrix, axis=0), TINY * math.sqrt(len(matrix)))
     matrix = matrix / size
-    excess = np.square(noise or np.zeros(len(columns))) * len(matrix) / size ** 2
+    excess = np.square(noise) * len(matrix) / size ** 2
     values, vectors = np.linalg.eigh(matrix.T @ matrix - np.diag(excess))
     known = values > np.maximum(1e-9, vectors.T ** 2 @ excess)
     inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
-    found = inverse @ (matrix.T @ target.ravel() + excess * size * (own if own is not None else 0))
+    found = inverse @ (matrix.T @ target.ravel() + excess * size * own)
     residual = target - (matrix @ found).reshape(target.shape)
     scores = np.array([part.T @ left for part, left in zip(
         np.array_split(matrix, BLOCKS), np.array_split(residual.ravel(), BLOCKS), strict=True)])

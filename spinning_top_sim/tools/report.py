@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from spinning_top_sim.tools import cli
+
 
 class Finding(NamedTuple):
     """
@@ -120,6 +122,16 @@ class Report:
 def number(value: float) -> float | None:
     """Return what JSON can hold: None for NaN and infinity."""
     return value if math.isfinite(value) else None
+
+
+def printed(report: Report, as_json: bool) -> int:
+    """Print a report; return the exit code of its command."""
+    if as_json:
+        print(report.as_json())
+    else:
+        for line in str(report).splitlines():
+            cli.print_line(line)
+    return cli.OK if report.passed else cli.FAILED
 
 
 def passing(judge: Callable[..., Report]) -> Callable[..., Report]:
