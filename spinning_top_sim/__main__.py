@@ -22,7 +22,7 @@ COMMANDS = {
     'export': ('tools.export', 'write the top as a model for physics engines'),
     'ensemble': ('tools.ensemble', 'simulate many tops with sampled parameters'),
     'examine': ('exam.command', 'examine an attitude filter'),
-    'grade': ('grade.command', 'grade the trajectory of a simulator'),
+    'grade': ('grade.command', 'compare an IMU with the motion of its body; grade a top'),
     'view': ('view.command', 'show a running node or a log in the browser'),
 }
 INTERRUPTED = 130

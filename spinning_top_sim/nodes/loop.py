@@ -201,7 +201,7 @@ class Loop:
                                f'{(target_ns - self.now_ns) / NANOSECONDS:.9g} s are left')
 
     def command(self, l3: float, lz: float) -> None:
-        """Send what is due, then let L3 and Lz jump [kg m^2/s], or raise ValueError."""
+        """Send what is due, then let L3 and Lz jump [kg m^2/s]; ValueError, RuntimeError."""
         self._send_before_change()
         self._recording.write(self._simulation.apply('command', l3=l3, lz=lz))
         self.commands += 1
@@ -239,8 +239,7 @@ class Loop:
         if self._simulation.now_ns < 0:         # the change sends the samples of t = 0
             self._update_subscribers()
         self._advance()
-        if self.failure:
-            raise ValueError(f'the motion stands still: {self.failure}')
+        self._check_failure()
 
     def _check_failure(self) -> None:
         if self.failure:

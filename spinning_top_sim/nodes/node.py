@@ -268,10 +268,14 @@ class Simulator(Node):
             self._align_ticks()
         return f'{self.loop.state.value} {self.loop.time_text}'
 
+    @property
+    def step_ns(self) -> int:
+        """The length of a step: whole nanoseconds, so that n steps are n times one step."""
+        return round(self.values['step.dt'] * NANOSECONDS)
+
     def _step(self, _: Trigger.Request) -> str:
         self.check_started()
-        # A step is a whole number of nanoseconds, so that n steps are n times one step.
-        self.loop.step(self.values['step.count'] * round(self.values['step.dt'] * NANOSECONDS))
+        self.loop.step(self.values['step.count'] * self.step_ns)
         return self.loop.time_text
 
     def _reset(self, _: Trigger.Request) -> str:

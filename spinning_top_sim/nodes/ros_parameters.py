@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameter table as ROS parameters: descriptors, start values, and checked changes."""
 
-import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,9 +10,8 @@ from rclpy.parameter import Parameter as RosParameter
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameter import ANY, Effect, Parameter
-from spinning_top_sim.tools.scene_file import likely_name, with_doubles
+from spinning_top_sim.tools.scene_file import OF_RCLPY, likely_name, with_doubles
 
-OF_RCLPY = ('use_sim_time', 'start_type_description_service')     # which it declares itself
 SPIN = ('spin.l3', 'spin.lz')
 
 
@@ -58,12 +56,12 @@ def declare(node: Node, given: Mapping[str, Any], overrides: Mapping[str, Any]) 
 
 def disobeyed_overrides(node: Node, overrides: Iterable[str]) -> Iterator[str]:
     """Yield a warning for each name of qos_overrides that no publisher of a node has used."""
-    used = list(node.get_parameters_by_prefix('qos_overrides'))
+    prefix = 'qos_overrides.'
+    used = node.get_parameters_by_prefix('qos_overrides')
     for name in overrides:
-        if name.startswith('qos_overrides.') and not node.has_parameter(name):
-            near = difflib.get_close_matches(name.removeprefix('qos_overrides.'), used, 1)
-            yield f'{name} is not obeyed: no publisher has this topic and policy' + (
-                f'; did you mean qos_overrides.{near[0]}?' if near else '')
+        if name.startswith(prefix) and not node.has_parameter(name):
+            yield (f'{name} is not obeyed: no publisher has this topic and policy'
+                   f'{likely_name(name, used, prefix)}')
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -26,7 +26,6 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS
 
 Message = Any           # message packages have no types
 # Each service, and the values of SimulatorFeatures that announce it.
@@ -168,7 +167,7 @@ class SimulationHandlers:
         if self._state != 'PAUSED':
             raise RuntimeError('the simulation is not paused: SetSimulationState must set '
                                'STATE_PAUSED first')
-        length_ns = steps * round(self._node.values['step.dt'] * NANOSECONDS)
+        length_ns = steps * self._node.step_ns
         target_ns = loop.now_ns + length_ns
         loop.step(length_ns)
         if loop.now_ns < target_ns:

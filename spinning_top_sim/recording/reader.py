@@ -146,7 +146,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for number, channel in sorted(self.channels.items())
             for schema in [self.schemas.get(channel.schema_id)])
 
-    @property
+    @cached_property
     def compression(self) -> tuple[str, str]:
         """Mode, such as 'MESSAGE', and format of compression, if rosbag2 has compressed more."""
         text = self.metadata.get(rosbag2.BAG_METADATA, {}).get('serialized_metadata', '')

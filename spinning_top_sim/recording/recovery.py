@@ -15,7 +15,7 @@ from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata
 
 
 def recover(reader: LogReader, output: Path,
-            progress: Callable[[float], object] = lambda done: None) -> int:
+            progress: Callable[[float], object]) -> int:
     """
     Write everything that can be read of a log into a new file; return the number of messages.
 

@@ -72,7 +72,7 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
         'format': 3, 'complete': False, 'versions': versions(),
         'specification': asdict(specification), 'failed': {}}))
     if (folder / MANIFEST).exists():
-        old = _read_manifest(folder)
+        old, _ = _read_manifest(folder)
         # As text: the order in entries counts, as in a grid of samples.
         if not arguments.overwrite and any(json.dumps(old[key]) != json.dumps(manifest[key])
                                            for key in ('specification', 'versions')):
@@ -108,8 +108,7 @@ def _compute_dataset(arguments: argparse.Namespace) -> int:
 def _compute_row(arguments: argparse.Namespace) -> int:
     path: Path = arguments.specification
     if path.is_dir():
-        manifest = _read_manifest(path)
-        specification = ensemble_spec.parse(manifest['specification'], str(path))
+        manifest, specification = _read_manifest(path)
         if manifest['versions'] != versions():
             cli.print_line('spinning-top ensemble: the last bits may differ: the dataset is of '
                            f'other versions, {manifest["versions"]}', sys.stderr)
@@ -123,13 +122,13 @@ def _compute_row(arguments: argparse.Namespace) -> int:
     return cli.OK
 
 
-def _read_manifest(folder: Path) -> dict[str, Any]:
-    """Return the manifest of a dataset.  Raises OSError or ValueError."""
+def _read_manifest(folder: Path) -> tuple[dict[str, Any], ensemble_spec.Specification]:
+    """Return the manifest of a dataset, and its specification.  Raises OSError or ValueError."""
     path = folder / MANIFEST
     try:
         manifest: dict[str, Any] = json.loads(path.read_bytes())
-        ensemble_spec.parse(manifest['specification'], 'specification')
-        return {**manifest, 'versions': dict(manifest['versions'])}
+        specification = ensemble_spec.parse(manifest['specification'], 'specification')
+        return {**manifest, 'versions': dict(manifest['versions'])}, specification
     except MALFORMED as error:
         raise ValueError(f'{path} is no manifest of an ensemble: {reason_of(error)}') from error
 

@@ -6,7 +6,7 @@ import array
 import contextlib
 import difflib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,18 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli
 
 NODE = '/spinning_top'      # the full name of the node where no other is asked for
-# Parameters that rclpy declares for every node.
-ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+# Parameters that rclpy declares for every node, and those that it declares for publishers.
+OF_RCLPY = 'use_sim_time', 'start_type_description_service'
+ROS_PARAMETERS = (*OF_RCLPY, 'qos_overrides')
 
 
 class _Loader(yaml.SafeLoader):
-    """Resolves plain scalars as rcl does: 1e5 is a double, 1_000 and ~ are strings."""
+    """As rcl: 1e5 is a double, 1_000 and ~ are strings, and there are no aliases."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError('rcl supports no aliases')
+        return super().compose_node(parent, index)
 
 
 _Loader.bool_values = yaml.SafeLoader.bool_values | {'y': True, 'n': False}
@@ -160,8 +166,6 @@ def parse_assignment(text: str) -> tuple[str, object]:
 def parse_yaml(text: str | bytes, source: str) -> object:
     """Return the content of YAML with the types of rcl.  Raises ValueError, as `read_scene`."""
     try:
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            raise ValueError('rcl supports no aliases')
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f'{source} is not YAML: {" ".join(str(error).split())}') from error
@@ -180,10 +184,10 @@ def is_of_ros(name: str) -> bool:
     return name.partition('.')[0] in ROS_PARAMETERS
 
 
-def likely_name(name: str) -> str:
-    """Return what to say of the parameter whose name is most like an unknown one."""
-    near = difflib.get_close_matches(name, parameters.BY_NAME, 1)
-    return f'; did you mean {near[0]}?' if near else ''
+def likely_name(name: str, known: Iterable[str] = parameters.BY_NAME, prefix: str = '') -> str:
+    """Return a hint at the known name, behind the prefix, that is most like an unknown one."""
+    near = difflib.get_close_matches(name.removeprefix(prefix), list(known), 1)
+    return f'; did you mean {prefix}{near[0]}?' if near else ''
 
 
 def _known(name: str, value: object, source: str) -> object:
