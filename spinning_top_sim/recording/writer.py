@@ -232,7 +232,9 @@ class McapWriter:
                     offset += written
                     rest = rest[written:]
                 crc = zlib.crc32(block, crc)
-        except BaseException:
+        except BaseException as error:
+            if isinstance(error, OSError):
+                error.filename = str(self._path)
             with contextlib.suppress(OSError):
                 os.ftruncate(descriptor, self.size)
             raise
