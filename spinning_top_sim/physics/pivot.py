@@ -37,8 +37,8 @@ class Kinematics(NamedTuple):
     acceleration: NDArray[np.float64]
 
 
-class Piece(NamedTuple):
-    """A time of constant acceleration."""
+class Ride(NamedTuple):
+    """What a pivot does while its acceleration is constant."""
 
     start_ns: int
     end_ns: int                         # the first time after it; NEVER_NS if it never ends
@@ -46,7 +46,7 @@ class Piece(NamedTuple):
     begins: NDArray[np.float64]         # (9,) position, velocity and acceleration at the start
 
 
-REST = Piece(0, NEVER_NS, ZERO, np.zeros(9))
+REST = Ride(0, NEVER_NS, ZERO, np.zeros(9))
 
 
 def ns_array(times: NDArray[np.int64] | range) -> NDArray[np.int64]:
@@ -56,10 +56,10 @@ def ns_array(times: NDArray[np.int64] | range) -> NDArray[np.int64]:
     return np.asarray(times)
 
 
-def kinematics(piece: Piece, times_ns: NDArray[np.int64]) -> Kinematics:
-    """Return what the pivot does in a piece at times (n,) [ns]."""
-    start, velocity, acceleration = piece.begins.reshape(3, 3, 1)
-    t = (times_ns - piece.start_ns) * 1e-9
+def kinematics(ride: Ride, times_ns: NDArray[np.int64]) -> Kinematics:
+    """Return what the pivot does at times (n,) [ns] of this ride."""
+    start, velocity, acceleration = ride.begins.reshape(3, 3, 1)
+    t = (times_ns - ride.start_ns) * 1e-9
     return Kinematics((0.5 * t * acceleration + velocity) * t + start,
                       velocity + t * acceleration, np.repeat(acceleration, len(t), axis=1))
 
@@ -152,7 +152,7 @@ class PivotPath:
             pieces += _ramp(goal, ZERO, most_acceleration)
         return cls(pieces, position=position, velocity=velocity, start_ns=start_ns)
 
-    def piece(self, t_ns: int) -> Piece:
+    def piece(self, t_ns: int) -> Ride:
         """Return the piece that a time [ns] from the start on belongs to."""
         since_ns = t_ns - self.start_ns
         cycle, phase = divmod(since_ns, self._cycle_ns) if self._cycle_ns else (0, since_ns)
@@ -163,10 +163,10 @@ class PivotPath:
         offset = self.start_ns + cycle * self._cycle_ns
         end = (self._starts[k + 1] if k + 1 < len(self._starts)
                else self._cycle_ns or NEVER_NS - offset)
-        return Piece(offset + self._starts[k], offset + end, self._accelerations[k],
+        return Ride(offset + self._starts[k], offset + end, self._accelerations[k],
                      self._begins[k] + cycle * self._per_cycle)
 
-    def lasting(self, t_ns: int) -> Piece:
+    def lasting(self, t_ns: int) -> Ride:
         """Return the piece from a time [ns] on with those that have the same acceleration."""
         piece = self.piece(t_ns)
         while piece.end_ns < NEVER_NS and (

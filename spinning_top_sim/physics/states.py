@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.installation import needed
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
-from spinning_top_sim.physics.pivot import Kinematics, Piece, kinematics
+from spinning_top_sim.physics.pivot import Kinematics, Ride, kinematics
 from spinning_top_sim.physics.top import State, Top
 
 if TYPE_CHECKING:
@@ -301,7 +301,7 @@ class WorldStates(States):
         cached_property(attrgetter(f'_moved.{name}')) for name in (
             't', 'l3', 'transverse_velocity', '_support'))
 
-    def __init__(self, top: Top, moved: States, rotation: Quaternion, ride: Piece,
+    def __init__(self, top: Top, moved: States, rotation: Quaternion, ride: Ride,
                  times_ns: NDArray[np.int64]) -> None:
         super().__init__(top, moved.start, len(moved))
         self.method, self._moved, self._rotation = moved.method, moved, rotation

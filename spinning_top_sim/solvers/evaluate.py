@@ -101,7 +101,7 @@ class ThetaArrays:
         rows = [[one[part] for one in factor.parts] for part in (0, 1) for factor in factors]
         self.prefactors = [(even.prefactor, odd.prefactor) for even, odd in rows]
         self.coefficients = _highest_first(
-            [float(scale * x) for x in one.polynomial[:motion.size]]
+            [float(scale * x) for x in one.polynomial(motion.size)]
             for row, factor in zip(rows, 2 * factors, strict=True)
             for one, scale in zip(row, factor.scales, strict=True)).reshape(-1, 4, 2)
         for name, factor in (('alpha', motion.alpha), ('beta', motion.beta)):
@@ -118,7 +118,7 @@ class ThetaArrays:
                       if SIN_ODD in pair}
         self.u_dot = np.array([*map(float, motion.u_dot)])
         self.u_dot_coefficients = _highest_first(
-            [[*map(float, motion.u_dot_series.polynomial[:motion.size])]])
+            [[*map(float, motion.u_dot_series.polynomial(motion.size))]])
         self.precession, self.swing = np.array(
             [[*map(float, motion.precession)], [*map(float, motion.swing)]])
         self._scaled: dict[int, list[Matrix]] = {}

@@ -103,17 +103,18 @@ class ExactSolution:
 
     def _check_start(self) -> None:
         """Refuse constants so large, or so far apart, that doubles lose the start among them."""
-        start = self.start
+        start, arrays = self.start, self.arrays
         with np.errstate(all='ignore'):
-            first = ThetaValues(self.arrays, Times(1, np.zeros(1)))
-            (alpha, beta), theta_dot, across = (np.ravel(x).tolist() for x in (
-                first.moduli, first.theta_dot, first.across))
+            first = ThetaValues(arrays, Times(1, np.zeros(1)))
+            alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
         cosine, sine = abs(math.cos(0.5 * start.theta)), abs(math.sin(0.5 * start.theta))
+        across = sum(rate * x / y for rate, x, y in (       # phi' sin(theta)
+            (arrays.bottom_rate, sine, cosine), (arrays.top_rate, cosine, sine)) if rate)
         # Relative to the distance from either pole, and to a small velocity of the axis.
         for name, error, size in (
                 ('theta', beta * cosine - alpha * sine, alpha * sine),
-                ('theta_dot', self.sign * theta_dot[0] - start.theta_dot,
-                 min(math.hypot(start.theta_dot, across[0]), max(1.0, abs(start.theta_dot))))):
+                ('theta_dot', self.sign * theta_dot - start.theta_dot,
+                 min(math.hypot(start.theta_dot, across), max(1.0, abs(start.theta_dot))))):
             if not abs(error) <= 1e-14 * abs(size):
                 raise ValueError(f'{name} = {getattr(start, name)!r} cannot be held in doubles: '
                                  f'the constants of {self.top} and {start} are too far apart in '

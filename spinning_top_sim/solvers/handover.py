@@ -54,7 +54,7 @@ class Piece:
     """
 
     def __init__(self, top: Top, start: State | Posture, start_ns: int,
-                 ride: pivot.Piece = pivot.REST, *, method: str = 'rk45',
+                 ride: pivot.Ride = pivot.REST, *, method: str = 'rk45',
                  equations: str = 'transport', rtol: float = 1e-11, atol: float = 1e-12) -> None:
         self.top, self.start_ns, self.ride, self._start = top, start_ns, ride, start
         try:
@@ -155,7 +155,7 @@ class Piece:
         if isinstance(self._motion, SteppedMotion):
             self._motion.forget(before_ns - self.start_ns)
 
-    def with_ride(self, ride: pivot.Piece) -> Self:
+    def with_ride(self, ride: pivot.Ride) -> Self:
         """Return this motion where the pivot has the same acceleration till another end."""
         changed = copy(self)
         changed.ride = ride

@@ -25,7 +25,7 @@ Positive constants that all series of a form share are left out.
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cached_property, reduce
+from functools import reduce
 from itertools import count, zip_longest
 from operator import add, mul
 from typing import NamedTuple
@@ -217,23 +217,23 @@ class Series:
     def __init__(self, prefactor: int, weights: Sequence[mpfr]) -> None:
         self.prefactor, self.weights = prefactor, weights
 
-    @cached_property
-    def polynomial(self) -> list[mpfr]:
-        """The coefficients of xi^0, xi^1 ..."""
+    def polynomial(self, terms: int | None = None) -> list[mpfr]:
+        """Return the coefficients of xi^0, xi^1 ... of the first terms, or of all."""
+        weights = self.weights[:terms]
         # A sum of -0 is -0.
-        return [reduce(add, map(mul, self.weights[power:], shapes)) for power, shapes in zip(
-            range(len(self.weights)), MULTIPLE_ANGLES[self.prefactor], strict=False)]
+        return [reduce(add, map(mul, weights[power:], shapes)) for power, shapes in zip(
+            range(len(weights)), MULTIPLE_ANGLES[self.prefactor], strict=False)]
 
     def at(self, sin: mpfr, cos: mpfr, xi: mpfr) -> mpfr:
         """Return the sum."""
         value = reduce(lambda value, coefficient: value * xi + coefficient,
-                       reversed(self.polynomial))
+                       reversed(self.polynomial()))
         return value * (ONE, cos, sin, sin * cos)[self.prefactor]
 
     @property
     def leading(self) -> mpfr:
         """At y = 0, the value of a cosine series, or the derivative of a sine series."""
-        return self.polynomial[0]
+        return reduce(add, map(mul, self.weights, MULTIPLE_ANGLES[self.prefactor][0]))
 
 
 NOTHING = Series(COS_EVEN, [ZERO])
