@@ -75,13 +75,13 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
 | service | `~/reset` | std_srvs/Trigger | starts again with the start state, spin and seed; the next stamp is the date |
 | service | `~/record` | std_srvs/SetBool | starts, stops a log; answers when it is open or closed, with path and counts |
 | parameters | `spin.l3`, `spin.lz` | double | the same as a command, with a result; set both atomically |
-| services | `get_entity_state`, `step_simulation`, … | simulation_interfaces | where that package is installed: [simulation_interfaces.md](simulation_interfaces.md) |
+| services | `get_entity_state`, `step_simulation`, … | simulation_interfaces | where that package is installed: [below](#simulation_interfaces) |
 
 The node refuses a command of wrong length, with NaN or infinity, or with Lz ≠ ±L3 while the axis is at a
 pole. It logs the reason and counts the command in `/diagnostics`. The motion continues unchanged.
 
 A command, a state set, a velocity of the pivot, a parameter that acts at once and a reset are *events*.
-A recording has them, with their times ([Logs](log_format.md#events)).
+A recording has them, with their times ([Logs](logs.md#events)).
 
 `spin.l3` and `spin.lz` in one request with a parameter of `initial.*` are no command: they are the spin of the
 next start, and take effect with `~/reset` as the others do.
@@ -99,6 +99,55 @@ takes effect at once, at the next `~/reset`, with the next recording, or only at
 COMMANDS = ('sim_node', 'replay_node', 'simulate', 'inspect', 'recover', 'export', 'ensemble',
             'examine', 'grade', 'view')
 AFTER_PARAMETERS = """
+## simulation_interfaces
+
+[simulation_interfaces](https://github.com/ros-simulation/simulation_interfaces) is the ROS 2 standard for simulators, which Gazebo,
+Isaac Sim, O3DE and an RViz plugin share. If that package is installed (`sudo apt install ros-$ROS_DISTRO-simulation-interfaces`),
+`sim_node` offers its services; the parameter `simulation_interfaces` set to false turns them off. This is version 2.1.
+
+Names are those of the types, relative to the namespace of the node: `/get_entities`, or `/left/get_entities` with `-r __ns:=/left`.
+
+| service | effect |
+|---|---|
+| `get_simulator_features` | lists the features offered |
+| `get_simulation_state`, `set_simulation_state` | STOPPED, PLAYING, PAUSED, QUITTING |
+| `step_simulation` | n steps of the parameter `step.dt`, only in PAUSED |
+| `reset_simulation` | time and state (scope 0, 3 or 255), or the state only (2) |
+| `get_entities`, `get_entities_states` | the top; filters must be empty |
+| `get_entity_state`, `set_entity_state` | pose, twist and acceleration |
+| `get_entity_info` | category, description, tags |
+
+Nothing spawns, deletes or renames entities. A refusal has the result code of the standard and an `error_message`, and changes nothing.
+
+<!-- not run: needs the command line tools of a ROS installation -->
+```bash
+ros2 service call /set_simulation_state simulation_interfaces/srv/SetSimulationState '{state: {state: 2}}'
+ros2 service call /step_simulation simulation_interfaces/srv/StepSimulation '{steps: 10}'
+ros2 service call /get_entity_state simulation_interfaces/srv/GetEntityState '{entity: spinning_top}'
+```
+
+### States, steps and resets
+
+- **STOPPED** is paused, before the first sample. A node with `start_paused`, or one that waits for `/clock`, begins so.
+  `set_simulation_state` STOPPED pauses and resets; stamps do not go back.
+- **PAUSED** from STOPPED sends no sample. A motion that has failed is PAUSED; `error_message` of `get_simulation_state` says why,
+  and only STOPPED leads on.
+- **QUITTING** closes the recording and ends the process with exit code 0. A node whose `duration` is over is QUITTING.
+- `step_simulation` answers after at most two seconds, and says how much is left. The action `SimulateSteps` is not offered.
+- Scope 2 of `reset_simulation` resets the top, while time, noise and bias go on. Scopes 1 and 4 are RESULT_FEATURE_UNSUPPORTED.
+
+### The entity
+
+Its name is that of the node, `spinning_top`, its category CATEGORY_ROBOT. Its origin is the pivot.
+
+**`get_entity_state`** answers in `world_frame`, with the stamp up to which all samples have been sent. Linear velocity and
+acceleration are those of the pivot, 0 while it rests. The quaternion is that of `ground_truth/odom`, to the last bit.
+
+**`set_entity_state`** sets pose and twist; simulated time goes on. The position must be the pivot, the quaternion a unit one
+within 0.001 (else INVALID_POSE), the linear velocity that of the pivot. What is not set stays. The acceleration follows from pose
+and twist and is ignored. φ and ψ begin again in [−2π, 2π]; a tilt below 1.5·10⁻⁸ rad is set to 0. `imu/dq` omits the jump, and the `imu/dv` that
+contains it has no physical meaning.
+
 ## Commands
 
 The help of each executable, in the site. `ros2 run spinning_top_sim NAME` runs the same.

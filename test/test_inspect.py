@@ -154,7 +154,7 @@ def test_text_tells_the_numbers_and_help_fits_into_80_columns(stepped, capsys):
 def test_json_is_strict_and_documented(short, capsys):
     _, out, _ = told(capsys, short, '--json', '--verify')
     content = json.loads(out, parse_constant=pytest.fail)
-    page = (ROOT / 'docs/log_format.md').read_text()
+    page = (ROOT / 'docs/logs.md').read_text()
     keys = set(content) | {key for name in ('damage', 'run', 'verify') for key in content[name]}
     keys |= set(content['motions'][0]) | set(content['motions'][0]['measured'])
     keys |= set(content['motions'][0]['exact']) | set(content['topics']['/pose'])

@@ -40,7 +40,7 @@ class Event:
     t_ns : simulated time at which it acts [ns]
     sent_ns : time up to which samples had been sent before, -1 for none [ns]; a reset puts t back
         to 0, and this is a time of the motion that ended
-    details : depends on the kind, as docs/log_format.md says
+    details : depends on the kind, as docs/logs.md says
     """
 
     kind: str

@@ -10,7 +10,7 @@ exit codes:
        picture could not be drawn
   2    wrong arguments
   130  interrupted
-The keys of --json are in docs/log_format.md.
+The keys of --json are in docs/logs.md.
 """
 
 import argparse
@@ -108,7 +108,7 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
 
 
 def _as_json(found: Survey, comparison: Comparison | None) -> object:
-    """Return the findings for JSON; docs/log_format.md has the keys."""
+    """Return the findings for JSON; docs/logs.md has the keys."""
     damage, run, (begin_ns, end_ns) = found.damage, found.run, found.span
     content: dict[str, object] = {
         'file': str(found.path), 'whole': not damage.reasons,

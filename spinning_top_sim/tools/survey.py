@@ -41,7 +41,7 @@ Rows = NDArray[np.float64]
 
 @dataclass
 class TopicReport:
-    """The findings about a topic, with the keys of docs/log_format.md."""
+    """The findings about a topic, with the keys of docs/logs.md."""
 
     type: str
     stream: str | None = None             # topic of the stream of this package
@@ -167,7 +167,7 @@ def _follow_run(found: Survey, run: RunDescription) -> None:
 
 def _source(run: RunDescription, channels: Mapping[str, Channel],
             exact: Description | None) -> str | None:
-    """Return the topic that a motion is measured from, as docs/log_format.md says."""
+    """Return the topic that a motion is measured from, as docs/logs.md says."""
     period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
     return max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
                key=lambda name: min(period_ns / channels[name].period_ns, ENOUGH_SAMPLES))
