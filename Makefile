@@ -4,13 +4,12 @@
 #:
 PYTHON ?= python3
 ROS ?= jazzy
-VENV ?= .venv$(if $(filter kilted,$(ROS)),-kilted)
+VENV ?= .venv$(patsubst %,-%,$(filter-out jazzy,$(ROS)))
 SCENE ?= cusp
 LOGS ?= logs
 TESTS ?= test
 WORKERS ?= 3
 SECONDS ?= 180
-$(if $(filter-out jazzy kilted,$(ROS)),$(error ROS=$(ROS) is neither jazzy nor kilted))
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
@@ -36,15 +35,17 @@ export PYTHONUNBUFFERED := 1
 export DIST_EXTRA_CONFIG := $(abspath $(VENV))/setup.cfg
 
 BIN := '$(VENV)/bin
-PIP := $(BIN)/python' -m pip --disable-pip-version-check install --quiet --quiet
+# On a terminal pip shows what it downloads.
+PIP = $(BIN)/python' -m pip --disable-pip-version-check install $(if $(MAKE_TERMOUT),,--quiet --quiet)
 # Each worker would import the other plug-ins, and rewrite their assertions, in two seconds.
 test coverage: export PYTEST_DISABLE_PLUGIN_AUTOLOAD := 1
 PYTEST = $(BIN)/pytest' -p xdist -n $(WORKERS) --max-worker-restart=0
-INSTALL = @flock Makefile $(MAKE) --silent --no-print-directory
+INSTALL = @flock --nonblock Makefile true || echo 'Another make installs: waiting for it'; \
+    flock Makefile $(MAKE) --silent --no-print-directory
 
 help:
 	@sed -n 's/^#: \{0,1\}//p' Makefile
-	@echo 'PYTHON=$(PYTHON)  ROS=$(ROS) (or kilted)  VENV=$(VENV)'
+	@echo 'PYTHON=$(PYTHON)  ROS=$(ROS)  VENV=$(VENV)'
 
 #: make run     simulate a scene and record it into logs/, until Ctrl-C; SCENE=...:
 #:              cusp fast_gyroscope free_top heavy_top looping near_separatrix
@@ -59,6 +60,7 @@ run:
 	@echo '  . $(VENV)/bin/activate'
 	@echo "  export ROS_DOMAIN_ID=$$ROS_DOMAIN_ID" \
 	    "ROS_AUTOMATIC_DISCOVERY_RANGE=$$ROS_AUTOMATIC_DISCOVERY_RANGE"
+	@echo '  python examples/listen.py pose'
 	@exec $(BIN)/spinning-top' node --scene '$(SCENE)' --ros-args -p record.enabled:=true \
 	    -p 'record.uri:=$(LOGS)/' $(ARGS)
 
@@ -94,7 +96,7 @@ docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.deps-docs $(VENV)/.package
 	$(BIN)/python' -m sphinx --fail-on-warning --keep-going --nitpicky --quiet docs site
 	@echo 'Open site/index.html'
 
-#: make build   build with colcon in a temporary workspace, and test that
+#: make build   build with colcon in a new workspace, test that, and leave it there
 build: $(VENV)/.deps-colcon $(VENV)/.deps-test $(VENV)/.package
 	.ci/colcon-build '$(VENV)'
 
@@ -150,12 +152,21 @@ $(VENV)/.deps-%: pyproject.toml $(VENV)/.made
 	@$(PIP) '.[build,$*]'
 	@touch '$@'
 
+# The wheels of a ROS distribution: in the ranges of its extra or, without one, the newest.
+.PRECIOUS: $(VENV)/.deps-ros-%
+$(VENV)/.deps-ros-%: pyproject.toml $(VENV)/.made
+	@echo 'Installing the wheels of ROS 2 $* into $(VENV), a minute or two'
+	@if grep -q '^ros-$* = ' pyproject.toml; then $(PIP) '.[build,ros-$*]'; \
+	    else $(PIP) '.[build]' 'ros-$*-rclpy[fastrtps]' ros-$*-common-interfaces || \
+	    { echo 'ROS=$*: there are no such wheels for this Python' >&2; exit 1; }; fi
+	@touch '$@'
+
 # The package alone: takes seconds and needs no network.  Folders too: their modification time
 # changes when a file is removed.  The dependencies may have brought an older wheel from a cache.
 SOURCES := $(shell find pyproject.toml setup.py setup.cfg package.xml config foxglove launch \
     resource rviz scripts spinning_top_sim urdf -name __pycache__ -prune -o \
     \( -type f -o -type d \) ! -name '.*' ! -name '*~' -print)
-$(VENV)/.package: $(VENV)/.deps-ros$(if $(filter kilted,$(ROS)),-kilted) $(SOURCES)
+$(VENV)/.package: $(VENV)/.deps-ros-$(ROS) $(SOURCES)
 	@echo 'Installing spinning_top_sim into $(VENV)'
 	@rm -rf '$(VENV)/build' '$(VENV)'/lib/python*/site-packages/spinning_top_sim
 	@mkdir '$(VENV)/build'

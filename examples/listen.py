@@ -1,0 +1,84 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""
+Print a line for each message on a topic: its stamp, its numbers, and the rate of the last ones.
+
+    python examples/listen.py pose
+    python examples/listen.py imu/data_raw --count 10
+
+The type of the topic is that of its publisher.  Ctrl-C ends it.
+"""
+
+import argparse
+import math
+import time
+from collections import deque
+from importlib import import_module
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.qos import qos_profile_sensor_data
+
+MOST_NUMBERS = 12       # of a line; covariances and long arrays are left out
+
+
+def numbers(message):
+    """Yield name=value for the numbers in a message, without its header."""
+    for name in message.get_fields_and_field_types():
+        value = getattr(message, name)
+        if isinstance(value, int | float):
+            yield f'{name}={value:+.4f}'
+        elif hasattr(value, 'get_fields_and_field_types'):
+            if name != 'header':
+                yield from numbers(value)
+        elif 'covariance' not in name and not isinstance(value, str) and len(value) <= 8:
+            yield from (f'{x:+.4f}' for x in value if isinstance(x, float))
+
+
+def wait_for_type(node, topic):
+    """Return the class of the messages on a topic, as soon as somebody publishes there."""
+    told = False
+    while True:
+        for name, types in node.get_topic_names_and_types():
+            if name == topic and node.count_publishers(topic):
+                package, _, kind = types[0].partition('/msg/')
+                return getattr(import_module(f'{package}.msg'), kind)
+        if not told:
+            print(f'waiting for a publisher on {topic}', flush=True)
+            told = True
+        rclpy.spin_once(node, timeout_sec=0.2)
+
+
+def main():
+    """Listen until Ctrl-C, or to so many messages."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('topic', help='such as pose, imu/data_raw, spinning_top/invariants')
+    parser.add_argument('--count', type=int, default=0, help='end after so many; 0 = never')
+    arguments = parser.parse_args()
+    rclpy.init()
+    node = rclpy.create_node('listener')
+    arrivals, heard = deque(maxlen=200), 0
+
+    def show(message):
+        nonlocal heard
+        heard += 1
+        arrivals.append(time.monotonic())
+        since = arrivals[-1] - arrivals[0]
+        rate = (len(arrivals) - 1) / since if since else math.nan
+        stamp = getattr(getattr(message, 'header', None), 'stamp', None)
+        when = f'{stamp.sec}.{stamp.nanosec:09d}  ' if stamp else ''
+        print(f'{when}{"  ".join([*numbers(message)][:MOST_NUMBERS])}  {rate:.1f} Hz', flush=True)
+
+    try:
+        topic = node.resolve_topic_name(arguments.topic)
+        # Best effort takes what any publisher offers.
+        node.create_subscription(wait_for_type(node, topic), topic, show, qos_profile_sensor_data)
+        while not arguments.count or heard < arguments.count:
+            rclpy.spin_once(node, timeout_sec=1.0)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+
+
+if __name__ == '__main__':
+    main()
