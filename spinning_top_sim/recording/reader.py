@@ -11,9 +11,9 @@ import itertools
 import os
 import struct
 import zlib
-from collections.abc import Container, Iterable, Iterator
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
@@ -24,8 +24,18 @@ import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
-from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import rosbag2
@@ -36,6 +46,8 @@ MOST_INDEX = 1 << 20        # bytes behind the last chunk that may be torn witho
 MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are grouped together
 HEAD = struct.Struct('<BQ')     # of every record: opcode, length of what follows
+MESSAGE_FIELDS = 2 + 4 + 8 + 8  # bytes of a message before its data
+DECLARATIONS = Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT
 # Where log times stand: the earliest and the latest in a chunk, and that of a message
 TIMES: dict[int, struct.Struct] = {
     Opcode.CHUNK: struct.Struct('<9xQQ'), Opcode.MESSAGE: struct.Struct('<15xQ')}
@@ -106,6 +118,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.metadata: dict[str, dict[str, str]] = {}
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
+        # By the summary: the channels in each chunk, and the number of messages
+        self._channels_in: dict[int, Collection[int]] = {}
+        self._counted: int | None = None
         try:
             if self.path.exists() and not self.path.is_file():     # opening a pipe would block
                 raise LogError(f'cannot read {self.path}: it is no regular file')
@@ -116,12 +131,12 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             self.size = os.fstat(self._file.fileno()).st_size
             header = self._read_header()
             self.profile, self.library = header.profile, header.library
-            self.whole = True
+            self._places = sorted(self._find_places())
             try:
                 self._read_summary()
+                self.whole = self._channels_in.keys() <= {offset for _, _, offset, _ in self._places}
             except UNREADABLE:
                 self.whole = False
-            self._places = sorted(self._find_places())
             self.span = (self._places[0][0] if self._places else 0,
                          max((end_ns for _, end_ns, *_ in self._places), default=0))
             if not self.whole or not self.channels:
@@ -185,45 +200,43 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             For a message that cannot be decompressed.
         """
         names = None if topics is None else frozenset(topics)
-        wanted = {number: channel.topic for number, channel in self.channels.items()
+        wanted = {number for number, channel in self.channels.items()
                   if names is None or channel.topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
-        # What is read and not yet passed: log time, place, number there
-        held: list[tuple[int, int, int, Message]] = []
+        # Of each chunk that is read and not yet passed: log time of its next message, place,
+        # that message, and those after it
+        held: list[tuple[int, int, LogMessage, Iterator[LogMessage]]] = []
         mode, form = self.compression
-        for start_ns, end_ns, offset, its_end in [*self._places, (1 << 64, 1 << 64, 0, 0)]:
+        for start_ns, end_ns, offset, its_end in [*self._places, (1 << 64, 0, 0, 0)]:
             while held and held[0][0] < start_ns:
-                *_, message = heapq.heappop(held)
-                topic, data = wanted[message.channel_id], message.data
-                try:
-                    if mode == 'MESSAGE':
-                        data = _decompress(data, form or 'unknown', self._max_bytes)
-                except McapError as error:
-                    raise LogError(
-                        f'cannot read {self.path}: a message of {topic}: {error}') from None
-                yield LogMessage(topic, message.log_time, message.publish_time, message.sequence,
-                                 data, message.channel_id)
-            if end_ns < times.start or start_ns >= times.stop or (
-                    names is not None and not self._may_hold(wanted, its_end)):
+                _, place, message, others = held[0]
+                if (following := next(others, None)) is None:
+                    heapq.heappop(held)
+                else:
+                    heapq.heapreplace(held, (following.log_time, place, following, others))
+                yield self._decompressed(message, form) if mode == 'MESSAGE' else message
+            if end_ns < times.start or start_ns >= times.stop or wanted.isdisjoint(
+                    self._channels_in.get(offset) or wanted):
                 continue
             try:
                 records = self._records(self._at(offset, its_end))
             except UNREADABLE:
                 self.left_out += 1
                 continue
-            for number, one in enumerate(records):
-                if isinstance(one, Message) and one.channel_id in wanted and one.log_time in times:
-                    heapq.heappush(held, (one.log_time, offset, number, one))
-
-    def _may_hold(self, channels: Container[int], offset: int) -> bool:
-        """Return whether a chunk has messages of channels, by its indexes, which begin there."""
-        begin = offset
-        for opcode, begin, end in self._heads(offset):
-            if opcode != Opcode.MESSAGE_INDEX or end > self.size:
+            chosen = iter(sorted((one for one in records if isinstance(one, LogMessage)
+                                  and one.channel_id in wanted and one.log_time in times),
+                                 key=attrgetter('log_time')))
+            for message in chosen:
+                heapq.heappush(held, (message.log_time, offset, message, chosen))
                 break
-            if int.from_bytes(self._at(begin + 9, begin + 11), 'little') in channels:
-                return True
-        return not self.whole or begin == offset        # there is no index, or a torn one
+
+    def _decompressed(self, message: LogMessage, form: str) -> LogMessage:
+        try:
+            return message._replace(
+                data=_decompress(message.data, form or 'unknown', self._max_bytes))
+        except McapError as error:
+            raise LogError(f'cannot read {self.path}: a message of {message.topic}: '
+                           f'{error}') from None
 
     def groups(self, topics: Iterable[str] | None = None,
                ) -> Iterator[tuple[str, list[LogMessage]]]:
@@ -245,18 +258,18 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
                 yield topic, list(group)
 
-    def parts(self) -> Iterator[tuple[int, list[McapRecord]]]:
+    def parts(self) -> Iterator[tuple[int, list[McapRecord | LogMessage]]]:
         """
         Iterate over what can be read, in file order; then `damage` tells what cannot.
 
         Yields
         ------
-        (int, list of McapRecord)
+        (int, list of McapRecord or LogMessage)
             The offset, and the record there, or those of a chunk.
         """
         damage = Damage(not self.whole)
         damage.reasons += ['found: the file does not end as an MCAP file ends'] * damage.torn
-        crc = zlib.crc32(MCAP0_MAGIC)
+        crc, count = zlib.crc32(MCAP0_MAGIC), 0
         for opcode, offset, end in self._heads():
             # What follows the last chunk is made anew.
             if damage.torn and end > self.size < offset + MOST_INDEX and opcode in (
@@ -275,7 +288,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                     int.from_bytes(raw[9:13], 'little') not in (0, crc)):
                 damage.reasons.append('found: the checksum of the data section is wrong')
             crc = zlib.crc32(raw, crc)
+            count += sum(isinstance(one, LogMessage) for one in records)
             yield offset, records
+        if self._counted not in (None, count) and not damage.lost_bytes:
+            damage.reasons.append(
+                f'found: {count} messages, and the summary counts {self._counted}')
         self.damage = damage
 
     # -------------------------------------------------------------------------------- the bytes
@@ -302,25 +319,55 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             end = offset + HEAD.size + length if opcode else self.size + 1
             yield opcode, offset, end
 
-    def _records(self, raw: bytes) -> list[McapRecord]:
+    def _records(self, raw: bytes) -> list[McapRecord | LogMessage]:
         """Return a record, or those of a chunk, after noting what they declare; UNREADABLE."""
-        # Opcodes that are unknown belong to an application.
-        if raw[0] > Opcode.DATA_END or raw[0] == Opcode.MESSAGE_INDEX:
-            return []
-        records = [next(_records_in(raw))]
-        if isinstance(chunk := records[0], Chunk):      # which mcap would unpack to any size
-            if chunk.uncompressed_size > self._max_bytes:
-                raise McapError(f'it unpacks to more than {self._max_bytes} bytes')
-            plain = _decompress(chunk.data, chunk.compression, chunk.uncompressed_size)
-            if len(plain) != chunk.uncompressed_size:
-                raise McapError('it has not the size that it says it has')
-            records = breakup_chunk(replace(chunk, compression='', data=plain), validate_crc=True)
-        for one in records:
-            if not isinstance(one, Message):
-                self._declare(one)
-            elif one.channel_id not in self.channels:
-                raise McapError('no whole record declares a channel of its messages')
-        return records
+        plain = self._unpacked(raw) if raw[0] == Opcode.CHUNK else raw
+        found: list[McapRecord | LogMessage] = []
+        at = 0
+        while at < len(plain):
+            opcode, length = HEAD.unpack_from(plain, at)
+            end = at + HEAD.size + length
+            if end > len(plain):
+                raise McapError('a length in it is wrong')
+            if opcode == Opcode.MESSAGE:
+                # Records of one length that follow one another, as in our chunks, are unpacked
+                # together: that takes a tenth of the time of mcap's reader.
+                end = self._messages_at(plain, at, length, found)
+            elif opcode in DECLARATIONS:
+                found.append(next(_records_in(plain[at:end])))
+                self._declare(found[-1])
+            at = end
+        return found
+
+    def _messages_at(self, plain: bytes, at: int, length: int,
+                     found: list[McapRecord | LogMessage]) -> int:
+        """Add the messages of this length from an offset on; return where they end."""
+        layout = message_layout(length)
+        whole = memoryview(plain)[at:len(plain) - (len(plain) - at) % layout.size]
+        try:
+            for opcode, its_length, channel, sequence, log_time, publish_time, data in (
+                    layout.iter_unpack(whole)):
+                if opcode != Opcode.MESSAGE or its_length != length:
+                    break
+                found.append(LogMessage(self.channels[channel].topic, log_time, publish_time,
+                                        sequence, data, channel))
+                at += layout.size
+        except KeyError:
+            raise McapError('no whole record declares a channel of its messages') from None
+        return at
+
+    def _unpacked(self, raw: bytes) -> bytes:
+        """Return the records in a chunk, which mcap would unpack to any size.  UNREADABLE."""
+        chunk = next(_records_in(raw))
+        assert isinstance(chunk, Chunk)
+        if chunk.uncompressed_size > self._max_bytes:
+            raise McapError(f'it unpacks to more than {self._max_bytes} bytes')
+        plain = _decompress(chunk.data, chunk.compression, chunk.uncompressed_size)
+        if len(plain) != chunk.uncompressed_size:
+            raise McapError('it has not the size that it says it has')
+        if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):
+            raise McapError('its checksum is wrong')
+        return plain
 
     def _declare(self, record: McapRecord) -> None:
         """Note a schema, a channel or metadata; of several with an id, the first counts."""
@@ -330,6 +377,10 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             self.schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
             self.channels.setdefault(record.id, record)
+        elif isinstance(record, ChunkIndex):
+            self._channels_in[record.chunk_start_offset] = record.message_index_offsets
+        elif isinstance(record, Statistics):
+            self._counted = record.message_count
 
     def _find_places(self) -> Iterator[tuple[int, int, int, int]]:
         """Yield log times and places of messages and chunks, noting what is declared outside."""
@@ -369,6 +420,12 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
 def _records_in(raw: bytes) -> Iterator[McapRecord]:
     return StreamReader(BytesIO(raw), skip_magic=True, emit_chunks=True).records
+
+
+@lru_cache
+def message_layout(length: int) -> struct.Struct:
+    """Return the layout of a message record of this length; struct.error if it is too small."""
+    return struct.Struct(f'<BQHIQQ{length - MESSAGE_FIELDS}s')
 
 
 def _decompress(data: bytes, compression: str, most: int) -> bytes:

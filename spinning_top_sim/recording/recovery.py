@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from mcap.records import Attachment, Message, Metadata
+from mcap.records import Attachment, Metadata
 from mcap.writer import Writer
 
 from spinning_top_sim.recording.errors import LogError, why_not_written
-from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata
 
 
@@ -52,7 +52,7 @@ def _copy(reader: LogReader, writer: Writer, name: str,
     for offset, records in reader.parts():
         progress(offset)
         for one in records:
-            if isinstance(one, Message):
+            if isinstance(one, LogMessage):
                 counts[one.channel_id] += 1
                 writer.add_message(channels[one.channel_id], one.log_time, one.data,
                                    one.publish_time, one.sequence)
