@@ -33,7 +33,7 @@ from rosbags.rosbag2 import Reader
 from spinning_top_sim.recording import recorder as recorder_module
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder, single
-from spinning_top_sim.recording.writer import McapWriter
+from spinning_top_sim.recording.writer import McapWriter, log_head
 
 PATIENCE_S = 20.0  # for what happens at once on an idle machine
 
@@ -68,7 +68,7 @@ def test_too_little_space_or_a_head_that_cannot_be_written_leaves_no_file(
     recorder = opened(Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, min_free_bytes=least))
     write(recorder, 0, 1, b'')
     assert recorder.state == 'failed' and recorder.path is None
-    assert re.fullmatch(rf'cannot record to {tmp_path}/run\.mcap: {reason}', recorder.error)
+    assert re.fullmatch(rf'cannot write {tmp_path}/run\.mcap: {reason}', recorder.error)
     summary = recorder.close()
     assert (summary.path, summary.lost, summary.messages) == (None, 1, 0)
     assert summary.error == recorder.error and not list(tmp_path.iterdir())
@@ -88,7 +88,7 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
     for uri, reason in (('run.mcap', 'it exists, and nothing is overwritten'),
                         ('none/a.mcap', f'there is no directory {tmp_path}/none')):
         recorder = opened(Recorder(uri, TOPICS, METADATA, min_free_bytes=0))
-        assert recorder.error == f'cannot record to {tmp_path}/{uri}: {reason}'
+        assert recorder.error == f'cannot write {tmp_path}/{uri}: {reason}'
     assert 'run.mcap' in opened(Recorder('run.mcap/', TOPICS, METADATA)).error
     recorder = opened(Recorder('twice.mcap', [TOPICS[0], TOPICS[0]], {}))
     assert recorder.error == "topic '/top/pose' is listed twice: once is allowed"
@@ -128,7 +128,7 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
     synced = []
     monkeypatch.setattr(os, 'fsync', lambda fd: synced.append(os.readlink(f'/proc/self/fd/{fd}')))
     path = tmp_path / 'run.mcap'
-    file = McapWriter(path, TOPICS, METADATA, compression='zstd')
+    file = McapWriter(path, log_head(TOPICS, METADATA), compression='zstd')
     assert synced == [str(path), str(tmp_path)]
     synced.clear()
     file.add(*single(0, 1, pose_cdr(1)))
@@ -138,7 +138,7 @@ def test_a_file_and_its_name_are_on_the_disk_when_it_is_closed(tmp_path, monkeyp
 
 def test_a_write_that_fails_or_is_interrupted_shifts_nothing(tmp_path, monkeypatch):
     """An error, which is told, also by `finish`, costs its chunk; an interrupt nothing."""
-    file = McapWriter(tmp_path / 'a.mcap', TOPICS, METADATA, compression='none')
+    file = McapWriter(tmp_path / 'a.mcap', log_head(TOPICS, METADATA), compression='none')
     pwrite, faults = os.pwrite, [OSError(28, os.strerror(28)), KeyboardInterrupt()]
 
     def fail(descriptor, data, offset):
@@ -160,7 +160,7 @@ def test_a_write_that_fails_or_is_interrupted_shifts_nothing(tmp_path, monkeypat
         stream.seek(0)
         read = make_reader(stream, validate_crcs=True).iter_messages()
         assert [one.log_time for *_, one in read] == [*range(100), *range(200, 300)]
-    file = McapWriter(tmp_path / 'b.mcap', TOPICS, METADATA, compression='zstd')
+    file = McapWriter(tmp_path / 'b.mcap', log_head(TOPICS, METADATA), compression='zstd')
     file.add(*rows_of(0, 100))
     faults.append(OSError(28, os.strerror(28)))
     with pytest.raises(OSError, match=r'No space left on device: .*b\.mcap'):

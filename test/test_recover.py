@@ -38,13 +38,13 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, Message
 from mcap.records import Metadata as MetadataRecord
-from mcap.writer import MCAP0_MAGIC, Writer
+from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.writer import record_bytes
+from spinning_top_sim.recording.writer import McapWriter, record_bytes
 
 
 def check_with_all_readers(path, messages) -> None:
@@ -353,7 +353,7 @@ def test_a_recovery_that_fails_leaves_nothing_behind(tmp_path, log, monkeypatch,
     if fault == 'disk':
         monkeypatch.setattr(os, 'pread', fail)
     else:
-        monkeypatch.setattr(Writer, 'finish', lambda _: signal.raise_signal(signal.SIGINT))
+        monkeypatch.setattr(McapWriter, 'finish', lambda *_, **__: signal.raise_signal(signal.SIGINT))
     code, _, err = run(path)
     assert code == (FAILED if fault == 'disk' else 130)
     assert fault != 'disk' or err == (f'spinning-top recover: cannot read {path}: Input/output '

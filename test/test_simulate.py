@@ -101,7 +101,7 @@ def test_a_command_exactly_at_the_end_is_applied(tmp_path):
     (['--scene', 'cups'], '--scene cups: must be the path of a file, or one of braking, cusp'),
     (['--params', '/nowhere.yaml'], 'spinning-top simulate: /nowhere.yaml: No such file'),
     (['--duration', '1', '-o', '/nowhere/run.mcap'], 'spinning-top simulate: '
-     'cannot record to /nowhere/run.mcap: there is no directory /nowhere\n'),
+     'cannot write /nowhere/run.mcap: there is no directory /nowhere\n'),
     (['--duration', '1', '-o', '/nowhere/run.csv'],
      'spinning-top simulate: /nowhere/run.csv: No such file or directory\n'),
     (['--duration', '0'], '--duration S, or the parameter duration'),

@@ -113,7 +113,7 @@ class Recorder:
         """What the recording has come to so far."""
         running = self.state in ('opening', 'recording')    # read first: nothing is written after
         file = self._file
-        messages = sum(file.message_counts) if file else 0
+        messages = file.message_counts.total() if file else 0
         missing = self._offered - messages
         return RecordingSummary(
             self.path, file.size if file else 0, messages, queued=missing if running else 0,
@@ -188,7 +188,7 @@ class Recorder:
     def _open(self) -> McapWriter:
         """Return the file that `uri` names; in a folder, under the first free name."""
         with needed('a recording', 'mcap'):
-            from spinning_top_sim.recording.writer import McapWriter  # noqa: PLC0415
+            from spinning_top_sim.recording.writer import McapWriter, log_head  # noqa: PLC0415
 
         folder = path = Path(self._uri).expanduser().absolute()
         if self._uri.endswith('/'):
@@ -199,7 +199,7 @@ class Recorder:
             if not named:
                 path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
             try:
-                file = McapWriter(path, self._topics, self._metadata,
+                file = McapWriter(path, log_head(self._topics, self._metadata),
                                    compression=self._compression,
                                    min_free_bytes=self._min_free_bytes)
                 self.path = path

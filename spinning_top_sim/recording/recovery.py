@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes what can be read of a damaged log into a new, indexed one, by mcap's writer."""
+"""Writes what can be read of a damaged log into a new, indexed one."""
 
-import os
-from collections import Counter
-from collections.abc import Callable
+import itertools
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from mcap.records import Attachment, Metadata
-from mcap.writer import Writer
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Header, McapRecord, Metadata
+from numpy.typing import NDArray
 
 from spinning_top_sim.recording.errors import LogError, why_not_written
-from spinning_top_sim.recording.reader import LogMessage, LogReader
-from spinning_top_sim.recording.rosbag2 import BAG_METADATA, bag_metadata
+from spinning_top_sim.recording.reader import MESSAGE_FIELDS, LogMessage, LogReader, message_layout
+from spinning_top_sim.recording.rosbag2 import BAG_METADATA
+from spinning_top_sim.recording.writer import CHUNK_BYTES, McapWriter
 
 
-def recover(reader: LogReader, output: Path,
-            progress: Callable[[float], object]) -> int:
+def recover(reader: LogReader, output: Path, progress: Callable[[float], object]) -> int:
     """
     Write everything that can be read of a log into a new file; return the number of messages.
 
@@ -23,49 +26,57 @@ def recover(reader: LogReader, output: Path,
     progress : is called with the bytes that are done, of `reader.size`
 
     Chunks, indexes, statistics, summary and the `rosbag2` record are made anew.
-    Raises LogError, also if a file that was not closed holds no whole message.
+    Raises RecordingError or LogError, also if a torn file holds no whole message.
     """
+    torn = reader.damage.torn       # now that all is read, all channels are known
+    file = McapWriter(output, _head(reader), compression='zstd')
     try:
-        with open(output, 'xb') as file:
-            try:
-                messages = _copy(reader, Writer(file), output.name, progress)
-                file.flush()
-                os.fsync(file.fileno())
-            except BaseException:
-                output.unlink()
-                raise
-    except OSError as error:
-        raise LogError(f'cannot write {output}: {why_not_written(output, error)}') from error
-    return messages
+        _copy(reader, file, progress)
+        if torn and not file.message_counts:
+            raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
+        file.finish(bag=reader.profile == 'ros2' or BAG_METADATA in reader.metadata,
+                    compression=reader.compression)
+    except BaseException as error:
+        file.discard()
+        if isinstance(error, OSError):
+            raise LogError(f'cannot write {output}: {why_not_written(output, error)}') from error
+        raise
+    return file.message_counts.total()
 
 
-def _copy(reader: LogReader, writer: Writer, name: str,
-          progress: Callable[[float], object]) -> int:
-    damage, counts = reader.damage, Counter[int]()
-    writer.start(reader.profile, reader.library)
-    # New ids by old ones; now that all is read, all are known.
-    schemas = {number: writer.register_schema(schema.name, schema.encoding, schema.data)
-               for number, schema in reader.schemas.items()}
-    channels = {number: writer.register_channel(
-        channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0),
-        channel.metadata) for number, channel in reader.channels.items()}
-    for offset, records in reader.parts():
+def _head(reader: LogReader) -> Iterator[McapRecord]:
+    yield Header(reader.profile, reader.library)
+    yield from (schema for number, schema in reader.schemas.items() if number)
+    for channel in reader.channels.values():
+        known = channel.schema_id in reader.schemas
+        yield channel if known else replace(channel, schema_id=0)   # which says: no schema
+
+
+def _copy(reader: LogReader, file: McapWriter, progress: Callable[[float], object]) -> None:
+    waiting: list[LogMessage] = []
+    size = 0
+    for offset, messages, others in itertools.chain(reader.parts(), [(reader.size, [], [])]):
         progress(offset)
-        for one in records:
-            if isinstance(one, LogMessage):
-                counts[one.channel_id] += 1
-                writer.add_message(channels[one.channel_id], one.log_time, one.data,
-                                   one.publish_time, one.sequence)
-            elif isinstance(one, Attachment):
-                writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type,
-                                      one.data)
-            elif isinstance(one, Metadata) and one.name != BAG_METADATA:
-                writer.add_metadata(one.name, one.metadata)
-    if damage.torn and not counts:
-        raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
-    if reader.profile == 'ros2' or BAG_METADATA in reader.metadata:
-        writer.add_metadata(BAG_METADATA, bag_metadata(
-            [(reader.channels[topic.channel_id], topic.type_name, counts[topic.channel_id])
-             for topic in reader.topics], name, *reader.span, reader.compression))
-    writer.finish()
-    return counts.total()
+        if waiting and (others or size > CHUNK_BYTES or offset == reader.size):
+            file.write_chunk(*_chunk(waiting))
+            waiting, size = [], 0
+        waiting += messages
+        size += sum(len(one.data) for one in messages)
+        for one in others:
+            if isinstance(one, Attachment) or (
+                    isinstance(one, Metadata) and one.name != BAG_METADATA):
+                file.write(one)
+
+
+def _chunk(messages: Sequence[LogMessage]) -> tuple[bytes, dict[int, NDArray[np.uint64]]]:
+    """Return messages in their order as `McapWriter.write_chunk` takes them."""
+    index: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
+    records, offset = [], 0
+    for topic, log_time, publish_time, sequence, data, channel in messages:
+        length = MESSAGE_FIELDS + len(data)
+        records.append(message_layout(length).pack(
+            Opcode.MESSAGE, length, channel, sequence, log_time, publish_time, data))
+        index[channel].append((log_time, offset))
+        offset += len(records[-1])
+    return b''.join(records), {
+        channel: np.array(entries, np.uint64) for channel, entries in sorted(index.items())}

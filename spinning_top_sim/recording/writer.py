@@ -53,58 +53,60 @@ class McapWriter:
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 
     path : must not exist
-    topics : all stand before the first chunk, so that a truncated file tells them in any case
-    metadata : the `spinning_top_sim` record at the head of the file
+    head : what stands before the first chunk, so that a truncated file tells it in any case
     compression : of the chunks, 'zstd', 'lz4' or 'none'
 
-    Raises ValueError for a topic that is listed twice, RecordingError naming path or type.
+    Raises RecordingError naming the path.
     """
 
-    def __init__(self, path: Path, topics: Sequence[rosbag2.RecordedTopic],
-                 metadata: Mapping[str, str], *, compression: str,
+    def __init__(self, path: Path, head: Iterable[records.McapRecord], *, compression: str,
                  min_free_bytes: int = 0) -> None:
-        for name, number in Counter(topic.name for topic in topics).items():
-            if number > 1:
-                raise ValueError(f'topic {name!r} is listed twice: once is allowed')
-        self._path, self._topics = path, topics
-        self._compression = '' if compression == 'none' else compression
+        self._path, self._compression = path, '' if compression == 'none' else compression
         self._rows: list[Rows] = []                 # of the next chunk,
         self._chunk_bytes = 0                       # and its size
-        self.message_counts = [0] * len(topics)     # messages in the file
+        self.schemas: dict[int, records.Schema] = {}        # in the file
+        self.channels: dict[int, records.Channel] = {}
+        self.message_counts = Counter[int]()        # messages in the file by channel
         self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
-        types = list(dict.fromkeys(topic.type_name for topic in topics))
-        definitions = {name: rosbag2.find_definition(name) for name in types}
-        self._channels = [records.Channel(      # with the index of their topic + 1
-            id=number, topic=topic.name, message_encoding='cdr',
-            schema_id=1 + types.index(topic.type_name),
-            metadata={'offered_qos_profiles': rosbag2.offered_qos_yaml(topic),
-                      'topic_type_hash': definitions[topic.type_name][1]})
-            for number, topic in enumerate(topics, start=1)]
         # Records of the summary.  Serialized: thousands of objects would take memory.
-        self._summary = [record_bytes(record) for record in (
-            *(records.Schema(number, definitions[name][0].encode(), 'ros2msg', name)
-              for number, name in enumerate(types, start=1)), *self._channels)]
-        header = record_bytes(records.Header(profile='ros2', library=OUR_LIBRARY + version()))
+        self._summary: list[bytes] = []
         try:
             self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
             try:
                 self.check_disk(min_free_bytes)
-                self._write([MCAP0_MAGIC, header, *self._summary])
-                self._write_metadata(METADATA_NAME, dict(metadata))
+                self._write([MCAP0_MAGIC])
+                for record in head:
+                    self.write(record)
                 self.sync()
                 _sync_directory(path.parent)
             except BaseException:
-                self._file.close()
-                path.unlink(missing_ok=True)
+                self.discard()
                 raise
         except (OSError, ValueError) as error:
-            raise RecordingError(
-                f'cannot record to {path}: {why_not_written(path, error)}') from error
+            raise RecordingError(f'cannot write {path}: {why_not_written(path, error)}') from error
 
     @property
     def size(self) -> int:
         return self._end[0]
+
+    def write(self, record: records.McapRecord) -> None:
+        """Write a record that is neither a message nor a chunk."""
+        offset, raw = self.size, record_bytes(record)
+        self._write([raw])
+        if isinstance(record, records.Schema):
+            self.schemas[record.id] = record
+            self._summary.append(raw)
+        elif isinstance(record, records.Channel):
+            self.channels[record.id] = record
+            self._summary.append(raw)
+        elif isinstance(record, records.Metadata):
+            self._summary.append(record_bytes(
+                records.MetadataIndex(offset, len(raw), record.name)))
+        elif isinstance(record, records.Attachment):
+            self._summary.append(record_bytes(records.AttachmentIndex(
+                offset, len(raw), record.log_time, record.create_time, len(record.data),
+                record.name, record.media_type)))
 
     def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
             rows: NDArray[np.uint8]) -> None:
@@ -114,6 +116,8 @@ class McapWriter:
         log_times_ns : log and publish times (n,), n >= 1, in any order
         rows : serialized messages (n, size)
         """
+        if topic_index >= len(self.channels):
+            raise IndexError(f'there is no topic {topic_index}')
         self._rows.append((topic_index, log_times_ns, rows))
         self._chunk_bytes += len(rows) * _message_type(rows.shape[1]).itemsize
 
@@ -127,32 +131,41 @@ class McapWriter:
         if self._chunk_bytes < (CHUNK_BYTES if if_full else 1):
             return
         try:
-            self._write_chunk()
+            self.write_chunk(*self._chunk())
         except Exception:
             self._rows, self._chunk_bytes = [], 0
             raise
         self._rows, self._chunk_bytes = [], 0
 
-    def _write_chunk(self) -> None:
-        plain, offset, counts = bytearray(self._chunk_bytes), 0, [*self.message_counts]
-        # By topic, log times and offsets in the chunk (n, 2), as they stand in message indexes
-        entries: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
+    def _chunk(self) -> tuple[bytearray, dict[int, NDArray[np.uint64]]]:
+        """Return what `write_chunk` takes of the rows in memory."""
+        plain, offset, counts = bytearray(self._chunk_bytes), 0, self.message_counts.copy()
+        index: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
         for (topic, size), alike in itertools.groupby(
                 sorted(self._rows, key=itemgetter(0)), lambda rows: (rows[0], rows[2].shape[1])):
             _, times, parts = zip(*alike, strict=True)
-            times_ns, record = np.concatenate(times), _message_type(size)
+            times_ns, record, channel = np.concatenate(times), _message_type(size), topic + 1
             numbers = np.arange(len(times_ns))
             messages = np.frombuffer(plain, record, len(numbers), offset)
             messages['opcode'], messages['length'] = Opcode.MESSAGE, record.itemsize - 9
-            messages['channel'], messages['sequence'] = topic + 1, numbers + counts[topic]
+            messages['channel'], messages['sequence'] = channel, numbers + counts[channel]
             messages['log_time'] = messages['publish_time'] = times_ns
             messages['data'] = np.concatenate(parts)
-            entries[topic].append(np.stack(
+            index[channel].append(np.stack(
                 [times_ns, numbers * record.itemsize + offset], axis=1).astype(np.uint64))
-            counts[topic] += len(numbers)
+            counts[channel] += len(numbers)
             offset += messages.nbytes
-        indexes = {topic + 1: np.concatenate(parts) for topic, parts in entries.items()}
-        times_ns = np.concatenate([index[:, 0] for index in indexes.values()])
+        return plain, {channel: np.concatenate(parts) for channel, parts in index.items()}
+
+    def write_chunk(self, plain: bytes | bytearray,
+                    index: Mapping[int, NDArray[np.uint64]]) -> None:
+        """
+        Write a chunk, and its message indexes.
+
+        plain : its message records
+        index : by channel, log times [ns] and offsets in `plain`, (n, 2) with n >= 1
+        """
+        times_ns = np.concatenate([entries[:, 0] for entries in index.values()])
         span = {'message_start_time': int(times_ns.min()), 'message_end_time': int(times_ns.max())}
         # A tenth of the time of `simulate` is all of this: not worth a thread.
         data = (zstandard.ZstdCompressor(compression_params=ZSTD).compress(plain)
@@ -162,23 +175,19 @@ class McapWriter:
         blocks = [record_bytes(records.Chunk(
             compression=self._compression, data=data, uncompressed_crc=zlib.crc32(plain),
             uncompressed_size=len(plain), **span)), *(
-                INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + index.nbytes, channel, index.nbytes)
-                + index.tobytes() for channel, index in indexes.items())]
+                INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel, entries.nbytes)
+                + entries.tobytes() for channel, entries in index.items())]
         first, *offsets, end = itertools.accumulate(map(len, blocks), initial=self.size)
         summary = record_bytes(records.ChunkIndex(
             chunk_start_offset=first, chunk_length=len(blocks[0]),
-            message_index_offsets=dict(zip(indexes, offsets, strict=True)),
+            message_index_offsets=dict(zip(index, offsets, strict=True)),
             message_index_length=end - offsets[0], compression=self._compression,
             compressed_size=len(data), uncompressed_size=len(plain), **span))
         self._write(blocks)
         self._summary.append(summary)
         self._times_ns += span.values()
-        self.message_counts = counts
-
-    def _write_metadata(self, name: str, content: dict[str, str]) -> None:
-        offset, raw = self.size, record_bytes(records.Metadata(name, content))
-        self._write([raw])
-        self._summary.append(record_bytes(records.MetadataIndex(offset, len(raw), name)))
+        self.message_counts += Counter({
+            channel: len(entries) for channel, entries in index.items()})
 
     def sync(self) -> None:
         os.fsync(self._file.fileno())
@@ -194,21 +203,34 @@ class McapWriter:
             raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
                           f'{min_free_bytes}')
 
-    def finish(self) -> None:
-        """Write the chunk in memory and the summary, bring all to the disk, close the file."""
+    def discard(self) -> None:
+        """Close and remove the file."""
+        self._file.close()
+        self._path.unlink(missing_ok=True)
+
+    def finish(self, *, bag: bool = True, compression: tuple[str, str] = ('', '')) -> None:
+        """
+        Write the chunk in memory and the summary, bring all to the disk, close the file.
+
+        bag : write the `rosbag2` record, too, with this `compression` of messages
+        """
         try:
             self.flush()
             start_ns, end_ns = min(self._times_ns, default=0), max(self._times_ns, default=0)
-            self._write_metadata(rosbag2.BAG_METADATA, rosbag2.bag_metadata(
-                [(channel, topic.type_name, count) for channel, topic, count in zip(
-                    self._channels, self._topics, self.message_counts, strict=True)],
-                self._path.name, start_ns, end_ns))
+            if bag:
+                self.write(records.Metadata(rosbag2.BAG_METADATA, rosbag2.bag_metadata(
+                    [(channel, schema.name if schema else '', self.message_counts[number])
+                     for number, channel in sorted(self.channels.items())
+                     for schema in [self.schemas.get(channel.schema_id)]],
+                    self._path.name, start_ns, end_ns, compression)))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
             kinds = Counter(raw[0] for raw in self._summary)
             statistics = record_bytes(records.Statistics(
-                attachment_count=0, channel_count=kinds[Opcode.CHANNEL],
-                channel_message_counts=dict(enumerate(self.message_counts, start=1)),
-                chunk_count=kinds[Opcode.CHUNK_INDEX], message_count=sum(self.message_counts),
+                attachment_count=kinds[Opcode.ATTACHMENT_INDEX],
+                channel_count=kinds[Opcode.CHANNEL],
+                channel_message_counts={
+                    number: self.message_counts[number] for number in self.channels},
+                chunk_count=kinds[Opcode.CHUNK_INDEX], message_count=self.message_counts.total(),
                 message_end_time=end_ns, message_start_time=start_ns,
                 metadata_count=kinds[Opcode.METADATA_INDEX], schema_count=kinds[Opcode.SCHEMA]))
             # The summary's checksum runs on into the footer, up to the checksum itself.
@@ -239,6 +261,33 @@ class McapWriter:
                 os.ftruncate(descriptor, self.size)
             raise
         self._end = offset, crc
+
+
+def log_head(topics: Sequence[rosbag2.RecordedTopic],
+             metadata: Mapping[str, str]) -> list[records.McapRecord]:
+    """
+    Return the head of a log of this package; the channel of a topic is its index + 1.
+
+    metadata : the `spinning_top_sim` record
+
+    Raises ValueError for a topic that is listed twice, RecordingError for an unknown type.
+    """
+    for name, number in Counter(topic.name for topic in topics).items():
+        if number > 1:
+            raise ValueError(f'topic {name!r} is listed twice: once is allowed')
+    types = list(dict.fromkeys(topic.type_name for topic in topics))
+    definitions = {name: rosbag2.find_definition(name) for name in types}
+    return [
+        records.Header(profile='ros2', library=OUR_LIBRARY + version()),
+        *(records.Schema(number, definitions[name][0].encode(), 'ros2msg', name)
+          for number, name in enumerate(types, start=1)),
+        *(records.Channel(
+            id=number, topic=topic.name, message_encoding='cdr',
+            schema_id=1 + types.index(topic.type_name),
+            metadata={'offered_qos_profiles': rosbag2.offered_qos_yaml(topic),
+                      'topic_type_hash': definitions[topic.type_name][1]})
+          for number, topic in enumerate(topics, start=1)),
+        records.Metadata(METADATA_NAME, dict(metadata))]
 
 
 def record_bytes(record: records.McapRecord) -> bytes:

@@ -21,7 +21,7 @@ from spinning_top_sim.recording.provenance import run_metadata
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import McapWriter
+from spinning_top_sim.recording.writer import McapWriter, log_head
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
@@ -168,10 +168,10 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     channels = recorded(simulation.channels, values)
     types = {channel.topic: channel.type_name for channel in channels} | events.TOPICS
     topics = list(types)
-    file = McapWriter(
-        path, [RecordedTopic(resolve_topic(name, namespace), type_name)
-               for name, type_name in types.items()],
-        run_metadata(values, epoch_ns, -1, (), values), compression=values['record.compression'])
+    file = McapWriter(path, log_head(
+        [RecordedTopic(resolve_topic(name, namespace), type_name)
+         for name, type_name in types.items()],
+        run_metadata(values, epoch_ns, -1, (), values)), compression=values['record.compression'])
 
     def add(event: Event) -> None:
         for topic, data in event.entries():
@@ -191,7 +191,7 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
                                 f'{simulation.now_ns / NANOSECONDS:g} s') from interrupt
     finally:
         file.finish()
-    return f'{sum(file.message_counts)} messages, {file.size / 1e6:.1f} MB'
+    return f'{file.message_counts.total()} messages, {file.size / 1e6:.1f} MB'
 
 
 main = partial(cli.run, 'simulate', __doc__, add_arguments, _run)

@@ -23,7 +23,7 @@ from helpers.recordings import METADATA
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import McapWriter
+from spinning_top_sim.recording.writer import McapWriter, log_head
 from spinning_top_sim.tools.recover import main
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
@@ -48,7 +48,7 @@ def cdr(number: int) -> tuple[int, bytes]:
 
 def write_log(path, compression='zstd'):
     """Write a log by our writer, chunk borders where they are wanted; return its messages."""
-    file = McapWriter(path, TOPICS, METADATA, compression=compression)
+    file = McapWriter(path, log_head(TOPICS, METADATA), compression=compression)
     messages = []
     for number in range(CHUNKS * MESSAGES_PER_CHUNK):
         index, data = cdr(number)

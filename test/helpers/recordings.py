@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, qos_profiles
-from spinning_top_sim.recording.writer import McapWriter
+from spinning_top_sim.recording.writer import McapWriter, log_head
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -43,7 +43,7 @@ def array_cdr(number: int) -> bytes:
 
 def write_rows(path, topics, rows, per_chunk=None, metadata=None):
     """Write a log of rows (number of a topic, stamp [ns], data), so many in a chunk."""
-    file = McapWriter(path, topics, metadata or {}, compression='none')
+    file = McapWriter(path, log_head(topics, metadata or {}), compression='none')
     for number, row in enumerate(rows, start=1):
         file.add(*single(*row))
         if per_chunk and number % per_chunk == 0:
