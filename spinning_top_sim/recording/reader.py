@@ -83,12 +83,14 @@ class Damage:
 
     torn: bool                  # it does not end as an MCAP file ends
     lost_bytes: int = 0         # that cannot be read; indexes do not count
+    lost_messages: int = 0      # that the summary counts besides those
     reasons: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """Return what is lost, and the first reasons."""
-        lost = [f'lost: {self.lost_bytes} bytes'] if self.lost_bytes else []
-        return lost + self.reasons[:MOST_REASONS]
+        lost = {'bytes': self.lost_bytes, 'messages': self.lost_messages}
+        return [*(f'lost: {count} {what}' for what, count in lost.items() if count),
+                *self.reasons[:MOST_REASONS]]
 
 
 class LogReader(contextlib.AbstractContextManager['LogReader']):
@@ -97,18 +99,12 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     What is damaged is left out.  A file that was not closed is read through at once.
 
-    Parameters
-    ----------
-    path : path
-        The file, or a folder as `ros2 bag` makes it, which must hold exactly one.
-    max_bytes : int
-        Of the largest record, and the largest uncompressed chunk, that is read.
+    path : the file, or a folder as `ros2 bag` makes it, which must hold exactly one
+    max_bytes : of the largest record, and the largest uncompressed chunk, that is read
 
-    Notes
-    -----
     Attributes are `path` and `size` [bytes] of the file when it was opened; `profile` and
-    `library`, which its header names; `whole`, whether it was closed and its summary, if any,
-    is right; `metadata`, the last of each name; `schemas` and `channels`, mcap's records by
+    `library`, which its header names; `whole`, whether it was closed, and its summary, if any,
+    describes it; `metadata`, the last of each name; `schemas` and `channels`, mcap's records by
     id; `span`, the earliest and the latest log time [ns], both 0 without messages; `left_out`,
     the number of damaged chunks that `messages` has skipped so far.
     """
@@ -118,7 +114,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         self.metadata: dict[str, dict[str, str]] = {}
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        # By the summary: the channels in each chunk, and the number of messages
+        # By the summary: channels in the chunk at an offset, and the number of messages
         self._channels_in: dict[int, Collection[int]] = {}
         self._counted: int | None = None
         try:
@@ -180,24 +176,13 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
                  end: int | None = None) -> Iterator[LogMessage]:
         """
-        Iterate over the messages in the order of their log times, equal ones in file order.
+        Yield the messages in the order of their log times, equal ones in file order.
 
-        Parameters
-        ----------
-        topics : iterable of str, optional
-            Names; default: all.
-        start, end : int, optional
-            Log times [ns]; `end` is exclusive.
+        topics : names; default: all
+        start, end : log times [ns]; `end` is exclusive
 
-        Yields
-        ------
-        LogMessage
-            Decompressed, where rosbag2 has compressed messages one by one.
-
-        Raises
-        ------
-        LogError
-            For a message that cannot be decompressed.
+        Those that rosbag2 has compressed one by one are decompressed.  Raises LogError for one
+        that cannot be.
         """
         names = None if topics is None else frozenset(topics)
         wanted = {number for number, channel in self.channels.items()
@@ -238,19 +223,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def groups(self, topics: Iterable[str] | None = None,
                ) -> Iterator[tuple[str, list[LogMessage]]]:
-        """
-        Iterate over the messages, some of a topic at a time.
-
-        Parameters
-        ----------
-        topics : iterable of str, optional
-            Names; default: all.
-
-        Yields
-        ------
-        (str, list of LogMessage)
-            A topic, and messages in the order of `messages`.
-        """
+        """Yield the messages of topics, some of one at a time, in the order of `messages`."""
         messages = self.messages(topics)
         while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
@@ -258,12 +231,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def parts(self) -> Iterator[tuple[int, list[LogMessage], list[McapRecord]]]:
         """
-        Iterate over what can be read, in file order; then `damage` tells what cannot.
+        Yield what can be read, in file order; then `damage` tells what cannot.
 
-        Yields
-        ------
-        (int, list of LogMessage, list of McapRecord)
-            The offset of a record or chunk, its messages, and what it declares or attaches.
+        Of each record or chunk: its offset, its messages, and what it declares or attaches.
         """
         damage = Damage(not self.whole)
         damage.reasons += ['found: the file does not end as an MCAP file ends'] * damage.torn
@@ -289,8 +259,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             count += len(messages)
             yield offset, messages, others
         if self._counted not in (None, count) and not damage.lost_bytes:
-            damage.reasons.append(
-                f'found: {count} messages, and the summary counts {self._counted}')
+            damage.lost_messages = max(self._counted - count, 0)
+            damage.reasons.append(f'found: {count} messages, where the summary counts '
+                                  f'{self._counted}')
         self.damage = damage
 
     # -------------------------------------------------------------------------------- the bytes
@@ -306,9 +277,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         except OSError as error:
             raise LogError(f'cannot read {self.path}: {error.strerror}') from error
 
-    def _heads(self, end: int = MAGIC_SIZE) -> Iterator[tuple[int, int, int]]:
+    def _heads(self) -> Iterator[tuple[int, int, int]]:
         """Yield opcode, begin and end of records, of which the last may end behind the file."""
-        opcode = 0
+        opcode, end = 0, MAGIC_SIZE
         while end < self.size and opcode not in (Opcode.DATA_END, Opcode.FOOTER):
             offset = end
             head = self._at(offset, min(offset + HEAD.size, self.size))

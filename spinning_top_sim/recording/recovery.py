@@ -47,7 +47,7 @@ def recover(reader: LogReader, output: Path, progress: Callable[[float], object]
 def _head(reader: LogReader) -> Iterator[McapRecord]:
     yield Header(reader.profile, reader.library)
     yield from (schema for number, schema in reader.schemas.items() if number)
-    for channel in reader.channels.values():
+    for _, channel in sorted(reader.channels.items()):
         known = channel.schema_id in reader.schemas
         yield channel if known else replace(channel, schema_id=0)   # which says: no schema
 

@@ -93,26 +93,22 @@ def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
     if len(text) > 1 << 16 or '<<' in text:     # merged keys may grow exponentially
         return ()
     try:
-        return tuple({key: _policy(key, profile.get(key)) for key in DEFAULT_QOS}
-                     for profile in yaml.safe_load(text))
+        return tuple({key: _understood(profile.get(key), default, _POLICY_NAMES.get(key, ()))
+                      for key, default in DEFAULT_QOS.items()} for profile in yaml.safe_load(text))
     except Exception:   # PyYAML raises many kinds for what it does not understand
         return ()
 
 
-def _policy(key: str, value: Any) -> Any:
-    default, names = DEFAULT_QOS[key], _POLICY_NAMES.get(key)
+def _understood(value: Any, default: Any, names: Sequence[str] = ()) -> Any:
+    """Return a policy by number or name, as its default where it is none of these."""
     if isinstance(default, dict):
         parts = value if isinstance(value, dict) else {}
-        return {part: _number(parts.get(part), known) for part, known in default.items()}
-    if names is None:
-        return _number(value, default)
-    number = names.index(value) if value in names else _number(value, default)
-    return number if number in range(len(names)) and names[number] != 'unknown' else default
-
-
-def _number(value: Any, default: int) -> int:
-    """Return an integer of 64 bits or a truth value, of the kind of the default."""
-    return value if type(value) is type(default) and -1 << 63 <= value < 1 << 63 else default
+        return {part: _understood(parts.get(part), known) for part, known in default.items()}
+    number = names.index(value) if value in names else value
+    if type(number) is not type(default) or not -1 << 63 <= number < 1 << 63 or (
+            names and (number not in range(len(names)) or names[number] == 'unknown')):
+        return default
+    return number
 
 
 def compression_of(text: str) -> tuple[str, str]:

@@ -45,9 +45,7 @@ Rows = tuple[int, NDArray[np.int64], NDArray[np.uint8]]
 
 class McapWriter:
     """
-    A new log, used by one thread at a time; its head is on the disk at once.
-
-    `add` collects messages for a chunk, `flush` writes it.
+    A new log, used by one thread at a time: `add` collects messages for a chunk, `flush` writes it.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
@@ -64,8 +62,8 @@ class McapWriter:
         self._path, self._compression = path, '' if compression == 'none' else compression
         self._rows: list[Rows] = []                 # of the next chunk,
         self._chunk_bytes = 0                       # and its size
-        self.schemas: dict[int, records.Schema] = {}        # in the file
-        self.channels: dict[int, records.Channel] = {}
+        self._types: dict[int, str] = {}            # names of the schemas in the file
+        self._channels: list[records.Channel] = []
         self.message_counts = Counter[int]()        # messages in the file by channel
         self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
@@ -95,18 +93,16 @@ class McapWriter:
         offset, raw = self.size, record_bytes(record)
         self._write([raw])
         if isinstance(record, records.Schema):
-            self.schemas[record.id] = record
-            self._summary.append(raw)
+            self._types[record.id] = record.name
         elif isinstance(record, records.Channel):
-            self.channels[record.id] = record
-            self._summary.append(raw)
+            self._channels.append(record)
         elif isinstance(record, records.Metadata):
-            self._summary.append(record_bytes(
-                records.MetadataIndex(offset, len(raw), record.name)))
+            raw = record_bytes(records.MetadataIndex(offset, len(raw), record.name))
         elif isinstance(record, records.Attachment):
-            self._summary.append(record_bytes(records.AttachmentIndex(
+            raw = record_bytes(records.AttachmentIndex(
                 offset, len(raw), record.log_time, record.create_time, len(record.data),
-                record.name, record.media_type)))
+                record.name, record.media_type))
+        self._summary += [raw] * (not isinstance(record, records.Header))
 
     def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
             rows: NDArray[np.uint8]) -> None:
@@ -116,7 +112,7 @@ class McapWriter:
         log_times_ns : log and publish times (n,), n >= 1, in any order
         rows : serialized messages (n, size)
         """
-        if topic_index >= len(self.channels):
+        if topic_index >= len(self._channels):
             raise IndexError(f'there is no topic {topic_index}')
         self._rows.append((topic_index, log_times_ns, rows))
         self._chunk_bytes += len(rows) * _message_type(rows.shape[1]).itemsize
@@ -219,9 +215,8 @@ class McapWriter:
             start_ns, end_ns = min(self._times_ns, default=0), max(self._times_ns, default=0)
             if bag:
                 self.write(records.Metadata(rosbag2.BAG_METADATA, rosbag2.bag_metadata(
-                    [(channel, schema.name if schema else '', self.message_counts[number])
-                     for number, channel in sorted(self.channels.items())
-                     for schema in [self.schemas.get(channel.schema_id)]],
+                    [(channel, self._types.get(channel.schema_id, ''),
+                      self.message_counts[channel.id]) for channel in self._channels],
                     self._path.name, start_ns, end_ns, compression)))
             self._write([record_bytes(records.DataEnd(self._end[1]))])
             kinds = Counter(raw[0] for raw in self._summary)
@@ -229,7 +224,7 @@ class McapWriter:
                 attachment_count=kinds[Opcode.ATTACHMENT_INDEX],
                 channel_count=kinds[Opcode.CHANNEL],
                 channel_message_counts={
-                    number: self.message_counts[number] for number in self.channels},
+                    channel.id: self.message_counts[channel.id] for channel in self._channels},
                 chunk_count=kinds[Opcode.CHUNK_INDEX], message_count=self.message_counts.total(),
                 message_end_time=end_ns, message_start_time=start_ns,
                 metadata_count=kinds[Opcode.METADATA_INDEX], schema_count=kinds[Opcode.SCHEMA]))

@@ -43,9 +43,10 @@ def _run(arguments: argparse.Namespace) -> int:
         damage = reader.damage
     for line in damage.lines():
         cli.print_line(line)
-    kept = 'kept' if damage.lost_bytes else 'kept all'
+    lost = damage.lost_bytes or damage.lost_messages
+    kept = 'kept' if lost else 'kept all'
     cli.print_line(f'{kept}: {messages} messages, {output.stat().st_size} bytes in {output}')
-    return SOME_LOST if damage.lost_bytes else cli.OK
+    return SOME_LOST if lost else cli.OK
 
 
 main = partial(cli.run, 'recover', __doc__, add_arguments, _run)
