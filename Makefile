@@ -91,7 +91,7 @@ lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(VENV)/.package
 
 #: make docs    write the generated pages and the site in site/
 docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.deps-docs $(VENV)/.package
-	for page in interface urdf figures; do $(BIN)/python' docs/$$page.py || exit; done
+	for page in interface definitions urdf figures; do $(BIN)/python' docs/$$page.py || exit; done
 	rm -rf site
 	$(BIN)/python' -m sphinx --fail-on-warning --keep-going --nitpicky --quiet docs site
 	@echo 'Open site/index.html'

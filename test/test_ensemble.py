@@ -17,6 +17,7 @@ from spinning_top_sim.tools import ensemble_spec
 from spinning_top_sim.tools.ensemble import main
 from spinning_top_sim.tools.ensemble_part import EPOCH_NS, arrow_table, compute_part, samples
 from spinning_top_sim.tools.recorded_run import channels_of
+from spinning_top_sim.tools.simulate import main as simulate
 
 pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='Dask is not there')
 pa = pytest.importorskip('pyarrow')
@@ -125,8 +126,10 @@ def test_a_run_has_the_samples_that_its_log_has(whole, tmp_path):
     assert set(rows['seed'].to_pylist()) == {values['seed']}
     assert rows['t'].to_pylist() == [k / 200.0 for k in range(201)]
     assert not [name for name in every.column_names if 'data_raw.orientation' in name]
-    log = tmp_path / 'run.mcap'
-    assert main([str(path), '--row', str(run), '-o', str(log)]) == 0
+    log, given = tmp_path / 'run.mcap', tmp_path / 'run.yaml'
+    given.write_text(yaml.safe_dump({'/**': {'ros__parameters': json.loads(json.dumps(
+        {name: value for name, value in values.items() if value is not None}))}}))
+    assert simulate(['--params', str(given), '-o', str(log), '--quiet']) == 0
     logged, lost = fields_in(log, values), 0
     for topic, column, field in (('imu/data_raw', 'linear_acceleration.y', 1),
                                  ('ground_truth/imu', 'orientation.w', 0)):
@@ -161,11 +164,6 @@ def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
     assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(manifest['versions'])
     assert ensemble_spec.parse(manifest['specification'], 'test') == ensemble_spec.read(path)
     assert sorted(entry.name for entry in folder.iterdir()) == ['data', 'manifest.json']
-    # A row alone is computed from the manifest.
-    one, every = tmp_path / 'one.parquet', parquet.read_table(data)
-    assert main([str(folder), '--row', '31', '-o', str(one)]) == 0
-    assert parquet.read_table(one).equals(
-        every.filter(every['run'].to_numpy() == 31).combine_chunks())
 
 
 def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_scheduler(
@@ -213,7 +211,9 @@ def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):
         assert said.count('\n') == 1
         failed = json.loads((folder / 'manifest.json').read_text())['failed']
         assert list(failed) == ['3', '4', '5']
-        assert all('ValueError: no motion from theta = ' in why for why in failed.values())
+        assert all('ValueError: no motion from theta = ' in why
+                   and 'initial.theta = ' in why and why.endswith(', spin.lz = 1e+30')
+                   for why in failed.values())
     part, = (folder / 'data').iterdir()
     assert set(parquet.read_table(part)['run'].to_pylist()) == {0, 1, 2}
 
@@ -344,22 +344,7 @@ def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble
         f'{tmp_path} exists and has no manifest.json: choose a new folder\n')
 
 
-def test_what_is_no_manifest_is_refused(tmp_path, capsys):
-    place = tmp_path / 'manifest.json'
-    place.write_text('{"versions": 1, "specification": {"runs": 1, "duration": 1.0}}')
-    assert main([str(tmp_path), '--row', '0', '-o', str(tmp_path / 'one.mcap')]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith('spinning-top ensemble: '
-                            f'{place} is no manifest') and error.count('\n') == 1
-
-
-@pytest.mark.parametrize(('arguments', 'said'), [
-    (['--row', '32', '-o', 'one.mcap'], '--row 32: must be from 0 to 31'),
-    (['--row', '1', '-o', 'one.csv'], 'one.csv: the name must end in .mcap or .parquet'),
-    (['-o', 'out', '--workers', '0'], '--workers 0: must be')])
-def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, said):
-    path = written(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    assert main([str(path), *arguments]) == 2
-    assert said in capsys.readouterr().err
+def test_bad_arguments_are_refused(tmp_path, capsys):
+    assert main([str(written(tmp_path)), '-o', str(tmp_path / 'out'), '--workers', '0']) == 2
+    assert '--workers 0: must be' in capsys.readouterr().err
     assert [entry.name for entry in tmp_path.iterdir()] == ['spec.yaml']

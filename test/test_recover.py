@@ -353,7 +353,8 @@ def test_a_recovery_that_fails_leaves_nothing_behind(tmp_path, log, monkeypatch,
     if fault == 'disk':
         monkeypatch.setattr(os, 'pread', fail)
     else:
-        monkeypatch.setattr(McapWriter, 'finish', lambda *_, **__: signal.raise_signal(signal.SIGINT))
+        monkeypatch.setattr(McapWriter, 'finish',
+                            lambda *_, **__: signal.raise_signal(signal.SIGINT))
     code, _, err = run(path)
     assert code == (FAILED if fault == 'disk' else 130)
     assert fault != 'disk' or err == (f'spinning-top recover: cannot read {path}: Input/output '

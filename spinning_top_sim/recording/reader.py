@@ -130,7 +130,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             self._places = sorted(self._find_places())
             try:
                 self._read_summary()
-                self.whole = self._channels_in.keys() <= {offset for _, _, offset, _ in self._places}
+                self.whole = self._channels_in.keys() <= {place[2] for place in self._places}
             except UNREADABLE:
                 self.whole = False
             self.span = (self._places[0][0] if self._places else 0,
@@ -210,7 +210,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 continue
             chosen = iter(sorted((one for one in messages if one.channel_id in wanted
                                   and one.log_time in times), key=attrgetter('log_time')))
-            if (message := next(chosen, None)) is not None:
+            for message in itertools.islice(chosen, 1):
                 heapq.heappush(held, (message.log_time, offset, message, chosen))
 
     def _decompressed(self, message: LogMessage, form: str) -> LogMessage:

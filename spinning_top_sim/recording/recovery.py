@@ -72,7 +72,7 @@ def _chunk(messages: Sequence[LogMessage]) -> tuple[bytes, dict[int, NDArray[np.
     """Return messages in their order as `McapWriter.write_chunk` takes them."""
     index: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
     records, offset = [], 0
-    for topic, log_time, publish_time, sequence, data, channel in messages:
+    for _, log_time, publish_time, sequence, data, channel in messages:
         length = MESSAGE_FIELDS + len(data)
         records.append(message_layout(length).pack(
             Opcode.MESSAGE, length, channel, sequence, log_time, publish_time, data))

@@ -59,17 +59,20 @@ class RecordedTopic(NamedTuple):
 
 
 def find_definition(type_name: str) -> tuple[str, str]:
+    """Return what `generated_definition` does, at once for the types of our streams."""
+    # docs/definitions.py writes the file: to load the types of rosbags takes 70 ms.
+    text, type_hash = read_table('recording/definitions.json').get(type_name) or (
+        generated_definition(type_name))
+    return text, type_hash
+
+
+def generated_definition(type_name: str) -> tuple[str, str]:
     """
     Return schema (`ros2msg`) and type hash (REP-2011) of a type of ROS 2 Jazzy.
 
     Other than rosbag2's, the schema, which is the definition followed by those it depends on, has
     no comments.  Raises RecordingError for another type.
     """
-    # What rosbags says of our types, kept: to load its types takes 70 ms, a fifth of a start.
-    known = read_table('recording/definitions.json')
-    if type_name in known:
-        text, type_hash = known[type_name]
-        return text, type_hash
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     types = get_typestore(Stores.ROS2_JAZZY)
     if type_name not in types.fielddefs:

@@ -45,7 +45,7 @@ Rows = tuple[int, NDArray[np.int64], NDArray[np.uint8]]
 
 class McapWriter:
     """
-    A new log, used by one thread at a time: `add` collects messages for a chunk, `flush` writes it.
+    A new log, for one thread at a time: `add` collects messages for a chunk, `flush` writes it.
 
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.

@@ -26,7 +26,6 @@ from spinning_top_sim.streams.channel import Channel, Rows, Stamps
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.streams.topics import ARRAY, INVARIANTS, JOINTS, TIMING, recorded
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
-from spinning_top_sim.tools.simulate import write_log
 
 if TYPE_CHECKING:
     import pyarrow
@@ -148,26 +147,6 @@ def arrow_table(specification: Specification, found: Mapping[int, Samples]) -> '
                      **{name: column(name) for name in others}})
 
 
-def write_row(specification: Specification, run: int, path: Path) -> None:
-    """
-    Compute one run into a new file, .mcap or .parquet.
-
-    Raises RecordingError or OSError if it exists, ValueError if no motion begins, IntegrationError
-    if it ends early.
-    """
-    from pyarrow import parquet  # noqa: PLC0415
-
-    values = specification.values(run)
-    simulation = Simulation(values, EPOCH_NS)
-    if path.suffix == '.mcap':
-        write_log(path, simulation, [(round(values['duration'] * NANOSECONDS), None)],
-                  lambda done: None, '/')
-    else:
-        rows = arrow_table(specification, {run: samples(specification, simulation)})
-        with open(path, 'xb') as file:
-            parquet.write_table(rows, file)
-
-
 def compute_part(specification: Specification, part: int, folder: str) -> dict[str, str]:
     """
     Compute the file of a part, unless it is in `folder`; return the runs that failed, and why.
@@ -183,10 +162,10 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
     failed: dict[str, str] = {}
     # All runs begin before one is played: caches of the processor hold the code of one of both.
     for run in specification.part(part):
-        with _noted(failed, run):
+        with _noted(failed, run, specification):
             begun[run] = Simulation(specification.values(run), EPOCH_NS)
     for run in [*begun]:
-        with _noted(failed, run):
+        with _noted(failed, run, specification):
             found[run] = samples(specification, begun.pop(run))     # which holds much memory
     if found:
         rows = arrow_table(specification, found).replace_schema_metadata(
@@ -202,8 +181,10 @@ def compute_part(specification: Specification, part: int, folder: str) -> dict[s
 
 
 @contextlib.contextmanager
-def _noted(failed: dict[str, str], run: int) -> Iterator[None]:
+def _noted(failed: dict[str, str], run: int, specification: Specification) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        failed[str(run)] = reason_of(error)
+        drawn = specification.drawn(run).items()
+        failed[str(run)] = (f'{reason_of(error)}; it has '
+                            f'{", ".join(f"{name} = {value!r}" for name, value in drawn)}')
