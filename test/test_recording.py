@@ -141,7 +141,7 @@ def test_bag_metadata_agrees_with_the_messages(tmp_path, monkeypatch, count):
     assert summary.messages == count
     with open(path, 'rb') as file:
         records = {item.name: item.metadata for item in make_reader(file).iter_metadata()}
-    assert records['spinning_top_sim'] == METADATA
+    assert records['spinning_top_sim'].items() >= METADATA.items()
     bag = yaml.safe_load(records['rosbag2']['serialized_metadata'])
     expected = {'version': 9, 'storage_identifier': 'mcap', 'ros_distro': 'jazzy',
                 'message_count': count, 'relative_file_paths': [path.name],
@@ -186,7 +186,8 @@ def test_what_decides_the_last_bits_is_told(monkeypatch):
     monkeypatch.setattr(provenance, 'version', lambda name='': versions.get(name, '1.0'))
     told = provenance.run_metadata({'seed': 7}, 5, -1, [{'event': 'start', 't_ns': 0}],
                                    {'seed': 7, 'record.streams': ('all',)})
-    assert json.loads(told['libraries']) == {'numpy': '1.0', 'mcap': '1.0', 'gmpy2': '2.2'}
+    assert json.loads(provenance.environment()['libraries']) == {
+        'numpy': '1.0', 'mcap': '1.0', 'gmpy2': '2.2'}
     assert (told['format'], told['seed'], told['epoch_ns']) == ('2', '7', '5')
     assert json.loads(told['history']) == [{'event': 'start', 't_ns': 0}]
     assert json.loads(told['parameters_now'])['record.streams'] == ['all']

@@ -23,6 +23,7 @@ import numpy as np
 
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import RecordingError, text_of, why_not_written
+from spinning_top_sim.recording.provenance import environment
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 
 if TYPE_CHECKING:       # the recorder's thread imports it, which takes 0.1 s
@@ -55,7 +56,7 @@ class Recorder:
     uri : the file, which must not exist; or a folder, in which a name with the date is taken, and
         which is made if it ends with '/'; '' is the working directory
     topics : a message refers to one by its index
-    metadata : of the run; see `provenance.run_metadata`
+    metadata : of the run; see `provenance.run_metadata`; the `environment` is added
     max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
     compression : 'zstd', 'lz4' or 'none'
     min_free_bytes : the recording stops if the disk has less left than this
@@ -190,6 +191,7 @@ class Recorder:
         with needed('a recording', 'mcap'):
             from spinning_top_sim.recording.writer import McapWriter, log_head  # noqa: PLC0415
 
+        head = log_head(self._topics, {**self._metadata, **environment()})
         folder = path = Path(self._uri).expanduser().absolute()
         if self._uri.endswith('/'):
             folder.mkdir(parents=True, exist_ok=True)
@@ -199,9 +201,8 @@ class Recorder:
             if not named:
                 path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
             try:
-                file = McapWriter(path, log_head(self._topics, self._metadata),
-                                   compression=self._compression,
-                                   min_free_bytes=self._min_free_bytes)
+                file = McapWriter(path, head, compression=self._compression,
+                                  min_free_bytes=self._min_free_bytes)
                 self.path = path
                 return file
             except RecordingError as error:

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from spinning_top_sim.recording.provenance import run_metadata
+from spinning_top_sim.recording.provenance import environment, run_metadata
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
@@ -171,7 +171,8 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     file = McapWriter(path, log_head(
         [RecordedTopic(resolve_topic(name, namespace), type_name)
          for name, type_name in types.items()],
-        run_metadata(values, epoch_ns, -1, (), values)), compression=values['record.compression'])
+        {**run_metadata(values, epoch_ns, -1, (), values), **environment()}),
+        compression=values['record.compression'])
 
     def add(event: Event) -> None:
         for topic, data in event.entries():
