@@ -10,7 +10,7 @@ from helpers.reference import scene_parameters
 from spinning_top_sim import solve
 from spinning_top_sim.__main__ import main
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.tools.models import FORMATS, model
+from spinning_top_sim.tools.export import FORMATS, model
 
 IMU = {'imu.lever_arm': (0.1, -0.05, 0.3), 'imu.rpy': (0.3, -0.2, 1.1)}
 HANGING = {'top.com_distance': -0.2, 'top.lambda1': 0.2}

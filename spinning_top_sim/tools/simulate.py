@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--duration', type=float, metavar='S',
         help='simulated time [s]; default: the parameter duration')
     add('-o', '--output', metavar='FILE', required=True, type=Path,
-        help='file to write; an existing one is never overwritten')
+        help='file to write, .mcap, .csv or .parquet; an existing one is never overwritten')
     add('--seed', type=int, help='seed of the noise; default: the parameter seed')
     add('--command', metavar='T:L3:LZ', action='append', default=[],
         help='at T [s] set L3 and Lz [kg m^2/s]; may be repeated; commands at the same time are '
@@ -54,18 +54,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--epoch', type=float, default=1.0, metavar='S',        # in ROS a stamp of 0 is "no time"
         help='stamp of t = 0 [s], default %(default)g')
     add('--namespace', default='/', help='of the topics in the log')
-    add('--format', choices=FORMATS,
-        help='format of the output; default: by the extension of its name')
     log_exports.add_argument(parser)
     add('--quiet', action='store_true', help='no progress, no summary')
 
 
 def _run(arguments: argparse.Namespace) -> int:
     output: Path = arguments.output
-    file_format = arguments.format or output.suffix[1:]
+    file_format = output.suffix[1:]
     if file_format not in FORMATS:
-        raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}, or --format be '
-                         'given')
+        raise ValueError(f'{output}: the name must end in .{", .".join(FORMATS)}')
     epoch_ns = arguments.epoch * NANOSECONDS
     if not 0.0 <= epoch_ns <= LAST_STAMP_NS:
         raise ValueError(f'--epoch {arguments.epoch!r}: must be >= 0 and < {2 ** 31} s')
