@@ -81,7 +81,7 @@ class LogTopic(NamedTuple):
 class Damage:
     """What is wrong with a log."""
 
-    torn: bool                  # it does not end as an MCAP file ends
+    torn: bool                  # its summary is missing or wrong
     lost_bytes: int = 0         # that cannot be read; indexes do not count
     lost_messages: int = 0      # that the summary counts besides those
     reasons: list[str] = field(default_factory=list)
@@ -236,7 +236,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         Of each record or chunk: its offset, its messages, and what it declares or attaches.
         """
         damage = Damage(not self.whole)
-        damage.reasons += ['found: the file does not end as an MCAP file ends'] * damage.torn
+        damage.reasons += ['found: the summary at the end is missing or wrong'] * damage.torn
         crc, count = zlib.crc32(MCAP0_MAGIC), 0
         for opcode, offset, end in self._heads():
             # What follows the last chunk is made anew.

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import reason_of
-from spinning_top_sim.streams.cdr import NANOSECONDS, Values, fill
+from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.channel import Channel, Rows, Stamps
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.streams.topics import ARRAY, INVARIANTS, JOINTS, TIMING, recorded
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
+from spinning_top_sim.tools.table import Columns
 
 if TYPE_CHECKING:
     import pyarrow
@@ -63,21 +64,6 @@ def _column_names(channel: Channel) -> list[str]:
     return names
 
 
-class _Columns:
-    """Encodes fields as the rows of a table, (n, numbers)."""
-
-    def __init__(self, counts: Sequence[int]) -> None:
-        self._counts = counts
-
-    def __len__(self) -> int:
-        return 8 * sum(self._counts)
-
-    def encode(self, stamps_ns: Stamps, fields: Sequence[Values]) -> Rows:
-        columns = np.empty((sum(self._counts), len(stamps_ns)))
-        fill([field.T for field in np.split(columns, np.cumsum(self._counts)[:-1])], fields)
-        return columns.T
-
-
 def samples(specification: Specification, simulation: Simulation) -> Samples:
     """
     Play a run; return its columns: t [s], and the numbers of the streams that are kept.
@@ -91,7 +77,7 @@ def samples(specification: Specification, simulation: Simulation) -> Samples:
     for channel in simulation.channels:
         if channel.name in specification.kept:
             names[channel.topic] = _column_names(channel)
-            tables.append(replace(channel, encoder=_Columns(
+            tables.append(replace(channel, encoder=Columns(
                 [field.size for field in channel.template.fields])))
     times: dict[str, list[Stamps]] = {topic: [] for topic in names}
     numbers: dict[str, list[Rows]] = {topic: [] for topic in names}

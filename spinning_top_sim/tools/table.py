@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.streams.cdr import NANOSECONDS, Values
+from spinning_top_sim.streams.cdr import NANOSECONDS, Values, fill
 from spinning_top_sim.streams.channel import Channel, Rows, Samples, Stamps
 
 # Names and units of the columns of a table.
@@ -20,30 +20,29 @@ UNITS = {
 RIDE_UNITS = {**UNITS, 'x': 'm', 'y': 'm', 'z': 'm', 'vx': 'm/s', 'vy': 'm/s', 'vz': 'm/s'}
 
 
-class TableRows:
-    """Encodes fields of one column each as rows of numbers, (n, columns)."""
+class Columns:
+    """Encodes fields of so many columns each as the rows of a table, (n, columns)."""
 
-    def __init__(self, units: Mapping[str, str]) -> None:
-        self.units = units      # names and units of the columns
+    def __init__(self, counts: Sequence[int]) -> None:
+        self._counts = counts
 
     def __len__(self) -> int:
-        return 8 * len(self.units)
+        return 8 * sum(self._counts)
 
     def encode(self, stamps_ns: Stamps, fields: Sequence[Values]) -> Rows:
-        rows = np.empty((len(stamps_ns), len(self.units)))
-        for column, numbers in zip(rows.T, fields, strict=True):
-            column[:] = numbers
-        return rows
+        columns = np.empty((sum(self._counts), len(stamps_ns)))
+        fill([field.T for field in np.split(columns, np.cumsum(self._counts)[:-1])], fields)
+        return columns.T
 
 
 def true_states(period_ns: int, *, pivot_moves: bool) -> Channel:
     """Return the channel whose messages are the rows of a table of true states."""
     return Channel('table', '', '', period_ns,
-                   TableRows(RIDE_UNITS if pivot_moves else UNITS),
-                   lambda samples: _true(samples, pivot_moves))
+                   Columns([len(RIDE_UNITS if pivot_moves else UNITS)]),
+                   lambda samples: [_true(samples, pivot_moves)])
 
 
-def _true(samples: Samples, pivot_moves: bool) -> Sequence[Values]:
+def _true(samples: Samples, pivot_moves: bool) -> Sequence[NDArray[np.float64]]:
     states = samples.states
     return (
         samples.t_ns / NANOSECONDS, states.theta, states.theta_dot, states.phi, states.phi_dot,
