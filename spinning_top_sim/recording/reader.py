@@ -127,12 +127,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             self.size = os.fstat(self._file.fileno()).st_size
             header = self._read_header()
             self.profile, self.library = header.profile, header.library
-            self._places = sorted(self._find_places())
             try:
                 self._read_summary()
-                self.whole = self._channels_in.keys() <= {place[2] for place in self._places}
+                closed = True
             except UNREADABLE:
-                self.whole = False
+                closed = False
+            self._places = sorted(self._find_places())
+            self.whole = closed and self._channels_in.keys() <= {
+                offset for _, _, offset, _ in self._places}
             self.span = (self._places[0][0] if self._places else 0,
                          max((end_ns for _, end_ns, *_ in self._places), default=0))
             if not self.whole or not self.channels:

@@ -102,7 +102,8 @@ class McapWriter:
             raw = record_bytes(records.AttachmentIndex(
                 offset, len(raw), record.log_time, record.create_time, len(record.data),
                 record.name, record.media_type))
-        self._summary += [raw] * (not isinstance(record, records.Header))
+        if not isinstance(record, records.Header):
+            self._summary.append(raw)
 
     def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
             rows: NDArray[np.uint8]) -> None:
