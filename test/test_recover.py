@@ -47,7 +47,6 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.writer import McapWriter, record_bytes
 
-
 CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8      # bytes before the records in an uncompressed chunk
 
 
@@ -132,7 +131,7 @@ def test_a_summary_that_does_not_describe_the_file_is_damage(tmp_path):
     write_anew(path, content)
     code, out, _ = run(path, '-o', output)
     assert code == SOME_LOST and out.startswith('lost: 1 messages\nfound: 35 messages, where ')
-    assert sorted(seen_by_mcap(output) + [messages[1]]) == sorted(messages)
+    assert sorted([*seen_by_mcap(output), messages[1]]) == sorted(messages)
     # The chunk behind its index.
     write_log(tmp_path / 'b.mcap')
     content = bytearray((tmp_path / 'b.mcap').read_bytes())
