@@ -21,20 +21,11 @@ from typing import BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
+from mcap import records
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    Schema,
-    Statistics,
-)
+from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.writer import MCAP0_MAGIC
 
@@ -102,11 +93,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     path : the file, or a folder as `ros2 bag` makes it, which must hold exactly one
     max_bytes : of the largest record, and the largest uncompressed chunk, that is read
 
-    Attributes are `path` and `size` [bytes] of the file when it was opened; `profile` and
-    `library`, which its header names; `whole`, whether it was closed, and its summary, if any,
-    describes it; `metadata`, the last of each name; `schemas` and `channels`, mcap's records by
-    id; `span`, the earliest and the latest log time [ns], both 0 without messages; `left_out`,
-    the number of damaged chunks that `messages` has skipped so far.
+    Attributes are `path` and `size` [bytes] of the file when it was opened; `header`, mcap's
+    record; `whole`, whether it was closed, and its summary, if any, describes it; `metadata`, the
+    last of each name; `schemas` and `channels`, mcap's records by id; `span`, the earliest and the
+    latest log time [ns], both 0 without messages; `left_out`, the number of damaged chunks that
+    `messages` has skipped so far.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
@@ -125,8 +116,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             raise LogError(f'cannot read {self.path}: {error.strerror}') from error
         try:
             self.size = os.fstat(self._file.fileno()).st_size
-            header = self._read_header()
-            self.profile, self.library = header.profile, header.library
+            self.header = self._read_header()
             try:
                 self._read_summary()
                 closed = True
@@ -342,15 +332,15 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def _declare(self, record: McapRecord) -> None:
         """Note a schema, a channel or metadata; of several with an id, the first counts."""
-        if isinstance(record, Metadata):
+        if isinstance(record, records.Metadata):
             self.metadata[record.name] = record.metadata
         elif isinstance(record, Schema):
             self.schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
             self.channels.setdefault(record.id, record)
-        elif isinstance(record, ChunkIndex):
+        elif isinstance(record, records.ChunkIndex):
             self._channels_in[record.chunk_start_offset] = record.message_index_offsets
-        elif isinstance(record, Statistics):
+        elif isinstance(record, records.Statistics):
             self._counted = record.message_count
 
     def _find_places(self) -> Iterator[tuple[int, int, int, int]]:

@@ -3,13 +3,13 @@
 
 import itertools
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Header, McapRecord, Metadata
+from mcap.records import Attachment, Metadata
 from numpy.typing import NDArray
 
 from spinning_top_sim.recording.errors import LogError, why_not_written
@@ -29,12 +29,16 @@ def recover(reader: LogReader, output: Path, progress: Callable[[float], object]
     Raises RecordingError or LogError, also if a torn file holds no whole message.
     """
     torn = reader.damage.torn       # now that all is read, all channels are known
-    file = McapWriter(output, _head(reader), compression='zstd')
+    # The schema 0 says that there is none.
+    schemas = {number: schema for number, schema in reader.schemas.items() if number}
+    channels = [channel if channel.schema_id in schemas else replace(channel, schema_id=0)
+                for _, channel in sorted(reader.channels.items())]
+    file = McapWriter(output, [reader.header, *schemas.values(), *channels], compression='zstd')
     try:
         _copy(reader, file, progress)
         if torn and not file.message_counts:
             raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
-        file.finish(bag=reader.profile == 'ros2' or BAG_METADATA in reader.metadata,
+        file.finish(bag=reader.header.profile == 'ros2' or BAG_METADATA in reader.metadata,
                     compression=reader.compression)
     except BaseException as error:
         file.discard()
@@ -42,14 +46,6 @@ def recover(reader: LogReader, output: Path, progress: Callable[[float], object]
             raise LogError(f'cannot write {output}: {why_not_written(output, error)}') from error
         raise
     return file.message_counts.total()
-
-
-def _head(reader: LogReader) -> Iterator[McapRecord]:
-    yield Header(reader.profile, reader.library)
-    yield from (schema for number, schema in reader.schemas.items() if number)
-    for _, channel in sorted(reader.channels.items()):
-        known = channel.schema_id in reader.schemas
-        yield channel if known else replace(channel, schema_id=0)   # which says: no schema
 
 
 def _copy(reader: LogReader, file: McapWriter, progress: Callable[[float], object]) -> None:

@@ -7,6 +7,7 @@ Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_stora
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -80,11 +81,6 @@ def generated_definition(type_name: str) -> tuple[str, str]:
     return types.generate_msgdef(type_name, ros_version=2)[0], types.hash_rihs01(type_name)
 
 
-def offered_qos_yaml(topic: RecordedTopic) -> str:
-    """Return the `offered_qos_profiles` of a channel, in integers as older releases read too."""
-    return _dump([{**DEFAULT_QOS, **topic.qos}])
-
-
 def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
     """
     Return the QoS profiles in the metadata of a channel, with policies by number or name.
@@ -135,7 +131,7 @@ def bag_metadata(topics: Sequence[tuple[Channel, str, int]], file_name: str, sta
     numbers = {'starting_time': {'nanoseconds_since_epoch': start_ns},
                'duration': {'nanoseconds': end_ns - start_ns},
                'message_count': sum(messages for _, _, messages in topics)}
-    return {'serialized_metadata': _dump({
+    return {'serialized_metadata': as_yaml({
         'version': 9,   # of rosbag2_storage::BagMetadata in jazzy
         'storage_identifier': 'mcap',
         **numbers,
@@ -157,12 +153,7 @@ def bag_metadata(topics: Sequence[tuple[Channel, str, int]], file_name: str, sta
         'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy'})}
 
 
-class _Dumper(yaml.SafeDumper):
-    def ignore_aliases(self, data: object) -> bool:
-        """Write what occurs twice twice: yaml-cpp writes no anchors."""
-        return True
-
-
-def _dump(value: object) -> str:
-    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
-                     width=float('inf')).rstrip('\n')
+def as_yaml(value: object) -> str:
+    """Return YAML as yaml-cpp writes it: what occurs twice stands there twice, without anchors."""
+    return yaml.safe_dump(json.loads(json.dumps(value)), sort_keys=False, allow_unicode=True,
+                          width=float('inf')).rstrip('\n')

@@ -280,7 +280,9 @@ def log_head(topics: Sequence[rosbag2.RecordedTopic],
         *(records.Channel(
             id=number, topic=topic.name, message_encoding='cdr',
             schema_id=1 + types.index(topic.type_name),
-            metadata={'offered_qos_profiles': rosbag2.offered_qos_yaml(topic),
+            # In integers, as older releases of ROS read them, too.
+            metadata={'offered_qos_profiles': rosbag2.as_yaml(
+                          [{**rosbag2.DEFAULT_QOS, **topic.qos}]),
                       'topic_type_hash': definitions[topic.type_name][1]})
           for number, topic in enumerate(topics, start=1)),
         records.Metadata(METADATA_NAME, dict(metadata))]
