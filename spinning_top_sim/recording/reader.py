@@ -90,14 +90,20 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     What is damaged is left out.  A file that was not closed is read through at once.
 
-    path : the file, or a folder as `ros2 bag` makes it, which must hold exactly one
-    max_bytes : of the largest record, and the largest uncompressed chunk, that is read
+    Parameters
+    ----------
+    path : path
+        The file, or a folder as `ros2 bag` makes it, which must hold exactly one.
+    max_bytes : int
+        Of the largest record, and the largest uncompressed chunk, that is read.
 
-    Attributes are `path` and `size` [bytes] of the file when it was opened; `header`, mcap's
-    record; `whole`, whether it was closed, and its summary, if any, describes it; `metadata`, the
-    last of each name; `schemas` and `channels`, mcap's records by id; `span`, the earliest and the
-    latest log time [ns], both 0 without messages; `left_out`, the number of damaged chunks that
-    `messages` has skipped so far.
+    Notes
+    -----
+    Attributes are `path` and `size` [bytes] of the file when it was opened; `profile` and
+    `library`, which its header names; `whole`, whether it was closed, and its summary, if any,
+    describes it; `metadata`, the last of each name; `schemas` and `channels`, mcap's records by
+    id; `span`, the earliest and the latest log time [ns], both 0 without messages; `left_out`,
+    the number of damaged chunks that `messages` has skipped so far.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
@@ -116,7 +122,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             raise LogError(f'cannot read {self.path}: {error.strerror}') from error
         try:
             self.size = os.fstat(self._file.fileno()).st_size
-            self.header = self._read_header()
+            header = self._read_header()
+            self.profile, self.library = header.profile, header.library
             try:
                 self._read_summary()
                 closed = True
@@ -168,13 +175,24 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
                  end: int | None = None) -> Iterator[LogMessage]:
         """
-        Yield the messages in the order of their log times, equal ones in file order.
+        Iterate over the messages in the order of their log times, equal ones in file order.
 
-        topics : names; default: all
-        start, end : log times [ns]; `end` is exclusive
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Names; default: all.
+        start, end : int, optional
+            Log times [ns]; `end` is exclusive.
 
-        Those that rosbag2 has compressed one by one are decompressed.  Raises LogError for one
-        that cannot be.
+        Yields
+        ------
+        LogMessage
+            Decompressed, where rosbag2 has compressed messages one by one.
+
+        Raises
+        ------
+        LogError
+            For a message that cannot be decompressed.
         """
         names = None if topics is None else frozenset(topics)
         wanted = {number for number, channel in self.channels.items()
@@ -215,7 +233,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def groups(self, topics: Iterable[str] | None = None,
                ) -> Iterator[tuple[str, list[LogMessage]]]:
-        """Yield the messages of topics, some of one at a time, in the order of `messages`."""
+        """
+        Iterate over the messages of topics as `messages` does, some of one topic at a time.
+
+        Yields
+        ------
+        (str, list of LogMessage)
+            A topic, and messages in the order of `messages`.
+        """
         messages = self.messages(topics)
         while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
@@ -223,9 +248,12 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def parts(self) -> Iterator[tuple[int, list[LogMessage], list[McapRecord]]]:
         """
-        Yield what can be read, in file order; then `damage` tells what cannot.
+        Iterate over what can be read, in file order; then `damage` tells what cannot.
 
-        Of each record or chunk: its offset, its messages, and what it declares or attaches.
+        Yields
+        ------
+        (int, list of LogMessage, list of McapRecord)
+            The offset of a record or chunk, its messages, and what it declares or attaches.
         """
         damage = Damage(not self.whole)
         damage.reasons += ['found: the summary at the end is missing or wrong'] * damage.torn

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Metadata
+from mcap.records import Attachment, Header, Metadata
 from numpy.typing import NDArray
 
 from spinning_top_sim.recording.errors import LogError, why_not_written
@@ -33,12 +33,13 @@ def recover(reader: LogReader, output: Path, progress: Callable[[float], object]
     schemas = {number: schema for number, schema in reader.schemas.items() if number}
     channels = [channel if channel.schema_id in schemas else replace(channel, schema_id=0)
                 for _, channel in sorted(reader.channels.items())]
-    file = McapWriter(output, [reader.header, *schemas.values(), *channels], compression='zstd')
+    file = McapWriter(output, [Header(reader.profile, reader.library), *schemas.values(),
+                               *channels], compression='zstd')
     try:
         _copy(reader, file, progress)
         if torn and not file.message_counts:
             raise LogError(f'nothing to save in {reader.path}: there is no whole message in it')
-        file.finish(bag=reader.header.profile == 'ros2' or BAG_METADATA in reader.metadata,
+        file.finish(bag=reader.profile == 'ros2' or BAG_METADATA in reader.metadata,
                     compression=reader.compression)
     except BaseException as error:
         file.discard()
