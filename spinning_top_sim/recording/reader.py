@@ -13,38 +13,39 @@ import struct
 import zlib
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
-from io import BytesIO
+from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
 from mcap import records
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
-from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Schema
-from mcap.stream_reader import MAGIC_SIZE, StreamReader
+from mcap.records import Channel, Footer, Header, McapRecord, Schema
+from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import rosbag2
 from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.parsing import (
+    HEAD,
+    UNREADABLE,
+    decompress,
+    message_layout,
+    records_in,
+    unpacked,
+)
 
 MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
 MOST_INDEX = 1 << 20        # bytes behind the last chunk that may be torn without a loss
 MOST_REASONS = 20           # of damage that are told
 BLOCK = 16384               # messages that are grouped together
-HEAD = struct.Struct('<BQ')     # of every record: opcode, length of what follows
-MESSAGE_FIELDS = 2 + 4 + 8 + 8  # bytes of a message before its data
 NOTED = Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT
 # Where log times stand: the earliest and the latest in a chunk, and that of a message
 TIMES: dict[int, struct.Struct] = {
     Opcode.CHUNK: struct.Struct('<9xQQ'), Opcode.MESSAGE: struct.Struct('<15xQ')}
 COMPRESSED = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}     # as a whole
-# What is raised for bytes that are not as they should be.
-UNREADABLE = (McapError, ValueError, OverflowError, struct.error)
 
 
 class LogMessage(NamedTuple):
@@ -226,7 +227,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def _decompressed(self, message: LogMessage, form: str) -> LogMessage:
         try:
             return message._replace(
-                data=_decompress(message.data, form or 'unknown', self._max_bytes))
+                data=decompress(message.data, form or 'unknown', self._max_bytes))
         except McapError as error:
             raise LogError(f'cannot read {self.path}: a message of {message.topic}: '
                            f'{error}') from None
@@ -310,7 +311,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def _records(self, raw: bytes) -> tuple[list[LogMessage], list[McapRecord]]:
         """Return the messages, and after noting them the others, in a record; UNREADABLE."""
-        plain = self._unpacked(raw) if raw[0] == Opcode.CHUNK else raw
+        plain = unpacked(raw, self._max_bytes) if raw[0] == Opcode.CHUNK else raw
         messages: list[LogMessage] = []
         others: list[McapRecord] = []
         at = 0
@@ -322,7 +323,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             if opcode == Opcode.MESSAGE:
                 end = self._add_messages(messages, plain, at, message_layout(length))
             elif opcode in NOTED:
-                others.append(next(_records_in(plain[at:end])))
+                others.append(next(records_in(plain[at:end])))
                 self._declare(others[-1])
             at = end
         return messages, others
@@ -344,19 +345,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         except KeyError:
             raise McapError('no whole record declares a channel of its messages') from None
         return at
-
-    def _unpacked(self, raw: bytes) -> bytes:
-        """Return the records in a chunk, which mcap would unpack to any size.  UNREADABLE."""
-        chunk = next(_records_in(raw))
-        assert isinstance(chunk, Chunk)
-        if chunk.uncompressed_size > self._max_bytes:
-            raise McapError(f'it unpacks to more than {self._max_bytes} bytes')
-        plain = _decompress(chunk.data, chunk.compression, chunk.uncompressed_size)
-        if len(plain) != chunk.uncompressed_size:
-            raise McapError('it has not the size that it says it has')
-        if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):
-            raise McapError('its checksum is wrong')
-        return plain
 
     def _declare(self, record: McapRecord) -> None:
         """Note a schema, a channel or metadata; of several with an id, the first counts."""
@@ -384,13 +372,13 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def _read_summary(self) -> None:
         """Note what the summary declares.  UNREADABLE if it is damaged or the file is torn."""
         footer_at = self.size - FOOTER_SIZE - MAGIC_SIZE
-        footer = next(_records_in(self._at(footer_at, self.size)))
+        footer = next(records_in(self._at(footer_at, self.size)))
         if not isinstance(footer, Footer):
             raise McapError
         summary = self._at(footer.summary_start or footer_at, self.size)
         if footer.summary_crc not in (0, zlib.crc32(summary[:-MAGIC_SIZE - 4])):
             raise McapError
-        for record in _records_in(summary):     # to the footer, and the magic behind it
+        for record in records_in(summary):     # to the footer, and the magic behind it
             self._declare(record)
 
     def _read_header(self) -> Header:
@@ -398,38 +386,13 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         magic = self._at(0, min(MAGIC_SIZE, self.size))
         with contextlib.suppress(*UNREADABLE):
             _, offset, end = next(self._heads(), (0, 0, 0))
-            header = next(_records_in(self._at(offset, end)))
+            header = next(records_in(self._at(offset, end)))
             if magic == MCAP0_MAGIC and isinstance(header, Header):
                 return header
         reason = 'it is no MCAP file' if magic else 'it is empty'
         if form := COMPRESSED.get(magic[:4]):
             reason = f'it is compressed as a whole, unpack it by {form} -d'
         raise LogError(f'cannot read {self.path}: {reason}')
-
-
-def _records_in(raw: bytes) -> Iterator[McapRecord]:
-    return StreamReader(BytesIO(raw), skip_magic=True, emit_chunks=True).records
-
-
-@lru_cache
-def message_layout(length: int) -> struct.Struct:
-    """Return the layout of a message record of this length; struct.error if it is too small."""
-    return struct.Struct(f'<BQHIQQ{length - MESSAGE_FIELDS}s')
-
-
-def _decompress(data: bytes, compression: str, most: int) -> bytes:
-    """Return the uncompressed bytes of all frames, or the first `most` + 1; UNREADABLE."""
-    stream: BinaryIO = BytesIO(data)
-    if compression == 'zstd':
-        stream = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)
-    elif compression == 'lz4':
-        stream = lz4.frame.open(stream)
-    elif compression:
-        raise McapError(f'its compression {compression[:20]!r} is none of zstd, lz4')
-    try:
-        return stream.read(most + 1)
-    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
-        raise McapError('it cannot be decompressed') from None
 
 
 def _file_of(path: Path) -> Path:

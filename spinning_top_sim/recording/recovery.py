@@ -13,7 +13,8 @@ from mcap.records import Attachment, Header, Metadata
 from numpy.typing import NDArray
 
 from spinning_top_sim.recording.errors import LogError, why_not_written
-from spinning_top_sim.recording.reader import MESSAGE_FIELDS, LogMessage, LogReader, message_layout
+from spinning_top_sim.recording.parsing import MESSAGE_FIELDS, message_layout
+from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.recording.rosbag2 import BAG_METADATA
 from spinning_top_sim.recording.writer import CHUNK_BYTES, McapWriter
 
