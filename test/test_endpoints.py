@@ -15,7 +15,8 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from spinning_top_sim.nodes.endpoints import answers_later, message_class
+from spinning_top_sim.nodes.node import answers_later
+from spinning_top_sim.nodes.publishers import message_class
 
 
 def test_only_message_classes_of_installed_ros_packages_are_found(monkeypatch):

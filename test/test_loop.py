@@ -29,9 +29,9 @@ class Run:
         recording = SimpleNamespace(has_room=lambda: self.room, wait_for_room=lambda: None,
                                     is_on=True, write=self.told.append)
         self.loop = Loop(
-            self.simulation, self.values, recording, SimulatedClock(self.values['time_scale']),
-            date=lambda: DATE_NS + self.now_ns - 77, update_subscribers=lambda: None,
-            warn=self.told.append, error=self.told.append, source=self.read, steady=self.read)
+            self.simulation, self.values, recording, SimulatedClock(
+                lambda: DATE_NS + self.now_ns - 77, self.told.append, steady=self.read),
+            update_subscribers=lambda: None, warn=self.told.append, error=self.told.append)
         self.simulation.log_to(lambda entries: self._taken.extend(
             stamp_ns for _, stamps_ns, _ in entries for stamp_ns in stamps_ns.tolist()),
             [channel(self.simulation, 'pose')])
@@ -58,6 +58,10 @@ class Run:
         for _ in range(count):
             self.tick()
         return self
+
+
+def command(run, l3):
+    run.loop.change('command', lambda: {'l3': l3, 'lz': 1.0})
 
 
 def grid(until_ns, period_ns=POSE_NS):
@@ -190,7 +194,7 @@ def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
     assert run.times == grid(stands_at)
     assert sum('until ~/reset' in told for told in run.told) == 1
     assert run.simulation.state().theta[0] >= 0.0, 'it can be described'
-    for act in (lambda: run.loop.command(1.0, 1.0), lambda: run.loop.step(POSE_NS),
+    for act in (lambda: command(run, 1.0), lambda: run.loop.step(POSE_NS),
                 run.loop.resume):
         with pytest.raises((ValueError, RuntimeError), match=f'stands still: .*{reason}'):
             act()
@@ -207,11 +211,11 @@ def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
 def test_events_come_after_what_is_due_and_refused_ones_change_nothing():
     run = Run().ticks(4)
     run.now_ns += 3_000_000
-    run.loop.command(2.0, 1.0)
+    command(run, 2.0)
     (event,) = run.told
     assert (event.kind, event.t_ns, event.details) == ('command', 23_000_000,
                                                        {'l3': 2.0, 'lz': 1.0})
-    for act, said in ((lambda: run.loop.command(float('nan'), 1.0), 'nan'),
+    for act, said in ((lambda: command(run, float('nan')), 'nan'),
                       (lambda: run.loop.drive((0.0, 0.0, 1e9)), r'1000000000\.0')):
         with pytest.raises(ValueError, match=said):
             act()

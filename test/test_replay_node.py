@@ -22,7 +22,6 @@ from helpers.node_harness import SimNode, Topic, wait_for
 from helpers.own_node import InThisProcess, run_main
 from mcap.writer import Writer as McapWriter
 from nav_msgs.msg import Path as PathMessage
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.time import Time
@@ -30,7 +29,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 
 from spinning_top_sim.nodes import replay_node
-from spinning_top_sim.nodes.endpoints import message_class
+from spinning_top_sim.nodes.publishers import message_class
 from spinning_top_sim.nodes.replayer import Replayer, open_log
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 
@@ -108,9 +107,6 @@ class OwnReplay(InThisProcess):
         self.spin_until('the end', self.node.finished.done)
         return self.node.finished.result()
 
-    def set_rate(self, rate):
-        return self.node.set_parameters([Parameter('rate', value=rate)])[0]
-
 
 def play_all(file, *options):
     """Play a log to its end; return what was sent by channel, and the exit code."""
@@ -184,7 +180,7 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, capfd):
             ((path, '--topics', '/nobody'), '/ours/chatter'),
             ((path, '--start', '99'), '--start 99: must be >= 0 and <= 1.18'),
             ((path, '--clock', '-1'), '--clock -1: must be >= 1e-06 and <= 10000'),
-            ((path, '--rate', '0'), 'out of range Min: 1e-06, Max: 1000000000.0, value: 0.0'),
+            ((path, '--rate', '0'), '--rate 0: must be >= 1e-06 and <= 1e+09'),
             ((path, '--rate', 'x'), "argument -r/--rate: invalid float value: 'x'")):
         run = run_main(replay_node.main, capfd, *options)
         assert run.code == 2
@@ -200,18 +196,6 @@ def test_loops_begin_again(tmp_path, step_ns, capfd):
         replay.spin_until('the status', lambda: 'of round ' in capfd.readouterr().out)
         for found, once in zip(replay.raw, of_each(messages), strict=True):
             assert found == (once * len(found))[:len(found)]
-
-
-def test_the_rate_is_a_parameter(tmp_path):
-    messages = texts(20, 1000 * SECOND)
-    with OwnReplay(write_log(tmp_path / 'slow.mcap', messages),
-                   arguments=('-p', 'rate:=2')) as replay:
-        assert replay.node.get_parameter('rate').value == 2.0
-        assert not replay.set_rate(0.0).successful
-        assert 'must be a number' in replay.set_rate('fast').reason
-        assert replay.set_rate(200_000).successful
-        assert replay.wait() == 0         # 19000 s of log
-        assert replay.raw == of_each(messages)
 
 
 def test_messages_of_a_time_before_the_first_clock_do_not_make_it_wait(tmp_path, capfd):
@@ -247,13 +231,13 @@ class Replay(SimNode):
 
 @pytest.mark.parametrize('executor', EXECUTORS)
 def test_a_log_is_played_over_dds_with_its_qos_or_another(peer, tmp_path, executor):
-    """It waits for two subscribers and the resume; /clock tells the time of the log meanwhile."""
+    """It waits for the resume; /clock tells the time of the log meanwhile."""
     path = write_log(tmp_path / 'run.mcap', texts(60, 20_000_000), (
         ('/chatter', STRING), ('/robot/names', STRING, {'reliability': 2, 'depth': 7})))
     names = ('/chatter', '/elsewhere/names', '/clock')
-    with Replay(tmp_path, path, '--start-paused', '--clock', '200', '--rate', '2', '-d', '0.1',
-                '--wait-for-subscribers', '3', executor=executor, arguments=(
-                    '-r', '/robot/names:=/elsewhere/names', '-p', 'rate:=0.001', '-p',
+    with Replay(tmp_path, path, '--start-paused', '--clock', '200', '--rate', '2',
+                executor=executor, arguments=(
+                    '-r', '/robot/names:=/elsewhere/names', '-p',
                     'qos_overrides./chatter.publisher.depth:=30', '-p',
                     'qos_overrides./elsewhere/names.publisher.depth:=30')) as node:
         first = peer.listen(names[0], String)
@@ -358,7 +342,7 @@ def test_with_a_clock_each_round_begins_with_the_clock_of_its_begin(peer, tmp_pa
 
 def test_a_signal_ends_it_while_it_waits_or_plays(peer, tmp_path):
     path = write_log(tmp_path / 'run.mcap', texts(100, SECOND))
-    for options, number, times in ((('--wait-for-subscribers', '99'), signal.SIGTERM, 1),
+    for options, number, times in ((('--start-paused',), signal.SIGTERM, 1),
                                    (('--rate', '0.5', '--clock'), signal.SIGINT, 2)):
         with Replay(tmp_path, path, *options) as node:
             # It serves before it plays, and plays for longer than the switch is repeated.

@@ -147,7 +147,7 @@ def start_values(*arguments):
         argv, make_node = sim_node._prepare(argv)
         rclpy.init(args=argv)
         node = make_node()
-        values = node.start_values
+        values = node.values
         node.stop()
         node.destroy_node()
     return values
@@ -212,7 +212,7 @@ def test_a_dump_of_the_parameters_gives_the_same_start(tmp_path):
                  record__streams=['pose', 'imu'], initial__theta=0.7) as node:
         assert node.set(solver__rtol=1e-10, seed=8).successful
         dumped = {name: one.value for name, one in node.node.get_parameters_by_prefix('').items()}
-        expected = {**node.node.start_values, 'spin.lz': node.get('spin.lz')[0]}
+        expected = {**node.node.values, 'spin.lz': node.get('spin.lz')[0]}
     for name, value in dumped.items():      # as ros2 param dump does
         if hasattr(value, 'tolist'):
             dumped[name] = value.tolist()

@@ -1,19 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The publishers of the channels of a simulation."""
+"""Publishers: of types by name, with the QoS of parameters, and those of a simulation."""
 
-from collections.abc import Mapping, Sequence
+import importlib
+import os
+import re
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.type_support import check_for_type_support
 
-from spinning_top_sim.nodes.endpoints import message_class
 from spinning_top_sim.nodes.recording import Topic
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.live import Output
+
+
+def message_class(type_name: str) -> type:
+    """
+    Return a message class of an installed ROS package, of which publishers can be made.
+
+    Raises LookupError for any other name.
+    """
+    # REP-144 and the ROS 2 interface names.
+    match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
+    package, name = match.groups() if match else ('', '')
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    # Other Python packages must not be imported because a log names them.
+    if not any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
+               for prefix in prefixes):
+        raise LookupError(f'{type_name} is not installed')
+    try:
+        kind: type = getattr(importlib.import_module(f'{package}.msg'), name)
+        check_for_type_support(kind)
+    except Exception as error:      # importing a broken package may raise anything
+        raise LookupError(f'{type_name} cannot be used: {error}') from error
+    return kind
+
+
+def create_publisher(node: Node, kind: type, topic: str, qos: QoSProfile | None = None,
+                     ) -> Publisher:
+    """Return a new publisher, whose QoS (by default: keep the last 10) parameters override."""
+    return node.create_publisher(
+        kind, topic, qos or QoSProfile(depth=10),
+        qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+
+def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float) -> None:
+    """Wait at most so long until all subscribers have acknowledged all messages."""
+    end = time.monotonic() + seconds
+    for publisher in publishers:
+        if publisher.get_subscription_count():
+            publisher.wait_for_all_acked(Duration(seconds=max(end - time.monotonic(), 0.001)))
 
 
 class ChannelPublishers:
@@ -22,12 +67,6 @@ class ChannelPublishers:
     def __init__(self, node: Node) -> None:
         self._node = node
         self.by_topic: dict[str, Publisher] = {}
-
-    def create(self, kind: type, topic: str) -> Publisher:
-        """Return a new publisher, whose QoS parameters can override."""
-        return self._node.create_publisher(
-            kind, topic, QoSProfile(depth=10),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     @staticmethod
     def check(outputs: Sequence[Output], values: Mapping[str, Any]) -> None:
@@ -45,7 +84,8 @@ class ChannelPublishers:
             topic = output.channel.topic
             enabled = parameters.is_enabled(output.channel.name, values)
             if enabled and topic not in self.by_topic:
-                self.by_topic[topic] = self.create(message_class(output.channel.type_name), topic)
+                self.by_topic[topic] = create_publisher(
+                    self._node, message_class(output.channel.type_name), topic)
             elif topic in self.by_topic and not enabled:
                 output.publish = None
                 self._node.destroy_publisher(self.by_topic.pop(topic))

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.events import TOPICS, Event
@@ -22,12 +21,11 @@ Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
 Answer = Callable[[bool, str], object]      # takes success and a text
 
 
-@dataclass
-class _Request:
-    """A log that is being opened or closed, and who waits for that."""
+class _Request(NamedTuple):
+    """A log that is being opened or closed, while it is in one of these states; who waits."""
 
     recorder: Recorder
-    is_end: bool
+    states: Sequence[str]
     answer: Answer
 
 
@@ -47,7 +45,7 @@ class Recording:
         self._requests: list[_Request] = []
         self._events_index = 0              # index of the first topic of events in the log
 
-    def start(self, values: Mapping[str, Any], answer: Answer = lambda *_: None) -> None:
+    def start(self, values: Mapping[str, Any], answer: Answer) -> None:
         """Record from now on; `check` answers once the file is open."""
         if self._recorder is not None:
             answer(True, f'recording already to {self._recorder.path}')
@@ -66,7 +64,7 @@ class Recording:
         self.error, self._events_index = None, len(channels)
         simulation.log_to(recorder.write, channels)
         self.write(Event('start', max(simulation.now_ns, 0), simulation.now_ns))
-        self._requests.append(_Request(recorder, False, answer))
+        self._requests.append(_Request(recorder, ('opening',), answer))
 
     def end(self, answer: Answer = lambda *_: None, error: str | None = None) -> None:
         """Record no more; `check` answers once the file is closed."""
@@ -77,27 +75,22 @@ class Recording:
         self._simulation.log_to(None)
         recorder.end()
         self.error = error
-        self._requests.append(_Request(recorder, True, answer))
+        self._requests.append(_Request(recorder, ('opening', 'recording'), answer))
 
     def check(self) -> str | None:
         """Answer the requests that are done; return why a recording has stopped by itself."""
-        waiting, self._requests = self._requests, []
-        for request in waiting:
-            recorder = request.recorder
-            if recorder.state == 'opening' or (request.is_end and recorder.state == 'recording'):
-                self._requests.append(request)
-            elif request.is_end:
-                request.answer(recorder.error is None, _summary(recorder))
-            elif recorder.error is not None:
-                request.answer(False, recorder.error)
-                if recorder is self._recorder:      # this told it
-                    self.end(error=recorder.error)
-            else:
-                request.answer(True, f'recording to {recorder.path}')
-        reason = self._recorder.error if self._recorder else None
-        if reason:
-            self.end(error=reason)
-        return reason
+        told = None
+        for request in [one for one in self._requests if one.recorder.state not in one.states]:
+            self._requests.remove(request)
+            recorder = told = request.recorder
+            opened = recorder.error or f'recording to {recorder.path}'
+            request.answer(recorder.error is None,
+                           _summary(recorder) if 'recording' in request.states else opened)
+        failed = self._recorder
+        if failed is None or failed.state != 'failed':
+            return None
+        self.end(error=failed.error)
+        return None if failed is told else failed.error
 
     def close(self) -> str | None:
         """Wait until all logs are closed; return a text for the user about the last one."""
