@@ -26,8 +26,8 @@ class Run:
         self.now_ns, self.step_ns, self.room, self.told = 77, 0, True, []
         self.simulation = simulate(**values)
         self.values, self._taken = self.simulation.values, []
-        recording = SimpleNamespace(has_room=lambda: self.room, wait_for_room=lambda: None,
-                                    is_on=True, write=self.told.append)
+        recording = SimpleNamespace(has_room=lambda *_: self.room, is_on=True,
+                                    write=self.told.append)
         self.loop = Loop(
             self.simulation, self.values, recording, SimulatedClock(
                 lambda: DATE_NS + self.now_ns - 77, self.told.append, steady=self.read),

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node says about itself, without a node."""
 
-import io
 import re
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -15,7 +13,6 @@ from helpers.simulations import EPOCH_NS, SECOND, simulate
 
 from spinning_top_sim.nodes import status
 from spinning_top_sim.nodes.clock import SimulatedClock
-from spinning_top_sim.nodes.executable import Terminal
 from spinning_top_sim.nodes.loop import Loop
 from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.nodes.status import NodeStatus
@@ -111,31 +108,3 @@ def test_the_status_line(clock, reported):
     assert status_of(reported)[:2] == (1, 'waiting for /clock')
     reported.loop.fail('at a pole')
     assert ' FAILED | ' in reported.report.status_line()
-
-
-def standard_output(monkeypatch, *, isatty):
-    """Return a standard output of 12 columns."""
-    out = io.StringIO()
-    out.isatty = lambda: isatty
-    monkeypatch.setattr(sys, 'stdout', out)
-    monkeypatch.setenv('COLUMNS', '12')
-    return out
-
-
-def test_a_line_that_stays_stands_below_the_status_line_which_fits_the_terminal(monkeypatch):
-    out, line = standard_output(monkeypatch, isatty=True), Terminal()
-    line.show('one | two | three')
-    line.end()
-    line.end()
-    line.show('four')
-    line.tell('done')
-    assert out.getvalue() == '\r\x1b[Kone | two |\n\r\x1b[Kfour\ndone\n'
-
-
-def test_without_a_terminal_each_status_is_a_line(monkeypatch):
-    out, line = standard_output(monkeypatch, isatty=False), Terminal()
-    line.show('a | b')
-    line.end()
-    assert out.getvalue() == 'a | b\n'
-    monkeypatch.setattr(sys, 'stdout', None)
-    line.show('c')                      # a closed standard output is no terminal

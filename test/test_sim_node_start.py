@@ -243,7 +243,7 @@ def test_before_the_clock_nothing_can_be_set(tmp_path):
         for name in ('PLAYING', 'PAUSED'):
             assert top.set_state(name) == TRANSITION_ERROR
         for expected, name, request in (
-                (FAILED, 'StepSimulation', {'steps': 1}),
+                (INCORRECT_STATE, 'StepSimulation', {'steps': 1}),
                 (INCORRECT_STATE, 'ResetSimulation', {'scope': 0}),
                 (INCORRECT_STATE, 'SetEntityState', {'entity': 'spinning_top'})):
             code, text = top.refused(name, **request)

@@ -323,5 +323,5 @@ def test_a_state_can_be_set_where_the_pivot_is(top):
 def test_what_the_entity_is(top):
     info = top.done('GetEntityInfo', entity=NAME).info
     assert info.category.category == top.messages.EntityCategory.CATEGORY_ROBOT
-    assert 'mass 2 kg' in info.description
+    assert 'mass=2.0' in info.description
     assert list(info.tags) == ['spinning_top', 'heavy_symmetric_top', 'imu']

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the executables of nodes share: start, spin, end on every signal, and a status line."""
+"""What the executables of nodes share: start, spin, end properly on every signal."""
 
 from __future__ import annotations
 
 import gc
 import os
 import re
-import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -167,27 +166,8 @@ def _executor(node: RunnableNode) -> Executor:
     return executor
 
 
-class Terminal:
-    """Shows a status line; on a terminal each line overwrites the previous one."""
 
-    def __init__(self) -> None:
-        self._open = False              # whether the cursor is at the end of a status line
-
-    def show(self, line: str) -> None:
-        """Show a status line as far as it fits on the terminal."""
-        if sys.stdout is None or not sys.stdout.isatty():
-            self.tell(line)
-            return
-        with cli.reader_may_end(OSError):       # or whose disk is full: the node goes on
-            print(f'\r\x1b[K{line[:max(shutil.get_terminal_size().columns - 1, 1)]}', end='')
-        self._open = True
-
-    def tell(self, line: str) -> None:
-        self.end()
-        with cli.reader_may_end(OSError):
-            print(line)
-
-    def end(self) -> None:
-        if self._open:
-            self._open = False
-            self.tell('')
+def tell(line: str) -> None:
+    """Print a line; a reader that has gone, or a full disk, does not end the node."""
+    with cli.reader_may_end(OSError):
+        print(line)

@@ -174,12 +174,9 @@ class Loop:
         target_ns = min(self.now_ns + length_ns, self._duration_ns)
         stop_at_ns = self._clock.steady() + STEP_BUDGET_NS
 
-        def give_way() -> bool:
-            if not self._recording.has_room():
-                self._recording.wait_for_room()
-            return self._clock.steady() > stop_at_ns
-
-        self._send(target_ns, 0, give_way)
+        # Other than a tick it waits for the recorder.
+        self._send(target_ns, 0, lambda: self._clock.steady() > stop_at_ns or (
+            not self._recording.has_room(STEP_BUDGET_NS / NANOSECONDS)))
         if self.failure:
             raise RuntimeError(self.failure)
         if self.now_ns < target_ns:

@@ -25,7 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import ros_parameters
 from spinning_top_sim.nodes.clock import SimulatedClock
-from spinning_top_sim.nodes.executable import Terminal
+from spinning_top_sim.nodes.executable import tell
 from spinning_top_sim.nodes.loop import Loop, LoopState
 from spinning_top_sim.nodes.publishers import (
     ChannelPublishers,
@@ -57,22 +57,22 @@ class Simulator(Node):
     def __init__(self, given: Mapping[str, Any]) -> None:
         super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()        # completes after `duration`
-        self._terminal = Terminal()
+        log = self._log = self.get_logger()
         overrides = ros_parameters.take_overrides(self)
         values = self.values = ros_parameters.declare(self, given, overrides)
         simulation = self.simulation = LiveSimulation(values)
         self.add_pre_set_parameters_callback(ros_parameters.all_with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._date = StampClock(self, parameters.is_enabled('clock', values))
-        self._topics = ChannelPublishers(self)
+        self._topics = ChannelPublishers(self, simulation)
         self._recording = Recording(simulation, self._topics.topics_to_record)
         self.loop = Loop(
             simulation, values, self._recording,
-            SimulatedClock(self._date.now_ns, self._warn, self._date.publishers),
-            warn=self._warn, error=self._tell_error, update_subscribers=self._update_subscribers)
+            SimulatedClock(self._date.now_ns, log.warning, self._date.publishers),
+            warn=log.warning, error=log.error, update_subscribers=self._topics.update_subscribers)
         self._report = NodeStatus(simulation, self.loop, self._recording)
         self._alarms: dict[str, Timer] = {}
-        self._topics.check(simulation.outputs, values)
+        self._topics.check(values)
         self._open_topics(values)
         self._diagnostics = create_publisher(self, DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
@@ -83,11 +83,9 @@ class Simulator(Node):
         answers_later(self.create_service(SetBool, '~/record', self._record))
         self._every('diagnostics', 1.0, self._publish_diagnostics)
         for warning in ros_parameters.disobeyed_overrides(self, overrides):
-            self._log.warning(warning)
+            log.warning(warning)
         if objection := simulation.trajectory.top.objection:
-            self._log.warning(objection)
-
-    # ------------------------------------------------------------------------- from start to end
+            log.warning(objection)
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
@@ -108,7 +106,8 @@ class Simulator(Node):
             self._log.warning(f'/clock: {error}', once=True)
             return
         if self.values['record.enabled']:
-            self._recording.start(self.values, self._tell_of_recording)
+            self._recording.start(self.values, lambda success, text: (
+                self._log.info(text) if success else self._log.error(f'not recording: {text}')))
 
     def _align_ticks(self) -> None:
         """Let ticks come just after samples are due."""
@@ -163,11 +162,8 @@ class Simulator(Node):
 
     def stop(self) -> None:
         """End the motion and close the recording, whether the context is valid or not."""
-        self._terminal.end()
         if summary := self._recording.close():
-            self._terminal.tell(summary)
-
-    # ------------------------------------------------------------------- commands and parameters
+            tell(summary)
 
     def _on_command(self, message: Float64MultiArray) -> None:
         """Treat a command as a change of the parameters spin.l3 and spin.lz."""
@@ -236,7 +232,7 @@ class Simulator(Node):
         if self._date.publishers and parameters.is_enabled('clock', values):
             raise ValueError('clock.enabled = True: must be false while this node follows another '
                              '/clock (use_sim_time)')
-        self._topics.check(self.simulation.outputs, values)
+        self._topics.check(values)
         lowest = self.simulation.lowest_imu_rate
         if values['imu.rate'] < lowest:
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
@@ -244,16 +240,9 @@ class Simulator(Node):
 
     def _open_topics(self, values: Mapping[str, Any]) -> None:
         """Open the publishers and the status line that these parameters ask for."""
-        self._topics.open(self.simulation.outputs, values)
-        self.simulation.refresh()
+        self._topics.open(values)
         self._every('status', values['status_period'],
-                    lambda: self._terminal.show(self._report.status_line()))
-
-    def _update_subscribers(self) -> None:
-        if self._topics.update_subscribers(self.simulation.outputs):
-            self.simulation.refresh()
-
-    # ---------------------------------------------------------------------------------- services
+                    lambda: tell(self._report.status_line()))
 
     def outcome(self, act: Callable[[], str | None]) -> tuple[Exception | None, str]:
         """
@@ -342,26 +331,6 @@ class Simulator(Node):
         if error is not None:
             answer(False, reason)
         return future
-
-    # --------------------------------------------------------------------- what the user is told
-
-    @property
-    def _log(self) -> Any:
-        """The logger, on a line below the status line."""
-        self._terminal.end()
-        return self.get_logger()
-
-    def _warn(self, text: str) -> None:
-        self._log.warning(text)
-
-    def _tell_error(self, text: str) -> None:
-        self._log.error(text)
-
-    def _tell_of_recording(self, success: bool, text: str) -> None:
-        if success:
-            self._log.info(text)
-        else:                   # no client waits for an answer
-            self._log.error(f'not recording: {text}')
 
     def _publish_diagnostics(self) -> None:
         waits = self._date.is_missing()

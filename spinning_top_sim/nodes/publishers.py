@@ -20,7 +20,7 @@ from rclpy.type_support import check_for_type_support
 from spinning_top_sim.nodes.recording import Topic
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.channel import Channel
-from spinning_top_sim.streams.live import Output
+from spinning_top_sim.streams.live import LiveSimulation
 
 
 def message_class(type_name: str) -> type:
@@ -62,25 +62,24 @@ def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float) -> None:
 
 
 class ChannelPublishers:
-    """Holds a publisher for each enabled channel, by topic."""
+    """Holds a publisher for each enabled channel of a simulation, by topic."""
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Node, simulation: LiveSimulation) -> None:
+        self._node, self._simulation = node, simulation
         self.by_topic: dict[str, Publisher] = {}
 
-    @staticmethod
-    def check(outputs: Sequence[Output], values: Mapping[str, Any]) -> None:
+    def check(self, values: Mapping[str, Any]) -> None:
         """Raise ValueError for an enabled channel whose messages are not installed."""
-        for channel in (output.channel for output in outputs):
+        for channel in self._simulation.channels:
             if parameters.is_enabled(channel.name, values):
                 try:
                     message_class(channel.type_name)
                 except LookupError as error:
                     raise ValueError(f'{channel.name}.enabled: {error}') from error
 
-    def open(self, outputs: Sequence[Output], values: Mapping[str, Any]) -> None:
+    def open(self, values: Mapping[str, Any]) -> None:
         """Create the publishers of enabled channels, and destroy those of disabled ones."""
-        for output in outputs:
+        for output in self._simulation.outputs:
             topic = output.channel.topic
             enabled = parameters.is_enabled(output.channel.name, values)
             if enabled and topic not in self.by_topic:
@@ -89,17 +88,19 @@ class ChannelPublishers:
             elif topic in self.by_topic and not enabled:
                 output.publish = None
                 self._node.destroy_publisher(self.by_topic.pop(topic))
+        self._simulation.refresh()
 
-    def update_subscribers(self, outputs: Sequence[Output]) -> bool:
-        """Connect the outputs that have subscribers; return whether others have some now."""
+    def update_subscribers(self) -> None:
+        """Connect the outputs that have subscribers."""
         changed = False
-        for output in outputs:
+        for output in self._simulation.outputs:
             publisher = self.by_topic.get(output.channel.topic)
             wanted = publisher is not None and publisher.get_subscription_count() > 0
             if wanted != (output.publish is not None):
                 output.publish = publisher.publish if wanted and publisher else None
                 changed = True
-        return changed
+        if changed:
+            self._simulation.refresh()
 
     def topics_to_record(self, channels: Sequence[Channel]) -> list[Topic]:
         """Return name, type and QoS of the topics of these channels, then those of events."""

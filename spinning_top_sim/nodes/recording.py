@@ -113,14 +113,11 @@ class Recording:
                 self._events_index + list(TOPICS).index(topic), simulation.epoch_ns + event.t_ns,
                 data) for topic, data in event.entries()])
 
-    def has_room(self) -> bool:
-        """Return whether the recorder takes more messages."""
-        return self._recorder is None or self._recorder.room
-
-    def wait_for_room(self) -> None:
-        """Wait until the recorder takes more messages, a tenth of a second at most."""
-        if self._recorder is not None:
-            self._recorder.wait_for_room(0.1)
+    def has_room(self, wait_s: float = 0.0) -> bool:
+        """Return whether the recorder takes more messages, after a wait at most."""
+        recorder = self._recorder
+        return recorder is None or recorder.room or bool(
+            wait_s and recorder.wait_for_room(wait_s))
 
     @property
     def warning(self) -> str | None:

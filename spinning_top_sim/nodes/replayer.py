@@ -24,7 +24,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import ros_parameters
-from spinning_top_sim.nodes.executable import Terminal, short_reason
+from spinning_top_sim.nodes.executable import short_reason, tell
 from spinning_top_sim.nodes.publishers import create_publisher, message_class, wait_for_all_acked
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
@@ -43,7 +43,7 @@ class Replayer(Node):
     """
     The node.  It plays an open log, which `stop` closes, when the executor spins.
 
-    Log time runs `options.rate` times as fast as steady time; a message is sent when it comes there.
+    Log time runs `rate` times as fast as steady time; messages are sent when it comes to them.
 
     options : those that `replay_node.add_arguments` describes
     outputs : the publishers by the number of the channel
@@ -57,7 +57,7 @@ class Replayer(Node):
         overrides = ros_parameters.take_overrides(self)
         self.finished: Future = Future()    # completes with the exit code when all is played
         self.sent = self.late = self.failed = 0
-        self._log, self._options, self._terminal = log, options, Terminal()
+        self._log, self._options = log, options
         first = next(log.messages(start=1), None)       # a time of 0 says: no clock yet
         log_begin_ns, self._end_ns = first.log_time if first else 0, log.span[1]
         self._length_s = (self._end_ns - log_begin_ns) / NANOSECONDS
@@ -79,7 +79,7 @@ class Replayer(Node):
         if options.clock:
             self._clock_output = self.create_publisher(ClockMessage, '/clock', 10)
             self.create_timer(1.0 / options.clock, self._publish_clock, clock=steady)
-        self.create_timer(1.0, lambda: self._terminal.show(self._status()), clock=steady)
+        self.create_timer(1.0, lambda: tell(self._status()), clock=steady)
         self.create_service(SetBool, '~/set_pause', self._set_pause)
 
     def _open_publishers(self) -> dict[int, Publisher]:
@@ -89,39 +89,38 @@ class Replayer(Node):
         for name in sorted(wanted - there):
             warn(f'the log has no topic {name}')
         outputs: dict[int, Publisher] = {}
-        for name in sorted(wanted & there):
-            channels = [topic for topic in self._log.topics if topic.name == name]
-            profiles = [qos for topic in channels for qos in topic.qos] or [DEFAULT_QOS]
-            # It serves all subscribers that the recorded publishers have served together.
-            profile = {**profiles[0], 'history': max(qos['history'] for qos in profiles),
-                       'depth': sum(qos['depth'] for qos in profiles)}
-            profile |= {key: min(qos[key] for qos in profiles)
-                        for key in ('reliability', 'durability')}
-            try:
-                outputs |= {topic.channel_id: self._publisher(topic, profile)
-                            for topic in channels}
-            except Exception as error:      # a log may ask for anything; the others are played
-                warn(short_reason(f'{name} is not played: {error}'))
-                continue
-            if any(qos != profiles[0] for qos in profiles):
-                qos = outputs[channels[0].channel_id].qos_profile
-                warn(f'{name} was recorded with several QoS profiles: it is played as '
-                     f'{qos.reliability.name.lower()} and {qos.durability.name.lower()}')
+        for topic in self._log.topics:
+            if topic.name in wanted:
+                try:
+                    outputs[topic.channel_id] = self._publisher(topic)
+                except Exception as error:  # a log may ask for anything; the others are played
+                    warn(short_reason(f'{topic.name} is not played: {error}'))
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
         return outputs
 
-    def _publisher(self, topic: LogTopic, qos: Mapping[str, Any]) -> Publisher:
+    def _publisher(self, topic: LogTopic) -> Publisher:
         if topic.name == '/clock' and self._options.clock:
             raise LookupError('--clock publishes another /clock')
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
-        policies = {key: Duration(seconds=value['sec'], nanoseconds=value['nsec'])
-                    if isinstance(value, Mapping) else value for key, value in qos.items()}
-        policies['depth'] = min(policies['depth'], 2 ** 31 - 1) or DEFAULT_QOS['depth']
-        return create_publisher(self, message_class(topic.type_name), topic.name,
-                                QoSProfile(**policies))
+        profiles = topic.qos or (DEFAULT_QOS,)
+        # It serves all subscribers that the recorded publishers have served together.
+        qos = {**profiles[0], **{key: min(one[key] for one in profiles)
+                                 for key in ('reliability', 'durability')},
+               'history': max(one['history'] for one in profiles),
+               'depth': min(sum(one['depth'] for one in profiles), 2 ** 31 - 1) or 10}
+        publisher = create_publisher(
+            self, message_class(topic.type_name), topic.name, QoSProfile(**{
+                key: Duration(seconds=value['sec'], nanoseconds=value['nsec'])
+                if isinstance(value, Mapping) else value for key, value in qos.items()}))
+        if any(one != profiles[0] for one in profiles):
+            played = publisher.qos_profile
+            self.get_logger().warning(
+                f'{topic.name} was recorded with several QoS profiles: it is played as '
+                f'{played.reliability.name.lower()} and {played.durability.name.lower()}')
+        return publisher
 
     def _set_log_time(self, log_ns: int) -> None:
         """Let log time be this, until messages are played."""
@@ -153,7 +152,6 @@ class Replayer(Node):
 
     def stop(self) -> None:
         self._log.close()
-        self._terminal.end()
 
     def _step(self) -> None:
         """Send what is due; a timer calls it when something is."""
@@ -169,13 +167,13 @@ class Replayer(Node):
         self._timer.reset()
 
     def _fail(self, reason: str) -> None:
-        self._terminal.end()
         self.get_logger().error(reason)
         self.finished.set_result(2)
 
     def _play(self) -> Iterator[float]:
         """Play the log; yield how long to wait each time [ns]."""
-        for self._round in itertools.count() if self._options.loop else range(1):
+        rounds = itertools.count() if self._options.loop else range(1)
+        for self._round in rounds:
             self._set_log_time(self._begin_ns)
             self._publish_clock()       # before the messages, since it may go back
             yield ROUND_GAP_NS
@@ -183,7 +181,7 @@ class Replayer(Node):
             yield ROUND_GAP_NS          # the last messages arrive before the clock goes back
         yield LAST_ANSWERS_NS
         wait_for_all_acked(self.outputs.values(), PATIENCE_S)
-        self._terminal.tell(f'played {self._counts()}')
+        tell(f'played {self._counts()}')
         if self._log.left_out and not self._options.partial:
             self._fail(f'{self._log.path} is damaged inside: `recover` tells what is lost')
         else:

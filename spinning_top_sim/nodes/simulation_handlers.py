@@ -42,6 +42,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     'SetEntityState': ('ENTITY_STATE_SETTING',),
     'GetEntityInfo': ('ENTITY_INFO_GETTING',),
 }
+ON_A_MOTION = ('StepSimulation', 'ResetSimulation', 'SetEntityState')     # they need one
 # Tolerances for the rounding of a client: of the pivot's place [m] and velocity [m/s], and of a
 # quaternion's length.
 NEAR, LENGTH_ERROR = 1e-6, 1e-3
@@ -83,6 +84,8 @@ class SimulationHandlers:
     def serve(self, name: str, request: Message, response: Message) -> Message:
         """Handle a request for the service of this type; return the response."""
         def handle() -> str | None:
+            if name in ON_A_MOTION:
+                self._check_runs()
             if getattr(request, 'entity', self._name) != self._name:
                 raise RefusedError(self._results.RESULT_NOT_FOUND,
                                    f'entity = {request.entity!r}: there is {self._name!r} only')
@@ -97,15 +100,15 @@ class SimulationHandlers:
             response.result.error_message = text.encode(errors='backslashreplace').decode()
         return response
 
-    def _unsupported(self, reason: str) -> RefusedError:
-        return RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED, reason)
-
     def _check_runs(self) -> None:
         """Raise RefusedError before the motion begins, and when the process ends."""
         error, reason = self._node.outcome(self._node.check_started)
         if error or self._state == 'QUITTING':
             raise RefusedError(self._results.RESULT_INCORRECT_STATE,
                                reason or 'the simulator is quitting')
+
+    def _unsupported(self, reason: str) -> RefusedError:
+        return RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED, reason)
 
     def _get_simulator_features(self, _: Message, response: Message) -> None:
         known = self._messages.SimulatorFeatures
@@ -162,7 +165,6 @@ class SimulationHandlers:
         loop, steps = self._loop, request.steps
         if steps < 1:
             raise ValueError(f'steps = {steps}: must be >= 1')
-        self._node.check_started()
         if self._state != 'PAUSED':
             raise RuntimeError('the simulation is not paused: SetSimulationState must set '
                                'STATE_PAUSED first')
@@ -172,7 +174,6 @@ class SimulationHandlers:
             raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
 
     def _reset_simulation(self, request: Message, _: Message) -> None:
-        self._check_runs()
         values, time_and_state = self._node.values, request.SCOPE_TIME | request.SCOPE_STATE
         if request.scope in (request.SCOPE_DEFAULT, request.SCOPE_ALL, time_and_state):
             self._node.start_again()
@@ -205,11 +206,8 @@ class SimulationHandlers:
 
     def _get_entity_info(self, _: Message, response: Message) -> None:
         response.info.category.category = self._messages.EntityCategory.CATEGORY_ROBOT
-        top = self._simulation.trajectory.top
         response.info.description = (
-            f'heavy symmetric top on a pivot: mass {top.mass:g} kg, centre of mass '
-            f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
-            f'{top.lambda3:g} kg m^2')
+            f'heavy symmetric top on a pivot, in SI units: {self._simulation.trajectory.top}')
         response.info.tags = ['spinning_top', 'heavy_symmetric_top', 'imu']
 
     def _fill(self, message: Message) -> None:
@@ -229,7 +227,6 @@ class SimulationHandlers:
                 setattr(target, name, float(column[0]))
 
     def _set_entity_state(self, request: Message, response: Message) -> None:
-        self._check_runs()
         # Older versions of the message have no flags, and set both.
         if not (getattr(request, 'set_pose', True) or getattr(request, 'set_twist', True)):
             raise ValueError('set_pose and set_twist are false: one of them must be true; the '
