@@ -5,11 +5,14 @@ Replays of logs, in this process and over real DDS.
 No test is decided by how long something took, except that nothing may come before its time.
 """
 
+import math
 import re
 import signal
 import time
 from argparse import ArgumentParser
+from fractions import Fraction
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
@@ -27,8 +30,9 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
+from std_srvs.srv import SetBool
 
-from spinning_top_sim.nodes import replay_node
+from spinning_top_sim.nodes import replay_node, replayer
 from spinning_top_sim.nodes.publishers import message_class
 from spinning_top_sim.nodes.replayer import Replayer, open_log
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
@@ -106,6 +110,57 @@ class OwnReplay(InThisProcess):
         """Wait for the end; return the exit code."""
         self.spin_until('the end', self.node.finished.done)
         return self.node.finished.result()
+
+
+def schedule(replay, monkeypatch, cost_ns=0, plan=None):
+    """
+    Play with a clock that stands except for a wait and `cost_ns` of a message.
+
+    plan: by time from the first message, what is done then
+    Returns when each message was sent, from the first deadline on [ns].
+    """
+    now, times, plan = [77], [], {77 + replayer.ROUND_GAP_NS + at: act for at, act in (
+        plan or {}).items()}
+
+    def publish(_):
+        times.append(now[0] - 77 - replayer.ROUND_GAP_NS)
+        now[0] += cost_ns
+
+    with monkeypatch.context() as patch:
+        patch.setattr(replayer, 'time', SimpleNamespace(
+            monotonic_ns=lambda: now[0], monotonic=time.monotonic))
+        for sink in replay.sinks:
+            sink.publish = publish
+        for left_ns in replay.node._play():
+            until, planned = now[0] + left_ns, min(plan, default=math.inf)
+            now[0] = math.ceil(min(until, planned))
+            if planned <= until:
+                plan.pop(planned)()
+    return times
+
+
+@pytest.mark.parametrize('rate', [0.1, 3.0])
+def test_every_message_has_its_own_deadline_from_the_start(tmp_path, monkeypatch, rate):
+    # Periods that no binary fraction is: rounding that added up would show at the end.
+    path = write_log(tmp_path / 'run.mcap', texts(2_000, step_ns=3_333_333))
+    with OwnReplay(path, '--rate', str(rate)) as replay:
+        for n, at in enumerate(schedule(replay, monkeypatch)):
+            assert 0 <= at - Fraction(n * 3_333_333) / Fraction(rate) <= 8, 'not before its time'
+        assert (n, replay.node.late) == (1_999, 0)
+
+
+def test_what_is_late_is_sent_at_once_and_a_pause_catches_nothing_up(tmp_path, monkeypatch):
+    cost, path = 30_000_000, write_log(tmp_path / 'run.mcap', texts(4, step_ns=1_000_000))
+    with OwnReplay(path) as replay:
+        assert schedule(replay, monkeypatch, cost) == [n * cost for n in range(4)]
+        assert (replay.node.sent, replay.node.late) == (4, 3)
+    with OwnReplay(path, '--start-paused') as replay:
+        def pause(on):
+            return lambda: replay.node._set_pause(SetBool.Request(data=on), SetBool.Response())
+
+        assert schedule(replay, monkeypatch, plan={
+            5: pause(False), 1_500_000: pause(True), 7_000_000: pause(True),
+            9_500_000: pause(False)}) == [5, 1_000_005, 10_000_005, 11_000_005]
 
 
 def play_all(file, *options):
