@@ -15,6 +15,7 @@ LATEST_NS = 500_000_000         # samples later than this are recorded, but not 
 # Further behind than this, simulated time slips: the real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
 JUMP_NS = 5_000_000_000         # the motion does not run through a longer step of a /clock
+PATIENCE_NS = 2_000_000_000     # a /clock that does not change for longer has stopped
 
 Reading = Callable[[], int]     # of a clock [ns]
 
@@ -26,13 +27,14 @@ class SimulatedClock:
     The source is the steady clock.  With `publishers`, which returns how many nodes publish on
     /clock, it is the date, which is that /clock, and the steady clock decides only what is late.
 
+    date, steady : return the date, 0 before the first message on a /clock, and steady time
     warn : takes a text about what /clock has done
     """
 
     def __init__(self, date: Reading, warn: Callable[[str], object],
                  publishers: Callable[[], int] | None = None,
                  steady: Reading = time.monotonic_ns) -> None:
-        self.steady, self._date, self._publishers, self._warn = steady, date, publishers, warn
+        self.date, self.steady, self._warn, self._publishers = date, steady, warn, publishers
         self._source = date if publishers else steady
         self._scale = 1.0
         self._source_ns = self._simulated_ns = 0    # the anchor: two times of one moment
@@ -40,6 +42,7 @@ class SimulatedClock:
         self._late_ns = 0                           # what was due LATEST_NS ago
         self._became_due: deque[tuple[int, int]] = deque()      # steady and simulated times
         self._told_of_several = False
+        self._seen_ns, self._changed_ns = 0, steady()       # of the date, by `is_missing`
 
     def next_epoch(self, last_stamp_ns: int = 0) -> int:
         """
@@ -50,7 +53,7 @@ class SimulatedClock:
 
         Raises ValueError if it is too late for a stamp of ROS.
         """
-        date_ns = self._counting(self._date())
+        date_ns = self._counting(self.date())
         epoch_ns = date_ns - date_ns % EPOCH_GRID_NS or EPOCH_GRID_NS   # 0 means "no time"
         if not self._publishers and epoch_ns < date_ns:
             epoch_ns += EPOCH_GRID_NS
@@ -62,7 +65,7 @@ class SimulatedClock:
 
     def begin(self, epoch_ns: int) -> None:
         """Let t = 0 be due when its stamp is the date."""
-        lead_ns = max(self._counting(self._date()) - epoch_ns, -EPOCH_GRID_NS)
+        lead_ns = max(self._counting(self.date()) - epoch_ns, -EPOCH_GRID_NS)
         self.run(int(lead_ns * self._scale))
         self._late_ns = -1                      # t = 0 is not sent yet
 
@@ -71,6 +74,14 @@ class SimulatedClock:
         self._anchor(sent_ns, self._counting(self._source()))
         self._late_ns = sent_ns
         self._became_due.clear()
+
+    def is_missing(self) -> bool:
+        """Return whether the /clock that is followed has not begun, or has stopped."""
+        date_ns, steady_ns = self.date(), self.steady()
+        if date_ns != self._seen_ns:
+            self._seen_ns, self._changed_ns = date_ns, steady_ns
+        return self._publishers is not None and (
+            date_ns == 0 or steady_ns > self._changed_ns + PATIENCE_NS)
 
     def set_scale(self, scale: float) -> None:
         source_ns = self._counting(self._source())

@@ -6,6 +6,7 @@ Everything happens in the thread of the executor; a steady timer ticks.
 """
 
 import sys
+import time
 import traceback
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -17,9 +18,12 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
 from rclpy.task import Future
+from rclpy.time import Time
 from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -34,7 +38,6 @@ from spinning_top_sim.nodes.publishers import (
 )
 from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.stamp_clock import StampClock
 from spinning_top_sim.nodes.status import NodeStatus
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -63,12 +66,16 @@ class Simulator(Node):
         simulation = self.simulation = LiveSimulation(values)
         self.add_pre_set_parameters_callback(ros_parameters.all_with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self._date = StampClock(self, parameters.is_enabled('clock', values))
         self._topics = ChannelPublishers(self, simulation)
         self._recording = Recording(simulation, self._topics.topics_to_record)
+        self._newest_ns = 0                     # of /clock
+        self._follows = self._listen_to_clock()
+        self.clock = SimulatedClock(
+            lambda: self._newest_ns, log.warning, lambda: self.count_publishers(
+                self.resolve_topic_name('/clock'))) if self._follows else SimulatedClock(
+            time.time_ns, log.warning)
         self.loop = Loop(
-            simulation, values, self._recording,
-            SimulatedClock(self._date.now_ns, log.warning, self._date.publishers),
+            simulation, values, self._recording, self.clock,
             warn=log.warning, error=log.error, update_subscribers=self._topics.update_subscribers)
         self._report = NodeStatus(simulation, self.loop, self._recording)
         self._alarms: dict[str, Timer] = {}
@@ -87,6 +94,21 @@ class Simulator(Node):
         if objection := simulation.trajectory.top.objection:
             log.warning(objection)
 
+    def _listen_to_clock(self) -> bool:
+        """With `use_sim_time`, take what is on /clock; return whether it is of another node."""
+        if not self.get_parameter('use_sim_time').value:
+            return False
+        for subscription in [*self.subscriptions]:
+            if subscription.msg_type is ClockMessage:   # it raises an error for times before 0
+                self.destroy_subscription(subscription)
+        self.create_subscription(ClockMessage, '/clock', self._on_clock, QoSProfile(
+            depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+        return not parameters.is_enabled('clock', self.values)
+
+    def _on_clock(self, message: ClockMessage) -> None:
+        if message.clock.sec >= 0:
+            self._newest_ns = message.clock.sec * NANOSECONDS + message.clock.nanosec
+
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
         # The recorder's thread releases the interpreter this soon when a tick is due.
@@ -96,12 +118,12 @@ class Simulator(Node):
 
     def _begin(self) -> None:
         """Let time run if the clock that is followed has begun; ticks try it until then."""
-        if self._date.now_ns() == 0:
+        if self.clock.date() == 0:
             return
         try:
             self.loop.start()
         except ValueError as error:
-            if not self._date.publishers:
+            if not self._follows:
                 raise
             self._log.warning(f'/clock: {error}', once=True)
             return
@@ -229,7 +251,7 @@ class Simulator(Node):
         self.values = values
 
     def _check_context(self, values: Mapping[str, Any]) -> None:
-        if self._date.publishers and parameters.is_enabled('clock', values):
+        if self._follows and parameters.is_enabled('clock', values):
             raise ValueError('clock.enabled = True: must be false while this node follows another '
                              '/clock (use_sim_time)')
         self._topics.check(values)
@@ -333,7 +355,7 @@ class Simulator(Node):
         return future
 
     def _publish_diagnostics(self) -> None:
-        waits = self._date.is_missing()
+        waits = self.clock.is_missing()
         if waits != self._report.waits_for_clock:
             self._report.waits_for_clock = waits
             self._log.warning('waiting for /clock (use_sim_time is set)' if waits else
@@ -341,7 +363,8 @@ class Simulator(Node):
         if self._recording.warning:
             self._log.warning(f'recording: {self._recording.warning}', throttle_duration_sec=10.0)
         self._diagnostics.publish(self._report.diagnostics(
-            self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/')))
+            Time(nanoseconds=self.clock.date()).to_msg(),
+            self.get_fully_qualified_name().lstrip('/')))
         if self._report.overloaded:
             self._log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
