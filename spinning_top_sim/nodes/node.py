@@ -68,12 +68,11 @@ class Simulator(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._topics = ChannelPublishers(self, simulation)
         self._recording = Recording(simulation, self._topics.topics_to_record)
-        self._newest_ns = 0                     # of /clock
-        self._follows = self._listen_to_clock()
-        self.clock = SimulatedClock(
-            lambda: self._newest_ns, log.warning, lambda: self.count_publishers(
-                self.resolve_topic_name('/clock'))) if self._follows else SimulatedClock(
-            time.time_ns, log.warning)
+        self._newest_ns = 0                     # on /clock
+        # Whether that is of another node: a node does not follow its own.
+        self._follows = self.get_parameter('use_sim_time').value and not (
+            parameters.is_enabled('clock', values))
+        self.clock = self._make_clock()
         self.loop = Loop(
             simulation, values, self._recording, self.clock,
             warn=log.warning, error=log.error, update_subscribers=self._topics.update_subscribers)
@@ -94,16 +93,16 @@ class Simulator(Node):
         if objection := simulation.trajectory.top.objection:
             log.warning(objection)
 
-    def _listen_to_clock(self) -> bool:
-        """With `use_sim_time`, take what is on /clock; return whether it is of another node."""
-        if not self.get_parameter('use_sim_time').value:
-            return False
+    def _make_clock(self) -> SimulatedClock:
+        if not self._follows:
+            return SimulatedClock(time.time_ns, self._log.warning)
         for subscription in [*self.subscriptions]:
             if subscription.msg_type is ClockMessage:   # it raises an error for times before 0
                 self.destroy_subscription(subscription)
-        self.create_subscription(ClockMessage, '/clock', self._on_clock, QoSProfile(
-            depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-        return not parameters.is_enabled('clock', self.values)
+        topic = self.create_subscription(ClockMessage, '/clock', self._on_clock, QoSProfile(
+            depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)).topic_name
+        return SimulatedClock(lambda: self._newest_ns, self._log.warning,
+                              lambda: int(self.count_publishers(topic)))
 
     def _on_clock(self, message: ClockMessage) -> None:
         if message.clock.sec >= 0:
@@ -120,13 +119,7 @@ class Simulator(Node):
         """Let time run if the clock that is followed has begun; ticks try it until then."""
         if self.clock.date() == 0:
             return
-        try:
-            self.loop.start()
-        except ValueError as error:
-            if not self._follows:
-                raise
-            self._log.warning(f'/clock: {error}', once=True)
-            return
+        self.loop.start()
         if self.values['record.enabled']:
             self._recording.start(self.values, lambda success, text: (
                 self._log.info(text) if success else self._log.error(f'not recording: {text}')))
