@@ -79,7 +79,7 @@ class Simulator(Node):
         self._report = NodeStatus(simulation, self.loop, self._recording)
         self._alarms: dict[str, Timer] = {}
         self._topics.check(values)
-        self._open_topics(values)
+        self._take_over(values)
         self._diagnostics = create_publisher(self, DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         self.create_subscription(Twist, '~/cmd_vel', self._on_velocity, 10)
@@ -233,8 +233,7 @@ class Simulator(Node):
         if rest := sorted(changes.keys() - SPIN):
             self._recording.write(self.simulation.apply(
                 'parameters', **{name: values[name] for name in rest}))
-            self._open_topics(values)
-            self.loop.set_pace(values)
+            self._take_over(values)
             self._align_ticks()
         for effect in (Effect.RESET, Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
@@ -253,9 +252,10 @@ class Simulator(Node):
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
                              'means or increments are taken, published or recorded')
 
-    def _open_topics(self, values: Mapping[str, Any]) -> None:
-        """Open the publishers and the status line that these parameters ask for."""
+    def _take_over(self, values: Mapping[str, Any]) -> None:
+        """Do what parameters of the node ask for that act at once."""
         self._topics.open(values)
+        self.loop.set_pace(values)
         self._every('status', values['status_period'],
                     lambda: tell(self._report.status_line()))
 
