@@ -8,7 +8,6 @@ installed ones where there are some.
 
 import json
 import math
-import re
 
 import numpy as np
 import pytest
@@ -80,6 +79,9 @@ def test_what_cannot_be_is_refused_with_its_values(top):
     code, text = top.refused('ResetSimulation', scope=1)
     assert code == UNSUPPORTED
     assert text.startswith('scope = 1: must be 0 or 255 (all), 2 (state) or 3')
+    info = top.done('GetEntityInfo', entity=NAME).info
+    assert info.category.category == top.messages.EntityCategory.CATEGORY_ROBOT
+    assert 'mass=2.0' in info.description and 'imu' in info.tags
     for service, name in (('GetEntityState', ''), ('SetEntityState', 'Spinning_top'),
                           ('GetEntityInfo', '/spinning_top')):
         assert top.refused(service, entity=name) == (
@@ -141,6 +143,19 @@ def numbers(state):
                      *xyz(state.acceleration.angular)])
 
 
+def upright(top, **changes):
+    """Return a state with these numbers, by paths such as twist__linear__x."""
+    state = top.messages.EntityState()
+    state.pose.orientation.w = 1.0
+    for path, value in changes.items():
+        *way, name = path.split('__')
+        target = state
+        for part in way:
+            target = getattr(target, part)
+        setattr(target, name, value)
+    return state
+
+
 def state_of(top):
     return top.done('GetEntityState', entity=NAME).state
 
@@ -167,42 +182,27 @@ def test_a_reset_of_the_state_lets_time_go_on(top):
 
 @pytest.mark.parametrize('method', ['rk45', 'exact'])
 def test_a_log_of_all_this_verifies(top, tmp_path, capsys, method):
-    """States and resets are in the journal: the run can be computed again."""
+    """States and resets are events: the run can be computed again."""
     path = str(tmp_path / 'run.mcap')
     assert top.set(
         solver__method=method, increments__enabled=True, markers__enabled=True, mag__enabled=True,
-        imu__lever_arm=[0.1, 0.0, 0.02], imu__gyroscope_noise_density=1e-3,
-        imu__gyroscope_bias_stddev=0.1, record__uri=path).successful
+        imu__lever_arm=[0.1, 0.0, 0.02], imu__gyroscope_noise_density=1e-3).successful
     top.done('ResetSimulation', scope=0)
-    state = top.messages.EntityState()
-    state.twist.angular.x, state.pose.orientation.w, state.twist.angular.z = 0.5, 1.0, 11.0
-
-    def put(**parts):
-        top.done('SetEntityState', entity='spinning_top', state=state, **parts)
-
-    def step(count):
-        top.done('StepSimulation', steps=count)
-
-    top.pause()
-    step(3)
-    put(set_twist=True)
-    step(3)
+    state = upright(top, twist__angular__x=0.5, twist__angular__z=11.0)
+    put = {'entity': NAME, 'state': state}
+    top.pause().done('StepSimulation', steps=3)
+    top.done('SetEntityState', set_twist=True, **put)
     assert top.switch('record', True).success
-    step(7)
-    put(set_pose=True, set_twist=True)
-    step(11)
+    top.done('StepSimulation', steps=7)
+    top.done('SetEntityState', set_pose=True, set_twist=True, **put)
+    top.done('StepSimulation', steps=11)
     top.done('ResetSimulation', scope=2)
-    step(25)
-    put(set_pose=True)
-    step(13)
+    top.done('StepSimulation', steps=25)
     assert top.switch('record', False).success
-    code = inspect.main([path, '--verify', '--json'])
+    assert inspect.main([path, '--verify', '--json']) == 0
     content = json.loads(capsys.readouterr().out)
-    assert (code, content['verify']['identical']) == (0, True), content['verify']
-    assert [motion['cause'] for motion in content['motions']] == [
-        'start', 'state', 'state', 'state']
-    assert inspect.main([path]) == 0
-    assert re.search('.*, 3 states set', capsys.readouterr().out)
+    assert content['verify']['identical'], content['verify']
+    assert [motion['cause'] for motion in content['motions']] == ['start', 'state', 'state']
 
 
 def test_the_state_is_what_is_published_at_its_stamp(top, tmp_path):
@@ -228,19 +228,6 @@ def test_the_state_is_what_is_published_at_its_stamp(top, tmp_path):
         turned = Rotation.from_quat(xyzw(odom.pose.pose.orientation)).apply(
             xyz(odom.twist.twist.angular))
         assert np.allclose(numbers(state)[4:7], turned, rtol=1e-14, atol=1e-14)
-
-
-def upright(top, **changes):
-    """Return a state with these numbers, by paths such as twist__linear__x."""
-    state = top.messages.EntityState()
-    state.pose.orientation.w = 1.0
-    for path, value in changes.items():
-        *way, name = path.split('__')
-        target = state
-        for part in way:
-            target = getattr(target, part)
-        setattr(target, name, value)
-    return state
 
 
 @pytest.mark.parametrize('which', ['pose', 'twist', 'both'])
@@ -318,10 +305,3 @@ def test_a_state_can_be_set_where_the_pivot_is(top):
     assert xyz(after.twist.angular) == pytest.approx(xyz(state.twist.angular), abs=1e-12)
     top.done('StepSimulation', steps=1)
     assert state_of(top).pose.position.x > after.pose.position.x
-
-
-def test_what_the_entity_is(top):
-    info = top.done('GetEntityInfo', entity=NAME).info
-    assert info.category.category == top.messages.EntityCategory.CATEGORY_ROBOT
-    assert 'mass=2.0' in info.description
-    assert list(info.tags) == ['spinning_top', 'heavy_symmetric_top', 'imu']
