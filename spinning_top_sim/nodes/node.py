@@ -10,12 +10,12 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock, ClockType, ROSClock
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -68,8 +68,7 @@ class Simulator(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._topics = ChannelPublishers(self, simulation)
         self._recording = Recording(simulation, self._topics.topics_to_record)
-        self._newest_ns = 0                     # on /clock
-        # Whether that is of another node: a node does not follow its own.
+        # Whether there is a /clock of another node: a node does not follow its own.
         self._follows = self.get_parameter('use_sim_time').value and not (
             parameters.is_enabled('clock', values))
         self.clock = self._make_clock()
@@ -101,12 +100,12 @@ class Simulator(Node):
                 self.destroy_subscription(subscription)
         topic = self.create_subscription(ClockMessage, '/clock', self._on_clock, QoSProfile(
             depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)).topic_name
-        return SimulatedClock(lambda: self._newest_ns, self._log.warning,
+        return SimulatedClock(lambda: int(self.get_clock().now().nanoseconds), self._log.warning,
                               lambda: int(self.count_publishers(topic)))
 
     def _on_clock(self, message: ClockMessage) -> None:
         if message.clock.sec >= 0:
-            self._newest_ns = message.clock.sec * NANOSECONDS + message.clock.nanosec
+            cast(ROSClock, self.get_clock()).set_ros_time_override(Time.from_msg(message.clock))
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
@@ -356,8 +355,7 @@ class Simulator(Node):
         if self._recording.warning:
             self._log.warning(f'recording: {self._recording.warning}', throttle_duration_sec=10.0)
         self._diagnostics.publish(self._report.diagnostics(
-            Time(nanoseconds=self.clock.date()).to_msg(),
-            self.get_fully_qualified_name().lstrip('/')))
+            self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/')))
         if self._report.overloaded:
             self._log.warning(
                 'this machine cannot keep up with these rates: live topics skip samples, or the '
