@@ -170,22 +170,13 @@ def play_all(file, *options):
         return replay.raw, code
 
 
-def test_all_bytes_are_sent_to_the_last_message_and_none_before_its_time(tmp_path, capfd):
-    messages = texts(1_000, step_ns=200_000)
-    path, begin = write_log(tmp_path / 'run.mcap', messages), time.monotonic()
-    raw, code = play_all(path, '--rate', '2')
-    assert time.monotonic() - begin >= 0.1998 / 2.0
-    assert (raw == of_each(messages), code) == (True, 0)
-    said = capfd.readouterr()
-    assert 'played 1000 messages on 2 topics' in said.out and said.err == ''
-
-
 def test_start_and_topics_choose_what_is_played(tmp_path, capfd):
     path = write_log(tmp_path / 'run.mcap', texts(60, 20_000_000))
     raw, _ = play_all(path, '--topics', '/ours/chatter', '/nobody', 'names',
                       '--start', '0.4', '--rate', '100')
     assert raw == [[text(n) for n in range(20, 60, 2)]]
     said = capfd.readouterr()
+    assert 'played 20 messages' in said.out
     assert 'the log has no topic /nobody\n' in said.err
     assert 'the log has no topic names' in said.err
     assert 'on 1 topics' in said.out
@@ -241,16 +232,6 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, capfd):
         assert run.code == 2
         assert says in run.err.splitlines()[-1], run.err
         assert 'Traceback' not in run.err
-
-
-@pytest.mark.parametrize('step_ns', [2_000_000, 0])
-def test_loops_begin_again(tmp_path, step_ns, capfd):
-    messages = texts(10, step_ns)
-    with OwnReplay(write_log(tmp_path / 'run.mcap', messages), '--loop') as replay:
-        replay.spin_until('three rounds', lambda: len(replay.raw[1]) >= 15)
-        replay.spin_until('the status', lambda: 'of round ' in capfd.readouterr().out)
-        for found, once in zip(replay.raw, of_each(messages), strict=True):
-            assert found == (once * len(found))[:len(found)]
 
 
 def test_messages_of_a_time_before_the_first_clock_do_not_make_it_wait(tmp_path, capfd):
@@ -360,9 +341,10 @@ def ns_of(stamp):
     return Time.from_msg(stamp).nanoseconds
 
 
-def test_without_a_clock_the_stamps_of_later_rounds_go_on(tmp_path):
+def test_without_a_clock_the_stamps_of_later_rounds_go_on(tmp_path, capfd):
     with OwnReplay(stamped_log(tmp_path / 'run.mcap'), '--loop') as replay:
         replay.spin_until('three rounds', lambda: len(replay.raw[1]) >= 60)
+        replay.spin_until('the status', lambda: 'of round ' in capfd.readouterr().out)
         joints, paths = ([deserialize_message(data, sink.msg_type) for data in sink.raw]
                          for sink in replay.sinks)
     stamps = [ns_of(message.header.stamp) for message in joints]
