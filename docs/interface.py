@@ -130,7 +130,7 @@ ros2 service call /get_entity_state simulation_interfaces/srv/GetEntityState '{e
 
 - **STOPPED** is paused, before the first sample. A node with `start_paused`, or one that waits for `/clock`, begins so.
   `set_simulation_state` STOPPED pauses and resets; stamps do not go back.
-- **PAUSED** from STOPPED sends no sample. A motion that has failed is PAUSED; `error_message` of `get_simulation_state` says why,
+- **PAUSED** from STOPPED sends the sample of t = 0. A motion that has failed is PAUSED; `error_message` of `get_simulation_state` says why,
   and only STOPPED leads on.
 - **QUITTING** closes the recording and ends the process with exit code 0. A node whose `duration` is over is QUITTING.
 - `step_simulation` answers after at most two seconds, and says how much is left. The action `SimulateSteps` is not offered.
