@@ -104,11 +104,10 @@ class ChannelPublishers:
 
     def topics_to_record(self, channels: Sequence[Channel]) -> list[Topic]:
         """Return name, type and QoS of the topics of these channels, then those of events."""
-        topics: list[Topic] = []
-        for channel in channels:
-            publisher = self.by_topic[channel.topic]
-            topics.append((publisher.topic_name, channel.type_name, {
-                name: int(getattr(publisher.qos_profile, name)) for name in (
-                    'history', 'depth', 'reliability', 'durability', 'liveliness')}))
-        return topics + [(self._node.resolve_topic_name(name), type_name, {})
-                         for name, type_name in events.TOPICS.items()]
+        policies = ('history', 'depth', 'reliability', 'durability', 'liveliness')
+        publishers = [(self.by_topic[channel.topic], channel.type_name) for channel in channels]
+        return [(one.topic_name, type_name, {
+            name: int(getattr(one.qos_profile, name)) for name in policies})
+            for one, type_name in publishers] + [
+                (self._node.resolve_topic_name(name), type_name, {})
+                for name, type_name in events.TOPICS.items()]

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.events import TOPICS, Event
@@ -21,14 +21,6 @@ Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
 Answer = Callable[[bool, str], object]      # takes success and a text
 
 
-class _Request(NamedTuple):
-    """A log that is being opened or closed, while it is in one of these states; who waits."""
-
-    recorder: Recorder
-    states: Sequence[str]
-    answer: Answer
-
-
 class Recording:
     """
     Records a simulation into one log at a time; the recorder's own thread uses the disk.
@@ -42,10 +34,11 @@ class Recording:
         self.error: str | None = None
         self._simulation, self._topics = simulation, topics
         self._recorder: Recorder | None = None
-        self._requests: list[_Request] = []
+        # Logs that are being opened or closed: the states meanwhile, and what tells who waits.
+        self._requests: list[tuple[Recorder, Sequence[str], Callable[[], object]]] = []
         self._events_index = 0              # index of the first topic of events in the log
 
-    def start(self, values: Mapping[str, Any], answer: Answer) -> None:
+    def start(self, values: Mapping[str, Any], answer: Answer = lambda *_: None) -> None:
         """Record from now on; `check` answers once the file is open."""
         if self._recorder is not None:
             answer(True, f'recording already to {self._recorder.path}')
@@ -64,7 +57,8 @@ class Recording:
         self.error, self._events_index = None, len(channels)
         simulation.log_to(recorder.write, channels)
         self.write(Event('start', max(simulation.now_ns, 0), simulation.now_ns))
-        self._requests.append(_Request(recorder, ('opening',), answer))
+        self._requests.append((recorder, ('opening',), lambda: answer(
+            recorder.error is None, recorder.error or f'recording to {recorder.path}')))
 
     def end(self, answer: Answer = lambda *_: None, error: str | None = None) -> None:
         """Record no more; `check` answers once the file is closed."""
@@ -75,17 +69,18 @@ class Recording:
         self._simulation.log_to(None)
         recorder.end()
         self.error = error
-        self._requests.append(_Request(recorder, ('opening', 'recording'), answer))
+        self._requests.append((recorder, ('opening', 'recording'), lambda: answer(
+            recorder.error is None, _summary(recorder))))
 
     def check(self) -> str | None:
         """Answer the requests that are done; return why a recording has stopped by itself."""
         told = None
-        for request in [one for one in self._requests if one.recorder.state not in one.states]:
-            self._requests.remove(request)
-            recorder = told = request.recorder
-            opened = recorder.error or f'recording to {recorder.path}'
-            request.answer(recorder.error is None,
-                           _summary(recorder) if 'recording' in request.states else opened)
+        for request in list(self._requests):
+            recorder, states, tell = request
+            if recorder.state not in states:
+                self._requests.remove(request)
+                told = recorder
+                tell()
         failed = self._recorder
         if failed is None or failed.state != 'failed':
             return None
@@ -96,8 +91,8 @@ class Recording:
         """Wait until all logs are closed; return a text for the user about the last one."""
         recorder = self._recorder
         self.end()
-        for request in self._requests:
-            request.recorder.close()
+        for one, *_ in self._requests:
+            one.close()
         self.check()
         if recorder is None or recorder.path is None:
             return None
