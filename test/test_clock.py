@@ -49,6 +49,7 @@ def test_by_the_steady_clock_t_0_is_due_when_the_date_of_its_stamp_has_come(scal
     assert top.epoch_ns == 1_000 * S + 10 * MS
     assert top.tick(77 * S + 7 * MS - 10).due_ns <= 0 == top.tick(77 * S + 7 * MS).due_ns
     assert top.tick(77 * S + 107 * MS).both == (100 * MS * scale, -400 * MS * scale)
+    assert top.clock.until_grid(30 * MS) == 20 * MS, '100 ms of real time from t = 0'
     before, date_ns = top.stamp_ns, 1_000 * S + 113 * MS
     top.begin(date_ns, 80 * S)
     assert top.epoch_ns == max(before + 10 * MS, 1_000 * S + 120 * MS), 'stamps do not go back'
@@ -132,6 +133,14 @@ def test_the_last_message_of_clocks_that_have_gone_is_no_step_back():
     top.publishers = 0
     top.tick(1 * S, 100 * S)
     assert top.warnings == [] and top.sent_ns == 1 * S
+
+
+def test_a_clock_is_missing_before_it_begins_and_2_s_after_it_has_stopped():
+    top, missing = Top(publishers=1), []
+    for second, date_ns in enumerate((0, 0, 7 * S, 8 * S, 9 * S, 9 * S, 9 * S, 9 * S, 10 * S)):
+        top.steady_ns, top.date_ns = second * S, date_ns
+        missing.append(top.clock.is_missing())
+    assert missing == [True, True, *5 * [False], True, False]
 
 
 def test_a_date_behind_the_last_stamp_is_refused_and_0_is_no_time():

@@ -237,7 +237,6 @@ class Loop:
         self._drive_from_ns = 0
         if paused is not None:
             self.paused = paused
-        self.set_pace(values)           # a change that failed midway may not have set it
         self._begin()
         if simulation.epoch_ns < last_stamp_ns and self._recording.is_on:
             reason = 'stamps have gone back with /clock, and a log keeps them in order'
