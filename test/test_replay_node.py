@@ -96,6 +96,7 @@ class OwnReplay(InThisProcess):
         replay_node.add_arguments(parser)
         given = parser.parse_args([str(file), *options])
         self.node = Replayer(open_log(given.file, given.partial), given)
+        self.profiles = [one.qos_profile for one in self.node.outputs.values()]
         self.node.outputs = {channel: Sink(one) for channel, one in self.node.outputs.items()}
         self.sinks = [*self.node.outputs.values()]
 
@@ -325,6 +326,14 @@ def test_who_comes_late_gets_what_all_latched_publishers_sent(peer, tmp_path, ch
                           'reliable and transient_local') == (len(channels[0]) == 5)
 
 
+def test_a_publisher_serves_all_whom_the_recorded_ones_have_served(tmp_path):
+    path = write_log(tmp_path / 'run.mcap', texts(2), [
+        ('/all', STRING, {'reliability': 2, 'depth': 3}, {'history': 2, 'depth': 4}), TWO[1]])
+    with OwnReplay(path) as replay:
+        one = replay.profiles[0]
+        assert (one.history.name, one.reliability.name) == ('KEEP_ALL', 'RELIABLE')
+
+
 def stamped_log(path):
     """Record 21 joint states and paths in 0.2 s, whose last poses have no stamps."""
     messages = []
@@ -333,8 +342,9 @@ def stamped_log(path):
         messages += [(channel, time_ns, serialize_message(message)) for channel, message in (
             (0, JointState(header=header, name=['joint'], position=[1.0])),
             (1, PathMessage(header=header, poses=[PoseStamped(header=header), PoseStamped()])))]
+        messages.append((2, time_ns, text(7)))
     return write_log(path, messages, [('/joint_states', 'sensor_msgs/msg/JointState'),
-                                      ('/path', 'nav_msgs/msg/Path')])
+                                      ('/path', 'nav_msgs/msg/Path'), ('/chatter', STRING)])
 
 
 def ns_of(stamp):
@@ -346,7 +356,8 @@ def test_without_a_clock_the_stamps_of_later_rounds_go_on(tmp_path, capfd):
         replay.spin_until('three rounds', lambda: len(replay.raw[1]) >= 60)
         replay.spin_until('the status', lambda: 'of round ' in capfd.readouterr().out)
         joints, paths = ([deserialize_message(data, sink.msg_type) for data in sink.raw]
-                         for sink in replay.sinks)
+                         for sink in replay.sinks[:2])
+        assert set(replay.raw[2]) == {text(7)}, 'what has no stamps keeps its bytes'
     stamps = [ns_of(message.header.stamp) for message in joints]
     assert stamps[:21] == [EPOCH_NS + n * SECOND // 100 for n in range(21)]
     assert {later - before for before, later in pairwise(stamps)} == {SECOND // 100}

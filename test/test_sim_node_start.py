@@ -18,6 +18,7 @@ from helpers.own_node import OwnNode, as_a_process, run_main
 from helpers.reference import ROOT
 from helpers.standard_node import StandardNode
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.logging import get_logger_level
 from test_scene_file import scene
 
 from spinning_top_sim.nodes import executable, replay_node, sim_node, simulation_handlers
@@ -110,6 +111,7 @@ def test_a_short_run_warns_of_what_is_odd_and_ends_with_code_0(main):
     run = main('--ros-args', '-p', 'spin.l33:=1.0', '-p', 'top.lambda3:=0.5', '-p',
                'duration:=0.01')
     assert (run.code, TRACEBACK in run.err) == (0, False)
+    assert get_logger_level('rcl').name == 'UNSET', 'silent at the start only'
     assert 'there is no parameter spin.l33: ignored; did you mean spin.l3?' in run.err
     assert 'top.lambda3 = 0.5 kg m^2: no rigid body' in run.err
 
