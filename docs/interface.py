@@ -55,7 +55,8 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
   of the top, lines on it that show the spin, and the trace of the tip over the last
   `markers.trace_length`. Every message has the whole trace. The trace is that of the exact solution; its
   last point is the tip according to the solver.
-- `/diagnostics`: level and message are those of the worst problem. Among the values, `state` is one of
+- `/diagnostics`: level and message are those of the worst problem, now or since the message before;
+  counters are totals. Among the values, `state` is one of
   {states}. `failed messages` counts what `publish` refused, as it
   does while a reader with KEEP_ALL has stalled; motion and recording go on.
 - A stamp is the time of its sample, on the grid k × period. A paused node publishes no samples.

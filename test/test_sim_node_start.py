@@ -16,7 +16,6 @@ from helpers.node_harness import SimNode
 from helpers.node_logs import TRACEBACK, log_of, the_log
 from helpers.own_node import OwnNode, as_a_process, run_main
 from helpers.reference import ROOT
-from helpers.standard_node import StandardNode
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger_level
 from test_scene_file import scene
@@ -26,9 +25,6 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.recorded_run import read_run_description
-
-# Of simulation_interfaces.
-STOPPED, QUITTING, INCORRECT_STATE, FAILED, TRANSITION_ERROR = 0, 3, 3, 4, 102
 
 
 @pytest.fixture
@@ -235,23 +231,3 @@ def test_remapping_and_qos_overrides_work(tmp_path):
     assert '/ns/pose' not in offered
     assert offered['/ns/attitude']['reliability'] == 2
     assert offered['/ns/imu/data_raw']['depth'] == 3
-
-
-def test_before_the_clock_nothing_can_be_set(tmp_path):
-    with StandardNode(tmp_path, use_sim_time=True) as top:
-        assert top.state == STOPPED
-        for name in ('PLAYING', 'PAUSED'):
-            assert top.set_state(name) == TRANSITION_ERROR
-        for expected, name, request in (
-                (INCORRECT_STATE, 'StepSimulation', {'steps': 1}),
-                (INCORRECT_STATE, 'ResetSimulation', {'scope': 0}),
-                (INCORRECT_STATE, 'SetEntityState', {'entity': 'spinning_top'})):
-            code, text = top.refused(name, **request)
-            assert (code, text) == (expected, 'waiting for /clock (use_sim_time is set)')
-
-
-def test_steps_beyond_the_duration_say_so(tmp_path):
-    with StandardNode(tmp_path, duration=0.05) as top:
-        assert top.pause().refused('StepSimulation', steps=6) == (
-            FAILED, 'at t = 0.050000000 s: `duration` ends before the steps do')
-        assert top.state == QUITTING

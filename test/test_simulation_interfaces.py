@@ -6,6 +6,8 @@ The handlers are called as the executor calls them, with stand-ins for the messa
 installed ones where there are some.
 """
 
+import importlib
+import importlib.util
 import json
 import math
 
@@ -14,13 +16,14 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from helpers import standard_types
 from helpers.node_logs import log_of, xyz, xyzw
-from helpers.standard_node import standard_node  # noqa: F401, a fixture
+from helpers.own_node import OwnNode
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.nodes.simulation_handlers import FEATURES
+from spinning_top_sim.nodes.simulation_handlers import FEATURES, SimulationHandlers
 from spinning_top_sim.tools import inspect
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
@@ -30,9 +33,65 @@ TRANSITION_ERROR, INCORRECT_TRANSITION = 102, 103
 NAME = 'spinning_top'
 
 
-@pytest.fixture
-def top(stopped):
-    return stopped
+INSTALLED = importlib.util.find_spec('simulation_interfaces') is not None
+KINDS = ('stand-in', 'installed') if INSTALLED else ('stand-in',)
+
+
+def types_of(kind):
+    """Return simulation_interfaces.msg and .srv."""
+    if kind == 'stand-in':
+        return standard_types.modules()
+    return [importlib.import_module(f'simulation_interfaces.{part}')
+            for part in ('msg', 'srv')]
+
+
+class StandardNode(OwnNode):
+    """The node, which starts paused; `call` calls a handler as the executor calls it."""
+
+    def __init__(self, folder, kind='stand-in', **values):
+        super().__init__(folder, start_paused=True, **values)
+        self.messages, self.services = types_of(kind)
+        self.handlers = SimulationHandlers(self.node, self.messages)
+
+    def call(self, name, **request):
+        """Return the response to a request with these fields."""
+        service = getattr(self.services, name)
+        return self.handlers.serve(name, service.Request(**request), service.Response())
+
+    def done(self, name, **request):
+        """Return the response to a request that succeeds."""
+        response = self.call(name, **request)
+        assert response.result.result == self.messages.Result.RESULT_OK, (
+            response.result.error_message)
+        return response
+
+    def refused(self, name, **request):
+        """Return the code of a refusal, and its text."""
+        result = self.call(name, **request).result
+        assert result.result != self.messages.Result.RESULT_OK
+        assert result.error_message
+        return result.result, result.error_message
+
+    @property
+    def state(self):
+        return self.done('GetSimulationState').state.state
+
+    def set_state(self, name):
+        """Ask for a state; return the code of the result."""
+        number = getattr(self.messages.SimulationState, f'STATE_{name}')
+        return self.call('SetSimulationState', state=self.messages.SimulationState(
+            state=number)).result.result
+
+    def pause(self):
+        """Leave the stopped state without a step."""
+        assert self.set_state('PAUSED') == self.messages.Result.RESULT_OK
+        return self
+
+
+@pytest.fixture(params=KINDS)
+def top(request, tmp_path):
+    with StandardNode(tmp_path, request.param) as top:
+        yield top
 
 
 def test_features_are_those_of_the_services(top):
@@ -305,3 +364,23 @@ def test_a_state_can_be_set_where_the_pivot_is(top):
     assert xyz(after.twist.angular) == pytest.approx(xyz(state.twist.angular), abs=1e-12)
     top.done('StepSimulation', steps=1)
     assert state_of(top).pose.position.x > after.pose.position.x
+
+
+def test_before_the_clock_nothing_can_be_set(tmp_path):
+    with StandardNode(tmp_path, use_sim_time=True) as top:
+        assert top.state == STOPPED
+        for name in ('PLAYING', 'PAUSED'):
+            assert top.set_state(name) == TRANSITION_ERROR
+        for expected, name, request in (
+                (INCORRECT_STATE, 'StepSimulation', {'steps': 1}),
+                (INCORRECT_STATE, 'ResetSimulation', {'scope': 0}),
+                (INCORRECT_STATE, 'SetEntityState', {'entity': 'spinning_top'})):
+            code, text = top.refused(name, **request)
+            assert (code, text) == (expected, 'waiting for /clock (use_sim_time is set)')
+
+
+def test_steps_beyond_the_duration_say_so(tmp_path):
+    with StandardNode(tmp_path, duration=0.05) as top:
+        assert top.pause().refused('StepSimulation', steps=6) == (
+            FAILED, 'at t = 0.050000000 s: `duration` ends before the steps do')
+        assert top.state == QUITTING
