@@ -79,11 +79,6 @@ class Loop:
         """The simulated time for the user, with all its digits."""
         return f'at t = {stamp_text(self.now_ns)} s'
 
-    @property
-    def next_tick_ns(self) -> float:
-        """How long it is to the next time at which a tick finds samples that are just due [ns]."""
-        return self._clock.until_grid(self.tick_period_ns)
-
     def set_pace(self, values: Mapping[str, Any]) -> None:
         """Take over tick_rate, time_scale and duration."""
         self._duration_ns = round(values['duration'] * NANOSECONDS) or NEVER_NS

@@ -125,11 +125,13 @@ class Simulator(Node):
 
     def _align_ticks(self) -> None:
         """Let ticks come just after samples are due."""
+        period_ns = self.loop.tick_period_ns
+
         def first() -> None:
-            self._every('tick', self.loop.tick_period_ns / NANOSECONDS, self._tick)
+            self._every('tick', period_ns / NANOSECONDS, self._tick)
             self._tick()
 
-        self._every('tick', self.loop.next_tick_ns / NANOSECONDS, first)
+        self._every('tick', self.clock.until_grid(period_ns) / NANOSECONDS, first)
 
     def _tick(self) -> None:
         self.loop.tick()

@@ -74,18 +74,18 @@ class Recording:
 
     def check(self) -> str | None:
         """Answer the requests that are done; return why a recording has stopped by itself."""
-        told = None
+        recorder, told = self._recorder, None
+        has_failed = recorder is not None and recorder.state == 'failed'
         for request in list(self._requests):
-            recorder, states, tell = request
-            if recorder.state not in states:
+            asked, states, tell = request
+            if asked.state not in states:
                 self._requests.remove(request)
-                told = recorder
+                told = asked
                 tell()
-        failed = self._recorder
-        if failed is None or failed.state != 'failed':
+        if recorder is None or not has_failed:
             return None
-        self.end(error=failed.error)
-        return None if failed is told else failed.error
+        self.end(error=recorder.error)
+        return None if recorder is told else recorder.error
 
     def close(self) -> str | None:
         """Wait until all logs are closed; return a text for the user about the last one."""
