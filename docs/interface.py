@@ -55,7 +55,8 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
   of the top, lines on it that show the spin, and the trace of the tip over the last
   `markers.trace_length`. Every message has the whole trace. The trace is that of the exact solution; its
   last point is the tip according to the solver.
-- `/diagnostics`: level and message are those of the worst problem. Among the values, `state` is one of
+- `/diagnostics`: level and message are those of the worst problem, now or since the message before;
+  counters are totals. Among the values, `state` is one of
   {states}. `failed messages` counts what `publish` refused, as it
   does while a reader with KEEP_ALL has stalled; motion and recording go on.
 - A stamp is the time of its sample, on the grid k × period. A paused node publishes no samples.
@@ -130,7 +131,7 @@ ros2 service call /get_entity_state simulation_interfaces/srv/GetEntityState '{e
 
 - **STOPPED** is paused, before the first sample. A node with `start_paused`, or one that waits for `/clock`, begins so.
   `set_simulation_state` STOPPED pauses and resets; stamps do not go back.
-- **PAUSED** from STOPPED sends no sample. A motion that has failed is PAUSED; `error_message` of `get_simulation_state` says why,
+- **PAUSED** from STOPPED sends the sample of t = 0. A motion that has failed is PAUSED; `error_message` of `get_simulation_state` says why,
   and only STOPPED leads on.
 - **QUITTING** closes the recording and ends the process with exit code 0. A node whose `duration` is over is QUITTING.
 - `step_simulation` answers after at most two seconds, and says how much is left. The action `SimulateSteps` is not offered.

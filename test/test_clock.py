@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated time by the steady clock and by a /clock of another node, without ROS."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from spinning_top_sim.nodes.clock import EPOCH_GRID_NS, SimulatedClock
@@ -13,24 +15,28 @@ class Top:
     """What follows a clock: it sends at once what is due, and stamps it."""
 
     def __init__(self, scale=1.0, publishers=None):
-        self.clock = SimulatedClock(scale, publishers and (lambda: self.publishers))
+        self.warnings = []
+        self.steady_ns = self.date_ns = 0
+        self.clock = SimulatedClock(
+            lambda: self.date_ns, self.warnings.append, publishers and (lambda: self.publishers),
+            lambda: self.steady_ns)
+        self.clock.set_scale(scale)
         self.publishers = publishers
         self.sent_ns = self.epoch_ns = 0
-        self.warnings = []
 
     def begin(self, date_ns, source_ns=None):
-        self.epoch_ns = self.clock.begin(
-            date_ns, date_ns if source_ns is None else source_ns, self.epoch_ns + self.sent_ns)
+        self.date_ns, self.steady_ns = date_ns, date_ns if source_ns is None else source_ns
+        self.epoch_ns = self.clock.next_epoch(self.epoch_ns + self.sent_ns)
+        self.clock.begin(self.epoch_ns)
         self.sent_ns = 0
         return self
 
     def tick(self, steady_ns, source_ns=None):
-        due = self.clock.due(steady_ns, steady_ns if source_ns is None else source_ns,
-                             self.epoch_ns)
-        self.epoch_ns += due.shift_ns
-        self.sent_ns = max(self.sent_ns, due.due_ns)
-        self.warnings += filter(None, [due.warning])
-        return due
+        self.steady_ns, self.date_ns = steady_ns, steady_ns if source_ns is None else source_ns
+        due_ns, late_ns, shift_ns = self.clock.due(self.epoch_ns)
+        self.epoch_ns += shift_ns
+        self.sent_ns = max(self.sent_ns, due_ns)
+        return SimpleNamespace(due_ns=due_ns, late_ns=late_ns, both=(due_ns, late_ns))
 
     @property
     def stamp_ns(self):
@@ -42,44 +48,25 @@ def test_by_the_steady_clock_t_0_is_due_when_the_date_of_its_stamp_has_come(scal
     top = Top(scale).begin(1_000 * S + 3 * MS, 77 * S)
     assert top.epoch_ns == 1_000 * S + 10 * MS
     assert top.tick(77 * S + 7 * MS - 10).due_ns <= 0 == top.tick(77 * S + 7 * MS).due_ns
-    assert top.tick(77 * S + 107 * MS).due_ns == 100 * MS * scale
+    assert top.tick(77 * S + 107 * MS).both == (100 * MS * scale, -400 * MS * scale)
+    assert top.clock.until_grid(30 * MS) == 20 * MS, '100 ms of real time from t = 0'
     before, date_ns = top.stamp_ns, 1_000 * S + 113 * MS
     top.begin(date_ns, 80 * S)
     assert top.epoch_ns == max(before + 10 * MS, 1_000 * S + 120 * MS), 'stamps do not go back'
     assert top.tick(80 * S + 10 * MS).due_ns >= 0, 'it takes 10 ms at most'
 
 
-def test_a_pause_is_not_caught_up_and_another_scale_holds_from_its_moment_on():
-    top = Top().begin(10 * S, 0)
-    top.tick(1 * S)
-    top.clock.hold(top.sent_ns)
-    assert top.tick(5 * S)[:2] == (1 * S, 1 * S)
-    top.clock.set_scale(2.0, 6 * S)
-    top.clock.run(top.sent_ns, 9 * S)
-    assert top.tick(10 * S).due_ns == 3 * S
-    top.clock.set_scale(0.5, 10 * S)
-    assert top.tick(12 * S).due_ns == 4 * S
-
-
-def test_what_is_long_due_by_the_steady_clock_is_late_and_then_slips():
-    top = Top(2.0).begin(10 * S, 0)
-    assert top.tick(3 * S)[:2] == (6 * S, 5 * S)
-    assert top.clock.slip(5 * S, 3 * S) == top.clock.slip(4 * S, 3 * S) == 0
-    assert top.clock.slip(3 * S, 3 * S) == 3 * S
-    assert top.tick(4 * S).due_ns == 5 * S
-
-
 @pytest.mark.parametrize('step_ns', [1 * S, 2 * S, 5 * S])
 def test_what_one_message_on_a_slow_clock_makes_due_is_on_time(step_ns):
     top = Top(publishers=1).begin(100 * S + 4 * MS)
     assert top.epoch_ns == 100 * S
-    assert top.tick(0, 100 * S + 4 * MS)[:2] == (4 * MS, -1), 't = 0 is on time'
+    assert top.tick(0, 100 * S + 4 * MS).both == (4 * MS, -1), 't = 0 is on time'
     for k in range(1, 1000):
         steady_ns = k * 10 * MS
         before, source_ns = top.sent_ns, 100 * S + 4 * MS + steady_ns // step_ns * step_ns
         due = top.tick(steady_ns, source_ns)
         assert due.late_ns <= before and top.stamp_ns == source_ns
-    assert top.clock.slip(0, source_ns) == 0 and top.warnings == []
+    assert top.clock.slip(0) == 0 and top.warnings == []
 
 
 def test_what_is_not_sent_half_a_second_after_its_message_is_late():
@@ -148,8 +135,16 @@ def test_the_last_message_of_clocks_that_have_gone_is_no_step_back():
     assert top.warnings == [] and top.sent_ns == 1 * S
 
 
+def test_a_clock_is_missing_before_it_begins_and_2_s_after_it_has_stopped():
+    top, missing = Top(publishers=1), []
+    for second, date_ns in enumerate((0, 0, 7 * S, 8 * S, 9 * S, 9 * S, 9 * S, 9 * S, 10 * S)):
+        top.steady_ns, top.date_ns = second * S, date_ns
+        missing.append(top.clock.is_missing())
+    assert missing == [True, True, *5 * [False], True, False]
+
+
 def test_a_date_behind_the_last_stamp_is_refused_and_0_is_no_time():
     with pytest.raises(ValueError, match='2038'):
-        SimulatedClock(1.0).begin(2 ** 31 * S, 0)
+        Top().begin(2 ** 31 * S, 0)
     top = Top(publishers=1).begin(5)
     assert (top.epoch_ns, top.tick(0, 5).due_ns) == (EPOCH_GRID_NS, 5 - EPOCH_GRID_NS)

@@ -7,7 +7,7 @@ import re
 import pytest
 from helpers.reference import ROOT
 
-from spinning_top_sim.nodes.endpoints import message_class
+from spinning_top_sim.nodes.publishers import message_class
 from spinning_top_sim.streams import parameters, topics
 from spinning_top_sim.tools.recorded_run import channels_of
 

@@ -198,14 +198,6 @@ def log(tmp_path):
     return path
 
 
-def test_a_file_for_a_node_of_another_namespace_is_refused(installed, tmp_path):
-    (tmp_path / 'left.yaml').write_text('/left/*:\n  ros__parameters:\n    top.mass: 5.0\n')
-    run = started('sim', scene=str(tmp_path / 'left.yaml'), namespace='left')
-    assert parameters_of(run.nodes['spinning_top_sim/sim_node'])['top.mass'] == 5.0
-    with pytest.raises(ValueError, match='no parameters for the node /right/spinning_top'):
-        started('sim', scene=str(tmp_path / 'left.yaml'), namespace='right')
-
-
 def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(installed, log):
     run = started('replay', file=str(log), rate='2', start='0.5', loop='true', clock='50',
                   rviz='true')

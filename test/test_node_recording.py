@@ -15,6 +15,7 @@ from helpers.own_node import OwnNode
 from helpers.reference import scene_parameters
 from helpers.simulations import EPOCH_NS, SECOND
 
+from spinning_top_sim.recording import recorder
 from spinning_top_sim.recording.writer import McapWriter
 from spinning_top_sim.tools import simulate
 
@@ -64,6 +65,14 @@ def test_ticks_and_commands_go_on_while_a_log_is_being_opened_or_closed(tmp_path
     assert [event['event'] for event in events_in(log)] == ['start', 'command']
     assert [data for _, data in log['/pose']] == expected
     assert verified(path)['identical']
+
+
+def test_a_step_waits_for_a_recorder_that_has_no_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder, 'QUEUE_BYTES', 20_000)
+    with OwnNode(tmp_path, start_paused=True) as node:
+        assert node.switch('record', True).success
+        node.step(500)
+    assert len(log_of(tmp_path / 'run.mcap')[0]['/pose']) == 501
 
 
 def test_a_recording_that_fails_is_told_once_and_gives_way_to_the_next(

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node says about itself, without a node."""
 
-import io
 import re
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -18,7 +16,6 @@ from spinning_top_sim.nodes.clock import SimulatedClock
 from spinning_top_sim.nodes.loop import Loop
 from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.nodes.status import NodeStatus
-from spinning_top_sim.nodes.terminal import Terminal
 
 
 @pytest.fixture
@@ -33,8 +30,8 @@ def reported():
     """A report of a paused simulation that stands at 1.25 s, and what it is about."""
     simulation = simulate(start_paused=True)
     recording = Recording(simulation, lambda channels: [])
-    loop = Loop(simulation, simulation.values, recording, SimulatedClock(1.0),
-                date=lambda: EPOCH_NS, source=lambda: 0, update_subscribers=lambda: None,
+    loop = Loop(simulation, simulation.values, recording, SimulatedClock(
+        lambda: EPOCH_NS, print, steady=lambda: 0), update_subscribers=lambda: None,
                 warn=print, error=print)
     loop.start()
     loop.step(5 * SECOND // 4)
@@ -75,10 +72,12 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
     output, loop = reported.simulation.outputs[0], reported.loop
     output.failed = 3
     assert status_of(reported)[:2] == (1, '3 messages could not be published')
-    output.failed, loop.slipped_ns = 0, 1_500_000_000
+    assert status_of(reported)[:2] == (0, 'paused'), 'nothing has happened since'
+    loop.slipped_ns = 1_500_000_000
     level, message, numbers = status_of(reported)
     assert (level, message) == (1, 'this machine cannot keep up')
     assert (numbers['clock slip [s]'], numbers['state']) == ('1.500', 'paused')
+    assert numbers['failed messages'] == '3', 'counters are totals'
     loop.resume()
     assert status_of(reported)[2]['state'] == 'running'
     loop.pause()
@@ -88,7 +87,6 @@ def test_the_worst_problem_is_the_level_and_the_message(reported):
     reported.recording.error = None
     loop.fail('at a pole')
     assert status_of(reported)[:2] == (2, 'at a pole')
-    loop.slipped_ns = 0
     loop.reset(reported.simulation.values)
     assert status_of(reported)[:2] == (0, 'paused')
 
@@ -99,7 +97,7 @@ def test_the_status_line(clock, reported):
     assert 'L3 1.6 Lz 1.386' in line and 'no subscribers yet' in line and 'energy drift ' in line
     clock.now += 1.0
     status_of(reported)
-    reported.loop.command(2.0, 1.0)
+    reported.loop.change('command', lambda: {'l3': 2.0, 'lz': 1.0})
     reported.simulation.outputs[0].sent = 12
     line = reported.report.status_line()
     assert 'L3 2 Lz 1' in line and ' | 12 messages | ' in line
@@ -110,31 +108,3 @@ def test_the_status_line(clock, reported):
     assert status_of(reported)[:2] == (1, 'waiting for /clock')
     reported.loop.fail('at a pole')
     assert ' FAILED | ' in reported.report.status_line()
-
-
-def standard_output(monkeypatch, *, isatty):
-    """Return a standard output of 12 columns."""
-    out = io.StringIO()
-    out.isatty = lambda: isatty
-    monkeypatch.setattr(sys, 'stdout', out)
-    monkeypatch.setenv('COLUMNS', '12')
-    return out
-
-
-def test_a_line_that_stays_stands_below_the_status_line_which_fits_the_terminal(monkeypatch):
-    out, line = standard_output(monkeypatch, isatty=True), Terminal()
-    line.show('one | two | three')
-    line.end()
-    line.end()
-    line.show('four')
-    line.tell('done')
-    assert out.getvalue() == '\r\x1b[Kone | two |\n\r\x1b[Kfour\ndone\n'
-
-
-def test_without_a_terminal_each_status_is_a_line(monkeypatch):
-    out, line = standard_output(monkeypatch, isatty=False), Terminal()
-    line.show('a | b')
-    line.end()
-    assert out.getvalue() == 'a | b\n'
-    monkeypatch.setattr(sys, 'stdout', None)
-    line.show('c')                      # a closed standard output is no terminal

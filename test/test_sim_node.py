@@ -71,6 +71,9 @@ def both_runs(peer, diagnostics, tmp_path_factory):
             data=[2.0, 1.5])) or peer.get(one, 'spin.l3', 'spin.lz') == [2.0, 1.5])
         assert peer.set_together(one, seed=99, pose__rate=50.0).successful
         assert peer.switch(one, 'set_pause', True).success
+        for run in runs.values():       # its answer waits for the file, on either executor
+            assert f'{run.node.folder}/' in peer.switch(run.node, 'record', False).message
+            assert peer.switch(run.node, 'record', False).message == 'not recording'
         said = diagnostics.next(two)
         assert [said[key] for key in ('state', 'commands', 'rejected commands')] == [
             'running', '0', '0']

@@ -4,6 +4,7 @@
 import os
 import re
 import signal
+import sys
 import time
 
 import numpy as np
@@ -25,7 +26,7 @@ from helpers.node_logs import (
 )
 from helpers.own_node import OwnNode
 
-from spinning_top_sim.nodes import terminal
+from spinning_top_sim.nodes import executable
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 
@@ -103,10 +104,9 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(monkeypa
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, 'w') as out:
-        monkeypatch.setattr(terminal.sys, 'stdout', out)
-        shown = terminal.Terminal()
-        shown.show('one')
-        shown.show('two')
+        monkeypatch.setattr(sys, 'stdout', out)
+        for line in ('one', 'two'):
+            executable.tell(line)
 
 
 READER = """
@@ -192,8 +192,7 @@ def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
         assert node.loop.failure == reason
         said = capfd.readouterr().err
         assert 'until ~/reset' in said and TRACEBACK in said
-        node.node._show_status()
-        assert ' FAILED |' in capfd.readouterr().out.splitlines()[-1]
+        assert ' FAILED |' in node.node._report.status_line()
         answer = node.switch('set_pause', False)
         assert not answer.success and f'stands still: {reason}' in answer.message
         heard = list(node.heard['pose'])

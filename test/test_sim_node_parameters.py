@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands and parameters of a node: what they do, what is refused, and what the user is told."""
 
+import importlib
 import math
 
 import numpy as np
@@ -16,6 +17,24 @@ from spinning_top_sim.nodes import publishers
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameter import ANY, Effect
 from spinning_top_sim.streams.topics import INVARIANTS
+
+
+def test_only_message_classes_of_installed_ros_packages_are_found(monkeypatch):
+    found = {publishers.message_class(f'geometry_msgs/{name}') for name in ('msg/Twist', 'Twist')}
+    assert [one.__name__ for one in found] == ['Twist']
+    assert publishers.message_class('std_msgs/msg/String').__name__ == 'String'
+    imported = []
+    monkeypatch.setattr(importlib, 'import_module', imported.append)
+    for name in ('antigravity/msg/X', '/msg/String', 'std_msgs', 'std_msgs/msg/string',
+                 'std_msgs.msg/msg/String', '../std_msgs/msg/String', 'std_msgs/msg/String\n',
+                 'nowhere_msgs/msg/Thing'):
+        with pytest.raises(LookupError):
+            publishers.message_class(name)
+    assert imported == []
+    monkeypatch.undo()
+    for name in ('std_msgs/msg/Nothing', 'std_srvs/srv/Trigger', 'std_srvs/msg/Trigger'):
+        with pytest.raises(LookupError):
+            publishers.message_class(name)
 
 
 @pytest.fixture

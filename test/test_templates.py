@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 
-from spinning_top_sim.nodes.endpoints import message_class  # noqa: E402
+from spinning_top_sim.nodes.publishers import message_class  # noqa: E402
 from spinning_top_sim.streams import events, messages  # noqa: E402
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which simulated time is due: by the steady clock, or by the /clock of another node."""
 
+import time
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
 
 from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 
@@ -15,87 +15,84 @@ LATEST_NS = 500_000_000         # samples later than this are recorded, but not 
 # Further behind than this, simulated time slips: the real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
 JUMP_NS = 5_000_000_000         # the motion does not run through a longer step of a /clock
+PATIENCE_NS = 2_000_000_000     # a /clock that does not change for longer has stopped
 
-
-class Due(NamedTuple):
-    """
-    What a clock says at a tick.
-
-    due_ns : simulated time up to which samples are to be sent
-    late_ns : simulated time up to which samples are too late to be published
-    shift_ns : by which the stamp of t = 0 moves, so that stamps are at /clock again
-    warning : what /clock has done, for the user; empty almost always
-    """
-
-    due_ns: int
-    late_ns: int
-    shift_ns: int = 0
-    warning: str = ''
+Reading = Callable[[], int]     # of a clock [ns]
 
 
 class SimulatedClock:
     """
-    Simulated time that runs `scale` times as fast as a source, or stands.  Times are in ns.
+    Simulated time that runs `scale` times as fast as a source.  Times are in ns.
 
     The source is the steady clock.  With `publishers`, which returns how many nodes publish on
-    /clock, it is that /clock, and the steady clock decides only what is late.
+    /clock, it is the date, which is that /clock, and the steady clock decides only what is late.
+
+    date, steady : return the date, 0 before the first message on a /clock, and steady time
+    warn : takes a text about what /clock has done
     """
 
-    def __init__(self, scale: float, publishers: Callable[[], int] | None = None) -> None:
-        self._scale, self._publishers = scale, publishers
-        self._runs = False
+    def __init__(self, date: Reading, warn: Callable[[str], object],
+                 publishers: Callable[[], int] | None = None,
+                 steady: Reading = time.monotonic_ns) -> None:
+        self.date, self.steady, self._warn, self._publishers = date, steady, warn, publishers
+        self._source = date if publishers else steady
+        self._scale = 1.0
         self._source_ns = self._simulated_ns = 0    # the anchor: two times of one moment
         self._newest_ns = 0                         # of the source
         self._late_ns = 0                           # what was due LATEST_NS ago
         self._became_due: deque[tuple[int, int]] = deque()      # steady and simulated times
         self._told_of_several = False
+        self._seen_ns, self._changed_ns = 0, steady()       # of the date, by `is_missing`
 
-    def begin(self, date_ns: int, source_ns: int, last_stamp_ns: int = 0) -> int:
+    def next_epoch(self, last_stamp_ns: int = 0) -> int:
         """
-        Let t = 0 be due when its stamp is the date; return that stamp.
+        Return the stamp of t = 0 of a motion that begins now.
 
-        The stamp is the date, rounded up, or the /clock that is followed, rounded down.  It is
-        after the last one that was sent, unless /clock has gone back meanwhile.
+        It is the date, rounded up, or the /clock that is followed, rounded down.  It is after the
+        last stamp that was sent, unless /clock has gone back meanwhile.
 
         Raises ValueError if it is too late for a stamp of ROS.
         """
-        if self._publishers is None:
-            epoch_ns = date_ns + -date_ns % EPOCH_GRID_NS
-        else:
-            date_ns = source_ns = self._counting(source_ns)
-            # 0 means "no time".
-            epoch_ns = max(date_ns - date_ns % EPOCH_GRID_NS, EPOCH_GRID_NS)
-        if self._publishers is None or last_stamp_ns <= date_ns:
+        date_ns = self._counting(self.date())
+        epoch_ns = date_ns - date_ns % EPOCH_GRID_NS or EPOCH_GRID_NS   # 0 means "no time"
+        if not self._publishers and epoch_ns < date_ns:
+            epoch_ns += EPOCH_GRID_NS
+        if not self._publishers or last_stamp_ns <= date_ns:
             epoch_ns = max(epoch_ns, last_stamp_ns + EPOCH_GRID_NS - last_stamp_ns % EPOCH_GRID_NS)
         if epoch_ns > LAST_EPOCH_NS:
             raise ValueError('the seconds of a ROS stamp, an int32, end in January 2038')
-        self.run(int(max(date_ns - epoch_ns, -EPOCH_GRID_NS) * self._scale), source_ns)
-        self._late_ns = -1                      # t = 0 is not sent yet
         return epoch_ns
 
-    def run(self, sent_ns: int, source_ns: int) -> None:
-        """Let simulated time run on from what is sent."""
-        self.hold(sent_ns)
-        self._runs = True
-        self._anchor(sent_ns, self._counting(source_ns))
+    def begin(self, epoch_ns: int) -> None:
+        """Let t = 0 be due when its stamp is the date."""
+        lead_ns = max(self._counting(self.date()) - epoch_ns, -EPOCH_GRID_NS)
+        self.run(int(lead_ns * self._scale))
+        self._late_ns = -1                      # t = 0 is not sent yet
 
-    def hold(self, sent_ns: int) -> None:
-        """Let simulated time stand at what is sent."""
-        self._runs = False
-        self._simulated_ns = self._late_ns = sent_ns
+    def run(self, sent_ns: int) -> None:
+        """Let simulated time run on from what is sent."""
+        self._anchor(sent_ns, self._counting(self._source()))
+        self._late_ns = sent_ns
         self._became_due.clear()
 
-    def set_scale(self, scale: float, source_ns: int) -> None:
-        if self._runs:
-            source_ns = self._counting(source_ns)
-            self._anchor(self._at(source_ns), source_ns)
+    def is_missing(self) -> bool:
+        """Return whether the /clock that is followed has not begun, or has stopped."""
+        date_ns, steady_ns = self.date(), self.steady()
+        if date_ns != self._seen_ns:
+            self._seen_ns, self._changed_ns = date_ns, steady_ns
+        return self._publishers is not None and (
+            date_ns == 0 or steady_ns > self._changed_ns + PATIENCE_NS)
+
+    def set_scale(self, scale: float) -> None:
+        source_ns = self._counting(self._source())
+        self._anchor(self._at(source_ns), source_ns)
         self._scale = scale
 
-    def until_grid(self, period_ns: float, source_ns: int) -> float:
-        """Return the time of the source to the next multiple of a period, from t = 0 on [ns]."""
-        if self._publishers is not None:
+    def until_grid(self, period_ns: float) -> float:
+        """Return how long it is to the next multiple of a period of real time from t = 0 [ns]."""
+        if self._publishers:
             return period_ns
-        return period_ns - (source_ns - self._source_ns + self._simulated_ns / self._scale
+        return period_ns - (self._source() - self._source_ns + self._simulated_ns / self._scale
                             ) % period_ns
 
     def _anchor(self, simulated_ns: int, source_ns: int) -> None:
@@ -108,49 +105,54 @@ class SimulatedClock:
 
     def _counting(self, source_ns: int) -> int:
         """Return the time of the source that counts: of several /clock, the latest."""
-        if source_ns < self._newest_ns and self._publishers and self._publishers() != 1:
+        if self._publishers and source_ns < self._newest_ns and self._publishers() != 1:
             return self._newest_ns
         return source_ns
 
-    def due(self, steady_ns: int, source_ns: int, epoch_ns: int) -> Due:
-        """Return what is due now; `epoch_ns` is the stamp of t = 0."""
-        if not self._runs:
-            return Due(self._simulated_ns, self._simulated_ns)
-        shift_ns, warning = 0, ''
+    def due(self, epoch_ns: int) -> tuple[int, int, int]:
+        """
+        Return which samples are due, which are too late, and by how much the stamps move.
+
+        Samples are due up to the first simulated time; those up to the second are too late to be
+        published.  By the third, the stamp of t = 0, `epoch_ns`, moves to be at /clock again.
+        """
+        source_ns = self._source()
         if self._publishers is None:
             due_ns = self._at(source_ns)
-            return Due(due_ns, due_ns - int(LATEST_NS * self._scale))
+            return due_ns, due_ns - int(LATEST_NS * self._scale), 0
+        shift_ns = 0
         step_ns, counting_ns = source_ns - self._newest_ns, self._counting(source_ns)
-        if step_ns < 0 and counting_ns != source_ns:
+        if counting_ns != source_ns:
             if self._publishers() > 1 and not self._told_of_several:
-                warning = (f'several nodes publish on /clock, {_seconds(-step_ns)} apart: the '
+                self._warn(f'several nodes publish on /clock, {_seconds(-step_ns)} apart: the '
                            'latest time counts')
                 self._told_of_several = True
         elif step_ns < 0:
-            warning = (f'/clock stepped back by {_seconds(-step_ns)}: the motion and its stamps '
+            self._warn(f'/clock stepped back by {_seconds(-step_ns)}: the motion and its stamps '
                        'go on from where they are; ~/reset brings the stamps back to /clock')
             self._anchor(self._at(self._newest_ns), source_ns)
         elif step_ns > JUMP_NS:
-            warning = f'/clock jumped forward by {_seconds(step_ns)}: so do the stamps'
+            self._warn(f'/clock jumped forward by {_seconds(step_ns)}: so do the stamps')
             simulated_ns = self._at(self._newest_ns)
             behind_ns = max(source_ns - epoch_ns - simulated_ns, 0)
             shift_ns = behind_ns - behind_ns % EPOCH_GRID_NS
             self._anchor(simulated_ns, source_ns)
         self._newest_ns = counting_ns
-        due_ns = self._at(counting_ns)
+        steady_ns, due_ns = self.steady(), self._at(counting_ns)
         self._became_due.append((steady_ns, due_ns))
         while self._became_due[0][0] <= steady_ns - LATEST_NS:
             self._late_ns = self._became_due.popleft()[1]
-        return Due(due_ns, self._late_ns, shift_ns, warning)
+        return due_ns, self._late_ns, shift_ns
 
-    def slip(self, sent_ns: int, source_ns: int) -> int:
+    def slip(self, sent_ns: int) -> int:
         """
         Let simulated time go on from what is sent if that is long due; return the lag then, or 0.
 
         With a /clock that is followed it never slips: what is too late is not published.
         """
+        source_ns = self._source()
         lag_ns = self._at(source_ns) - sent_ns
-        if not self._runs or self._publishers or lag_ns <= LONGEST_LAG_NS * self._scale:
+        if self._publishers or lag_ns <= LONGEST_LAG_NS * self._scale:
             return 0
         self._anchor(sent_ns, source_ns)
         return lag_ns

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the executables of nodes share: start, spin, and end properly on every signal."""
+"""What the executables of nodes share: start, spin, end properly on every signal."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def run_node(name: str, argv: Sequence[str] | None,
     """
     Run the node of `spinning-top NAME`; return its exit code.
 
-    It is 0 after an ordinary end, or 2 with one line that says why the node cannot start.
+    It is OK after an ordinary end, or WRONG_USAGE with one line that says why it cannot start.
 
     argv : arguments, None for those of the program
     prepare : takes the arguments; returns those for ROS, and what makes the node
@@ -46,7 +46,7 @@ def run_node(name: str, argv: Sequence[str] | None,
     argv = list(sys.argv[1:] if argv is None else argv)
     name = f'spinning-top {name}'
     # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
-    _handle(lambda *_: os._exit(130), signal.SIGINT)
+    _handle(lambda *_: os._exit(cli.INTERRUPTED), signal.SIGINT)
     # Open the streams that the shell has closed (2>&-); otherwise a log gets their number.
     while os.open(os.devnull, os.O_RDWR) <= 2:
         pass
@@ -67,12 +67,12 @@ def run_node(name: str, argv: Sequence[str] | None,
         # Python handles signals between waits; without a timeout, Jazzy's EventsExecutor hangs.
         while rclpy.ok() and not interrupts and not node.finished.done():
             executor.spin_until_future_complete(node.finished, 0.5)
-        return (node.finished.result() or 0) if node.finished.done() else 0
+        return (node.finished.done() and node.finished.result()) or cli.OK
     except Exception as error:
         # A call may raise anything when the context ends.
         if rclpy.ok() and started:
             raise
-        return _cannot_start(name, error) if rclpy.ok() else 0
+        return _cannot_start(name, error) if rclpy.ok() else cli.OK
     finally:
         signals = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT
         _handle(signal.SIG_IGN, *signals)
@@ -86,12 +86,16 @@ def run_node(name: str, argv: Sequence[str] | None,
 def _initialize_ros(argv: list[str]) -> list[int]:
     """Initialize rclpy; return the list to which SIGINT and SIGTERM are appended from now on."""
     import rclpy  # noqa: PLC0415
+    from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level  # noqa: PLC0415
     # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
     # SIGINT twice, from the terminal and from launch.
     interrupts: list[int] = []
     _handle(lambda number, _: interrupts.append(number), signal.SIGINT, signal.SIGTERM)
     _handle(lambda *_: signal.raise_signal(signal.SIGTERM), signal.SIGHUP, signal.SIGQUIT)
+    set_logger_level('rcl', LoggingSeverity.FATAL)      # it says what the exception says
     rclpy.init(args=argv)
+    if get_logger_level('rcl') is LoggingSeverity.FATAL:    # no argument has set another
+        set_logger_level('rcl', LoggingSeverity.UNSET)
     return interrupts
 
 
@@ -137,7 +141,7 @@ def _cannot_start(name: str, error: Exception) -> int:
                 or kind.startswith('Invalid'))
     print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{short_reason(text_of(error))}',
           file=sys.stderr)
-    return 2
+    return cli.WRONG_USAGE
 
 
 def short_reason(text: object) -> str:
@@ -160,3 +164,10 @@ def _executor(node: RunnableNode) -> Executor:
     gc.freeze()             # a full collection then skips all objects of the start
     gc.collect()            # finds nothing, so that the next full collection comes soon
     return executor
+
+
+
+def tell(line: str) -> None:
+    """Print a line; a reader that has gone, or a full disk, does not end the node."""
+    with cli.reader_may_end(OSError):
+        print(line)

@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a tick does: which samples are sent now, in real time, without ROS."""
 
-import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from enum import Enum
 from typing import Any
 
 from spinning_top_sim.nodes.clock import LATEST_NS, SimulatedClock
 from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.physics.pivot import NEVER_NS
-from spinning_top_sim.physics.states import States
-from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.streams.live import LiveSimulation
@@ -27,16 +23,7 @@ DRIVE_PERIOD_NS = 20_000_000
 
 
 class LoopState(Enum):
-    """
-    What a `Loop` does; simulated time runs in RUNNING only.
-
-        WAITING --start--> RUNNING --pause--> PAUSED --resume--> RUNNING
-        RUNNING, or PAUSED by a step --duration--> ENDED, which is final
-        any but ENDED --fail--> FAILED
-        any but ENDED --reset--> RUNNING
-
-    `start` and `reset` lead to PAUSED if a pause is asked for.
-    """
+    """What a `Loop` does; simulated time runs in RUNNING only."""
 
     WAITING = 'waiting for the start'
     RUNNING = 'running'
@@ -51,32 +38,36 @@ class Loop:
 
     What is sent does not depend on when ticks come: each sends all samples that are due.
 
-    date, source : return the date, and the time that simulated time follows [ns]
     update_subscribers : sets `publish` of each output that has subscribers
     warn, error : take a text for the log; `error` why the motion has failed
-    steady : returns steady time [ns]; decides which ticks are late and how long one may work
     """
 
     def __init__(self, simulation: LiveSimulation, values: Mapping[str, Any],
-                 recording: Recording, clock: SimulatedClock, *, date: Callable[[], int],
-                 warn: Callable[[str], object], error: Callable[[str], object],
-                 update_subscribers: Callable[[], object],
-                 source: Callable[[], int] = time.monotonic_ns,
-                 steady: Callable[[], int] = time.monotonic_ns) -> None:
+                 recording: Recording, clock: SimulatedClock, *, warn: Callable[[str], object],
+                 error: Callable[[str], object], update_subscribers: Callable[[], object],
+                 ) -> None:
         self.late_ticks = self.skipped_ticks = self.slipped_ns = 0      # since the start
         self.commands = self.rejected_commands = 0
-        self.state = LoopState.WAITING
         self.paused: bool = values['start_paused']      # asked for; a failure does not change it
         self.failure: str | None = None         # why the motion stands still until `reset`
-        self.interruptions = 0                  # changes of the state, and resets
+        self._started = False
         self._simulation, self._recording, self._clock = simulation, recording, clock
-        self._date, self._source, self._steady = date, source, steady
         self._update_subscribers, self._warn, self._error = update_subscribers, warn, error
         self._subscribers_due_ns = self._last_tick_ns = 0       # on the steady clock
         # Asked for the pivot, and not yet applied
         self._velocity: Sequence[float] | None = None
         self._drive_from_ns = 0                 # simulated time of the next velocity
         self.set_pace(values)
+
+    @property
+    def state(self) -> LoopState:
+        if self._simulation.now_ns >= self._duration_ns:
+            return LoopState.ENDED              # which is final
+        if self.failure:
+            return LoopState.FAILED             # until a reset
+        if not self._started:
+            return LoopState.WAITING
+        return LoopState.PAUSED if self.paused else LoopState.RUNNING
 
     @property
     def now_ns(self) -> int:
@@ -88,10 +79,13 @@ class Loop:
         """The simulated time for the user, with all its digits."""
         return f'at t = {stamp_text(self.now_ns)} s'
 
-    @property
-    def next_tick_s(self) -> float:
-        """How long it is to the next time at which a tick finds samples that are just due [s]."""
-        return self._clock.until_grid(self.tick_period_ns, self._source()) / NANOSECONDS
+    def set_pace(self, values: Mapping[str, Any]) -> None:
+        """Take over tick_rate, time_scale and duration."""
+        self._duration_ns = round(values['duration'] * NANOSECONDS) or NEVER_NS
+        # With fewer ticks, some of what is due would be too late to be published.
+        self.tick_period_ns = min(NANOSECONDS / values['tick_rate'], LATEST_NS / 2)
+        self._ahead_ns = round(values['time_scale'] * max(AHEAD_NS, 1.5 * self.tick_period_ns))
+        self._clock.set_scale(values['time_scale'])
 
     def start(self) -> None:
         """
@@ -99,23 +93,18 @@ class Loop:
 
         Raises ValueError where t = 0 would have no stamp.
         """
-        self._simulation.epoch_ns = self._clock.begin(self._date(), self._source())
-        self._enter(LoopState.PAUSED if self.paused else LoopState.RUNNING)
+        self._simulation.epoch_ns = self._clock.next_epoch()
+        self._begin()
 
-    def _enter(self, state: LoopState) -> None:
-        """Change the state; unless it is RUNNING, time stands where all samples are sent."""
-        if self.state not in {state, LoopState.ENDED}:
-            self.state = state
-            self.interruptions += 1
-        self._last_tick_ns = self._steady()     # the next tick is not late
-        if self.state is not LoopState.RUNNING:
-            self._clock.hold(self.now_ns)
+    def _begin(self) -> None:
+        self._clock.begin(self._simulation.epoch_ns)
+        self._started, self._last_tick_ns = True, self._clock.steady()
 
     def tick(self) -> None:
         """Send what is due, then compute some of what is due next."""
         if self.state is not LoopState.RUNNING:
             return
-        steady_ns = self._steady()
+        steady_ns = self._clock.steady()
         since_ns, self._last_tick_ns = steady_ns - self._last_tick_ns, steady_ns
         if since_ns > 1.5 * self.tick_period_ns:
             self.late_ticks += 1
@@ -125,9 +114,7 @@ class Loop:
             self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
         target_ns = self._advance()
         self._apply_velocity()
-        if self._simulation.now_ns >= self._duration_ns:
-            self._enter(LoopState.ENDED)
-        elif self._simulation.now_ns >= target_ns:
+        if self._simulation.now_ns >= target_ns:
             self._simulation.look_ahead(target_ns + self._ahead_ns,
                                         self.tick_period_ns / NANOSECONDS)
 
@@ -136,31 +123,29 @@ class Loop:
         simulation, clock = self._simulation, self._clock
         if self.state is not LoopState.RUNNING:
             return simulation.now_ns
-        due = clock.due(self._steady(), self._source(), simulation.epoch_ns)
-        if due.warning:
-            self._warn(due.warning)
-        if due.shift_ns:
+        due_ns, late_ns, shift_ns = clock.due(simulation.epoch_ns)
+        if shift_ns:
             self._recording.write(
-                simulation.apply('epoch', epoch_ns=simulation.epoch_ns + due.shift_ns))
-        target_ns = min(due.due_ns, self._duration_ns)
-        stop_at_ns, has_room = self._steady() + TICK_BUDGET_NS, self._recording.has_room
+                simulation.apply('epoch', epoch_ns=simulation.epoch_ns + shift_ns))
+        target_ns = min(due_ns, self._duration_ns)
+        stop_at_ns, has_room = clock.steady() + TICK_BUDGET_NS, self._recording.has_room
+        if has_room():
+            self._send(target_ns, min(late_ns, target_ns) + 1,
+                       lambda: clock.steady() > stop_at_ns or not has_room())
+        if simulation.now_ns < target_ns and not self.failure:
+            self.slipped_ns += clock.slip(self.now_ns)
+        return target_ns
+
+    def _send(self, until_ns: int, publish_from_ns: int, give_way: Callable[[], bool]) -> None:
         try:
-            if has_room():
-                simulation.send(target_ns, min(due.late_ns, target_ns) + 1,
-                                lambda: self._steady() > stop_at_ns or not has_room())
+            self._simulation.send(until_ns, publish_from_ns, give_way)
         except IntegrationError as error:
             self.fail(str(error))
-        else:
-            if simulation.now_ns < target_ns:
-                self.slipped_ns += clock.slip(self.now_ns, self._source())
-        return target_ns
 
     def pause(self) -> None:
         """Send what is due, then hold the motion; does nothing when paused already."""
         self._advance()
         self.paused = True
-        if self.state is LoopState.RUNNING:
-            self._enter(LoopState.PAUSED)
 
     def resume(self) -> None:
         """
@@ -169,10 +154,10 @@ class Loop:
         Raises RuntimeError if the motion has failed; a pause remains then.
         """
         self._check_failure()
-        self.paused = False
-        if self.state is LoopState.PAUSED:
-            self._clock.run(self.now_ns, self._source())
-            self._enter(LoopState.RUNNING)
+        if self.paused:
+            self.paused = False
+            self._clock.run(self.now_ns)
+            self._last_tick_ns = self._clock.steady()   # the next tick is not late
 
     def step(self, length_ns: int) -> None:
         """Move a paused motion on, at most to `duration`, or raise RuntimeError."""
@@ -182,39 +167,30 @@ class Loop:
         self._update_subscribers()
         self._apply_velocity()
         target_ns = min(self.now_ns + length_ns, self._duration_ns)
-        stop_at_ns = self._steady() + STEP_BUDGET_NS
+        stop_at_ns = self._clock.steady() + STEP_BUDGET_NS
 
-        def give_way() -> bool:
-            if not self._recording.has_room():
-                self._recording.wait_for_room()
-            return self._steady() > stop_at_ns
-
-        try:
-            self._simulation.send(target_ns, give_way=give_way)
-        except IntegrationError as error:
-            self.fail(str(error))
-        self._enter(LoopState.ENDED if self.now_ns >= self._duration_ns else self.state)
+        # Other than a tick it waits for the recorder.
+        self._send(target_ns, 0, lambda: self._clock.steady() > stop_at_ns or (
+            not self._recording.has_room(STEP_BUDGET_NS / NANOSECONDS)))
         if self.failure:
             raise RuntimeError(self.failure)
         if self.now_ns < target_ns:
             raise RuntimeError(f'{self.time_text}: this takes too long, '
                                f'{(target_ns - self.now_ns) / NANOSECONDS:.9g} s are left')
 
-    def command(self, l3: float, lz: float) -> None:
-        """Send what is due, then let L3 and Lz jump [kg m^2/s]; ValueError, RuntimeError."""
-        self._send_before_change()
-        self._recording.write(self._simulation.apply('command', l3=l3, lz=lz))
-        self.commands += 1
-
-    def set_state(self, change: Callable[[States], State]) -> None:
+    def change(self, kind: str, details: Callable[[], Mapping[str, Any]]) -> None:
         """
-        Send what is due, then let the top be in another state, or raise ValueError.
+        Send what is due, then let an event change the motion.
 
-        change : takes the present state (n = 1), and returns the new one
+        details : returns those of the event, of what is the present state then
+
+        Raises ValueError for what cannot be, and RuntimeError if the motion has failed.
         """
-        self._send_before_change()
-        state = change(self._simulation.state())
-        self._recording.write(self._simulation.apply('state', **asdict(state)))
+        if self._simulation.now_ns < 0:         # the change sends the samples of t = 0
+            self._update_subscribers()
+        self._advance()
+        self._check_failure()
+        self._recording.write(self._simulation.apply(kind, **details()))
         self.commands += 1
 
     def drive(self, velocity: Sequence[float]) -> None:
@@ -235,12 +211,6 @@ class Loop:
                 self.rejected_commands += 1
                 self._warn(f'~/cmd_vel: refused: {error}')
 
-    def _send_before_change(self) -> None:
-        if self._simulation.now_ns < 0:         # the change sends the samples of t = 0
-            self._update_subscribers()
-        self._advance()
-        self._check_failure()
-
     def _check_failure(self) -> None:
         if self.failure:
             raise RuntimeError(f'the motion stands still: {self.failure}')
@@ -256,20 +226,13 @@ class Loop:
             raise RuntimeError(f'{self.state.value}: nothing follows')
         simulation = self._simulation
         last_stamp_ns = simulation.epoch_ns + simulation.now_ns
-        try:
-            event = simulation.apply('reset', parameters=values, epoch_ns=self._clock.begin(
-                self._date(), self._source(), last_stamp_ns))
-        except ValueError:
-            if self.state is LoopState.RUNNING:
-                self._clock.run(self.now_ns, self._source())
-            raise
+        event = simulation.apply('reset', parameters=values,
+                                 epoch_ns=self._clock.next_epoch(last_stamp_ns))
         self.failure = self._velocity = None
         self._drive_from_ns = 0
         if paused is not None:
             self.paused = paused
-        self.interruptions += 1
-        self.set_pace(values)           # a change that failed midway may not have set it
-        self._enter(LoopState.PAUSED if self.paused else LoopState.RUNNING)
+        self._begin()
         if simulation.epoch_ns < last_stamp_ns and self._recording.is_on:
             reason = 'stamps have gone back with /clock, and a log keeps them in order'
             self._recording.end(error=reason)
@@ -279,13 +242,4 @@ class Loop:
     def fail(self, reason: str) -> None:
         """Hold the motion until `reset`."""
         self.failure = reason
-        self._enter(LoopState.FAILED)
         self._error(f'{reason}; the motion stands still until ~/reset')
-
-    def set_pace(self, values: Mapping[str, Any]) -> None:
-        """Take over tick_rate, time_scale and duration."""
-        self._duration_ns = round(values['duration'] * NANOSECONDS) or NEVER_NS
-        # With fewer ticks, some of what is due would be too late to be published.
-        self.tick_period_ns = min(NANOSECONDS / values['tick_rate'], LATEST_NS / 2)
-        self._ahead_ns = round(values['time_scale'] * max(AHEAD_NS, 1.5 * self.tick_period_ns))
-        self._clock.set_scale(values['time_scale'], self._source())

@@ -5,41 +5,46 @@ The node `spinning_top`: connects a simulation to topics, services and parameter
 Everything happens in the thread of the executor; a steady timer ticks.
 """
 
-import functools
 import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock, ClockType, ROSClock
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.service import Service
 from rclpy.task import Future
+from rclpy.time import Time
 from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from spinning_top_sim.nodes import ros_parameters
 from spinning_top_sim.nodes.clock import SimulatedClock
-from spinning_top_sim.nodes.endpoints import answers_later, wait_for_all_acked
+from spinning_top_sim.nodes.executable import tell
 from spinning_top_sim.nodes.loop import Loop, LoopState
-from spinning_top_sim.nodes.publishers import ChannelPublishers
+from spinning_top_sim.nodes.publishers import (
+    ChannelPublishers,
+    create_publisher,
+    wait_for_all_acked,
+)
 from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.nodes.ros_parameters import SPIN
-from spinning_top_sim.nodes.stamp_clock import StampClock
 from spinning_top_sim.nodes.status import NodeStatus
-from spinning_top_sim.nodes.terminal import Terminal
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.parameter import Effect
 
 LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
-WAIT_S = 0.02                   # how often a /clock that has not begun is looked at
 
 
 class Simulator(Node):
@@ -47,6 +52,7 @@ class Simulator(Node):
     The node.
 
     given : parameters of its command line, which those of ROS override
+    values : the parameters that a reset starts with; an unset spin.lz follows initial.theta
 
     Raises ValueError for a parameter that is not allowed.
     """
@@ -54,93 +60,113 @@ class Simulator(Node):
     def __init__(self, given: Mapping[str, Any]) -> None:
         super().__init__('spinning_top', automatically_declare_parameters_from_overrides=True)
         self.finished: Future = Future()        # completes after `duration`
-        self._terminal = Terminal()
+        log = self._log = self.get_logger()
         overrides = ros_parameters.take_overrides(self)
-        values = ros_parameters.declare(self, given, overrides)
+        values = self.values = ros_parameters.declare(self, given, overrides)
         simulation = self.simulation = LiveSimulation(values)
-        # A reset starts with this spin.  An unset spin.lz stays unset: it follows initial.theta.
-        self._start_spin = {name: values[name] for name in SPIN}
-        # The parameters, with the spin as last commanded.
-        self.values = {**values, 'spin.lz': simulation.trajectory.lz}
         self.add_pre_set_parameters_callback(ros_parameters.all_with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self._date = StampClock(self, parameters.is_enabled('clock', values))
-        self._topics = ChannelPublishers(self)
+        self._topics = ChannelPublishers(self, simulation)
         self._recording = Recording(simulation, self._topics.topics_to_record)
-        follows = self._date.follows
+        # Whether there is a /clock of another node: a node does not follow its own.
+        self._follows = self.get_parameter('use_sim_time').value and not (
+            parameters.is_enabled('clock', values))
+        self.clock = self._make_clock()
         self.loop = Loop(
-            simulation, values, self._recording,
-            SimulatedClock(values['time_scale'], self._date.publishers if follows else None),
-            date=self._date.now_ns, source=self._date.now_ns if follows else time.monotonic_ns,
-            warn=self._warn, error=self._tell_error, update_subscribers=self._update_subscribers)
+            simulation, values, self._recording, self.clock,
+            warn=log.warning, error=log.error, update_subscribers=self._topics.update_subscribers)
         self._report = NodeStatus(simulation, self.loop, self._recording)
         self._alarms: dict[str, Timer] = {}
-        self._topics.check(simulation.outputs, values)
-        self._open_topics(values)
-        self._diagnostics = self._topics.create(DiagnosticArray, '/diagnostics')
+        self._topics.check(values)
+        self._take_over(values)
+        self._diagnostics = create_publisher(self, DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         self.create_subscription(Twist, '~/cmd_vel', self._on_velocity, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset)):
-            self.create_service(kind, f'~/{name}', functools.partial(self._serve, act))
+            self.create_service(kind, f'~/{name}', partial(self._serve, act))
         answers_later(self.create_service(SetBool, '~/record', self._record))
         self._every('diagnostics', 1.0, self._publish_diagnostics)
         for warning in ros_parameters.disobeyed_overrides(self, overrides):
-            self._log.warning(warning)
+            log.warning(warning)
         if objection := simulation.trajectory.top.objection:
-            self._log.warning(objection)
+            log.warning(objection)
+
+    def _make_clock(self) -> SimulatedClock:
+        if not self._follows:
+            return SimulatedClock(time.time_ns, self._log.warning)
+        for subscription in [*self.subscriptions]:
+            if subscription.msg_type is ClockMessage:   # it raises an error for times before 0
+                self.destroy_subscription(subscription)
+        topic = self.create_subscription(ClockMessage, '/clock', self._on_clock, QoSProfile(
+            depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)).topic_name
+        return SimulatedClock(lambda: int(self.get_clock().now().nanoseconds), self._log.warning,
+                              lambda: int(self.count_publishers(topic)))
+
+    def _on_clock(self, message: ClockMessage) -> None:
+        if message.clock.sec >= 0:
+            cast(ROSClock, self.get_clock()).set_ros_time_override(Time.from_msg(message.clock))
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
         # The recorder's thread releases the interpreter this soon when a tick is due.
         sys.setswitchinterval(1e-4)
-        self._every('start', WAIT_S, self._begin)
         self._begin()
+        self._align_ticks()
 
     def _begin(self) -> None:
-        """Let time run if the clock that is followed has begun; a timer calls it until then."""
-        if self._date.now_ns() == 0:
+        """Let time run if the clock that is followed has begun; ticks try it until then."""
+        if self.clock.date() == 0:
             return
         try:
             self.loop.start()
         except ValueError as error:
-            if not self._date.follows:
+            if not self._follows:
                 raise
             self._log.warning(f'/clock: {error}', once=True)
             return
-        self._every('start', 0.0)
         if self.values['record.enabled']:
-            self._recording.start(self.start_values, self._tell_of_recording)
-        self._align_ticks()
+            self._recording.start(self.values, lambda success, text: (
+                self._log.info(text) if success else self._log.error(f'not recording: {text}')))
 
     def _align_ticks(self) -> None:
         """Let ticks come just after samples are due."""
+        period_ns = self.loop.tick_period_ns
+
         def first() -> None:
-            self._every('tick', self.loop.tick_period_ns / NANOSECONDS, self._tick)
+            self._every('tick', period_ns / NANOSECONDS, self._tick)
             self._tick()
 
-        self._every('tick', self.loop.next_tick_s, first)
+        self._every('tick', self.clock.until_grid(period_ns) / NANOSECONDS, first)
 
-    def _tell_of_recording(self, success: bool, text: str) -> None:
-        if success:
-            self._log.info(text)
-        else:                   # no client waits for an answer
-            self._log.error(f'not recording: {text}')
+    def _tick(self) -> None:
+        self.loop.tick()
+        if reason := self._recording.check():
+            self._log.error(f'recording stopped: {reason}; the simulation goes on')
+        state = self.loop.state
+        if state is LoopState.WAITING:
+            self._begin()
+        elif state is LoopState.ENDED and not self.finished.done():
+            wait_for_all_acked(self._topics.by_topic.values(), 1.0)
+            self.finished.set_result(None)
 
-    def _update_subscribers(self) -> None:
-        if self._topics.update_subscribers(self.simulation.outputs):
-            self.simulation.refresh()
+    def _every(self, name: str, period: float, callback: Callable[[], object]) -> None:
+        """
+        Call back periodically [s], 0 = never, instead of what this timer did before.
 
-    def stop(self) -> None:
-        """End the motion and close the recording, whether the context is valid or not."""
-        self._terminal.end()
-        if summary := self._recording.close():
-            self._terminal.tell(summary)
+        The timer follows no /clock; unexpected errors stop the motion.
+        """
+        def call() -> None:
+            try:
+                callback()
+            except Exception as error:
+                self.fail(error)
 
-    def finish(self) -> None:
-        """End the process after the response that is being prepared."""
-        self._every('finish', LAST_ANSWERS_S,
-                    lambda: self.finished.done() or self.finished.set_result(None))
+        if name in self._alarms:
+            self.destroy_timer(self._alarms.pop(name))
+        if period:
+            self._alarms[name] = self.create_timer(
+                period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def fail(self, error: Exception) -> None:
         """Stop the motion after an unexpected error, and close the log while it is whole."""
@@ -151,17 +177,15 @@ class Simulator(Node):
         self.loop.fail(reason)
         self._recording.end(error=reason)
 
-    def _tick(self) -> None:
-        self.loop.tick()
-        self._check_recording()
-        if self.loop.state is LoopState.ENDED and not self.finished.done():
-            wait_for_all_acked(self._topics.by_topic.values(), 1.0)
-            self.finished.set_result(None)
+    def finish(self) -> None:
+        """End the process after the response that is being prepared."""
+        self._every('finish', LAST_ANSWERS_S,
+                    lambda: self.finished.done() or self.finished.set_result(None))
 
-    @property
-    def start_values(self) -> dict[str, Any]:
-        """The parameters that a reset starts with."""
-        return {**self.values, **self._start_spin}
+    def stop(self) -> None:
+        """End the motion and close the recording, whether the context is valid or not."""
+        if summary := self._recording.close():
+            tell(summary)
 
     def _on_command(self, message: Float64MultiArray) -> None:
         """Treat a command as a change of the parameters spin.l3 and spin.lz."""
@@ -199,47 +223,48 @@ class Simulator(Node):
             self.loop.rejected_commands += 1
         return SetParametersResult(successful=error is None, reason=reason)
 
-    def _change(self, changes: dict[str, Any]) -> None:
-        values, start_spin = ros_parameters.changed(self.values, changes, self._start_spin)
+    def _change(self, changes: Mapping[str, Any]) -> None:
+        for name, value in changes.items():
+            if value is None:
+                raise ValueError(f'{name}: cannot be unset while the node runs')
+        spin = {name: changes[name] for name in SPIN if name in changes}
+        command = parameters.checked_changes(spin if ros_parameters.is_command(changes) else {})
+        values = parameters.checked({**self.values, **{
+            name: value for name, value in changes.items() if name not in command}})
         self._check_context(values)
-        rest = sorted(changes.keys() - SPIN)
-        if ros_parameters.is_command(changes):
+        if command:
             self.check_started()
-            self.loop.command(values['spin.l3'], values['spin.lz'])
-        if rest:
+            motion = self.simulation.trajectory     # it goes on with what is not commanded
+            self.loop.change('command', lambda: {
+                'l3': command.get('spin.l3', motion.l3), 'lz': command.get('spin.lz', motion.lz)})
+        if rest := sorted(changes.keys() - SPIN):
             self._recording.write(self.simulation.apply(
                 'parameters', **{name: values[name] for name in rest}))
-            self._open_topics(values)
-            self.loop.set_pace(values)
-            if 'tick' in self._alarms:
-                self._align_ticks()
+            self._take_over(values)
+            self._align_ticks()
         for effect in (Effect.RESET, Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
                      and values[name] != self.values[name]]
             if names:
                 self._log.info(f'{", ".join(names)}: {effect.value}')
-        self.values, self._start_spin = values, start_spin
+        self.values = values
 
     def _check_context(self, values: Mapping[str, Any]) -> None:
-        if self._date.follows and parameters.is_enabled('clock', values):
+        if self._follows and parameters.is_enabled('clock', values):
             raise ValueError('clock.enabled = True: must be false while this node follows another '
                              '/clock (use_sim_time)')
-        self._topics.check(self.simulation.outputs, values)
+        self._topics.check(values)
         lowest = self.simulation.lowest_imu_rate
         if values['imu.rate'] < lowest:
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
                              'means or increments are taken, published or recorded')
 
-    def _open_topics(self, values: Mapping[str, Any]) -> None:
-        """Open the publishers and the status line that these parameters ask for."""
-        self._topics.open(self.simulation.outputs, values)
-        self.simulation.refresh()
-        self._every('status', values['status_period'], self._show_status)
-
-    def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
-        error, response.message = self.outcome(lambda: act(request))
-        response.success = error is None
-        return response
+    def _take_over(self, values: Mapping[str, Any]) -> None:
+        """Do what parameters of the node ask for that act at once."""
+        self._topics.open(values)
+        self.loop.set_pace(values)
+        self._every('status', values['status_period'],
+                    lambda: tell(self._report.status_line()))
 
     def outcome(self, act: Callable[[], str | None]) -> tuple[Exception | None, str]:
         """
@@ -254,6 +279,11 @@ class Simulator(Node):
         except Exception as error:
             self.fail(error)
             return error, f'{type(error).__name__}: {error}'
+
+    def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
+        error, response.message = self.outcome(lambda: act(request))
+        response.success = error is None
+        return response
 
     def check_started(self) -> None:
         """Raise RuntimeError before the first /clock that is followed."""
@@ -290,17 +320,17 @@ class Simulator(Node):
         motion begins with the present parameters; nothing changes then.
         """
         self.check_started()
-        self.loop.reset(self.start_values, paused)
+        self.loop.reset(self.values, paused)
         self._align_ticks()
         self.show_spin()
 
     def show_spin(self) -> None:
         """Let the parameters show the present spin."""
         motion = self.simulation.trajectory
-        self.values |= {'spin.l3': motion.l3, 'spin.lz': motion.lz}
         self.remove_on_set_parameters_callback(self._on_set_parameters)
         try:
-            self.set_parameters([Parameter(name, value=self.values[name]) for name in SPIN])
+            self.set_parameters([Parameter(name, value=value) for name, value in zip(
+                SPIN, (motion.l3, motion.lz), strict=True)])
         finally:
             self.add_on_set_parameters_callback(self._on_set_parameters)
 
@@ -312,72 +342,43 @@ class Simulator(Node):
             response.success, response.message = success, message
             future.set_result(response)
 
-        error, reason = self.outcome(lambda: self._start_or_end(request.data, answer))
+        def act() -> None:
+            if request.data:
+                self.check_started()
+                self._recording.start(self.values, answer)
+            else:
+                self._recording.end(answer)
+
+        error, reason = self.outcome(act)
         if error is not None:
             answer(False, reason)
         return future
 
-    def _start_or_end(self, start: bool, answer: Callable[[bool, str], object]) -> None:
-        if start:
-            self.check_started()
-            self._recording.start(self.start_values, answer)
-        else:
-            self._recording.end(answer)
-
-    @property
-    def _log(self) -> Any:
-        """The logger, on a line below the status line."""
-        self._terminal.end()
-        return self.get_logger()
-
-    def _warn(self, text: str) -> None:
-        self._log.warning(text)
-
-    def _tell_error(self, text: str) -> None:
-        self._log.error(text)
-
-    def _every(self, name: str, period: float, callback: Callable[[], object] = lambda: None,
-               ) -> None:
-        """
-        Call back periodically [s], 0 = never, instead of what this timer did before.
-
-        The timer follows no /clock; unexpected errors stop the motion.
-        """
-        def call() -> None:
-            try:
-                callback()
-            except Exception as error:
-                self.fail(error)
-
-        if name in self._alarms:
-            self.destroy_timer(self._alarms.pop(name))
-        if period:
-            self._alarms[name] = self.create_timer(
-                period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
     def _publish_diagnostics(self) -> None:
-        self._check_clock()
-        if self._recording.warning:
-            self._log.warning(f'recording: {self._recording.warning}', throttle_duration_sec=10.0)
-        if self._report.overloaded:
-            self._log.warning(
-                'this machine cannot keep up with these rates: live topics skip samples, or the '
-                'clock slips; a recording stays complete, and /diagnostics counts', once=True)
-        self._diagnostics.publish(self._report.diagnostics(
-            self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/')))
-
-    def _check_clock(self) -> None:
-        """Warn when the /clock that is followed stops; say when it goes on."""
-        waits = self._date.is_missing()
+        waits = self.clock.is_missing()
         if waits != self._report.waits_for_clock:
             self._report.waits_for_clock = waits
             self._log.warning('waiting for /clock (use_sim_time is set)' if waits else
                               '/clock goes on')
+        if self._recording.warning:
+            self._log.warning(f'recording: {self._recording.warning}', throttle_duration_sec=10.0)
+        self._diagnostics.publish(self._report.diagnostics(
+            self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/')))
+        if self._report.overloaded:
+            self._log.warning(
+                'this machine cannot keep up with these rates: live topics skip samples, or the '
+                'clock slips; a recording stays complete, and /diagnostics counts', once=True)
 
-    def _check_recording(self) -> None:
-        reason = self._recording.check()
-        if reason:
-            self._log.error(f'recording stopped: {reason}; the simulation goes on')
 
-    def _show_status(self) -> None:
-        self._terminal.show(self._report.status_line())
+def answers_later(service: Service) -> None:
+    """
+    Let the callback of a service return a Future of the response, which is sent when that is done.
+
+    rclpy's EventsExecutor has no coroutines for services.
+    """
+    send = service.send_response
+
+    def send_when_done(future: Future, header: object) -> None:
+        future.add_done_callback(lambda done: send(done.result(), header))
+
+    vars(service)['send_response'] = send_when_done

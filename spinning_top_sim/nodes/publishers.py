@@ -1,73 +1,113 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The publishers of the channels of a simulation."""
+"""Publishers: of types by name, with the QoS of parameters, and those of a simulation."""
 
-from collections.abc import Mapping, Sequence
+import importlib
+import os
+import re
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.type_support import check_for_type_support
 
-from spinning_top_sim.nodes.endpoints import message_class
 from spinning_top_sim.nodes.recording import Topic
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.channel import Channel
-from spinning_top_sim.streams.live import Output
+from spinning_top_sim.streams.live import LiveSimulation
+
+
+def message_class(type_name: str) -> type:
+    """
+    Return a message class of an installed ROS package, of which publishers can be made.
+
+    Raises LookupError for any other name.
+    """
+    # REP-144 and the ROS 2 interface names.
+    match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
+    package, name = match.groups() if match else ('', '')
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    # Other Python packages must not be imported because a log names them.
+    if not any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
+               for prefix in prefixes):
+        raise LookupError(f'{type_name} is not installed')
+    try:
+        kind: type = getattr(importlib.import_module(f'{package}.msg'), name)
+        check_for_type_support(kind)
+    except Exception as error:      # importing a broken package may raise anything
+        raise LookupError(f'{type_name} cannot be used: {error}') from error
+    return kind
+
+
+def create_publisher(node: Node, kind: type, topic: str, qos: QoSProfile | None = None,
+                     ) -> Publisher:
+    """Return a new publisher, whose QoS (by default: keep the last 10) parameters override."""
+    return node.create_publisher(
+        kind, topic, qos or QoSProfile(depth=10),
+        qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+
+def wait_for_all_acked(publishers: Iterable[Publisher], seconds: float) -> None:
+    """Wait at most so long until all subscribers have acknowledged all messages."""
+    end = time.monotonic() + seconds
+    for publisher in publishers:
+        if publisher.get_subscription_count():
+            publisher.wait_for_all_acked(Duration(seconds=max(end - time.monotonic(), 0.001)))
 
 
 class ChannelPublishers:
-    """Holds a publisher for each enabled channel, by topic."""
+    """Holds a publisher for each enabled channel of a simulation, by topic."""
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Node, simulation: LiveSimulation) -> None:
+        self._node, self._simulation = node, simulation
         self.by_topic: dict[str, Publisher] = {}
 
-    def create(self, kind: type, topic: str) -> Publisher:
-        """Return a new publisher, whose QoS parameters can override."""
-        return self._node.create_publisher(
-            kind, topic, QoSProfile(depth=10),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
-
-    @staticmethod
-    def check(outputs: Sequence[Output], values: Mapping[str, Any]) -> None:
+    def check(self, values: Mapping[str, Any]) -> None:
         """Raise ValueError for an enabled channel whose messages are not installed."""
-        for channel in (output.channel for output in outputs):
+        for channel in self._simulation.channels:
             if parameters.is_enabled(channel.name, values):
                 try:
                     message_class(channel.type_name)
                 except LookupError as error:
                     raise ValueError(f'{channel.name}.enabled: {error}') from error
 
-    def open(self, outputs: Sequence[Output], values: Mapping[str, Any]) -> None:
+    def open(self, values: Mapping[str, Any]) -> None:
         """Create the publishers of enabled channels, and destroy those of disabled ones."""
-        for output in outputs:
+        for output in self._simulation.outputs:
             topic = output.channel.topic
             enabled = parameters.is_enabled(output.channel.name, values)
             if enabled and topic not in self.by_topic:
-                self.by_topic[topic] = self.create(message_class(output.channel.type_name), topic)
+                self.by_topic[topic] = create_publisher(
+                    self._node, message_class(output.channel.type_name), topic)
             elif topic in self.by_topic and not enabled:
                 output.publish = None
                 self._node.destroy_publisher(self.by_topic.pop(topic))
+        self._simulation.refresh()
 
-    def update_subscribers(self, outputs: Sequence[Output]) -> bool:
-        """Connect the outputs that have subscribers; return whether others have some now."""
+    def update_subscribers(self) -> None:
+        """Connect the outputs that have subscribers."""
         changed = False
-        for output in outputs:
+        for output in self._simulation.outputs:
             publisher = self.by_topic.get(output.channel.topic)
             wanted = publisher is not None and publisher.get_subscription_count() > 0
             if wanted != (output.publish is not None):
                 output.publish = publisher.publish if wanted and publisher else None
                 changed = True
-        return changed
+        if changed:
+            self._simulation.refresh()
 
     def topics_to_record(self, channels: Sequence[Channel]) -> list[Topic]:
         """Return name, type and QoS of the topics of these channels, then those of events."""
-        topics: list[Topic] = []
-        for channel in channels:
-            publisher = self.by_topic[channel.topic]
-            topics.append((publisher.topic_name, channel.type_name, {
-                name: int(getattr(publisher.qos_profile, name)) for name in (
-                    'history', 'depth', 'reliability', 'durability', 'liveliness')}))
-        return topics + [(self._node.resolve_topic_name(name), type_name, {})
-                         for name, type_name in events.TOPICS.items()]
+        policies = ('history', 'depth', 'reliability', 'durability', 'liveliness')
+        publishers = [(self.by_topic[channel.topic], channel.type_name) for channel in channels]
+        return [(one.topic_name, type_name, {
+            name: int(getattr(one.qos_profile, name)) for name in policies})
+            for one, type_name in publishers] + [
+                (self._node.resolve_topic_name(name), type_name, {})
+                for name, type_name in events.TOPICS.items()]

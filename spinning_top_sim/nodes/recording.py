@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.streams.channel import Channel
@@ -22,15 +21,6 @@ Topic = tuple[str, str, dict[str, int]]     # full name, type, and offered QoS
 Answer = Callable[[bool, str], object]      # takes success and a text
 
 
-@dataclass
-class _Request:
-    """A log that is being opened or closed, and who waits for that."""
-
-    recorder: Recorder
-    is_end: bool
-    answer: Answer
-
-
 class Recording:
     """
     Records a simulation into one log at a time; the recorder's own thread uses the disk.
@@ -44,7 +34,8 @@ class Recording:
         self.error: str | None = None
         self._simulation, self._topics = simulation, topics
         self._recorder: Recorder | None = None
-        self._requests: list[_Request] = []
+        # Logs that are being opened or closed: the states meanwhile, and what tells who waits.
+        self._requests: list[tuple[Recorder, Sequence[str], Callable[[], object]]] = []
         self._events_index = 0              # index of the first topic of events in the log
 
     def start(self, values: Mapping[str, Any], answer: Answer = lambda *_: None) -> None:
@@ -66,7 +57,8 @@ class Recording:
         self.error, self._events_index = None, len(channels)
         simulation.log_to(recorder.write, channels)
         self.write(Event('start', max(simulation.now_ns, 0), simulation.now_ns))
-        self._requests.append(_Request(recorder, False, answer))
+        self._requests.append((recorder, ('opening',), lambda: answer(
+            recorder.error is None, recorder.error or f'recording to {recorder.path}')))
 
     def end(self, answer: Answer = lambda *_: None, error: str | None = None) -> None:
         """Record no more; `check` answers once the file is closed."""
@@ -77,34 +69,30 @@ class Recording:
         self._simulation.log_to(None)
         recorder.end()
         self.error = error
-        self._requests.append(_Request(recorder, True, answer))
+        self._requests.append((recorder, ('opening', 'recording'), lambda: answer(
+            recorder.error is None, _summary(recorder))))
 
     def check(self) -> str | None:
         """Answer the requests that are done; return why a recording has stopped by itself."""
-        waiting, self._requests = self._requests, []
-        for request in waiting:
-            recorder = request.recorder
-            if recorder.state == 'opening' or (request.is_end and recorder.state == 'recording'):
-                self._requests.append(request)
-            elif request.is_end:
-                request.answer(recorder.error is None, _summary(recorder))
-            elif recorder.error is not None:
-                request.answer(False, recorder.error)
-                if recorder is self._recorder:      # this told it
-                    self.end(error=recorder.error)
-            else:
-                request.answer(True, f'recording to {recorder.path}')
-        reason = self._recorder.error if self._recorder else None
-        if reason:
-            self.end(error=reason)
-        return reason
+        recorder, told = self._recorder, None
+        has_failed = recorder is not None and recorder.state == 'failed'
+        for request in list(self._requests):
+            asked, states, tell = request
+            if asked.state not in states:
+                self._requests.remove(request)
+                told = asked
+                tell()
+        if recorder is None or not has_failed:
+            return None
+        self.end(error=recorder.error)
+        return None if recorder is told else recorder.error
 
     def close(self) -> str | None:
         """Wait until all logs are closed; return a text for the user about the last one."""
         recorder = self._recorder
         self.end()
-        for request in self._requests:
-            request.recorder.close()
+        for one, *_ in self._requests:
+            one.close()
         self.check()
         if recorder is None or recorder.path is None:
             return None
@@ -120,14 +108,11 @@ class Recording:
                 self._events_index + list(TOPICS).index(topic), simulation.epoch_ns + event.t_ns,
                 data) for topic, data in event.entries()])
 
-    def has_room(self) -> bool:
-        """Return whether the recorder takes more messages."""
-        return self._recorder is None or self._recorder.room
-
-    def wait_for_room(self) -> None:
-        """Wait until the recorder takes more messages, a tenth of a second at most."""
-        if self._recorder is not None:
-            self._recorder.wait_for_room(0.1)
+    def has_room(self, wait_s: float = 0.0) -> bool:
+        """Return whether the recorder takes more messages, after a wait at most."""
+        recorder = self._recorder
+        return recorder is None or recorder.room or bool(
+            wait_s and recorder.wait_for_room(wait_s))
 
     @property
     def warning(self) -> str | None:

@@ -33,7 +33,6 @@ round on, stamps are later by the rounds before.
 
 while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'
-  ros2 param set /replay rate 2.0
 
 exit code: 0 played (also in part: topics left out, ended by a signal),
 2 cannot be played, or is damaged inside
@@ -58,8 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add = parser.add_argument
     add('file', type=Path, metavar='FILE', help='the log')
-    add('-r', '--rate', type=float, metavar='R',
-        help='recorded over real time (default: the parameter `rate`, 1)')
+    add('-r', '--rate', type=float, default=1.0, metavar='R', help='recorded over real time')
     add('-l', '--loop', action='store_true', help='begin again at the end')
     add('--start', type=float, default=0.0, metavar='S',
         help='begin S seconds after the begin of the log')
@@ -70,7 +68,3 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'recorded /clock')
     add('--partial', action='store_true', help='play what is whole of a damaged log')
     add('-p', '--start-paused', action='store_true', help='wait for ~/set_pause false')
-    add('-d', '--delay', type=float, default=0.0, metavar='S',
-        help='wait S seconds before the first message')
-    add('--wait-for-subscribers', type=int, default=0, metavar='COUNT',
-        help='wait until there are so many, over all topics')

@@ -89,22 +89,3 @@ def is_command(changes: Mapping[str, Any]) -> bool:
     """Return whether changes command the spin; beside `initial.*` it is that of the next start."""
     return not changes.keys().isdisjoint(SPIN) and not any(
         name.startswith('initial.') for name in changes)
-
-
-def changed(values: Mapping[str, Any], changes: Mapping[str, Any],
-            start_spin: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the changed values and the spin of the next start.  Raises ValueError."""
-    for name, value in changes.items():
-        if value is None:
-            raise ValueError(f'{name}: cannot be unset while the node runs')
-    spin = {name: value for name, value in changes.items() if name in SPIN}
-    present, start = {name: values[name] for name in SPIN}, dict(start_spin)
-    if is_command(changes):
-        present.update(spin)
-    else:
-        start.update(spin)
-    # A reset combines `start` with the other parameters, so they are checked together.  The
-    # present spin belongs to the present state, and `Loop.command` checks it.
-    checked = parameters.checked({**values, **changes, **start})
-    return ({**checked, **{name: parameters.BY_NAME[name].check(present[name]) for name in SPIN}},
-            {name: checked[name] for name in SPIN})

@@ -2,7 +2,7 @@
 """
 Offers simulation_interfaces, the standard of ROS 2 for simulators; the top is its one entity.
 
-The handler of GetEntities is `_get_entities`.  A handler takes a request, fills the response, and
+The handler of GetEntities is `get_entities`.  A handler takes a request, fills the response, and
 may return a text for `error_message`.  RefusedError has the result code of a refusal; other errors
 mean RESULT_OPERATION_FAILED.
 """
@@ -11,6 +11,7 @@ import importlib
 import re
 import types
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -41,6 +42,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     'SetEntityState': ('ENTITY_STATE_SETTING',),
     'GetEntityInfo': ('ENTITY_INFO_GETTING',),
 }
+ON_A_MOTION = ('StepSimulation', 'ResetSimulation', 'SetEntityState')     # they need one
 # Tolerances for the rounding of a client: of the pivot's place [m] and velocity [m/s], and of a
 # quaternion's length.
 NEAR, LENGTH_ERROR = 1e-6, 1e-3
@@ -77,12 +79,20 @@ class SimulationHandlers:
         self._node, self._loop, self._simulation = node, node.loop, node.simulation
         self._messages, self._results = messages, messages.Result
         self._name = node.get_name()            # of the entity
-        self._pause_at_start = -1               # `loop.interruptions` when PAUSED was set at t = 0
         self._quits = False
 
     def serve(self, name: str, request: Message, response: Message) -> Message:
         """Handle a request for the service of this type; return the response."""
-        error, text = self._node.outcome(lambda: self._handle(name, request, response))
+        def handle() -> str | None:
+            if name in ON_A_MOTION:
+                self._check_runs()
+            if getattr(request, 'entity', self._name) != self._name:
+                raise RefusedError(self._results.RESULT_NOT_FOUND,
+                                   f'entity = {request.entity!r}: there is {self._name!r} only')
+            text: str | None = getattr(self, f'_{service_name(name)}')(request, response)
+            return text
+
+        error, text = self._node.outcome(handle)
         if hasattr(response, 'result'):
             response.result.result = self._results.RESULT_OK if error is None else getattr(
                 error, 'code', self._results.RESULT_OPERATION_FAILED)
@@ -90,19 +100,15 @@ class SimulationHandlers:
             response.result.error_message = text.encode(errors='backslashreplace').decode()
         return response
 
-    def _handle(self, name: str, request: Message, response: Message) -> str | None:
-        if getattr(request, 'entity', self._name) != self._name:
-            raise RefusedError(self._results.RESULT_NOT_FOUND,
-                               f'entity = {request.entity!r}: there is {self._name!r} only')
-        text: str | None = getattr(self, f'_{service_name(name)}')(request, response)
-        return text
-
     def _check_runs(self) -> None:
         """Raise RefusedError before the motion begins, and when the process ends."""
         error, reason = self._node.outcome(self._node.check_started)
         if error or self._state == 'QUITTING':
             raise RefusedError(self._results.RESULT_INCORRECT_STATE,
                                reason or 'the simulator is quitting')
+
+    def _unsupported(self, reason: str) -> RefusedError:
+        return RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED, reason)
 
     def _get_simulator_features(self, _: Message, response: Message) -> None:
         known = self._messages.SimulatorFeatures
@@ -113,15 +119,13 @@ class SimulationHandlers:
     @property
     def _state(self) -> str:
         """The state as SimulationState names it."""
-        loop = self._loop
-        if self._quits or loop.state is LoopState.ENDED:
+        state = self._loop.state
+        if self._quits or state is LoopState.ENDED:
             return 'QUITTING'
-        if loop.state is LoopState.RUNNING:
+        if state is LoopState.RUNNING:
             return 'PLAYING'
-        is_at_start = (loop.state is LoopState.PAUSED and self._simulation.now_ns < 0
-                       and loop.interruptions != self._pause_at_start)
-        # A failed motion is PAUSED, too.
-        return 'STOPPED' if is_at_start or loop.state is LoopState.WAITING else 'PAUSED'
+        # A motion that has failed is PAUSED, too.
+        return 'STOPPED' if self._simulation.now_ns < 0 and not self._loop.failure else 'PAUSED'
 
     def _get_simulation_state(self, _: Message, response: Message) -> str:
         response.state.state = getattr(response.state, f'STATE_{self._state}')
@@ -149,10 +153,8 @@ class SimulationHandlers:
             raise RefusedError(response.STATE_TRANSITION_ERROR, error) from error
 
     def _pause(self) -> None:
-        if self._state == 'STOPPED':
-            self._pause_at_start = self._loop.interruptions
-        else:
-            self._loop.pause()
+        self._loop.pause()
+        self._loop.step(0)          # the sample of t = 0 tells PAUSED from STOPPED
 
     def _quit(self) -> None:
         self._loop.pause()
@@ -163,40 +165,35 @@ class SimulationHandlers:
         loop, steps = self._loop, request.steps
         if steps < 1:
             raise ValueError(f'steps = {steps}: must be >= 1')
-        self._node.check_started()
         if self._state != 'PAUSED':
             raise RuntimeError('the simulation is not paused: SetSimulationState must set '
                                'STATE_PAUSED first')
-        length_ns = steps * self._node.step_ns
-        target_ns = loop.now_ns + length_ns
-        loop.step(length_ns)
+        target_ns = loop.now_ns + steps * self._node.step_ns
+        loop.step(target_ns - loop.now_ns)
         if loop.now_ns < target_ns:
             raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
 
     def _reset_simulation(self, request: Message, _: Message) -> None:
-        self._check_runs()
-        values, time_and_state = self._node.start_values, request.SCOPE_TIME | request.SCOPE_STATE
+        values, time_and_state = self._node.values, request.SCOPE_TIME | request.SCOPE_STATE
         if request.scope in (request.SCOPE_DEFAULT, request.SCOPE_ALL, time_and_state):
             self._node.start_again()
         elif request.scope == request.SCOPE_STATE:
             self._set_state(lambda _: parameters.start_state(values))
         else:
-            raise RefusedError(
-                self._results.RESULT_FEATURE_UNSUPPORTED,
+            raise self._unsupported(
                 f'scope = {request.scope}: must be {request.SCOPE_DEFAULT} or '
                 f'{request.SCOPE_ALL} (all), {request.SCOPE_STATE} (state) or {time_and_state} '
                 '(time and state): time goes back with the state only, and nothing is spawned')
 
     def _set_state(self, change: Callable[[States], State]) -> None:
-        self._loop.set_state(change)
+        self._loop.change('state', lambda: asdict(change(self._simulation.state())))
         self._node.show_spin()
 
     def _get_entities(self, request: Message, response: Message) -> None:
         filters = request.filters
         if (filters.filter or filters.categories or filters.tags.tags
                 or filters.bounds.type != filters.bounds.TYPE_EMPTY):
-            raise RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED,
-                               'filters must be empty: there is one entity')
+            raise self._unsupported('filters must be empty: there is one entity')
         response.entities = [self._name]
 
     def _get_entities_states(self, request: Message, response: Message) -> None:
@@ -209,11 +206,8 @@ class SimulationHandlers:
 
     def _get_entity_info(self, _: Message, response: Message) -> None:
         response.info.category.category = self._messages.EntityCategory.CATEGORY_ROBOT
-        top = self._simulation.trajectory.top
         response.info.description = (
-            f'heavy symmetric top on a pivot: mass {top.mass:g} kg, centre of mass '
-            f'{top.com_distance:g} m from the pivot, moments of inertia {top.lambda1:g} and '
-            f'{top.lambda3:g} kg m^2')
+            f'heavy symmetric top on a pivot, in SI units: {self._simulation.trajectory.top}')
         response.info.tags = ['spinning_top', 'heavy_symmetric_top', 'imu']
 
     def _fill(self, message: Message) -> None:
@@ -233,15 +227,13 @@ class SimulationHandlers:
                 setattr(target, name, float(column[0]))
 
     def _set_entity_state(self, request: Message, response: Message) -> None:
-        self._check_runs()
         # Older versions of the message have no flags, and set both.
         if not (getattr(request, 'set_pose', True) or getattr(request, 'set_twist', True)):
             raise ValueError('set_pose and set_twist are false: one of them must be true; the '
                              'acceleration follows from pose and twist')
         frame, given = self._node.values['world_frame'], request.state.header.frame_id
         if given not in ('', frame):
-            raise RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED,
-                               f'header.frame_id = {given!r}: must be {frame!r} or empty')
+            raise self._unsupported(f'header.frame_id = {given!r}: must be {frame!r} or empty')
         self._set_state(partial(requested_state, request, response))
 
 

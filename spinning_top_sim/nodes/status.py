@@ -18,6 +18,7 @@ from spinning_top_sim.streams.live import LiveSimulation
 # Keys in /diagnostics that the page of `view` reads, with those of `recording`.
 STATE, TIME, EPOCH = 'state', 'simulated time [s]', 'stamp of t = 0 [ns]'
 SPEED, DRIFT = 'real-time factor', 'energy drift'
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
 class NodeStatus:
@@ -26,23 +27,31 @@ class NodeStatus:
     def __init__(self, simulation: LiveSimulation, loop: Loop, recording: Recording) -> None:
         self._simulation, self._loop, self._recording = simulation, loop, recording
         self._speed = math.nan                  # simulated time over real time
-        self._described: object = None          # the piece of the motion that `_regime` names
-        self._regime = ''
         self._read_at, self._read_ns = time.monotonic(), 0
+        self._told = 0, 0, 0            # failed, skipped, slipped: at the message before
+        self.overloaded = False         # whether samples were skipped, or the clock has slipped
         self.waits_for_clock = False            # whether /clock has not begun, or has stopped
 
     def diagnostics(self, stamp: Time, name: str) -> DiagnosticArray:
-        """Return the message for /diagnostics."""
+        """
+        Return the message for /diagnostics.
+
+        Counters are totals; level and message tell the present, and what has happened since the
+        message before.
+        """
         simulation, loop, recording = self._simulation, self._loop, self._recording
-        failed = self._total('failed')
+        totals = failed, skipped, _ = (
+            self._total('failed'), self._total('skipped'), loop.slipped_ns)
+        new_failed = failed - self._told[0]
+        self.overloaded, self._told = totals[1:] != self._told[1:], totals
         states = (      # whether it holds, its level, its message
-            (True, DiagnosticStatus.OK, 'paused' if loop.paused else 'running'),
-            (self.waits_for_clock, DiagnosticStatus.WARN, 'waiting for /clock'),
-            (failed, DiagnosticStatus.WARN, f'{failed} messages could not be published'),
-            (self.overloaded, DiagnosticStatus.WARN, 'this machine cannot keep up'),
-            (recording.warning, DiagnosticStatus.WARN, f'recording: {recording.warning}'),
-            (recording.error, DiagnosticStatus.ERROR, f'recording: {recording.error}'),
-            (loop.failure, DiagnosticStatus.ERROR, loop.failure))
+            (True, OK, 'paused' if loop.paused else 'running'),
+            (self.waits_for_clock, WARN, 'waiting for /clock'),
+            (new_failed, WARN, f'{new_failed} messages could not be published'),
+            (self.overloaded, WARN, 'this machine cannot keep up'),
+            (recording.warning, WARN, f'recording: {recording.warning}'),
+            (recording.error, ERROR, f'recording: {recording.error}'),
+            (loop.failure, ERROR, loop.failure))
         _, level, message = max(filter(itemgetter(0), states), key=itemgetter(1))
         now_ns, motion = loop.now_ns, simulation.trajectory
         numbers = {
@@ -53,7 +62,7 @@ class NodeStatus:
             'late ticks': loop.late_ticks,
             'skipped ticks': loop.skipped_ticks,
             'published messages': self._total('sent'),
-            'skipped samples': self._total('skipped'),
+            'skipped samples': skipped,
             'failed messages': failed,
             'clock slip [s]': f'{loop.slipped_ns / NANOSECONDS:.3f}',
             DRIFT: f'{self._energy_drift():.3g}',
@@ -65,11 +74,6 @@ class NodeStatus:
         return DiagnosticArray(header=Header(stamp=stamp), status=[DiagnosticStatus(
             level=level, name=name, hardware_id='none', message=message,
             values=[KeyValue(key=key, value=str(value)) for key, value in numbers.items()])])
-
-    @property
-    def overloaded(self) -> bool:
-        """Whether samples were too late to be published, or the clock has slipped."""
-        return self._loop.slipped_ns > 0 or self._total('skipped') > 0
 
     def _total(self, count: str) -> int:
         return sum(getattr(output, count) for output in self._simulation.outputs)
@@ -92,17 +96,15 @@ class NodeStatus:
         """Return the line for the terminal, with the angle in degrees."""
         simulation, loop = self._simulation, self._loop
         motion = simulation.trajectory
-        piece = motion.after(loop.now_ns)
-        if piece is not self._described:
-            self._described, description = piece, piece.describe()
-            self._regime = description.name if description else ''
+        regime = motion.after(loop.now_ns).describe()
         theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
         flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
         is_running = loop.state is LoopState.RUNNING and not math.isnan(self._speed)
         # The most important parts come first: a terminal shows as much as fits.
         return ' | '.join(filter(None, (
-            f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', self._regime, f'theta {theta:6.2f} deg',
+            f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', regime.name if regime else '',
+            f'theta {theta:6.2f} deg',
             f'x{self._speed:.2f}' if is_running else '',
             f'{sent} messages' if sent else 'no subscribers yet',
             f'L3 {motion.l3:.4g} Lz {motion.lz:.4g}',

@@ -22,7 +22,6 @@ import time
 from pathlib import Path
 
 import rclpy
-from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -40,11 +39,11 @@ PATIENCE_S = 60.0           # for what takes a second on an idle machine
 LIFETIME_S = 300.0          # a node that is still there is killed
 
 
-def wait_for(what, condition, timeout=PATIENCE_S):
-    """Wait until a condition holds, and return its value; fail with `what` after the timeout."""
-    end = time.monotonic() + timeout
+def wait_for(what, condition):
+    """Wait until a condition holds, and return its value; fail with `what` after PATIENCE_S."""
+    end = time.monotonic() + PATIENCE_S
     while not (result := condition()):
-        assert time.monotonic() < end, f'{timeout:g} s and still not: {what}'
+        assert time.monotonic() < end, f'{PATIENCE_S:g} s and still not: {what}'
         time.sleep(0.005)
     return result
 
@@ -128,13 +127,11 @@ class SimNode:
             self.kill()
             return -signal.SIGKILL
 
-    def end(self, number=signal.SIGINT, times=1, gap=0.0):
+    def end(self, number=signal.SIGINT, times=1):
         """Signal the process group, wait, and return the exit code."""
         for _ in range(times):
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.process.pid, number)
-            if times > 1:
-                time.sleep(gap)
         return self.wait(10.0)
 
     def memory(self):
@@ -174,15 +171,14 @@ class Topic:
         if not self.muted:
             self.raw.append(data)
 
-    def wait(self, count, timeout=PATIENCE_S):
+    def wait(self, count):
         """Wait until `count` messages have arrived in all."""
-        wait_for(f'{count} messages of {self.kind.__name__} (there are {len(self.raw)})',
-                 lambda: len(self.raw) >= count, timeout)
+        wait_for(f'{count} messages of {self.kind.__name__}', lambda: len(self.raw) >= count)
         return self
 
-    def wait_more(self, count, timeout=PATIENCE_S):
+    def wait_more(self, count):
         """Wait until `count` more messages have arrived."""
-        return self.wait(len(self.raw) + count, timeout)
+        return self.wait(len(self.raw) + count)
 
     def messages(self):
         return [deserialize_message(data, self.kind) for data in self.raw]
@@ -245,7 +241,7 @@ class Peer:
             raw=True)
         return topic
 
-    def call(self, kind, name, request, timeout=PATIENCE_S, again=False):
+    def call(self, kind, name, request, again=False):
         """
         Call a service and return its answer.
 
@@ -256,10 +252,10 @@ class Peer:
         if new:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]
-        assert client.wait_for_service(timeout), f'no service {name}'
+        assert client.wait_for_service(PATIENCE_S), f'no service {name}'
         # A server that has not discovered a new client drops its answer after 0.1 s
         # ("client will not receive response", rmw_fastrtps).
-        for patience in (timeout / 10, timeout) if new or again else (timeout,):
+        for patience in (PATIENCE_S / 10, PATIENCE_S) if new or again else (PATIENCE_S,):
             done = threading.Event()
             future = client.call_async(request)
             future.add_done_callback(lambda _, done=done: done.set())
@@ -278,7 +274,9 @@ class Peer:
 
     def set_together(self, node, **values):
         """Set parameters all or none (`__` for the dot); return the one result."""
-        request = SetParametersAtomically.Request(parameters=_parameters(values))
+        request = SetParametersAtomically.Request(parameters=[
+            Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
+            for name, value in values.items()])
         return self.call(SetParametersAtomically, node.topic('~/set_parameters_atomically'),
                          request).result
 
@@ -286,12 +284,6 @@ class Peer:
         answer = self.call(GetParameters, node.topic('~/get_parameters'),
                            GetParameters.Request(names=list(names)), again=True)
         return [parameter_value_to_python(value) for value in answer.values]
-
-
-def _parameters(values):
-    return [value if isinstance(value, ParameterMessage)
-            else Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
-            for name, value in values.items()]
 
 
 class Diagnostics:

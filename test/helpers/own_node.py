@@ -50,10 +50,14 @@ class OwnNode(InThisProcess):
     def listen(self, *topics):
         """Let these streams, and no others, have a subscriber."""
         self.heard |= {topic: [] for topic in topics}
-        self.node._topics.update_subscribers = lambda outputs: [
-            setattr(one, 'publish', self.heard[one.channel.topic].append)
-            for one in outputs if one.channel.topic in self.heard and one.publish is None]
+        self.loop._update_subscribers = self._connect
         return self
+
+    def _connect(self):
+        for one in self.simulation.outputs:
+            if one.channel.topic in self.heard and one.publish is None:
+                one.publish = self.heard[one.channel.topic].append
+                self.simulation.refresh()
 
     def set(self, **values):
         """Set parameters all or none; return the result."""
