@@ -8,9 +8,9 @@ from pathlib import Path
 from spinning_top_sim.nodes.clock import JUMP_NS
 from spinning_top_sim.nodes.loop import LoopState
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.tools.recorded_run import channels_of
 
 HEAD = """<!-- Written by docs/interface.py from the code. -->

@@ -17,8 +17,8 @@ from stress.tops import COLUMNS, UNIT, time_limit
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS
 from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.times import LAST_STAMP_NS
 from spinning_top_sim.tools.simulate import main
 
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.8}

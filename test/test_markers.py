@@ -9,7 +9,7 @@ from helpers.simulations import SECOND, play, run, simulate
 
 from spinning_top_sim import solve
 from spinning_top_sim.shape import Shape
-from spinning_top_sim.streams import messages, parameters
+from spinning_top_sim.streams import markers, parameters
 
 PERIOD_NS = 50_000_000
 
@@ -108,7 +108,7 @@ def test_bodies_and_lines_are_drawn_to_the_scale_of_the_top(frame):
     nowhere, level = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
     for marker, kind, color, scale, place, q, points in zip(
             message.markers, (Marker.CYLINDER, Marker.LINE_LIST, Marker.LINE_STRIP),
-            (messages.BODY_COLOR, messages.AXIS_COLOR, messages.TRACE_COLOR),
+            (markers.BODY_COLOR, markers.AXIS_COLOR, markers.TRACE_COLOR),
             (size, (width, 0.0, 0.0), (0.5 * width, 0.0, 0.0)), (position, nowhere, nowhere),
             (body, body, level), ((), corners, trace), strict=True):
         assert (marker.type, marker.header.frame_id) == (kind, frame)

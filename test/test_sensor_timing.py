@@ -6,10 +6,12 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from helpers.simulations import EPOCH_NS, SECOND, run
+from helpers.simulations import EPOCH_NS, SECOND, channel, play, run
 
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.streams.timing import Timing
+from spinning_top_sim.times import LAST_STAMP_NS
 
 FAULTS = {'imu.stamp_offset': -0.02, 'imu.stamp_jitter': 3e-4, 'imu.clock_drift': 200.0,
           'imu.drop_rate': 0.1, 'imu.duplicate_rate': 0.05}
@@ -69,8 +71,8 @@ def test_losses_and_repetitions_have_their_rates_and_are_independent():
     timing, other = (Timing(parameters.checked({**FAULTS, 'seed': seed}), PERIOD_NS)
                      for seed in (0, 1))
     t_ns = np.arange(0, 200_000 * PERIOD_NS, PERIOD_NS)
-    copies = timing.copies(t_ns)
-    assert np.corrcoef(copies, other.copies(t_ns))[0, 1] < 4.0 / math.sqrt(len(t_ns))
+    copies = timing(t_ns)[1]
+    assert np.corrcoef(copies, other(t_ns)[1])[0, 1] < 4.0 / math.sqrt(len(t_ns))
     counts, n = Counter(copies.tolist()), len(copies)
     for value, share in ((0, 0.1), (2, 0.9 * 0.05)):
         assert counts[value] / n == pytest.approx(share, abs=4.0 * math.sqrt(share / n))
@@ -85,14 +87,13 @@ def test_no_jitter_puts_a_stamp_before_an_earlier_one(rate, drift):
                     period_ns)
     for start in (0, 94_608_000 * SECOND // period_ns):
         t_ns = (start + np.arange(20_000)) * period_ns
-        stamps = timing.stamps(SECOND, t_ns)
+        stamps = t_ns + timing(t_ns)[0]
         assert np.diff(stamps).min() > 0
         assert np.ptp(stamps - np.polyval((1.0 + drift * 1e-6, 0.0), t_ns)) > 0.5 * period_ns
 
 
 def test_stamps_stay_within_what_a_message_holds():
-    earlier, later = (Timing(parameters.checked({'imu.stamp_offset': offset}), PERIOD_NS)
-                      for offset in (-1.0, 1.0))
-    assert earlier.stamps(0, np.array([0, 2 * SECOND])).tolist() == [0, SECOND]
-    last_ns = 2 ** 31 * SECOND - 1
-    assert later.stamps(last_ns, np.zeros(1, np.int64)) == last_ns
+    for epoch_ns, offset, expected in ((0, -1.0, 0), (LAST_STAMP_NS, 1.0, LAST_STAMP_NS)):
+        simulation = Simulation(parameters.checked({'imu.stamp_offset': offset}), epoch_ns)
+        (_, _, data), = play(simulation, 0, RAW)
+        assert channel(simulation, RAW).template.stamps_ns(data).tolist() == [expected]

@@ -22,7 +22,7 @@ from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import command, plots, shapes, svg, text

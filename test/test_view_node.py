@@ -13,8 +13,8 @@ from helpers.simulations import play
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.play import Simulation
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.view.track import Track
 
 VIEW = ('-m', 'spinning_top_sim', 'view', '--no-browser', '--port', '0')

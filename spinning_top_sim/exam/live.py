@@ -24,7 +24,7 @@ from sensor_msgs.msg import Imu, MagneticField
 from spinning_top_sim.exam.examiner import examine
 from spinning_top_sim.exam.feeding import INTERRUPTED, MakeFilter, NodeError, Outcome, feed
 from spinning_top_sim.exam.motions import Reals, Run
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
 from spinning_top_sim.tools.report import Report

@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.magnetometer import Magnetometer
+from spinning_top_sim.streams.imu import Imu, Magnetometer
 
 Reals = NDArray[np.float64]
 

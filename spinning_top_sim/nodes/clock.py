@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS
 
 # The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
 EPOCH_GRID_NS = 10_000_000

@@ -7,10 +7,9 @@ from typing import Any
 
 from spinning_top_sim.nodes.clock import LATEST_NS, SimulatedClock
 from spinning_top_sim.nodes.recording import Recording
-from spinning_top_sim.physics.pivot import NEVER_NS
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
 from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.times import NANOSECONDS, NEVER_NS, stamp_text
 
 SUBSCRIBERS_PERIOD_NS = 50_000_000      # subscribers are counted so often
 AHEAD_NS = 50_000_000                   # of what is due, so much is computed ahead

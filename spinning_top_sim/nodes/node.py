@@ -40,9 +40,9 @@ from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.status import NodeStatus
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.streams.parameter import Effect
+from spinning_top_sim.times import NANOSECONDS
 
 LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
 

@@ -28,8 +28,8 @@ from spinning_top_sim.nodes.executable import short_reason, tell
 from spinning_top_sim.nodes.publishers import create_publisher, message_class, wait_for_all_acked
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.streams.parameter import Range
+from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS
 
 LATE_NS = 10_000_000            # a message that is sent later than this is counted
 BUDGET_NS = 20_000_000          # services wait for messages that are due at most so long

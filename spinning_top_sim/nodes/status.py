@@ -12,8 +12,8 @@ from std_msgs.msg import Header
 from spinning_top_sim.nodes.loop import Loop, LoopState
 from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.live import LiveSimulation
+from spinning_top_sim.times import NANOSECONDS
 
 # Keys in /diagnostics that the page of `view` reads, with those of `recording`.
 STATE, TIME, EPOCH = 'state', 'simulated time [s]', 'stamp of t = 0 [ns]'

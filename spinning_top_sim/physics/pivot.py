@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.top import shown
+from spinning_top_sim.times import NANOSECONDS, NEVER_NS
 
-NANOSECONDS = 1_000_000_000
-NEVER_NS = 2 ** 63 - 1
 # x, y, z in the world; doubles are fractions, too.
 Fractions = tuple[Fraction, Fraction, Fraction]
 Given = Sequence[float | Fraction]
@@ -47,13 +46,6 @@ class Ride(NamedTuple):
 
 
 REST = Ride(0, NEVER_NS, ZERO, np.zeros(9))
-
-
-def ns_array(times: NDArray[np.int64] | range) -> NDArray[np.int64]:
-    """Return times [ns] as an array."""
-    if isinstance(times, range):        # `numpy.arange` takes its length from doubles
-        return times.start + times.step * np.arange(len(times), dtype=np.int64)
-    return np.asarray(times)
 
 
 def kinematics(ride: Ride, times_ns: NDArray[np.int64]) -> Kinematics:

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.physics.pivot import NANOSECONDS, ns_array
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.times import NANOSECONDS, ns_array
 
 # The unknowns of one state: complex numbers, of which floats are some.
 Unknowns = tuple[complex, ...]

@@ -23,9 +23,9 @@ from gmpy2 import const_pi, mpfr, rint
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Number
-from spinning_top_sim.physics.pivot import NANOSECONDS, ns_array
 from spinning_top_sim.solvers.constants import ThetaMotion
 from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
+from spinning_top_sim.times import NANOSECONDS, ns_array
 
 Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]

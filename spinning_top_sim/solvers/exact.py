@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion
-from spinning_top_sim.physics.pivot import NANOSECONDS, Fractions
+from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.regimes import (
     COINCIDE,
     Description,
@@ -32,6 +32,7 @@ from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set
 from spinning_top_sim.solvers.evaluate import ThetaArrays, ThetaValues, Times
 from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
+from spinning_top_sim.times import NANOSECONDS
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52

@@ -20,6 +20,7 @@ from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import IntegrationError, SteppedMotion
 from spinning_top_sim.solvers.solve import motion_of
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical, posture_at
+from spinning_top_sim.times import NANOSECONDS, ns_array
 
 if TYPE_CHECKING:
     from spinning_top_sim.solvers.exact import ExactSolution
@@ -75,7 +76,7 @@ class Piece:
         except (ArithmeticError, IntegrationError, ValueError) as error:
             whence = (f'theta = {start.theta!r} rad, theta_dot = {start.theta_dot!r} rad/s with '
                       f'l3 = {start.l3!r}, lz = {start.lz!r} kg m^2/s' if isinstance(start, State)
-                      else f't = {start_ns / pivot.NANOSECONDS!r} s on')
+                      else f't = {start_ns / NANOSECONDS!r} s on')
             raise ValueError(f'no motion from {whence}, for {top}: {error}') from error
 
     def _begun(self, method: str, **settings: Any) -> Solution:
@@ -162,7 +163,7 @@ class Piece:
         return changed
 
     def _in_world(self, solution: Solution, t_ns: Times) -> States:
-        (motion, vertical), times_ns = solution, pivot.ns_array(t_ns)
+        (motion, vertical), times_ns = solution, ns_array(t_ns)
         states = motion.states(times_ns - self.start_ns)
         return states if vertical is None else WorldStates(
             self.top, states, vertical.rotation, self.ride, times_ns)

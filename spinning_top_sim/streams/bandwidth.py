@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams.trajectory import Times, Trajectory
+from spinning_top_sim.streams.trajectory import Trajectory
+from spinning_top_sim.times import Times
 
 # The filter forgets what is older than so many time constants: e^-25 = 1e-11 is left.
 TIME_CONSTANTS = 25.0
@@ -57,32 +58,27 @@ class LowPass:
                  ) -> NDArray[np.float64]:
         """Return the filtered signal at times (n,) [ns] of a motion, (columns, n)."""
         found = []
-        for piece, within in trajectory.pieces(t_ns):
-            panels = self._panels(piece.fastest_rate)
-            together = max(1, MOST_TOGETHER // (NODES * panels))
-            # Samples that see this piece alone have the same nodes, each of the others its own.
-            mixed = int(np.searchsorted(within, piece.start_ns + self.memory_ns))
-            for begin in range(0, mixed, together):
-                found += self._readings(trajectory, [
-                    (within[at:at + 1], self._edges(trajectory, int(within[at]), panels))
-                    for at in range(begin, min(begin + together, mixed))], signal)
-            edges = np.linspace(0.0, self.memory_ns, panels + 1)
-            for begin in range(mixed, len(within), together):
-                found += self._readings(trajectory, [(within[begin:begin + together], edges)],
-                                        signal)
+        for piece, times in trajectory.pieces(t_ns):
+            # A specific force has squares of rates, thus twice their frequency.
+            seconds = ANGLE / (self._corner + 2.0 * piece.fastest_rate)
+            edges = np.linspace(0.0, self.memory_ns, 1 + min(
+                math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS))
+            together = max(1, MOST_TOGETHER // (NODES * (len(edges) - 1)))
+            for begin in range(0, len(times), together):
+                now = times[begin:begin + together]
+                # Samples that see this piece alone have the same nodes, the others their own.
+                mixed = int(np.searchsorted(now, piece.start_ns + self.memory_ns))
+                samples = [(now[at:at + 1], self._edges(trajectory, int(now[at]), edges))
+                           for at in range(mixed)]
+                if mixed < len(now):
+                    samples.append((now[mixed:], edges))
+                found += self._readings(trajectory, samples, signal)
         return np.concatenate(found, axis=1)
 
-    def _panels(self, fastest_rate: float) -> int:
-        # A specific force has squares of rates, thus twice their frequency.
-        seconds = ANGLE / (self._corner + 2.0 * fastest_rate)
-        return min(math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS)
-
-    def _edges(self, trajectory: Trajectory, t_ns: int, panels: int) -> Edges:
-        """Return how long before a sample panels begin and end [ns], those of pieces too."""
-        edges = np.linspace(0.0, self.memory_ns, panels + 1)
-        starts = [t_ns - start_ns for start_ns in trajectory.starts(
-            max(t_ns - self.memory_ns, 0), t_ns)]
+    def _edges(self, trajectory: Trajectory, t_ns: int, edges: Edges) -> Edges:
+        """Return these edges of panels [ns before a sample], and those of pieces."""
         oldest = min(t_ns, self.memory_ns)
+        starts = [t_ns - start_ns for start_ns in trajectory.starts(t_ns - oldest, t_ns)]
         return np.unique(np.concatenate((edges[edges < oldest], starts, [oldest])))
 
     def _readings(self, trajectory: Trajectory, samples: Sequence[tuple[Times, Edges]],

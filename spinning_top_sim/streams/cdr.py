@@ -15,18 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-ENCAPSULATION = b'\x00\x01\x00\x00'
-NANOSECONDS = 1_000_000_000
-# The seconds of a stamp are an int32: the last stamp is in January 2038.
-LAST_STAMP_NS = 2 ** 31 * NANOSECONDS - 1
+from spinning_top_sim.times import NANOSECONDS, Times
 
+ENCAPSULATION = b'\x00\x01\x00\x00'
+STAMP = np.dtype([('sec', '<i4'), ('nanosec', '<u4')])
 # The numbers of a field in n messages: an array (n, count), or `count` columns or numbers.
 Values = NDArray[Any] | Sequence[NDArray[Any] | float]
-
-
-def stamp_text(time_ns: int) -> str:
-    """Return a time in seconds, to the nanosecond."""
-    return f'{time_ns // NANOSECONDS}.{time_ns % NANOSECONDS:09d}'
 
 
 class Field(NamedTuple):
@@ -63,41 +57,41 @@ class Template:
     """
 
     def __init__(self, *parts: Part) -> None:
-        buffer, self._stamps_at, self._places = bytearray(ENCAPSULATION), [], []
+        buffer = bytearray(ENCAPSULATION)
         self.fields = tuple(part for part in parts if isinstance(part, Field))
+        self._stamps: list[str] = []
+        # What is replaced, by name: the type of NumPy and the offset.
+        self._places: dict[str, tuple[np.dtype[Any], int]] = {}
         for part in parts:
             if isinstance(part, Header):
-                self._stamps_at.append(_append(buffer, 'I', (0, 0)))
-                _append_text(buffer, part.frame_id)
+                self._stamps.append(f'stamp {len(self._stamps)}')
+                self._places[self._stamps[-1]] = STAMP, _append(buffer, 'I', (0, 0))
+                if part.frame_id is not None:
+                    _append_text(buffer, part.frame_id)
             elif isinstance(part, str):
                 _append_text(buffer, part)
             elif isinstance(part, Field):
-                self._places.append(_append(buffer, part.code, part.size * (0,)))
+                self._places[part.name] = (np.dtype((f'<{part.code}', (part.size,))),
+                                           _append(buffer, part.code, part.size * (0,)))
             else:
                 _append(buffer, *part)
         # RTPS pads to four bytes; a template does so too, so that logs have what subscribers get.
         self.data = bytes(buffer + bytes(-len(buffer) % 4))
-        # A message as a type of NumPy: the fields by number, then the stamps.
-        columns: list[tuple[str, Any, int]] = [
-            (f'{i}', (f'<{field.code}', (field.size,)), at)
-            for i, (field, at) in enumerate(zip(self.fields, self._places, strict=True))]
-        for at in self._stamps_at:
-            columns += [(f'sec{at}', '<i4', at), (f'nanosec{at}', '<u4', at + 4)]
+        places = self._places.values()
         self._row_type = np.dtype({
-            'names': [name for name, _, _ in columns], 'formats': [one for _, one, _ in columns],
-            'offsets': [at for _, _, at in columns], 'itemsize': len(self.data)})
+            'names': [*self._places], 'formats': [kind for kind, _ in places],
+            'offsets': [at for _, at in places], 'itemsize': len(self.data)})
 
     def __len__(self) -> int:
         return len(self.data)
 
-    def encode(self, stamps_ns: NDArray[np.int64], fields: Sequence[Values]) -> NDArray[np.uint8]:
+    def encode(self, stamps_ns: Times, fields: Sequence[Values]) -> NDArray[np.uint8]:
         """Return messages (n, size) with stamps (n,) [ns]."""
-        count = len(stamps_ns)
-        rows = np.frombuffer(bytearray(count * self.data), self._row_type)
-        for at in self._stamps_at:
-            rows[f'sec{at}'], rows[f'nanosec{at}'] = np.divmod(stamps_ns, NANOSECONDS)
-        fill([rows[f'{i}'] for i in range(len(self.fields))], fields)
-        return rows.view(np.uint8).reshape(count, len(self))
+        rows = np.frombuffer(bytearray(len(stamps_ns) * self.data), self._row_type)
+        for name in self._stamps:
+            rows[name]['sec'], rows[name]['nanosec'] = np.divmod(stamps_ns, NANOSECONDS)
+        fill([rows[field.name] for field in self.fields], fields)
+        return rows.view(np.uint8).reshape(len(stamps_ns), len(self))
 
     def encode_one(self, stamp_ns: int, *fields: Values) -> bytes:
         return self.encode(np.array([stamp_ns]), fields).tobytes()
@@ -105,29 +99,23 @@ class Template:
     def decode(self, data: bytes | NDArray[np.uint8]) -> tuple[NDArray[Any], ...]:
         """Return the fields, (n, count) each, of n concatenated messages."""
         rows = np.frombuffer(data, self._row_type)
-        return tuple(rows[f'{i}'] for i in range(len(self.fields)))
+        return tuple(rows[field.name] for field in self.fields)
 
-    def stamps_ns(self, data: bytes) -> NDArray[np.int64]:
+    def stamps_ns(self, data: bytes) -> Times:
         """Return the stamps (n,) [ns] of n concatenated messages."""
-        rows, at = np.frombuffer(data, self._row_type), self._stamps_at[0]
-        stamps: NDArray[np.int64] = rows[f'sec{at}'].astype(np.int64) * NANOSECONDS
-        stamps += rows[f'nanosec{at}']
-        return stamps
+        stamps = np.frombuffer(data, self._row_type)[self._stamps[0]]
+        return np.asarray(stamps['sec'].astype(np.int64) * NANOSECONDS + stamps['nanosec'])
 
     def shown_at(self, at: int, *messages: bytes) -> tuple[str, list[str]]:
         """Return the name of what the byte at an offset belongs to, and its value in messages."""
-        for stamp_at in self._stamps_at:
-            if 0 <= at - stamp_at < 8:
-                return 'header.stamp', [
-                    '{}.{:09d}'.format(*struct.unpack_from('<iI', one, stamp_at))
-                    for one in messages]
-        for field, offset in zip(self.fields, self._places, strict=True):
-            size = struct.calcsize('<' + field.code)
-            if 0 <= at - offset < field.size * size:
-                element = (at - offset) // size
-                return f'{field.name}[{element}]', [
-                    repr(*struct.unpack_from('<' + field.code, one, offset + element * size))
-                    for one in messages]
+        rows = np.frombuffer(b''.join(messages), self._row_type)
+        for name, (kind, offset) in self._places.items():
+            if 0 <= at - offset < kind.itemsize:
+                if name in self._stamps:
+                    return 'header.stamp', [
+                        '{}.{:09d}'.format(*stamp) for stamp in rows[name].tolist()]
+                element = (at - offset) // kind.base.itemsize
+                return f'{name}[{element}]', list(map(repr, rows[name][:, element].tolist()))
         return f'byte {at}', [f'0x{one[at]:02x}' for one in messages]
 
 
@@ -140,11 +128,10 @@ def _append(buffer: bytearray, code: str, values: Sequence[float]) -> int:
     return len(buffer) - len(values) * size
 
 
-def _append_text(buffer: bytearray, text: str | None) -> None:
-    if text is not None:
-        data = text.encode() + b'\0'
-        _append(buffer, 'I', (len(data),))
-        buffer += data
+def _append_text(buffer: bytearray, text: str) -> None:
+    data = text.encode() + b'\0'
+    _append(buffer, 'I', (len(data),))
+    buffer += data
 
 
 def fill(rows: Sequence[NDArray[Any]], fields: Sequence[Values]) -> None:

@@ -20,6 +20,7 @@ COMMANDS, EVENTS = '~/commands', '~/events'
 TOPICS = {COMMANDS: 'std_msgs/msg/Float64MultiArray', EVENTS: 'std_msgs/msg/String'}
 # What an event of each kind has besides its times, and how that is read.
 MOTIONS = ('command', 'state', 'drive')     # events that begin another motion, on the same clock
+CHANGES = (*MOTIONS, 'parameters', 'epoch', 'reset')        # all but the start of a recording
 _DETAILS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     'start': {},
     'command': {'l3': float, 'lz': float},

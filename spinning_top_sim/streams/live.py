@@ -19,9 +19,10 @@ import numpy as np
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.channel import Channel, Rows, Stamps
+from spinning_top_sim.streams.channel import Channel, Rows
 from spinning_top_sim.streams.events import MOTIONS, Event
 from spinning_top_sim.streams.play import Simulation
+from spinning_top_sim.times import Times
 
 MOST_SAMPLES, MOST_BYTES = 256, 4 << 20     # of a channel that are computed together
 # How far ahead is computed: little behind an event, as the next one may come soon.
@@ -33,7 +34,7 @@ PIECE_SECONDS = 5e-3        # of work, between two questions whether to give way
 BLOCKED_SECONDS = 1.0       # a reader that stalls holds every call for 0.1 s: it gets a rest
 
 # Messages of a topic for a log: its number there, stamps (n,) [ns], messages (n, size).
-LogRows = tuple[int, Stamps, Rows]
+LogRows = tuple[int, Times, Rows]
 
 
 @dataclass(eq=False)
@@ -54,7 +55,7 @@ class Output:
     skipped: int = 0
     failed: int = 0
     # What waits to be sent: times [ns], messages as rows and as bytes, and how many are sent.
-    _t_ns: Stamps = field(default_factory=lambda: np.empty(0, np.int64))
+    _t_ns: Times = field(default_factory=lambda: np.empty(0, np.int64))
     _times: list[int] = field(default_factory=list)
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
     _data: bytes = b''
@@ -69,7 +70,7 @@ class Output:
     def clear(self) -> None:
         self._times, self._cursor = [], 0
 
-    def add(self, t_ns: Stamps, rows: Rows) -> None:
+    def add(self, t_ns: Times, rows: Rows) -> None:
         """Put messages behind those that wait."""
         if self._cursor < len(self._times):
             t_ns = np.concatenate((self._t_ns[self._cursor:], t_ns))

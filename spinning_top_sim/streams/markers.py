@@ -9,7 +9,6 @@ of the body.
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,18 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.states import Point
 from spinning_top_sim.shape import Shape
-from spinning_top_sim.streams import messages, parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS, Values
-from spinning_top_sim.streams.channel import Channel, Samples, period_ns
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.cdr import Field, Header, Numbers, Part, Template, Values
+from spinning_top_sim.streams.channel import Channel
+from spinning_top_sim.streams.messages import NO_ROTATION, ORIGIN, message
+from spinning_top_sim.streams.samples import Samples
 from spinning_top_sim.streams.trajectory import Trajectory
+from spinning_top_sim.times import NANOSECONDS, Times, period_ns
+
+CYLINDER, LINE_STRIP, LINE_LIST = 3, 4, 5       # visualization_msgs/Marker
+BODY_COLOR = (0.20, 0.40, 0.70, 1.0)            # red, green, blue, alpha
+AXIS_COLOR = (0.95, 0.75, 0.20, 1.0)
+TRACE_COLOR = (0.90, 0.30, 0.20, 1.0)
 
 
 def markers(values: Mapping[str, Any]) -> Channel:
@@ -28,42 +35,72 @@ def markers(values: Mapping[str, Any]) -> Channel:
     shape = Shape(parameters.top_of(values))
     length_ns = round(values['markers.trace_length'] * NANOSECONDS)
     count = min(values['markers.trace_points'], length_ns)
-    # Slightly outside of the body, so that it does not hide the lines.
-    rim, side = 1.01 * shape.radius, 1.01 * math.copysign(0.5 * shape.height, shape.tip)
-    far, near = shape.centre + side, shape.centre - side
-    lines = (0.0, 0.0, 0.0, 0.0, 0.0, shape.tip,
-             0.0, 0.0, far, rim, 0.0, far,
-             rim, 0.0, far, rim, 0.0, near,
-             rim, 0.0, near, 0.0, 0.0, near)
-    template = messages.markers(
-        values['world_frame'], (2.0 * shape.radius, 2.0 * shape.radius, shape.height), lines,
-        0.02 * abs(shape.tip), count + 1 if count else 0)
+    spacing_ns = length_ns // count if count else 0
+
+    def fields(samples: Samples) -> Sequence[Values]:
+        states = samples.states
+        body = (states.position((0.0, 0.0, shape.centre)), states.rows_quaternion,
+                (*states.pivot.position,), states.rows_quaternion)
+        if not count:
+            return body
+        newest = (samples.t_ns[:, np.newaxis] - 1) // spacing_ns
+        # Traces share points, which are computed once.
+        numbers, places = np.unique(np.maximum(newest + np.arange(1 - count, 1), 0),
+                                    return_inverse=True)
+        tip = (0.0, 0.0, shape.tip)
+        points = _exact_places(samples.trajectory, numbers * spacing_ns, tip)
+        traces = points[places.reshape(len(newest), -1)]
+        now = np.stack(states.position(tip), axis=-1)[:, np.newaxis]
+        traces = np.where(np.isnan(traces), now, traces)
+        return *body, np.concatenate((traces, now), axis=1).reshape(len(newest), -1)
+
     return Channel('markers', 'markers', 'visualization_msgs/msg/MarkerArray',
-                   period_ns(values['markers.rate']), template,
-                   partial(_fields, shape, count, length_ns // count if count else 0))
+                   period_ns(values['markers.rate']),
+                   _template(shape, values['world_frame'], count + 1 if count else 0), fields)
 
 
-def _fields(shape: Shape, count: int, spacing_ns: int, samples: Samples) -> Sequence[Values]:
-    states = samples.states
-    body = (states.position((0.0, 0.0, shape.centre)), states.rows_quaternion,
-            (*states.pivot.position,), states.rows_quaternion)
-    if not count:
-        return body
-    newest = (samples.t_ns[:, np.newaxis] - 1) // spacing_ns
-    # Traces share points, which are computed once.
-    numbers, places = np.unique(np.maximum(newest + np.arange(1 - count, 1), 0),
-                                return_inverse=True)
-    points = _exact_places(samples.trajectory, numbers * spacing_ns, (0.0, 0.0, shape.tip))
-    traces = points[places.reshape(len(newest), -1)]
-    tip = np.stack(states.position((0.0, 0.0, shape.tip)), axis=-1)[:, np.newaxis]
-    traces = np.where(np.isnan(traces), tip, traces)
-    return *body, np.concatenate((traces, tip), axis=1).reshape(len(newest), -1)
-
-
-def _exact_places(trajectory: Trajectory, t_ns: NDArray[np.int64], point: Point,
-                  ) -> NDArray[np.float64]:
+def _exact_places(trajectory: Trajectory, t_ns: Times, point: Point) -> NDArray[np.float64]:
     """Return where a point of the body is, (n, 3) [m]; NaN where the solution is not known."""
     truths = [(times, piece.truth(times)) for piece, times in trajectory.pieces(t_ns)]
     return np.concatenate([
         np.full((len(times), 3), np.nan) if states is None
         else np.stack(states.position(point), axis=-1) for times, states in truths])
+
+
+def _template(shape: Shape, frame_id: str, trace_points: int) -> Template:
+    """Return a cylinder, lines on it, and a trace if it has points."""
+    # Slightly outside of the body, so that it does not hide the lines.
+    rim, side = 1.01 * shape.radius, 1.01 * math.copysign(0.5 * shape.height, shape.tip)
+    far, near = shape.centre + side, shape.centre - side
+    # Begin and end of each line.
+    lines = (0.0, 0.0, 0.0, 0.0, 0.0, shape.tip,
+             0.0, 0.0, far, rim, 0.0, far,
+             rim, 0.0, far, rim, 0.0, near,
+             rim, 0.0, near, 0.0, 0.0, near)
+    diameter, width = 2.0 * shape.radius, 0.02 * abs(shape.tip)
+    parts = [
+        *_marker(0, frame_id, 'body', CYLINDER, (diameter, diameter, shape.height), BODY_COLOR,
+                 Numbers('I', (0,))),
+        *_marker(1, frame_id, 'axis', LINE_LIST, (width, 0.0, 0.0), AXIS_COLOR,
+                 Numbers('I', (len(lines) // 3,)), Numbers('d', lines))]
+    if trace_points:
+        parts += _marker(2, frame_id, 'trace', LINE_STRIP, (0.5 * width, 0.0, 0.0), TRACE_COLOR,
+                         Numbers('I', (trace_points,)),
+                         Field('markers[2].points', 3 * trace_points))
+    return message(Numbers('I', (3 if trace_points else 2,)), *parts)
+
+
+def _marker(number: int, frame_id: str, namespace: str, kind: int, scale: tuple[float, ...],
+            color: tuple[float, ...], *points: Part) -> list[Part]:
+    """Return a visualization_msgs/Marker; the points of a line strip are in the world."""
+    place = f'markers[{number}].pose'
+    pose: list[Part] = [Numbers('d', (*ORIGIN, *NO_ROTATION))] if kind == LINE_STRIP else [
+        Field(f'{place}.position', 3), Field(f'{place}.orientation', 4)]
+    return [
+        Header(frame_id), namespace, Numbers('i', (0, kind, 0)),    # id, type, action: add
+        *pose, Numbers('d', scale), Numbers('f', color),
+        Numbers('I', (0, 0)), Numbers('?', (False,)),               # lifetime, frame_locked
+        *points, Numbers('I', (0,)), '',                            # colors, texture_resource
+        Numbers('I', (0, 0)), '', '', Numbers('I', (0, 0)),         # texture, uv_coordinates
+        '', '', '', Numbers('I', (0,)),                             # text, mesh, its file and data
+        Numbers('?', (False,))]                                     # mesh_use_embedded_materials

@@ -15,6 +15,8 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.times import Times
+
 # Step of the paths, whatever the rate of the sensor is.
 STEP_NS = 1_000_000
 # Number of samples, or steps of a path, whose random numbers are drawn together: a power of two.
@@ -36,15 +38,10 @@ class Part(enum.IntEnum):
     WHITE, TURN_ON, WALK, GAUSS_MARKOV, FLICKER = range(5)
 
 
-def white(seed: int, kind: Kind, part: Part, numbers: NDArray[np.int64], columns: int,
+def white(seed: int, kind: Kind, part: Part, numbers: Times, columns: int = 3,
           ) -> NDArray[np.float64]:
     """Return standard normal numbers (columns, n) for samples with ascending numbers (n,)."""
-    return _gathered(partial(_normal, seed, kind, part, columns=columns), numbers)
-
-
-def constants(seed: int, kind: Kind, part: Part, columns: int) -> NDArray[np.float64]:
-    """Return standard normal numbers (columns, 1)."""
-    return _normal(seed, kind, part, 0, columns, 1).T
+    return _gathered(partial(_normal, seed, kind, part, columns), numbers)
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ class RandomPath:
     part: Part
     processes: tuple[tuple[float, float], ...]
 
-    def at(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def at(self, t_ns: Times) -> NDArray[np.float64]:
         """Return the values (3, n) at ascending times (n,) >= 0 [ns]."""
         return _gathered(partial(_path, self), t_ns // STEP_NS)
 
@@ -75,9 +72,9 @@ class RandomPath:
         return np.exp(-seconds / times), np.where(
             np.isinf(times), seconds, -np.expm1(-2.0 * seconds / times))
 
-    def draw(self, block: int, count: int = 1, *, of_ends: bool = False) -> NDArray[np.float64]:
+    def draw(self, block: int, count: int, of_ends: bool = False) -> NDArray[np.float64]:
         """Return standard normal numbers (count, processes, 3) of a block."""
-        return _normal(self.seed, self.kind, self.part, block, 3 * len(self.processes), count,
+        return _normal(self.seed, self.kind, self.part, 3 * len(self.processes), block, count,
                        of_ends).reshape(count, -1, 3)
 
 
@@ -93,26 +90,16 @@ def flicker_parts(shortest: float, longest: float) -> Sequence[tuple[float, floa
     tau = (np.geomspace(shortest, longest, count) if count > 1
            else np.array([np.sqrt(shortest * longest)]))
     times = tau / 1.89
-    variances = np.linalg.solve(gauss_markov_allan_variance(tau[:, np.newaxis] / times),
-                                np.ones(count))
+    # IEEE Std 952-1997, annex C, with the variance q^2 T/2; a series where this cancels.
+    ratio = tau[:, np.newaxis] / times
+    closed = 2.0 / ratio * (1.0 - (3.0 - 4.0 * np.exp(-ratio) + np.exp(-2.0 * ratio))
+                            / (2.0 * ratio))
+    variances = np.linalg.solve(
+        np.where(ratio < 1e-3, ratio * (2.0 / 3.0 - 0.5 * ratio), closed), np.ones(count))
     return list(zip(times.tolist(), np.sqrt(variances).tolist(), strict=True))
 
 
-def gauss_markov_allan_variance(ratio: NDArray[np.float64]) -> NDArray[np.float64]:
-    """
-    Return the Allan variance of a Gauss-Markov process of variance 1.
-
-    ratio : averaging time over correlation time
-
-    (IEEE Std 952-1997, annex C, with the variance q^2 T/2.)
-    """
-    closed = 2.0 / ratio * (1.0 - (3.0 - 4.0 * np.exp(-ratio) + np.exp(-2.0 * ratio))
-                            / (2.0 * ratio))
-    # The closed form cancels at small ratios; use its series there.
-    return np.where(ratio < 1e-3, ratio * (2.0 / 3.0 - 0.5 * ratio), closed)
-
-
-def _gathered(block: Callable[[int], NDArray[np.float64]], numbers: NDArray[np.int64],
+def _gathered(block: Callable[[int], NDArray[np.float64]], numbers: Times,
               ) -> NDArray[np.float64]:
     """Return samples (columns, n) by ascending numbers, from blocks (DRAWN_TOGETHER, columns)."""
     edges = np.flatnonzero(np.diff(numbers // DRAWN_TOGETHER)) + 1
@@ -121,7 +108,7 @@ def _gathered(block: Callable[[int], NDArray[np.float64]], numbers: NDArray[np.i
 
 
 @lru_cache(16)
-def _normal(seed: int, kind: Kind, part: Part, number: int, columns: int,
+def _normal(seed: int, kind: Kind, part: Part, columns: int, block: int,
             count: int = DRAWN_TOGETHER, of_ends: bool = False) -> NDArray[np.float64]:
     """
     Return standard normal numbers (count, columns) that depend on the arguments alone.
@@ -129,7 +116,7 @@ def _normal(seed: int, kind: Kind, part: Part, number: int, columns: int,
     Philox is a counter-based generator (J. Salmon et al., "Parallel random numbers: as easy as 1,
     2, 3", SC11).
     """
-    counter = [0, int(of_ends), len(Part) * int(kind) + int(part), number]
+    counter = [0, int(of_ends), len(Part) * int(kind) + int(part), block]
     return np.random.Generator(np.random.Philox(key=seed, counter=counter)
                                ).standard_normal((count, columns))
 
@@ -159,7 +146,7 @@ def _begin(path: RandomPath, block: int) -> NDArray[np.float64]:
     The block with the number 2^k follows from the block 2^(k-1).  Every other block is half-way
     between two with fewer digits, so that some log2(block) values are computed.
     """
-    normal: NDArray[np.float64] = path.draw(block, of_ends=True)[0]
+    normal: NDArray[np.float64] = path.draw(block, 1, of_ends=True)[0]
     if block == 0:
         return np.array([[0.0 if math.isinf(time) else 1.0] for time, _ in path.processes]
                         ) * normal

@@ -7,16 +7,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spinning_top_sim.physics.pivot import NEVER_NS
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.channel import Channel, Rows, Samples, Stamps, period_ns
-from spinning_top_sim.streams.events import Event
+from spinning_top_sim.streams.channel import Channel, Rows
+from spinning_top_sim.streams.events import CHANGES, Event
 from spinning_top_sim.streams.imu import LONGEST_NS, Imu
+from spinning_top_sim.streams.samples import Samples
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.streams.trajectory import Trajectory
+from spinning_top_sim.times import (
+    LAST_STAMP_NS,
+    NANOSECONDS,
+    NEVER_NS,
+    Times,
+    check_stamp,
+    period_ns,
+)
 
 BLOCK_BYTES = 1_000_000                     # of a block offline
 LONGEST_BLOCK_NS = 100 * NANOSECONDS        # for the sake of progress
@@ -31,7 +38,7 @@ class Block(NamedTuple):
     """
 
     until_ns: int
-    messages: Sequence[tuple[Channel, Stamps, Rows]]
+    messages: Sequence[tuple[Channel, Times, Rows]]
 
 
 class Simulation:
@@ -54,7 +61,8 @@ class Simulation:
 
     def _restart(self, values: Mapping[str, Any], epoch_ns: int) -> None:
         # Whatever may be refused comes first, before anything changes.
-        check_stamps(epoch_ns, values['duration'])
+        for stamp_ns in (epoch_ns, epoch_ns + round(values['duration'] * NANOSECONDS)):
+            check_stamp(stamp_ns)
         motion = Trajectory(
             parameters.top_of(values), parameters.start_state(values),
             parameters.pivot_path(values),
@@ -89,18 +97,15 @@ class Simulation:
         elif kind == 'parameters':
             self._set_rates(details)
         elif kind == 'epoch':
-            check_stamps(details['epoch_ns'], 0.0)
+            check_stamp(details['epoch_ns'])
             self.epoch_ns = details['epoch_ns']
-        self._remember(event)
-        return event
-
-    def _remember(self, event: Event) -> None:
-        """Add an event to the history, or let a drive that is repeated last longer."""
-        last = self.history[-1] if self.history else None
-        if last and event.repeats(last):
-            self.history[-1] = replace(last, details=event.details)
+        else:
+            raise ValueError(f'event {kind!r}: must be one of {", ".join(CHANGES)}')
+        if self.history and event.repeats(self.history[-1]):    # it lasts longer
+            self.history[-1] = replace(self.history[-1], details=details)
         else:
             self.history.append(event)
+        return event
 
     def _set_rates(self, changes: Mapping[str, Any]) -> None:
         """Take over new rates of channels after `now_ns`."""
@@ -187,11 +192,3 @@ class Simulation:
         memory_ns = self.imu.memory_ns
         self.trajectory.forget(self.now_ns - max(self._keep_ns, memory_ns),
                                self.now_ns - memory_ns)
-
-
-def check_stamps(epoch_ns: int, duration: float) -> None:
-    """Raise ValueError if ROS has no stamp for t = 0 [ns] or for the end of a run [s]."""
-    for stamp_ns in (epoch_ns, epoch_ns + round(duration * NANOSECONDS)):
-        if not 0 <= stamp_ns <= LAST_STAMP_NS:
-            raise ValueError(f'the stamp {stamp_ns / NANOSECONDS:.12g} s: must be >= 0 and '
-                             f'< {2 ** 31} s, in January 2038')

@@ -12,7 +12,9 @@ from spinning_top_sim.physics.attitude import Column, Vector
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.noise import Part, RandomPath
 from spinning_top_sim.streams.parameters import IDENTITY
+from spinning_top_sim.times import Times
 
+# White noise and bias, (3, n) or (3, 1) each.
 Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -42,45 +44,41 @@ class Sensor:
         def given(error: str) -> float:
             return float(values.get(prefix + error, 0.0))
 
-        self._seed, self._kind, self._period_ns = values['seed'], kind, period_ns
+        seed = self._seed = values['seed']
+        self._kind, self._period_ns = kind, period_ns
         self._matrix, self._resolution, self._range = matrix, given('resolution'), given('range')
         self._deviation = given('noise_density') / math.sqrt(period_ns * 1e-9)
         self.variance = self._deviation ** 2 + self._resolution ** 2 / 12.0
         # Adding 0.0 turns -0.0 into 0.0.
         self._offset = np.array(offset)[:, np.newaxis] + 0.0
         if turn_on := given('turn_on_bias'):
-            self._offset = self._offset + turn_on * noise.constants(
-                self._seed, kind, Part.TURN_ON, 3)
-        self._paths = []
-        if walk := given('random_walk'):
-            self._paths.append(RandomPath(self._seed, kind, Part.WALK, ((math.inf, walk),)))
-        if deviation := given('bias_stddev'):
-            self._paths.append(RandomPath(self._seed, kind, Part.GAUSS_MARKOV, (
-                (given('bias_correlation_time'), deviation),)))
-        if flat := given('bias_instability'):
-            self._paths.append(RandomPath(self._seed, kind, Part.FLICKER, tuple(
-                (time, part * flat) for time, part in noise.flicker_parts(
-                    *values['imu.bias_instability_band']))))
+            self._offset = self._offset + turn_on * noise.white(
+                seed, kind, Part.TURN_ON, np.zeros(1, np.int64))
+        flat = given('bias_instability')
+        self._paths = [RandomPath(seed, kind, part, tuple(processes)) for part, processes in (
+            (Part.WALK, [(math.inf, given('random_walk'))]),
+            (Part.GAUSS_MARKOV, [(given('bias_correlation_time'), given('bias_stddev'))]),
+            (Part.FLICKER, [(time, share * flat) for time, share in noise.flicker_parts(
+                *values['imu.bias_instability_band'])] if flat else []),
+        ) if any(deviation for _, deviation in processes)]
         self.is_perfect = not (self.variance or self._range or self._paths or self._offset.any()
                                or tuple(matrix) != IDENTITY)
 
-    def errors(self, t_ns: NDArray[np.int64]) -> Errors:
-        """Return white noise and bias at times (n,) [ns], (3, n) or (3, 1) each."""
+    def errors(self, t_ns: Times) -> Errors:
+        """Return white noise and bias at times (n,) [ns]."""
         white, bias = np.zeros((3, 1)), self._offset
         if self._deviation:
             white = self._deviation * noise.white(
-                self._seed, self._kind, Part.WHITE, t_ns // self._period_ns, 3)
+                self._seed, self._kind, Part.WHITE, t_ns // self._period_ns)
         for path in self._paths:
             bias = bias + path.at(t_ns)
         return white, bias
 
-    def read(self, true: Vector, errors: Errors, added: Vector | None = None) -> Vector:
+    def read(self, true: Vector, errors: Errors, added: Vector = (0.0, 0.0, 0.0)) -> Vector:
         """Return the readings of true values; `added` comes behind the matrix."""
-        seen = transformed(self._matrix, true)
-        if added is not None:
-            seen = summed(seen, added)
         x, y, z = (converted(value + bias + white, self._resolution, self._range)
-                   for value, white, bias in zip(seen, *errors, strict=True))
+                   for value, white, bias in zip(
+                       summed(transformed(self._matrix, true), added), *errors, strict=True))
         return x, y, z
 
 

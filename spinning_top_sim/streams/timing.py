@@ -6,10 +6,9 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.streams import noise
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS, Times
 
 # Jitter is cut at this share of the period, so that no stamp is before that of an earlier sample.
 MOST_JITTER = 0.45
@@ -19,10 +18,7 @@ FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_r
 
 class Timing:
     """
-    The clock of an IMU, and its losses.
-
-    Offset, drift and jitter of its stamps, and what is lost or doubled, depend on the seed, the
-    number of the sample and its time alone.
+    The clock of an IMU, and its losses, by seed, number and time of a sample alone.
 
     period_ns : of its samples [ns]
     is_right : whether there are no faults
@@ -39,21 +35,15 @@ class Timing:
             for rate in (values['imu.drop_rate'], values['imu.duplicate_rate']))
         self.is_right = not any(map(values.get, FAULTS))
 
-    def stamps(self, epoch_ns: int, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the stamps (n,) [ns] of samples at times (n,) [ns]; epoch_ns is that of t = 0."""
-        jitter, _, _ = self._draw(t_ns)
+    def __call__(self, t_ns: Times) -> tuple[Times, Times]:
+        """
+        Return how late the stamps of samples at times (n,) are [ns], and how often each is sent.
+
+        The latter is 0, 1 or 2.
+        """
+        jitter, drop, repeat = noise.white(self._seed, noise.Kind.TIMING, noise.Part.WHITE,
+                                           t_ns // self._period_ns)
         most = MOST_JITTER * self._period_ns
         errors = self._drift * t_ns + np.clip(self._jitter_ns * jitter, -most, most)
-        stamps: NDArray[np.int64] = (
-            epoch_ns + self._offset_ns + t_ns + np.rint(errors).astype(np.int64))
-        return np.clip(stamps, 0, LAST_STAMP_NS)
-
-    def copies(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return how many messages are sent for each of the samples: 0, 1 or 2."""
-        _, drop, repeat = self._draw(t_ns)
-        return np.where(drop < self._dropped_below, 0,
-                        np.where(repeat < self._repeated_below, 2, 1))
-
-    def _draw(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        return noise.white(self._seed, noise.Kind.TIMING, noise.Part.WHITE,
-                           t_ns // self._period_ns, 3)
+        return self._offset_ns + np.rint(errors).astype(np.int64), np.where(
+            drop < self._dropped_below, 0, np.where(repeat < self._repeated_below, 2, 1))

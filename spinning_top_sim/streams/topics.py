@@ -10,13 +10,14 @@ import numpy as np
 
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.streams import gnss, messages, parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS, Field, Header, Numbers, Template, Values
-from spinning_top_sim.streams.channel import Channel, Samples, period_ns
-from spinning_top_sim.streams.imu import Imu, Mounting
-from spinning_top_sim.streams.magnetometer import Magnetometer
+from spinning_top_sim.streams.cdr import Field, Header, Numbers, Template, Values
+from spinning_top_sim.streams.channel import Channel, stamps
+from spinning_top_sim.streams.imu import Imu, Magnetometer
 from spinning_top_sim.streams.markers import markers
 from spinning_top_sim.streams.messages import message
+from spinning_top_sim.streams.samples import Samples
 from spinning_top_sim.streams.timing import Timing
+from spinning_top_sim.times import NANOSECONDS, period_ns
 
 NODE_NAME = 'spinning_top'
 JOINTS = ('precession_joint', 'nutation_joint', 'spin_joint')
@@ -47,24 +48,23 @@ def _joints(samples: Samples) -> Sequence[Values]:
 
 def _timing(timing: Timing, samples: Samples) -> Sequence[Values]:
     """Return stamp and true time of each sample of the IMU, and how often it was sent."""
-    true_ns = samples.epoch_ns + samples.t_ns
-    stamps_ns = timing.stamps(samples.epoch_ns, samples.t_ns)
-    return (*np.divmod(stamps_ns, NANOSECONDS), *np.divmod(true_ns, NANOSECONDS),
-            timing.copies(samples.t_ns)),
+    late_ns, copies = timing(samples.t_ns)
+    return (*np.divmod(stamps(samples, late_ns), NANOSECONDS),
+            *np.divmod(stamps(samples), NANOSECONDS), copies),
 
 
 def _invariants(samples: Samples) -> Sequence[Values]:
     """Return the constants of the motion, drifts, and errors of norm and orientation."""
     states = samples.states
-    now = (states.energy, states.l3, states.lz)
-    drifts = map(relative_drift, now, map(samples.at_start, ('energy', 'l3', 'lz')))
-    error = samples.trajectory.orientation_error(states, samples.t_ns)
+    trajectory, now = samples.trajectory, (states.energy, states.l3, states.lz)
+    drifts = (relative_drift(value, trajectory.constants(name, samples.t_ns))
+              for name, value in zip(('energy', 'l3', 'lz'), now, strict=True))
+    error = trajectory.orientation_error(states, samples.t_ns)
     return (*now, *drifts, states.norm_error, error),
 
 
-def _magnetic_field(mounting: Mounting, sensor: Magnetometer,
-                    samples: Samples) -> Sequence[Values]:
-    field = sensor.felt(mounting.orientation(samples.states), samples.t_ns)
+def _magnetic_field(sensor: Magnetometer, samples: Samples) -> Sequence[Values]:
+    field = sensor.felt(samples.orientation, samples.t_ns)
     return (sensor.read(field, sensor.errors(samples.t_ns)),
             messages.diagonal(*3 * (sensor.variance,)))
 
@@ -77,7 +77,6 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
     imu : at the present `imu.rate`
     """
     world, body, frame = values['world_frame'], values['body_frame'], values['imu.frame_id']
-    mounting, timing = imu.mounting, Timing(values, imu.period_ns)
 
     def channel(name: str, topic: str, type_name: str, encoder: Template,
                 fields: Callable[[Samples], Sequence[Values]] = lambda _: (),
@@ -87,9 +86,8 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
 
     def timed(one: Channel) -> Channel:
         """Return the channel with the stamps and the losses of the IMU."""
-        faults = Timing(values, one.period_ns)
-        return one if faults.is_right else replace(
-            one, stamps=faults.stamps, copies=faults.copies)
+        timing = Timing(values, one.period_ns)
+        return one if timing.is_right else replace(one, faults=timing)
 
     of_imu = partial(channel, type_name=IMU)
     # Covariances of orientation, angular velocity and specific force.
@@ -113,31 +111,30 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
             Header(''), Numbers('I', (3,)), *JOINTS, Numbers('I', (3,)), Field('position', 3),
             Numbers('I', (3,)), Field('velocity', 3), Numbers('I', (0,))), _joints),
         timed(of_imu('imu', 'imu/data_raw', encoder=messages.imu(frame, unknown, *noisy[1:]),
-                     fields=lambda samples: samples.imu.read)),
+                     fields=lambda samples: samples.readings)),
         timed(of_imu('imu_data', 'imu/data', encoder=messages.imu(frame, *noisy),
-                     fields=lambda samples: (samples.imu.estimated_orientation,
-                                             *samples.imu.read))),
+                     fields=lambda samples: (samples.estimated_orientation, *samples.readings))),
         of_imu('imu', 'ground_truth/imu_bias', encoder=messages.imu(frame, unknown, *EXACT[1:]),
-               fields=lambda samples: samples.imu.bias),
+               fields=lambda samples: samples.biases),
         of_imu('ground_truth_imu', 'ground_truth/imu', encoder=messages.imu(frame, *EXACT),
-               fields=lambda samples: (samples.imu.orientation, *samples.imu.exact)),
+               fields=lambda samples: (samples.orientation, *samples.exact)),
         channel('imu_timing', 'ground_truth/imu_timing', ARRAY,
-                messages.float64_multi_array(TIMING), partial(_timing, timing), 'imu.rate'),
+                messages.float64_multi_array(TIMING),
+                partial(_timing, Timing(values, imu.period_ns)), 'imu.rate'),
         channel('mag', 'imu/mag', MAGNETIC_FIELD, magnetic_field,
-                partial(_magnetic_field, mounting, magnetometer)),
+                partial(_magnetic_field, magnetometer)),
         channel('mag', 'ground_truth/mag', MAGNETIC_FIELD, magnetic_field,
-                lambda samples: (magnetometer.true(mounting.orientation(samples.states)),
-                                 messages.EXACT)),
+                lambda samples: (magnetometer.true(samples.orientation), messages.EXACT)),
         *gnss.channels(values),
         timed(increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped', message(
-            Header(frame), Field('quaternion', 4)), lambda samples: samples.imu.increments[:1])),
+            Header(frame), Field('quaternion', 4)), lambda samples: samples.increments[:1])),
         timed(increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', message(
-            Header(frame), Field('vector', 3)), lambda samples: samples.imu.increments[1:])),
+            Header(frame), Field('vector', 3)), lambda samples: samples.increments[1:])),
         channel('ground_truth_odom', 'ground_truth/odom', ODOMETRY,
                 messages.odometry(world, body), _odometry),
         channel('ground_truth_imu_odom', 'ground_truth/imu_odom', ODOMETRY,
                 messages.odometry(world, frame),
-                lambda samples: (*samples.imu.motion, mounting.felt(samples.states)[0])),
+                lambda samples: (*samples.imu_motion, imu.mounting.felt(samples.states)[0])),
         channel('invariants', '~/invariants', ARRAY, messages.float64_multi_array(INVARIANTS),
                 _invariants),
         markers(values)]

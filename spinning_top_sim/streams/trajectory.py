@@ -22,8 +22,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams.events import Event
-
-Times = NDArray[np.int64]       # (n,), ascending [ns]
+from spinning_top_sim.times import Times
 
 
 class Trajectory:

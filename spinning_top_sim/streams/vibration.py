@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics.attitude import Column, Vector
 from spinning_top_sim.streams import noise
+from spinning_top_sim.times import Times
 
 # Sines that a spectral density becomes, for each axis.
 LINES = 512
@@ -24,10 +25,9 @@ class Vibration:
 
     A sensor with the complex gain `response` at frequencies [Hz] reads it.
 
-    Each axis is a sum of sines: that of `imu.vibration.frequency`, with the phase 0 at t = 0, and
-    `LINES` for a spectral density.  Of these, each has a band of the same width; its power is that
-    of the band.  Its place in the middle half of the band and its phase follow from the seed.  So
-    no beat is longer than two over the width of a band, and short records have the power.
+    Each axis is a sum of sines: that of `imu.vibration.frequency`, and `LINES` for a spectral
+    density, each with the power of a band.  Its place in the middle half of the band and its phase
+    follow from the seed.  So no beat is longer than two over the width of a band.
 
     is_off : whether nothing vibrates
 
@@ -40,7 +40,7 @@ class Vibration:
             ('rate', noise.Kind.VIBRATION_RATE), ('force', noise.Kind.VIBRATION_FORCE))]
         self.is_off = not any(map(len, self._kinds))
 
-    def add(self, true: tuple[Vector, Vector], t_ns: NDArray[np.int64],
+    def add(self, true: tuple[Vector, Vector], t_ns: Times,
             seconds: Column | float = 0.0) -> tuple[Vector, Vector]:
         """
         Return rates and forces (n,) with the vibration at these times [ns].
@@ -77,8 +77,8 @@ def _lines(values: Mapping[str, Any], name: str, kind: noise.Kind,
     profile = np.reshape(values[f'imu.vibration.{name}_psd'], (-1, 2))
     if profile.any():
         # The angle of two normal numbers is uniform.
-        normal = noise.white(values['seed'], kind, noise.Part.WHITE, np.arange(LINES), 12
-                             ).reshape(2, 2, 3, -1)
+        normal = noise.white(values['seed'], kind, noise.Part.WHITE, np.arange(LINES), 12)
+        normal = normal.reshape(2, 2, 3, -1)
         uniform = np.arctan2(normal[0], normal[1]) / math.tau + 0.5
         edges = np.linspace(profile[0, 0], profile[-1, 0], LINES + 1)
         powers = np.diff([power_below(profile.tolist(), edge) for edge in edges.tolist()])

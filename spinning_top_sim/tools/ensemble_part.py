@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import reason_of
-from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.streams.channel import Channel, Rows, Stamps
+from spinning_top_sim.streams.channel import Channel, Rows
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.streams.topics import ARRAY, INVARIANTS, JOINTS, TIMING, recorded
+from spinning_top_sim.times import NANOSECONDS, Times
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
 from spinning_top_sim.tools.table import Columns
 
@@ -79,7 +79,7 @@ def samples(specification: Specification, simulation: Simulation) -> Samples:
             names[channel.topic] = _column_names(channel)
             tables.append(replace(channel, encoder=Columns(
                 [field.size for field in channel.template.fields])))
-    times: dict[str, list[Stamps]] = {topic: [] for topic in names}
+    times: dict[str, list[Times]] = {topic: [] for topic in names}
     numbers: dict[str, list[Rows]] = {topic: [] for topic in names}
     for block in simulation.play(recorded(tables, values),
                                  round(values['duration'] * NANOSECONDS)):

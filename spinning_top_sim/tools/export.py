@@ -24,11 +24,11 @@ import numpy as np
 
 from spinning_top_sim.installation import needed, share
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.pivot import NANOSECONDS, NEVER_NS
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.shape import Shape
 from spinning_top_sim.solvers.solve import solve
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.times import NANOSECONDS, NEVER_NS
 from spinning_top_sim.tools import cli, scene_file
 from spinning_top_sim.tools import urdf as robot
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
+from spinning_top_sim.times import NANOSECONDS
 
 NO_ORIENTATION = -1.0           # first variance of a sensor_msgs/Imu without orientation
 # By type: where the quaternion is, and the covariance matrix, whose last three rows are those of

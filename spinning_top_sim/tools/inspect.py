@@ -26,7 +26,7 @@ from pathlib import Path
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
+from spinning_top_sim.times import NANOSECONDS, stamp_text
 from spinning_top_sim.tools import cli, log_exports
 from spinning_top_sim.tools.recorded_run import RunDescription
 from spinning_top_sim.tools.survey import MotionReport, Survey, survey

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams.cdr import stamp_text
+from spinning_top_sim.times import stamp_text
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.recorded_run import RunDescription, channels_of
 

@@ -13,12 +13,13 @@ from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import events, parameters
-from spinning_top_sim.streams.channel import Channel, period_ns
+from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.streams.topics import all_channels, recorded
+from spinning_top_sim.times import period_ns
 
 LAST_LOG_TIME_NS = 1 << 62  # the difference of any two log times fits into int64
 # What is computed for a log at most: for a small one, and more for each of its bytes.

@@ -24,11 +24,11 @@ from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import McapWriter, log_head
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import events, parameters
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS
-from spinning_top_sim.streams.channel import Channel, period_ns
+from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.streams.topics import recorded, resolve_topic
+from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, period_ns
 from spinning_top_sim.tools import cli, log_exports, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
 from spinning_top_sim.tools.table import RIDE_UNITS, UNITS, true_states, write_csv, write_parquet

@@ -22,10 +22,10 @@ from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import Damage, LogMessage, LogReader
 from spinning_top_sim.solvers.handover import Piece
-from spinning_top_sim.streams.cdr import LAST_STAMP_NS, NANOSECONDS, stamp_text
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.play import Block
+from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, stamp_text
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured
 from spinning_top_sim.tools.recorded_run import LAST_LOG_TIME_NS, RunDescription

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.streams.cdr import NANOSECONDS, Values, fill
-from spinning_top_sim.streams.channel import Channel, Rows, Samples, Stamps
+from spinning_top_sim.streams.cdr import Values, fill
+from spinning_top_sim.streams.channel import Channel, Rows, Samples
+from spinning_top_sim.times import NANOSECONDS, Times
 
 # Names and units of the columns of a table.
 UNITS = {
@@ -29,7 +30,7 @@ class Columns:
     def __len__(self) -> int:
         return 8 * sum(self._counts)
 
-    def encode(self, stamps_ns: Stamps, fields: Sequence[Values]) -> Rows:
+    def encode(self, stamps_ns: Times, fields: Sequence[Values]) -> Rows:
         columns = np.empty((sum(self._counts), len(stamps_ns)))
         fill([field.T for field in np.split(columns, np.cumsum(self._counts)[:-1])], fields)
         return columns.T

@@ -20,7 +20,7 @@ from std_msgs.msg import Float64MultiArray
 
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.status import EPOCH
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.view import shapes
 from spinning_top_sim.view.controls import Controls
 from spinning_top_sim.view.node_client import ANSWER_S, NodeClient, RequestError

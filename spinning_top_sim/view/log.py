@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from spinning_top_sim.recording.errors import MALFORMED, LogError, reason_of
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.play import Block
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
 from spinning_top_sim.view import plots, svg, text

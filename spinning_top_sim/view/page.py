@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 import viser
 
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.view import body, plots, shapes, svg, text
 from spinning_top_sim.view.server import Server
 from spinning_top_sim.view.track import QUATERNION, DescribedMotion, Track

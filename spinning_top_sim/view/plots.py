@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.topics import INVARIANTS
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.view import shapes
 from spinning_top_sim.view.svg import Line, Plot
 from spinning_top_sim.view.track import (

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import natural_momentum
-from spinning_top_sim.streams.cdr import NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.view.track import (
     ATTITUDE_TOPICS,
     FORCE,

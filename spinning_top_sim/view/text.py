@@ -11,7 +11,7 @@ import numpy as np
 
 from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
-from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
+from spinning_top_sim.times import NANOSECONDS, stamp_text
 from spinning_top_sim.view.track import DescribedMotion, Track
 
 HERE = Path(__file__).parent

@@ -16,9 +16,9 @@ from spinning_top_sim.shape import Shape
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.channel import period_ns
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import INVARIANTS, all_channels
+from spinning_top_sim.times import period_ns
 from spinning_top_sim.tools.analysis import attitudes_of
 
 # The topics that tell the attitude, the best first; those that tell its rates, and the pivot.
