@@ -3,12 +3,10 @@
 
 import contextlib
 import enum
-import math
-import re
 import sys
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 from spinning_top_sim.physics.top import shown
 
@@ -20,9 +18,6 @@ class Effect(enum.Enum):
     RESET = 'a change takes effect at the next ~/reset'
     RECORDING = 'a change takes effect at the next start of a recording'
     START = 'cannot be changed while the node runs'
-
-
-_RANGE = re.compile(r'(0 or )?([\[(])(\S+), (\S+)\]')
 
 
 @dataclass(frozen=True)
@@ -38,16 +33,6 @@ class Range:
     highest: float
     is_open: bool = False
     has_zero: bool = False
-
-    @classmethod
-    def parse(cls, text: str) -> Self:
-        """Return a range from [a, b], (a, b] or '0 or [a, b]'; a bound may be pi."""
-        match = _RANGE.fullmatch(text)
-        assert match is not None, text
-        zero, bracket, *bounds = match.groups()
-        lowest, highest = (math.pi if bound == 'pi' else int(bound) if bound.isdigit()
-                           else float(bound) for bound in bounds)
-        return cls(lowest, highest, bracket == '(', bool(zero))
 
     def __contains__(self, number: object) -> bool:
         return isinstance(number, int | float) and not isinstance(number, bool) and (
@@ -84,15 +69,14 @@ class Parameter:
     effect: Effect = Effect.RESET
 
     @property
-    def is_double(self) -> bool:
-        """Whether the value is a double; an integer is converted."""
-        return self.default is None or isinstance(self.default, float)
+    def is_list(self) -> bool:
+        return isinstance(self.default, tuple)
 
     @property
-    def has_doubles(self) -> bool:
-        """Whether the value is a double or a list of doubles."""
-        return self.is_double or (
-            isinstance(self.default, tuple) and isinstance(self.default[0], float))
+    def kind(self) -> type:
+        """Type of the value, or of each item of a list; integers are converted to doubles."""
+        one = self.default[0] if self.is_list else self.default
+        return float if one is None else type(one)
 
     def describe(self, range_too: bool = True) -> str:
         return '; '.join(filter(None, (
@@ -104,36 +88,34 @@ class Parameter:
     def allowed(self) -> str:
         if self.choices:
             return f'must be one of {", ".join(self.choices)}'
-        kind = {bool: 'true or false', int: 'an integer', str: 'a string'}.get(
-            type(self.default), 'a number')
-        if isinstance(self.default, tuple):
-            kind = ('a list of strings' if isinstance(self.default[0], str)
-                    else f'a list of {len(self.default)} numbers'
-                    + (', or a multiple of that,' if self.repeated else ''))
-        return f'must be {kind}' + (f' {self.range}' if self.range is not ANY else '')
+        if not self.is_list:
+            what = {bool: 'true or false', int: 'an integer', str: 'a string'}.get(
+                self.kind, 'a number')
+        elif self.kind is str:
+            what = 'a list of strings'
+        else:
+            what = f'a list of {len(self.default)} numbers' + (
+                ', or a multiple of that,' if self.repeated else '')
+        return f'must be {what}' + (f' {self.range}' if self.range is not ANY else '')
 
     def check(self, value: Any) -> Any:
         """Return the value in the type of the default.  Raises ValueError if it is not allowed."""
         if value is None and self.default is None:
             return None
         with contextlib.suppress(TypeError, OverflowError):
-            if self._is_allowed(value):
-                if isinstance(self.default, tuple):
-                    kind = type(self.default[0])
-                    return tuple(map(kind, value))
-                return float(value) if self.is_double else value
+            if not self.is_list:
+                if self._allows(value):
+                    return self.kind(value)
+            # These are iterable, but not lists.
+            elif not isinstance(value, str | bytes | Mapping | Set) and (
+                    self.kind is str or len(value) == len(self.default)
+                    or (self.repeated and len(value) and not len(value) % len(self.default))
+            ) and all(map(self._allows, value)):
+                return tuple(map(self.kind, value))
         raise ValueError(f'{self.name} = {shown(value)}: {self.allowed}')
 
-    def _is_allowed(self, value: Any) -> bool:
-        default = self.default
-        if isinstance(default, tuple):
-            if isinstance(value, str | bytes | Mapping | Set):       # iterable, but not lists
-                return False
-            if isinstance(default[0], str):
-                return all(isinstance(item, str) for item in value)
-            count = len(value) // len(default) if self.repeated else 1
-            return len(value) == max(count, 1) * len(default) and all(
-                item in self.range for item in value)
-        if isinstance(default, bool | str):
-            return isinstance(value, type(default)) and (not self.choices or value in self.choices)
-        return (self.is_double or isinstance(value, int)) and value in self.range
+    def _allows(self, item: Any) -> bool:
+        """Return whether a value, or an item of a list, is allowed."""
+        if self.kind in (bool, str):
+            return isinstance(item, self.kind) and (not self.choices or item in self.choices)
+        return item in self.range and (self.kind is float or isinstance(item, int))

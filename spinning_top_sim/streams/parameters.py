@@ -14,7 +14,7 @@ from typing import Any
 from spinning_top_sim.installation import read_table, remedy
 from spinning_top_sim.physics.pivot import SHORTEST_S, PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
-from spinning_top_sim.streams.parameter import Effect, Parameter, Range
+from spinning_top_sim.streams.parameter import ANY, Effect, Parameter, Range
 
 # Second parameter that switches a stream on.
 OTHER_SWITCH = {'ground_truth_imu_odom': 'increments.enabled'}
@@ -24,13 +24,10 @@ LOWEST_RATE_OF_INTERVALS = 1.0      # of increments and means: the motion is kep
 
 
 def _parameter(name: str, row: Mapping[str, Any]) -> Parameter:
-    given: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value
-        for key, value in row.items()}
-    if 'range' in row:
-        given['range'] = Range.parse(row['range'])
-    if 'effect' in row:
-        given['effect'] = Effect[row['effect'].upper()]
+    given: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value
+                             for key, value in row.items()}
+    given['range'] = Range(**row['range']) if 'range' in row else ANY
+    given['effect'] = Effect[row.get('effect', 'reset').upper()]
     return Parameter(name, **given)
 
 

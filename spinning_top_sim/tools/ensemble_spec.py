@@ -201,7 +201,7 @@ def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
         if not items:
             raise ValueError(f'{what}: values = []: must have one value at least')
         return {kind: [*map(check, items)]}
-    if parameter is None or not parameter.is_double:
+    if parameter is None or parameter.is_list or parameter.kind is not float:
         raise ValueError(f'{what}: {kind}: must be values, because the parameter is no double')
     _, allowed, is_allowed = DISTRIBUTIONS[kind]
     bounds = list(_entry(f'{what}: {kind}', default=(0.0, 0.0)).check(items))

@@ -208,7 +208,7 @@ def with_doubles(name: str, value: Any) -> Any:
 
     YAML 1.1, as in `ros2 param set`, takes 1e-9 for a text.  What is no number stays.
     """
-    if name in parameters.BY_NAME and parameters.BY_NAME[name].has_doubles:
+    if name in parameters.BY_NAME and parameters.BY_NAME[name].kind is float:
         if isinstance(value, list | array.array):
             items = [with_doubles(name, item) for item in value]
             return items if len(set(map(type, items))) == 1 else value
