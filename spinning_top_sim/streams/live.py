@@ -8,28 +8,27 @@ ahead, and wait as rows.  An event, another rate or another listener drops what 
 
 import contextlib
 import time
-from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import repeat
 from operator import attrgetter, itemgetter
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import Channel, Rows
 from spinning_top_sim.streams.events import MOTIONS, Event
 from spinning_top_sim.streams.play import Simulation
-from spinning_top_sim.times import Times
+from spinning_top_sim.times import NEVER_NS, Times
 
 MOST_SAMPLES, MOST_BYTES = 256, 4 << 20     # of a channel that are computed together
-# How far ahead is computed: little behind an event, as the next one may come soon.
-FIRST_SPAN_NS, LONGEST_SPAN_NS = 20_000_000, 300_000_000
-# The solver goes on in strides; the first one is tiny, as the pace of a motion is not known
-# before it is tried.  Each is at most so many times as long as the one before.
-FIRST_STRIDE_NS, GROWTH = 1_000, 16.0
+# What is computed at once: little behind an event, as the next one may come soon.  The motion
+# alone begins with a tiny part, as its pace is not known before it is tried.
+FIRST_SPAN_NS, LONGEST_SPAN_NS, FIRST_STRIDE_NS = 20_000_000, 300_000_000, 1_000
+GROWTH = 16.0               # of a span over the one before, at most
 PIECE_SECONDS = 5e-3        # of work, between two questions whether to give way
 BLOCKED_SECONDS = 1.0       # a reader that stalls holds every call for 0.1 s: it gets a rest
 
@@ -54,12 +53,9 @@ class Output:
     sent: int = 0
     skipped: int = 0
     failed: int = 0
-    # What waits to be sent: times [ns], messages as rows and as bytes, and how many are sent.
+    # What waits to be sent: times [ns] and messages.
     _t_ns: Times = field(default_factory=lambda: np.empty(0, np.int64))
-    _times: list[int] = field(default_factory=list)
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
-    _data: bytes = b''
-    _cursor: int = 0
     _blocked_until: float = 0.0     # on the monotonic clock [s]
 
     @property
@@ -67,33 +63,18 @@ class Output:
         """Whether anybody takes the messages: else they are not computed."""
         return self.publish is not None or self.log_index is not None
 
-    def clear(self) -> None:
-        self._times, self._cursor = [], 0
-
     def add(self, t_ns: Times, rows: Rows) -> None:
         """Put messages behind those that wait."""
-        if self._cursor < len(self._times):
-            t_ns = np.concatenate((self._t_ns[self._cursor:], t_ns))
-            rows = np.concatenate((self._rows[self._cursor:], rows))
-        self._t_ns, self._times, self._rows = t_ns, t_ns.tolist(), rows
-        self._data, self._cursor = rows.tobytes(), 0
+        if len(self._t_ns):
+            t_ns, rows = np.concatenate((self._t_ns, t_ns)), np.concatenate((self._rows, rows))
+        self._t_ns, self._rows = t_ns, rows
 
-    def take(self, until_ns: int, epoch_ns: int, publish_from_ns: int,
-             ) -> tuple[list[tuple[int, bytes]], LogRows | None]:
-        """Return what waits up to a time: to publish, with the times [ns]; and for the log."""
-        begin = self._cursor
-        end = self._cursor = bisect_right(self._times, until_ns, begin)
-        if begin == end:
-            return [], None
-        logged = None if self.log_index is None else (
-            self.log_index, epoch_ns + self._t_ns[begin:end], self._rows[begin:end])
-        if self.publish is None:
-            return [], logged
-        first = bisect_right(self._times, publish_from_ns - 1, begin, end)
-        self.skipped += first - begin
-        size = len(self.channel.encoder)
-        return [(self._times[k], self._data[k * size:(k + 1) * size])
-                for k in range(first, end)], logged
+    def take(self, until_ns: int) -> tuple[Times, Rows]:
+        """Return what waits up to a time, which waits no longer."""
+        count = int(np.searchsorted(self._t_ns, until_ns, 'right'))
+        taken = self._t_ns[:count], self._rows[:count]
+        self._t_ns, self._rows = self._t_ns[count:], self._rows[count:]
+        return taken
 
     def send(self, message: bytes) -> None:
         """Publish a message; what the middleware refuses is counted."""
@@ -109,6 +90,26 @@ class Output:
         self.failed += 1
 
 
+@dataclass(eq=False)
+class _Group:
+    """
+    The outputs in use of one grid, whose messages are computed together; none: the motion alone.
+
+    computed_ns : how far they are computed [ns]
+    span_ns : how much is computed at once, as far as the pace is known [ns]
+    """
+
+    outputs: Mapping[Channel, Output]
+    computed_ns: int
+    span_ns: int
+
+    @property
+    def most_ns(self) -> int:
+        """How much may be computed at once [ns]."""
+        return min((max(1, min(MOST_SAMPLES, MOST_BYTES // len(one.encoder))) * one.period_ns
+                    for one in self.outputs), default=NEVER_NS)
+
+
 class LiveSimulation(Simulation):
     """
     A simulation with an output for each channel.
@@ -122,11 +123,9 @@ class LiveSimulation(Simulation):
         super().__init__(values, epoch_ns)
         self.outputs = [Output(channel) for channel in self.channels]
         self._write: Callable[[Sequence[LogRows]], object] = lambda rows: None
-        self._used: list[tuple[int, Output]] = []   # outputs in use, with their numbers
-        self._groups: list[_Group] = []             # of these
-        self._span_ns = FIRST_SPAN_NS               # of what is computed ahead
-        self._stride_ns = FIRST_STRIDE_NS           # of the solver
-        self._reached_ns = -1                       # how far the motion has gone
+        self._motion = _Group({}, self.now_ns, FIRST_STRIDE_NS)
+        self._groups: list[_Group] = []             # of what is used
+        self._used: list[tuple[int, Output]] = []   # with their numbers
 
     def log_to(self, write: Callable[[Sequence[LogRows]], object] | None,
                channels: Sequence[Channel] = ()) -> None:
@@ -148,7 +147,7 @@ class LiveSimulation(Simulation):
         for output, channel in zip(self.outputs, self.channels, strict=True):
             output.channel = channel
         if event.begins_motion or kind == 'reset':
-            self._stride_ns, self._reached_ns = FIRST_STRIDE_NS, self.now_ns
+            self._motion = _Group({}, self.now_ns, FIRST_STRIDE_NS)
         self.refresh()
         return event
 
@@ -156,10 +155,11 @@ class LiveSimulation(Simulation):
         """Compute anew what waits: the motion, or who takes the messages, has changed."""
         self._used = [(number, output) for number, output in enumerate(self.outputs)
                       if output.is_used]
-        grid = attrgetter('channel.grid')
-        self._groups = [_Group(list(group), self.now_ns) for _, group in groupby(
-            sorted((output for _, output in self._used), key=grid), grid)]
-        self._span_ns = FIRST_SPAN_NS
+        grids: dict[tuple[int, int], dict[Channel, Output]] = {}
+        for _, output in self._used:
+            output.take(NEVER_NS)
+            grids.setdefault(output.channel.grid, {})[output.channel] = output
+        self._groups = [_Group(outputs, self.now_ns, FIRST_SPAN_NS) for outputs in grids.values()]
 
     @property
     def lowest_imu_rate(self) -> float:
@@ -190,95 +190,60 @@ class LiveSimulation(Simulation):
     @property
     def _ready_ns(self) -> int:
         """Time up to which all messages are sent or wait [ns]."""
-        return min((group.computed_ns for group in self._groups), default=self._reached_ns)
+        return min((group.computed_ns for group in self._groups), default=self._motion.computed_ns)
 
     def _prepare(self, due_ns: int) -> None:
         """Compute what is due, or a part of it; raise where all is sent that the motion has."""
         # No further than what is computed next: a solver keeps a limited number of steps.
-        goal_ns = min([due_ns, *(group.furthest_ns for group in self._groups)])
+        goal_ns = min([due_ns, *(one.computed_ns + one.most_ns for one in self._groups)])
         try:
-            self._go_ahead(goal_ns, PIECE_SECONDS)
+            self._compute(self._motion, goal_ns, PIECE_SECONDS)
         except IntegrationError:
-            if self.now_ns >= self._reached_ns:
+            if self.now_ns >= self._motion.computed_ns:
                 raise
-        until_ns = min(goal_ns, self._reached_ns)
         for group in self._groups:
-            self._compute(group, until_ns)
+            self._compute(group, min(goal_ns, self._motion.computed_ns), PIECE_SECONDS)
 
     def look_ahead(self, until_ns: int, seconds: float) -> None:
-        """
-        Compute some of what is due up to a time, for one grid.
-
-        seconds : time that this may take; what is computed at once is chosen so that it does
-        """
-        behind = min(self._groups, key=lambda group: group.computed_ns, default=None)
-        if behind is None or behind.computed_ns >= until_ns:
+        """Compute some of what is due up to a time, for one grid; it may take so long."""
+        behind = min(self._groups, key=attrgetter('computed_ns'), default=self._motion)
+        if behind is self._motion or behind.computed_ns >= until_ns:
             return
-        begin = time.monotonic()
-        goal_ns = min(behind.computed_ns + self._span_ns, behind.furthest_ns)
+        goal_ns = behind.computed_ns + min(behind.span_ns, behind.most_ns, LONGEST_SPAN_NS)
         with contextlib.suppress(IntegrationError):     # `send` meets it when the time has come
-            self._go_ahead(goal_ns, 0.5 * seconds)
-            self._compute(behind, min(goal_ns, self._reached_ns))
-        taken = time.monotonic() - begin
-        if taken < 0.5 * seconds:
-            self._span_ns = min(2 * self._span_ns, LONGEST_SPAN_NS)
-        elif taken > 0.8 * seconds:
-            self._span_ns = max(self._span_ns // 2, FIRST_SPAN_NS)
+            self._compute(self._motion, goal_ns, 0.5 * seconds)
+            self._compute(behind, min(goal_ns, self._motion.computed_ns), 0.5 * seconds)
 
-    def _go_ahead(self, until_ns: int, seconds: float) -> None:
-        """Let the solver go on up to a time, or for about so long."""
+    def _compute(self, group: _Group, until_ns: int, seconds: float) -> None:
+        """Compute the messages of a group up to a time, or for about so long."""
         now = begin = time.monotonic()
-        while self._reached_ns < until_ns and now < begin + seconds:
-            goal_ns = min(until_ns, self._reached_ns + self._stride_ns)
-            stride_ns, called = goal_ns - self._reached_ns, now
-            self._reached_ns = self.reach(self._reached_ns, goal_ns)
-            now = time.monotonic()
-            self._stride_ns = max(1, int(stride_ns * min(
-                GROWTH, 0.5 * seconds / max(now - called, 1e-6))))
-        self.forget()
-
-    def _compute(self, group: '_Group', until_ns: int) -> None:
-        """Compute the messages of a grid up to a time that the motion has reached."""
-        if group.computed_ns < until_ns:
-            by_channel = {output.channel: output for output in group.outputs}
-            block = self.block([*by_channel], group.computed_ns, until_ns)
+        while group.computed_ns < until_ns and now < begin + seconds:
+            goal_ns = min(until_ns, group.computed_ns + min(group.span_ns, group.most_ns))
+            block = self.block([*group.outputs], group.computed_ns, goal_ns)
             for channel, t_ns, rows in block.messages:
-                by_channel[channel].add(t_ns, rows)
-            group.computed_ns = block.until_ns
+                group.outputs[channel].add(t_ns, rows)
+            done_ns, called = block.until_ns - group.computed_ns, now
+            group.computed_ns, now = block.until_ns, time.monotonic()
+            room = 0.5 * seconds / max(now - called, 1e-6)
+            group.span_ns = max(int(done_ns * min(room, GROWTH)),
+                                1 if room < 1.0 else group.span_ns)
 
     def _send(self, until_ns: int, publish_from_ns: int) -> None:
         """Send what waits up to a time, to the log before others."""
         logged: list[LogRows] = []
-        due: list[tuple[int, int, bytes]] = []
+        due: list[tuple[int, int, NDArray[np.uint8]]] = []
         for number, output in self._used:
-            messages, rows = output.take(until_ns, self.epoch_ns, publish_from_ns)
-            if rows is not None:
-                logged.append(rows)
-            for t_ns, data in messages:
-                due.append((t_ns, number, data))
+            t_ns, rows = output.take(until_ns)
+            if len(t_ns) and output.log_index is not None:
+                logged.append((output.log_index, self.epoch_ns + t_ns, rows))
+            if len(t_ns) and output.publish is not None:
+                late = int(np.searchsorted(t_ns, publish_from_ns))
+                output.skipped += late
+                due += zip(t_ns[late:].tolist(), repeat(number), rows[late:])
         if logged:
             self._write(logged)
         self.now_ns = until_ns
+        self.forget()
         due.sort(key=itemgetter(0, 1))
-        for _, number, data in due:
-            self.outputs[number].send(data)
-
-
-@dataclass(eq=False)
-class _Group:
-    """The outputs in use of one grid, whose messages are computed together up to `computed_ns`."""
-
-    outputs: list[Output]
-    computed_ns: int
-
-    def __post_init__(self) -> None:
-        for output in self.outputs:
-            output.clear()
-
-    @property
-    def furthest_ns(self) -> int:
-        """How far MOST_SAMPLES behind those that are computed reach [ns]."""
-        channels = [output.channel for output in self.outputs]
-        largest = max(len(channel.encoder) for channel in channels)
-        return (self.computed_ns
-                + max(1, min(MOST_SAMPLES, MOST_BYTES // largest)) * channels[0].period_ns)
+        for _, number, row in due:
+            self.outputs[number].send(row.tobytes())
