@@ -170,8 +170,9 @@ def _readings(values: Mapping[str, Any], turns: Rotation, rates: Reals, force: R
     t_ns = HALF_NS * np.arange(1, len(rates) + 1)
     steps = range(PERIOD_NS, int(t_ns[-1]) + 1, PERIOD_NS)
     exact: Any = rates.T, force.T
-    signals: Any = np.concatenate([np.stack(felt) for felt in Vibration(
-        values, np.ones_like).add(exact, t_ns)])
+    signals: Any = np.concatenate([
+        np.stack(Vibration(values, name, np.ones_like).add(true, t_ns))
+        for name, true in (('rate', exact[0]), ('force', exact[1]))])
     if 0.0 < values['imu.bandwidth'] < 0.5 / HALF:
         from scipy.signal import butter, lfilter, lfilter_zi  # noqa: PLC0415 - slow
 

@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Quaternion, Vector
+from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.bandwidth import LowPass
@@ -104,10 +104,22 @@ class Imu:
                            and not any(self._g_sensitivity))
         bandwidth = values['imu.bandwidth']
         self.low_pass = LowPass(bandwidth, values['imu.bandwidth_order']) if bandwidth else None
-        self.vibration = Vibration(
-            values, self.low_pass.response if self.low_pass else np.ones_like)
+        self._vibrations = [Vibration(
+            values, name, self.low_pass.response if self.low_pass else np.ones_like)
+            for name in ('rate', 'force')]
         interval_ns = min(period_ns, LONGEST_NS) + since_ns - first_begin_ns
         self.memory_ns = max(interval_ns, self.low_pass.memory_ns if self.low_pass else 0)
+
+    @property
+    def vibrates(self) -> bool:
+        return not all(one.is_off for one in self._vibrations)
+
+    def vibrating(self, true: tuple[Vector, Vector], t_ns: Times,
+                  seconds: Column | float) -> tuple[Vector, Vector]:
+        """Return true rates and forces with vibration; see `Vibration.add`."""
+        rates, force = (one.add(vector, t_ns, seconds)
+                        for one, vector in zip(self._vibrations, true, strict=True))
+        return rates, force
 
     def errors(self, t_ns: Times) -> tuple[Errors, Errors]:
         """Return white noise and bias of rates and of forces at times (n,) [ns]."""

@@ -81,8 +81,7 @@ class Simulation:
         """
         Let something change the run now; return the event, with the time at which it acts.
 
-        kind, details : of an `Event`; a drive needs no `stop_ns`, which is then now +
-            `pivot.cmd_timeout`
+        kind, details : of an `Event`, but no 'start'
 
         Raises ValueError naming what is off; the run goes on unchanged.
         """
@@ -148,7 +147,13 @@ class Simulation:
         if last_ns <= after_ns:
             raise IntegrationError(f'the stamp {(self.epoch_ns + until_ns) / NANOSECONDS:.12g} s: '
                                    f'must be < {2 ** 31} s, in January 2038', reached_ns=last_ns)
-        until_ns = self.reach(after_ns, min(until_ns, last_ns))
+        until_ns = min(until_ns, last_ns)
+        try:
+            self.trajectory.evaluate(np.array([until_ns]))
+        except IntegrationError as error:
+            if error.reached_ns <= after_ns:
+                raise
+            until_ns = error.reached_ns
         samples: dict[tuple[int, int], Samples] = {}
         messages = []
         for channel in channels:
@@ -160,16 +165,6 @@ class Simulation:
                 if len(t_ns):           # a sensor may lose all samples of a block
                     messages.append((channel, t_ns, rows))
         return Block(until_ns, messages)
-
-    def reach(self, after_ns: int, until_ns: int) -> int:
-        """Return the last time up to `until_ns` that the motion has; as `block`, raise if none."""
-        try:
-            self.trajectory.evaluate(np.array([until_ns]))
-        except IntegrationError as error:
-            if error.reached_ns <= after_ns:
-                raise
-            return error.reached_ns
-        return until_ns
 
     def play(self, channels: Sequence[Channel], until_ns: int) -> Iterator[Block]:
         """

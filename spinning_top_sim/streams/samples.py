@@ -64,7 +64,7 @@ class Samples:
             w1, w2, w3, f1, f2, f3 = imu.low_pass.filtered(
                 self.trajectory, self.t_ns, self._signal)
             felt = (w1, w2, w3), (f1, f2, f3)
-        felt = imu.vibration.add(felt, self.t_ns, self._seconds if imu.takes_means else 0.0)
+        felt = imu.vibrating(felt, self.t_ns, self._seconds if imu.takes_means else 0.0)
         return imu.read(felt, self._errors)
 
     @cached_property
@@ -95,10 +95,9 @@ class Samples:
         if imu.mounting.rotation is not None:
             x, y, z = attitude.rotated_back(imu.mounting.rotation, (x, y, z))
         v1, v2, v3 = imu.mounting.from_body((v1, v2, v3))
-        if imu.is_perfect and imu.vibration.is_off:
+        if imu.is_perfect and not imu.vibrates:
             return (x, y, z, w), (v1, v2, v3)
-        readings = imu.read(imu.vibration.add(self._means, self.t_ns, self._seconds),
-                            self._errors)
+        readings = imu.read(imu.vibrating(self._means, self.t_ns, self._seconds), self._errors)
         r1, r2, r3, *force = (self._seconds * (reading - mean) for reading, mean in zip(
             chain(*readings), chain(*self._means), strict=True))
         x, y, z = attitude.rotation_vector((x, y, z, w))

@@ -145,39 +145,31 @@ class Trajectory:
 
         Raises ValueError naming what is off with the event.
         """
-        after = copy(self)
-        now = self.after(event.t_ns)
+        after, now, t_ns = copy(self), self.after(event.t_ns), event.t_ns
         after._pieces = self._pieces[:self._pieces.index(now) + 1]
-        after._follow(event, now)
+        if event.kind == 'drive':
+            after._follow(event, now)
+        else:
+            start = (State(**event.details) if event.kind == 'state'
+                     else commanded(now.states(np.array([t_ns])), **event.details))
+            after._pieces.append(self._begin(start, t_ns))
+            after.lz, after._jumps = start.lz, (*self._jumps, t_ns)
         return after
 
-    def _follow(self, event: Event, now: Piece) -> None:
-        t_ns, details = event.t_ns, event.details
-        state = now.states(np.array([t_ns]))
-        if event.kind == 'drive':
-            repeats = self._drive is not None and event.repeats(self._drive)
-            self._drive = event
-            self.pivot = self._driven_path(stop_ns=details['stop_ns']) if repeats else (
-                self._path_of(event))
-            if repeats:         # the motion up to now is the same
-                self._pieces[-1] = now.with_ride(self.pivot.lasting(now.start_ns))
-                return
-            start: State | Posture = now.posture(t_ns)
-        elif event.kind == 'command':
-            start = commanded(state, **details)
+    def _follow(self, drive: Event, now: Piece) -> None:
+        t_ns, details = drive.t_ns, drive.details
+        repeats = self._drive is not None and drive.repeats(self._drive)
+        if not repeats:
+            place = self.place(np.array([t_ns]))
+            self._path_until = partial(
+                PivotPath.to_velocity, [details[axis] for axis in 'xyz'],
+                position=place.position[:, 0].tolist(), velocity=place.velocity[:, 0].tolist(),
+                start_ns=t_ns, most_acceleration=self._most_acceleration)
+        self._drive, self.pivot = drive, self._path_until(stop_ns=details['stop_ns'])
+        if repeats:         # the motion up to now is the same
+            self._pieces[-1] = now.with_ride(self.pivot.lasting(now.start_ns))
         else:
-            start = State(**details)
-        self._pieces.append(self._begin(start, t_ns))
-        if isinstance(start, State):
-            self.lz, self._jumps = start.lz, (*self._jumps, t_ns)
-
-    def _path_of(self, event: Event) -> PivotPath:
-        place = self.place(np.array([event.t_ns]))
-        self._driven_path = partial(
-            PivotPath.to_velocity, [event.details[axis] for axis in 'xyz'],
-            position=place.position[:, 0].tolist(), velocity=place.velocity[:, 0].tolist(),
-            start_ns=event.t_ns, most_acceleration=self._most_acceleration)
-        return self._driven_path(stop_ns=event.details['stop_ns'])
+            self._pieces.append(self._begin(now.posture(t_ns), t_ns))
 
     def forget(self, before_ns: int, steps_before_ns: int) -> None:
         """Forget the pieces before a time, and integration steps before another one."""

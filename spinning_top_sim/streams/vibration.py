@@ -13,82 +13,71 @@ from spinning_top_sim.physics.attitude import Column, Vector
 from spinning_top_sim.streams import noise
 from spinning_top_sim.times import Times
 
-# Sines that a spectral density becomes, for each axis.
-LINES = 512
+LINES = 512             # that a spectral density becomes, for each axis
 Matrix = NDArray[np.float64]
-Response = Callable[[Matrix], NDArray[np.complex128]]
 
 
 class Vibration:
     """
-    A vibration of angular velocity and specific force in the frame of the IMU.
+    Vibration of a vector in the frame of the IMU, as a sum of sines for each axis.
 
-    A sensor with the complex gain `response` at frequencies [Hz] reads it.
+    One is that of `imu.vibration.frequency`; a spectral density becomes LINES more, each with the
+    power of a band.  Its place in the middle half of the band and its phase follow from the seed.
+    So no beat is longer than two over the width of a band.
 
-    Each axis is a sum of sines: that of `imu.vibration.frequency`, and `LINES` for a spectral
-    density, each with the power of a band.  Its place in the middle half of the band and its phase
-    follow from the seed.  So no beat is longer than two over the width of a band.
-
+    name : 'rate' or 'force'
+    response : complex gain of the sensor at frequencies [Hz]
     is_off : whether nothing vibrates
 
     (S. Rice, "Mathematical analysis of random noise", Bell System Technical Journal 23 (1944) 282;
     M. Shinozuka, C. Jan, Journal of Sound and Vibration 25 (1972) 111)
     """
 
-    def __init__(self, values: Mapping[str, Any], response: Response) -> None:
-        self._kinds = [_lines(values, name, kind, response) for name, kind in (
-            ('rate', noise.Kind.VIBRATION_RATE), ('force', noise.Kind.VIBRATION_FORCE))]
-        self.is_off = not any(map(len, self._kinds))
+    def __init__(self, values: Mapping[str, Any], name: str,
+                 response: Callable[[Matrix], NDArray[np.complex128]]) -> None:
+        # Frequencies [Hz], amplitudes and phases [turns] of the lines, (lines, 3, 3 axes).
+        self._lines = np.empty((0, 3, 3))
+        amplitude = values[f'imu.vibration.{name}']
+        if any(amplitude):
+            frequency = 3 * (values['imu.vibration.frequency'],)
+            self._lines = np.array([[frequency, amplitude, 3 * (0.0,)]])
+        profile = np.reshape(values[f'imu.vibration.{name}_psd'], (-1, 2))
+        if profile.any():
+            kind = noise.Kind[f'VIBRATION_{name.upper()}']
+            self._lines = np.concatenate((self._lines, _noise(profile, values['seed'], kind)))
+        gain = response(self._lines[:, 0])
+        self._lines[:, 1] *= np.abs(gain)
+        self._lines[:, 2] += np.angle(gain) / math.tau
+        self.is_off = not len(self._lines)
 
-    def add(self, true: tuple[Vector, Vector], t_ns: Times,
-            seconds: Column | float = 0.0) -> tuple[Vector, Vector]:
+    def add(self, vector: Vector, t_ns: Times, seconds: Column | float = 0.0) -> Vector:
         """
-        Return rates and forces (n,) with the vibration at these times [ns].
+        Return a vector (n,) with its vibration at times (n,) [ns].
 
         seconds : time before these over which the means are taken [s]
         """
+        if self.is_off:
+            return vector
         middle = t_ns.astype(np.float64) * 1e-9 - 0.5 * seconds
-        rates, force = (_sum(lines, middle, seconds, one)
-                        for lines, one in zip(self._kinds, true, strict=True))
-        return rates, force
+        total = np.zeros((3, len(middle)))
+        for line in self._lines:            # in one order, however many samples there are
+            frequency, amplitude, phase = line[..., np.newaxis]
+            turns = frequency * middle + phase
+            total += amplitude * np.sinc(frequency * seconds) * np.sin(
+                math.tau * (turns - np.floor(turns)))
+        x, y, z = vector
+        return x + total[0], y + total[1], z + total[2]
 
 
-def _sum(lines: Matrix, middle: Column, seconds: Column | float, vector: Vector) -> Vector:
-    if not len(lines):
-        return vector
-    total = np.zeros((3, len(middle)))
-    for line in lines:                          # in one order, however many samples there are
-        frequency, amplitude, phase = line[..., np.newaxis]
-        turns = frequency * middle + phase
-        total += amplitude * np.sinc(frequency * seconds) * np.sin(
-            math.tau * (turns - np.floor(turns)))
-    x, y, z = vector
-    return x + total[0], y + total[1], z + total[2]
-
-
-def _lines(values: Mapping[str, Any], name: str, kind: noise.Kind,
-           response: Response) -> Matrix:
-    """Return frequencies [Hz], amplitudes and phases [turns] of the sines, (lines, 3, 3 axes)."""
-    lines = np.empty((0, 3, 3))
-    amplitude = values[f'imu.vibration.{name}']
-    if any(amplitude):
-        frequency = 3 * (values['imu.vibration.frequency'],)
-        lines = np.array([[frequency, amplitude, 3 * (0.0,)]])
-    profile = np.reshape(values[f'imu.vibration.{name}_psd'], (-1, 2))
-    if profile.any():
-        # The angle of two normal numbers is uniform.
-        normal = noise.white(values['seed'], kind, noise.Part.WHITE, np.arange(LINES), 12)
-        normal = normal.reshape(2, 2, 3, -1)
-        uniform = np.arctan2(normal[0], normal[1]) / math.tau + 0.5
-        edges = np.linspace(profile[0, 0], profile[-1, 0], LINES + 1)
-        powers = np.diff([power_below(profile.tolist(), edge) for edge in edges.tolist()])
-        sines = np.stack((edges[:-1] + (edges[1] - edges[0]) * (0.25 + 0.5 * uniform[0]),
-                          np.broadcast_to(np.sqrt(2.0 * powers), (3, LINES)), uniform[1]))
-        lines = np.concatenate((lines, sines.transpose(2, 0, 1)))
-    gain = response(lines[:, 0])
-    lines[:, 1] *= np.abs(gain)
-    lines[:, 2] += np.angle(gain) / math.tau
-    return lines
+def _noise(profile: Matrix, seed: int, kind: noise.Kind) -> Matrix:
+    # The angle of two normal numbers is uniform.
+    normal = noise.white(seed, kind, noise.Part.WHITE, np.arange(LINES), 12)
+    place, phase = np.arctan2(*normal.reshape(2, 6, -1)).reshape(2, 3, -1) / math.tau + 0.5
+    edges = np.linspace(profile[0, 0], profile[-1, 0], LINES + 1)
+    powers = np.diff([power_below(profile.tolist(), edge) for edge in edges.tolist()])
+    return np.stack((edges[:-1] + (edges[1] - edges[0]) * (0.25 + 0.5 * place),
+                     np.broadcast_to(np.sqrt(2.0 * powers), (3, LINES)), phase)
+                    ).transpose(2, 0, 1)
 
 
 def power_below(profile: Sequence[Sequence[float]], frequency: float) -> float:
