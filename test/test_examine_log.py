@@ -138,7 +138,7 @@ def test_a_reset_that_turns_the_sensor_on_the_body_is_refused(log, tmp_path):
     epoch_ns = int(metadata['epoch_ns'])
     values = {**json.loads(metadata['parameters']), 'imu.rpy': [-1.0, 0.5, 2.0]}
     rows.append((1, epoch_ns + 10 ** 9, Event('reset', 0, 10 ** 9 - 1, {
-        'epoch_ns': epoch_ns, 'parameters': values}).encoded()))
+        'epoch_ns': epoch_ns, 'parameters': values}).entries()[0][1]))
     path = write_rows(tmp_path / 'reset.mcap', [RecordedTopic('/pose', POSE),
                                                 RecordedTopic('/events', STRING)], rows,
                       metadata=metadata)

@@ -10,7 +10,7 @@ from helpers.simulations import EPOCH_NS, SECOND, channel, play, run
 
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.play import Simulation
-from spinning_top_sim.streams.timing import Timing
+from spinning_top_sim.streams.sensor import Timing
 from spinning_top_sim.times import LAST_STAMP_NS
 
 FAULTS = {'imu.stamp_offset': -0.02, 'imu.stamp_jitter': 3e-4, 'imu.clock_drift': 200.0,

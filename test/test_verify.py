@@ -257,7 +257,7 @@ def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
     monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
     monkeypatch.setattr(recorded_run, 'LEAST_STEPS', 5_000)
     t_ns = 3_999_999_998_000_000_000
-    far = Event('command', t_ns, t_ns, {'l3': 1.7, 'lz': 1.4}).encoded()
+    far = Event('command', t_ns, t_ns, {'l3': 1.7, 'lz': 1.4}).entries()[0][1]
     path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (
         far if topic.endswith('/events') and number == 1 else data),
         stamp=lambda topic, number, stamp_ns: (

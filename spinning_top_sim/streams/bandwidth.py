@@ -2,9 +2,8 @@
 """
 The bandwidth of a sensor: a low pass of the true signal, as data sheets state it.
 
-A reading is the convolution of the signal with the impulse response of the analog filter, by
-Gauss-Legendre panels over the time that the filter remembers; panels end where a piece of the
-motion does.  So a reading depends on the motion and on its own time only.
+A reading is the convolution of the signal with the impulse response, by Gauss-Legendre panels over
+the time that the filter remembers.  So it depends on the motion and on its own time only.
 """
 
 import math
@@ -13,6 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.trajectory import Trajectory
 from spinning_top_sim.times import Times
@@ -24,9 +24,8 @@ NODES, ANGLE = 8, 4.0
 # So many panels follow a motion that is some 20 times as fast as the corner.
 MOST_PANELS = 256
 MOST_TOGETHER = 200_000     # states
-# Returns the signals of some states, (columns, n).
-Signal = Callable[[States], NDArray[np.float64]]
-Edges = NDArray[np.float64]
+# Returns the signals of some states (n,); one that is the same for all may be a float.
+Signal = Callable[[States], Sequence[Column | float]]
 
 
 class LowPass:
@@ -61,50 +60,41 @@ class LowPass:
         for piece, times in trajectory.pieces(t_ns):
             # A specific force has squares of rates, thus twice their frequency.
             seconds = ANGLE / (self._corner + 2.0 * piece.fastest_rate)
-            edges = np.linspace(0.0, self.memory_ns, 1 + min(
-                math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS))
-            together = max(1, MOST_TOGETHER // (NODES * (len(edges) - 1)))
-            for begin in range(0, len(times), together):
-                now = times[begin:begin + together]
-                # Samples that see this piece alone have the same nodes, the others their own.
-                mixed = int(np.searchsorted(now, piece.start_ns + self.memory_ns))
-                samples = [(now[at:at + 1], self._edges(trajectory, int(now[at]), edges))
-                           for at in range(mixed)]
-                if mixed < len(now):
-                    samples.append((now[mixed:], edges))
-                found += self._readings(trajectory, samples, signal)
+            panels = min(math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS)
+            edges = np.linspace(0.0, self.memory_ns, 1 + panels)
+            # Samples that see this piece alone have the same nodes, each of the others its own.
+            mixed = int(np.searchsorted(times, piece.start_ns + self.memory_ns))
+            found += [self._readings(
+                trajectory, times[at:at + 1], self._edges(trajectory, int(times[at]), edges),
+                signal) for at in range(mixed)]
+            together = max(1, MOST_TOGETHER // (NODES * panels))
+            found += [self._readings(trajectory, times[at:at + together], edges, signal)
+                      for at in range(mixed, len(times), together)]
         return np.concatenate(found, axis=1)
 
-    def _edges(self, trajectory: Trajectory, t_ns: int, edges: Edges) -> Edges:
+    def _edges(self, trajectory: Trajectory, t_ns: int, edges: Column) -> Column:
         """Return these edges of panels [ns before a sample], and those of pieces."""
         oldest = min(t_ns, self.memory_ns)
         starts = [t_ns - start_ns for start_ns in trajectory.starts(t_ns - oldest, t_ns)]
         return np.unique(np.concatenate((edges[edges < oldest], starts, [oldest])))
 
-    def _readings(self, trajectory: Trajectory, samples: Sequence[tuple[Times, Edges]],
-                  signal: Signal) -> list[NDArray[np.float64]]:
-        """Return the readings (columns, n) of samples (n,) with their edges [ns before]."""
-        weights, at_ns = [], []
-        for t_ns, edges in samples:
-            lengths = np.diff(edges)[:, np.newaxis]
-            before = (edges[:-1, np.newaxis] + lengths * self._nodes).ravel()
-            # The signal that was there before t = 0 has the rest of the weight.
-            weights.append(np.append(
-                1e-9 * (lengths * self._weights).ravel() * self._response(1e-9 * before),
-                self._rest(1e-9 * edges[-1])))
-            back_ns = np.append(np.rint(before), edges[-1]).astype(np.int64)
-            at_ns.append(t_ns - back_ns[:, np.newaxis])
-        unique, places = np.unique(np.concatenate(list(map(np.ravel, at_ns))),
-                                   return_inverse=True)
-        values, found, end = signal(trajectory.evaluate(unique)), [], 0
-        for own_weights, own_ns in zip(weights, at_ns, strict=True):
-            begin, end = end, end + own_ns.size
-            own = values[:, places[begin:end].reshape(own_ns.shape)]
-            total = np.zeros_like(own[:, 0])
-            for node, weight in enumerate(own_weights):     # in one order, however many there are
-                total += weight * own[:, node]
-            found.append(total)
-        return found
+    def _readings(self, trajectory: Trajectory, t_ns: Times, edges: Column,
+                  signal: Signal) -> NDArray[np.float64]:
+        """Return the readings (columns, n) of samples (n,) with these edges [ns before]."""
+        lengths = np.diff(edges)[:, np.newaxis]
+        before = (edges[:-1, np.newaxis] + lengths * self._nodes).ravel()
+        # The signal that was there before t = 0 has the rest of the weight.
+        weights = np.append(
+            1e-9 * (lengths * self._weights).ravel() * self._response(1e-9 * before),
+            self._rest(1e-9 * edges[-1]))
+        back_ns = np.append(np.rint(before), edges[-1]).astype(np.int64)
+        unique, places = np.unique(t_ns - back_ns[:, np.newaxis], return_inverse=True)
+        values = np.stack(np.broadcast_arrays(*signal(trajectory.evaluate(unique)), unique)[:-1])
+        values = values[:, places.reshape(len(back_ns), -1)]
+        total = np.zeros_like(values[:, 0])
+        for node, weight in enumerate(weights):     # in one order, however many there are
+            total += weight * values[:, node]
+        return total
 
     def _response(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the impulse response [1/s]."""

@@ -14,6 +14,8 @@ from spinning_top_sim.times import LAST_STAMP_NS, Times
 
 # Messages as rows (n, size): bytes or, of a table, numbers.
 Rows = NDArray[Any]
+# A channel, times (n,) at which its messages are due [ns], and these.
+Messages = tuple['Channel', Times, Rows]
 # Returns how late the stamps of samples at times (n,) are [ns], and how often each is sent.
 Faults = Callable[[Times], tuple[Times | int, NDArray[np.int64]]]
 

@@ -79,10 +79,6 @@ class Event:
             raise ValueError(f'event {kind!r} is unknown')
         return cls(kind, operator.index(t_ns), operator.index(sent_ns), details)
 
-    def encoded(self) -> bytes:
-        """Return the event as it is logged: std_msgs/String of JSON."""
-        return messages.string(json.dumps(self.as_mapping(), default=list))
-
     @classmethod
     def decoded(cls, data: bytes) -> Self:
         """Return a logged event.  Raises one of MALFORMED for any other message."""
@@ -94,8 +90,8 @@ class Event:
         return cls.from_mapping(mapping)
 
     def entries(self) -> list[tuple[str, bytes]]:
-        """Return what is logged of the event: topics and messages."""
-        logged = [(EVENTS, self.encoded())]
+        """Return what is logged of the event: topics and messages; std_msgs/String of JSON."""
+        logged = [(EVENTS, messages.string(json.dumps(self.as_mapping(), default=list)))]
         if self.kind == 'command':
             logged.append((COMMANDS, command(**self.details)))
         return logged

@@ -23,7 +23,9 @@ from spinning_top_sim.times import NANOSECONDS, Times, period_ns
 
 NO_FIX, FIX = -1, 0         # sensor_msgs/NavSatStatus
 UNKNOWN, DIAGONAL_KNOWN = 0, 2      # sensor_msgs/NavSatFix
-EXACT = 0.0, 0.0            # standard deviations of the truth
+# Standard deviations along the axes.
+Deviations = tuple[float, float, float]
+EXACT = 0.0, 0.0, 0.0
 
 
 def channels(values: Mapping[str, Any]) -> list[Channel]:
@@ -33,13 +35,14 @@ def channels(values: Mapping[str, Any]) -> list[Channel]:
     edges_ns = np.rint(np.array(values['gnss.outages']) * NANOSECONDS).astype(np.int64)
     channel = partial(Channel, 'gnss', period_ns=period_ns(values['gnss.rate']))
 
-    def fix(topic: str, deviations: Sequence[float], edges_ns: Times, **more: Any) -> Channel:
-        variances = messages.diagonal(*_variances(deviations))
+    def fix(topic: str, deviations: Deviations, edges_ns: Times, **more: Any) -> Channel:
+        variances = messages.diagonal(*(one ** 2 for one in deviations))
 
         def fields(samples: Samples) -> Sequence[Values]:
             """Return status, position (NaN in an outage), covariance and its kind."""
             from pymap3d import enu2geodetic  # noqa: PLC0415 - not every node has a receiver
-            position = _measured(values, deviations, Kind.GNSS_POSITION, samples, 'position')
+            position = _measured(values, deviations, Kind.GNSS_POSITION, samples,
+                                 samples.trajectory.place(samples.t_ns).position)
             out = _is_out(edges_ns, samples.t_ns)
             return ([np.where(out, NO_FIX, FIX)],
                     [np.where(out, np.nan, part)
@@ -52,19 +55,22 @@ def channels(values: Mapping[str, Any]) -> list[Channel]:
             Field('position', 3), Field('position_covariance', 9),
             Field('position_covariance_type', 1, 'B')), **more)
 
-    def velocity(topic: str, deviations: Sequence[float], **more: Any) -> Channel:
-        covariance = messages.diagonal(*_variances(deviations), *3 * (-1.0,))
+    def velocity(topic: str, deviations: Deviations, **more: Any) -> Channel:
+        covariance = messages.diagonal(*(one ** 2 for one in deviations), *3 * (-1.0,))
         return channel(
             topic, 'geometry_msgs/msg/TwistWithCovarianceStamped', encoder=message(
                 Header(values['world_frame']), Field('twist.twist.linear', 3),
                 Numbers('d', (*messages.ORIGIN, *covariance))),
             fields=lambda samples: [list(_measured(
-                values, deviations, Kind.GNSS_VELOCITY, samples, 'velocity'))], **more)
+                values, deviations, Kind.GNSS_VELOCITY, samples,
+                samples.trajectory.place(samples.t_ns).velocity))], **more)
 
+    of_fix, of_velocity = ((level, level, vertical) for level, vertical in (
+        values['gnss.position_noise'], values['gnss.velocity_noise']))
     return [
-        fix('gnss/fix', values['gnss.position_noise'], edges_ns, delay_ns=delay_ns),
+        fix('gnss/fix', of_fix, edges_ns, delay_ns=delay_ns),
         fix('ground_truth/gnss/fix', EXACT, edges_ns[:0]),
-        velocity('gnss/velocity', values['gnss.velocity_noise'], delay_ns=delay_ns,
+        velocity('gnss/velocity', of_velocity, delay_ns=delay_ns,
                  faults=lambda t_ns: (0, 1 - _is_out(edges_ns, t_ns))),
         velocity('ground_truth/gnss/velocity', EXACT)]
 
@@ -74,17 +80,8 @@ def _is_out(edges_ns: Times, t_ns: Times) -> NDArray[np.int64]:
     return np.searchsorted(edges_ns, t_ns, 'right') % 2
 
 
-def _measured(values: Mapping[str, Any], deviations: Sequence[float], kind: Kind,
-              samples: Samples, name: str) -> NDArray[np.float64]:
-    """Return measurements (3, n); deviations are those of a horizontal axis and the vertical."""
-    exact: NDArray[np.float64] = getattr(samples.trajectory.place(samples.t_ns), name)
-    if not any(deviations):
-        return exact
-    level, vertical = deviations
-    return exact + np.array([[level], [level], [vertical]]) * noise.white(
+def _measured(values: Mapping[str, Any], deviations: Deviations, kind: Kind,
+              samples: Samples, exact: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return measurements (3, n)."""
+    return exact if not any(deviations) else exact + np.array([deviations]).T * noise.white(
         values['seed'], kind, noise.Part.WHITE, samples.t_ns // samples.times.step)
-
-
-def _variances(deviations: Sequence[float]) -> tuple[float, float, float]:
-    level, vertical = deviations
-    return level ** 2, level ** 2, vertical ** 2

@@ -12,17 +12,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spinning_top_sim.physics.states import Point
+from spinning_top_sim.physics.attitude import rotated
 from spinning_top_sim.shape import Shape
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import Field, Header, Numbers, Part, Template, Values
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.messages import NO_ROTATION, ORIGIN, message
 from spinning_top_sim.streams.samples import Samples
-from spinning_top_sim.streams.trajectory import Trajectory
-from spinning_top_sim.times import NANOSECONDS, Times, period_ns
+from spinning_top_sim.times import NANOSECONDS, period_ns
 
 CYLINDER, LINE_STRIP, LINE_LIST = 3, 4, 5       # visualization_msgs/Marker
 BODY_COLOR = (0.20, 0.40, 0.70, 1.0)            # red, green, blue, alpha
@@ -47,8 +45,9 @@ def markers(values: Mapping[str, Any]) -> Channel:
         # Traces share points, which are computed once.
         numbers, places = np.unique(np.maximum(newest + np.arange(1 - count, 1), 0),
                                     return_inverse=True)
-        tip = (0.0, 0.0, shape.tip)
-        points = _exact_places(samples.trajectory, numbers * spacing_ns, tip)
+        t_ns, tip = numbers * spacing_ns, (0.0, 0.0, shape.tip)
+        points = (np.stack(rotated(samples.trajectory.exact_attitude(t_ns), tip))
+                  + samples.trajectory.place(t_ns).position).T
         traces = points[places.reshape(len(newest), -1)]
         now = np.stack(states.position(tip), axis=-1)[:, np.newaxis]
         traces = np.where(np.isnan(traces), now, traces)
@@ -57,14 +56,6 @@ def markers(values: Mapping[str, Any]) -> Channel:
     return Channel('markers', 'markers', 'visualization_msgs/msg/MarkerArray',
                    period_ns(values['markers.rate']),
                    _template(shape, values['world_frame'], count + 1 if count else 0), fields)
-
-
-def _exact_places(trajectory: Trajectory, t_ns: Times, point: Point) -> NDArray[np.float64]:
-    """Return where a point of the body is, (n, 3) [m]; NaN where the solution is not known."""
-    truths = [(times, piece.truth(times)) for piece, times in trajectory.pieces(t_ns)]
-    return np.concatenate([
-        np.full((len(times), 3), np.nan) if states is None
-        else np.stack(states.position(point), axis=-1) for times, states in truths])
 
 
 def _template(shape: Shape, frame_id: str, trace_points: int) -> Template:

@@ -16,6 +16,7 @@ from spinning_top_sim.physics.pivot import SHORTEST_S, PivotPath
 from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.streams.parameter import ANY, Effect, Parameter, Range
 
+FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')      # each the parent of the next one
 # Second parameter that switches a stream on.
 OTHER_SWITCH = {'ground_truth_imu_odom': 'increments.enabled'}
 REMOVED = ('pacing', 'max_error', 'publish_clock')      # in logs of 1.x
@@ -23,29 +24,27 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 LOWEST_RATE_OF_INTERVALS = 1.0      # of increments and means: the motion is kept for a second
 
 
-def _parameter(name: str, row: Mapping[str, Any]) -> Parameter:
-    given: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value
-                             for key, value in row.items()}
-    given['range'] = Range(**row['range']) if 'range' in row else ANY
-    given['effect'] = Effect[row.get('effect', 'reset').upper()]
-    return Parameter(name, **given)
-
-
-def _of_stream(name: str, row: Mapping[str, Any]) -> Iterator[Parameter]:
-    yield Parameter(f'{name}.enabled', f'Whether there is {row["text"]}; a recording keeps the '
-                    'streams that it began with', row['enabled'], effect=Effect.NOW)
-    if 'rate' in row:
-        yield Parameter(f'{name}.rate', f'Rate of {row["text"]}', row['rate'],
-                        Range(1e-6, 1e4), unit='Hz', effect=Effect.NOW)
+def _described(name: str, row: Mapping[str, Any]) -> Iterator[Parameter]:
+    """Yield the parameters that an entry of the table describes."""
+    if name != 'streams':
+        given: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value
+                                 for key, value in row.items()}
+        given['range'] = Range(**row['range']) if 'range' in row else ANY
+        given['effect'] = Effect[row.get('effect', 'reset').upper()]
+        yield Parameter(name, **given)
+        return
+    for stream, one in row.items():
+        yield Parameter(f'{stream}.enabled', f'Whether there is {one["text"]}; a recording keeps '
+                        'the streams that it began with', one['enabled'], effect=Effect.NOW)
+        if 'rate' in one:
+            yield Parameter(f'{stream}.rate', f'Rate of {one["text"]}', one['rate'],
+                            Range(1e-6, 1e4), unit='Hz', effect=Effect.NOW)
 
 
 _CONTENT = read_table('streams/parameters.toml')
 # Descriptions of the streams, by name.
 STREAMS: Mapping[str, str] = {name: row['text'] for name, row in _CONTENT['streams'].items()}
-TABLE: tuple[Parameter, ...] = tuple(
-    parameter for name, row in _CONTENT.items() for parameter in (
-        chain.from_iterable(_of_stream(*one) for one in row.items()) if name == 'streams'
-        else (_parameter(name, row),)))
+TABLE = tuple(chain.from_iterable(_described(*entry) for entry in _CONTENT.items()))
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
 LONGEST = BY_NAME['duration'].range.highest     # time [s], three years
 FASTEST = BY_NAME['pivot.speed'].range.highest  # speed of the pivot [m/s]
@@ -82,13 +81,12 @@ def _check_together(values: Mapping[str, Any]) -> None:
             raise ValueError(
                 f'{name} = {list(value) if isinstance(value, tuple) else value!r}: {text}')
 
-    above: list[str] = []
-    for name in ('world_frame', 'body_frame', 'imu.frame_id'):
-        frame = values[name]
+    frames = [values[name] for name in FRAMES]
+    for name, frame in zip(FRAMES, frames, strict=True):
         need(frame != '' and not frame.startswith('/'), name,
              'must be the name of a frame, without a slash at its begin')
-        need(frame not in above, name, 'must be another frame than its parent')
-        above.append(frame)
+        need(frames.index(frame) == FRAMES.index(name), name,
+             'must be another frame than its parent')
     for name in values['record.streams']:
         need(name in ('all', *STREAMS), 'record.streams',
              f'{name!r} is no stream; must be all or some of {", ".join(STREAMS)}')

@@ -10,20 +10,13 @@ import numpy as np
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.channel import Channel, Rows
+from spinning_top_sim.streams.channel import Channel, Messages
 from spinning_top_sim.streams.events import CHANGES, Event
 from spinning_top_sim.streams.imu import LONGEST_NS, Imu
 from spinning_top_sim.streams.samples import Samples
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.streams.trajectory import Trajectory
-from spinning_top_sim.times import (
-    LAST_STAMP_NS,
-    NANOSECONDS,
-    NEVER_NS,
-    Times,
-    check_stamp,
-    period_ns,
-)
+from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, NEVER_NS, check_stamp, period_ns
 
 BLOCK_BYTES = 1_000_000                     # of a block offline
 LONGEST_BLOCK_NS = 100 * NANOSECONDS        # for the sake of progress
@@ -31,14 +24,10 @@ MOST_BLOCKS = 20_000                        # of a run; then they are longer
 
 
 class Block(NamedTuple):
-    """
-    The messages of some channels after the block before and up to `until_ns`.
-
-    messages : (channel, times (n,) [ns], rows (n, size)) of each channel that has any
-    """
+    """The messages of some channels up to a time [ns], of each that has any."""
 
     until_ns: int
-    messages: Sequence[tuple[Channel, Times, Rows]]
+    messages: Sequence[Messages]
 
 
 class Simulation:
@@ -155,7 +144,7 @@ class Simulation:
                 raise
             until_ns = error.reached_ns
         samples: dict[tuple[int, int], Samples] = {}
-        messages = []
+        messages: list[Messages] = []
         for channel in channels:
             if channel.grid not in samples:
                 samples[channel.grid] = Samples(

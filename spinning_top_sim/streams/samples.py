@@ -5,7 +5,6 @@ from functools import cached_property, reduce
 from itertools import chain, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
@@ -47,11 +46,6 @@ class Samples:
         return self._imu.mounting.orientation(self.states)
 
     @cached_property
-    def estimated_orientation(self) -> Quaternion:
-        """`orientation` with the noise of an IMU that estimates it."""
-        return self._imu.estimated(self.orientation, self.t_ns)
-
-    @cached_property
     def exact(self) -> tuple[Vector, Vector]:
         """Rates [rad/s] and forces [m/s^2] of a perfect IMU: values or means."""
         return self._means if self._imu.takes_means else self._imu.mounting.felt(self.states)
@@ -62,24 +56,15 @@ class Samples:
         imu, felt = self._imu, self.exact
         if imu.low_pass is not None:
             w1, w2, w3, f1, f2, f3 = imu.low_pass.filtered(
-                self.trajectory, self.t_ns, self._signal)
+                self.trajectory, self.t_ns, lambda states: [*chain(*imu.mounting.felt(states))])
             felt = (w1, w2, w3), (f1, f2, f3)
         felt = imu.vibrating(felt, self.t_ns, self._seconds if imu.takes_means else 0.0)
-        return imu.read(felt, self._errors)
+        return imu.read(felt, self.errors)
 
     @cached_property
-    def biases(self) -> tuple[Vector, Vector]:
-        """The biases that are in `readings`."""
-        (_, (a, b, c)), (_, (d, e, f)) = self._errors
-        return (a, b, c), (d, e, f)
-
-    @cached_property
-    def _errors(self) -> tuple[Errors, Errors]:
+    def errors(self) -> tuple[Errors, Errors]:
+        """White noise and bias that are in `readings`."""
         return self._imu.errors(self.t_ns)
-
-    def _signal(self, states: States) -> NDArray[np.float64]:
-        return np.stack(np.broadcast_arrays(
-            *chain(*self._imu.mounting.felt(states)), np.zeros(len(states)))[:6])
 
     @cached_property
     def increments(self) -> tuple[Quaternion, Vector]:
@@ -97,7 +82,7 @@ class Samples:
         v1, v2, v3 = imu.mounting.from_body((v1, v2, v3))
         if imu.is_perfect and not imu.vibrates:
             return (x, y, z, w), (v1, v2, v3)
-        readings = imu.read(imu.vibrating(self._means, self.t_ns, self._seconds), self._errors)
+        readings = imu.read(imu.vibrating(self._means, self.t_ns, self._seconds), self.errors)
         r1, r2, r3, *force = (self._seconds * (reading - mean) for reading, mean in zip(
             chain(*readings), chain(*self._means), strict=True))
         x, y, z = attitude.rotation_vector((x, y, z, w))
@@ -106,13 +91,6 @@ class Samples:
             (force[0], force[1], force[2]))
         return (attitude.quaternion_of_vector((x + r1, y + r2, z + r3)),
                 (v1 + f1, v2 + f2, v3 + f3))
-
-    @cached_property
-    def imu_motion(self) -> tuple[Vector, Quaternion, Vector]:
-        """Position [m] and orientation of the IMU in the world, velocity in its frame [m/s]."""
-        states, mounting = self.states, self._imu.mounting
-        return (states.position(mounting.lever_arm), self.orientation,
-                mounting.from_body(states.world_velocity(mounting.lever_arm)))
 
     @cached_property
     def _seconds(self) -> Column:

@@ -2,21 +2,21 @@
 """The channels; docs/architecture.md says how to add one."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.streams import gnss, messages, parameters
 from spinning_top_sim.streams.cdr import Field, Header, Numbers, Template, Values
 from spinning_top_sim.streams.channel import Channel, stamps
-from spinning_top_sim.streams.imu import Imu, Magnetometer
+from spinning_top_sim.streams.imu import Imu, Magnetometer, Mounting
 from spinning_top_sim.streams.markers import markers
 from spinning_top_sim.streams.messages import message
 from spinning_top_sim.streams.samples import Samples
-from spinning_top_sim.streams.timing import Timing
+from spinning_top_sim.streams.sensor import Timing
 from spinning_top_sim.times import NANOSECONDS, period_ns
 
 NODE_NAME = 'spinning_top'
@@ -40,6 +40,12 @@ def _odometry(samples: Samples) -> Sequence[Values]:
             states.rows_angular_velocity)
 
 
+def _imu_odometry(mounting: Mounting, samples: Samples) -> Sequence[Values]:
+    states, arm = samples.states, mounting.lever_arm
+    return (states.position(arm), samples.orientation,
+            mounting.from_body(states.world_velocity(arm)), mounting.felt(states)[0])
+
+
 def _joints(samples: Samples) -> Sequence[Values]:
     states = samples.states
     return ((states.phi, states.theta, states.psi),
@@ -59,7 +65,7 @@ def _invariants(samples: Samples) -> Sequence[Values]:
     trajectory, now = samples.trajectory, (states.energy, states.l3, states.lz)
     drifts = (relative_drift(value, trajectory.constants(name, samples.t_ns))
               for name, value in zip(('energy', 'l3', 'lz'), now, strict=True))
-    error = trajectory.orientation_error(states, samples.t_ns)
+    error = angle_between(states.rows_quaternion, trajectory.exact_attitude(samples.t_ns))
     return (*now, *drifts, states.norm_error, error),
 
 
@@ -80,23 +86,19 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
 
     def channel(name: str, topic: str, type_name: str, encoder: Template,
                 fields: Callable[[Samples], Sequence[Values]] = lambda _: (),
-                rate: str = '') -> Channel:
-        return Channel(name, topic, type_name, period_ns(values[rate or f'{name}.rate']), encoder,
-                       fields)
+                rate: str = '', timed: bool = False) -> Channel:
+        """Return a channel; one that is `timed` has the stamps and the losses of the IMU."""
+        period = period_ns(values[rate or f'{name}.rate'])
+        timing = Timing(values, period) if timed else None
+        return Channel(name, topic, type_name, period, encoder, fields,
+                       None if timing is None or timing.is_right else timing)
 
-    def timed(one: Channel) -> Channel:
-        """Return the channel with the stamps and the losses of the IMU."""
-        timing = Timing(values, one.period_ns)
-        return one if timing.is_right else replace(one, faults=timing)
-
-    of_imu = partial(channel, type_name=IMU)
     # Covariances of orientation, angular velocity and specific force.
     noisy = [messages.diagonal(*variances) for variances in (
         imu.orientation_variances, 3 * (imu.gyroscope.variance,),
         3 * (imu.accelerometer.variance,))]
     unknown = messages.UNKNOWN_ORIENTATION
     magnetometer = Magnetometer(values, period_ns(values['mag.rate']))
-    increment = partial(channel, 'increments', rate='imu.rate')
     magnetic_field = message(Header(frame), Field('magnetic_field', 3),
                              Field('magnetic_field_covariance', 9))
     return [
@@ -110,14 +112,15 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
         channel('joint_states', 'joint_states', 'sensor_msgs/msg/JointState', message(
             Header(''), Numbers('I', (3,)), *JOINTS, Numbers('I', (3,)), Field('position', 3),
             Numbers('I', (3,)), Field('velocity', 3), Numbers('I', (0,))), _joints),
-        timed(of_imu('imu', 'imu/data_raw', encoder=messages.imu(frame, unknown, *noisy[1:]),
-                     fields=lambda samples: samples.readings)),
-        timed(of_imu('imu_data', 'imu/data', encoder=messages.imu(frame, *noisy),
-                     fields=lambda samples: (samples.estimated_orientation, *samples.readings))),
-        of_imu('imu', 'ground_truth/imu_bias', encoder=messages.imu(frame, unknown, *EXACT[1:]),
-               fields=lambda samples: samples.biases),
-        of_imu('ground_truth_imu', 'ground_truth/imu', encoder=messages.imu(frame, *EXACT),
-               fields=lambda samples: (samples.orientation, *samples.exact)),
+        channel('imu', 'imu/data_raw', IMU, messages.imu(frame, unknown, *noisy[1:]),
+                lambda samples: samples.readings, timed=True),
+        channel('imu_data', 'imu/data', IMU, messages.imu(frame, *noisy),
+                lambda samples: (imu.estimated(samples.orientation, samples.t_ns),
+                                 *samples.readings), timed=True),
+        channel('imu', 'ground_truth/imu_bias', IMU, messages.imu(frame, unknown, *EXACT[1:]),
+                lambda samples: [list(bias) for _, bias in samples.errors]),
+        channel('ground_truth_imu', 'ground_truth/imu', IMU, messages.imu(frame, *EXACT),
+                lambda samples: (samples.orientation, *samples.exact)),
         channel('imu_timing', 'ground_truth/imu_timing', ARRAY,
                 messages.float64_multi_array(TIMING),
                 partial(_timing, Timing(values, imu.period_ns)), 'imu.rate'),
@@ -126,15 +129,16 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
         channel('mag', 'ground_truth/mag', MAGNETIC_FIELD, magnetic_field,
                 lambda samples: (magnetometer.true(samples.orientation), messages.EXACT)),
         *gnss.channels(values),
-        timed(increment('imu/dq', 'geometry_msgs/msg/QuaternionStamped', message(
-            Header(frame), Field('quaternion', 4)), lambda samples: samples.increments[:1])),
-        timed(increment('imu/dv', 'geometry_msgs/msg/Vector3Stamped', message(
-            Header(frame), Field('vector', 3)), lambda samples: samples.increments[1:])),
+        channel('increments', 'imu/dq', 'geometry_msgs/msg/QuaternionStamped', message(
+            Header(frame), Field('quaternion', 4)), lambda samples: samples.increments[:1],
+            'imu.rate', timed=True),
+        channel('increments', 'imu/dv', 'geometry_msgs/msg/Vector3Stamped', message(
+            Header(frame), Field('vector', 3)), lambda samples: samples.increments[1:],
+            'imu.rate', timed=True),
         channel('ground_truth_odom', 'ground_truth/odom', ODOMETRY,
                 messages.odometry(world, body), _odometry),
         channel('ground_truth_imu_odom', 'ground_truth/imu_odom', ODOMETRY,
-                messages.odometry(world, frame),
-                lambda samples: (*samples.imu_motion, imu.mounting.felt(samples.states)[0])),
+                messages.odometry(world, frame), partial(_imu_odometry, imu.mounting)),
         channel('invariants', '~/invariants', ARRAY, messages.float64_multi_array(INVARIANTS),
                 _invariants),
         markers(values)]

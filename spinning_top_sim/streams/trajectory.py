@@ -13,8 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Vector
+from spinning_top_sim.physics.attitude import Quaternion, Vector
 from spinning_top_sim.physics.pivot import REST, Kinematics, PivotPath, kinematics
 from spinning_top_sim.physics.states import Point, States, joined
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
@@ -127,17 +126,13 @@ class Trajectory:
             kinematics(piece.ride, times)
             for piece, times in self.pieces(t_ns)), strict=True)))
 
-    def orientation_error(self, states: States, t_ns: Times) -> NDArray[np.float64]:
-        """Return the angles (n,) [rad] of states to the exact ones; NaN: these are not known."""
-        angles, begin = np.zeros(len(t_ns)), 0
-        for piece, times in self.pieces(t_ns):
-            part = slice(begin, begin := begin + len(times))
-            if not piece.is_exact:
-                truth = piece.truth(times)
-                x, y, z, w = (column[part] for column in states.rows_quaternion)
-                angles[part] = math.nan if truth is None else attitude.angle_between(
-                    (x, y, z, w), truth.rows_quaternion)
-        return angles
+    def exact_attitude(self, t_ns: Times) -> Quaternion:
+        """Return q(world <- body) of the exact solution at times (n,); NaN: it is not known."""
+        truths = [(times, piece.truth(times)) for piece, times in self.pieces(t_ns)]
+        x, y, z, w = np.concatenate([
+            np.full((4, len(times)), np.nan) if states is None else states.rows_quaternion
+            for times, states in truths], axis=1)
+        return x, y, z, w
 
     def then(self, event: Event) -> Self:
         """
