@@ -20,8 +20,8 @@ from spinning_top_sim.exam.measures import gyroscope_alone
 from spinning_top_sim.exam.motions import GRAVITY, Reals, Run
 from spinning_top_sim.exam.scored import ScoredRun, report_of
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.felt import Vibration
 from spinning_top_sim.streams.imu import Imu, Magnetometer
-from spinning_top_sim.streams.vibration import Vibration
 from spinning_top_sim.tools.report import Report
 
 # The motion is computed every half step.

@@ -35,13 +35,10 @@ class Event:
     """
     Something that changes a run.
 
-    kind : 'start' (of a recording), 'command' (L3 and Lz jump), 'state' (the top is put
-        somewhere), 'drive' (of the pivot), 'parameters' (that act at once), 'epoch' (stamps jump,
-        the motion does not) or 'reset'
+    kind, details : as docs/logs.md says
     t_ns : simulated time at which it acts [ns]
     sent_ns : time up to which samples had been sent before, -1 for none [ns]; a reset puts t back
         to 0, and this is a time of the motion that ended
-    details : depends on the kind, as docs/logs.md says
     """
 
     kind: str

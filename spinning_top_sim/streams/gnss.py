@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.streams import messages, noise
 from spinning_top_sim.streams.cdr import Field, Header, Numbers, Values
-from spinning_top_sim.streams.channel import Channel
+from spinning_top_sim.streams.channel import Channel, Samples
 from spinning_top_sim.streams.messages import message
 from spinning_top_sim.streams.noise import Kind
-from spinning_top_sim.streams.samples import Samples
 from spinning_top_sim.times import NANOSECONDS, Times, period_ns
 
 NO_FIX, FIX = -1, 0         # sensor_msgs/NavSatStatus

@@ -16,11 +16,10 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams import noise
-from spinning_top_sim.streams.bandwidth import LowPass
+from spinning_top_sim.streams.felt import LowPass, Vibration
 from spinning_top_sim.streams.noise import Kind, Part
 from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
 from spinning_top_sim.streams.sensor import Errors, Sensor, summed, transformed
-from spinning_top_sim.streams.vibration import Vibration
 from spinning_top_sim.times import NANOSECONDS, Times
 
 # The longest interval over which means and increments are taken [ns].
@@ -83,9 +82,8 @@ class Imu:
     since_ns : when this rate began [ns]
     memory_ns : the time before a sample that its reading depends on [ns]
 
-    Intervals [t - period, t) end with the samples.  The first one is empty, as the motion begins
-    with the first sample.  After a change of the rate the first one begins with the last sample of
-    the old rate, so that no motion is left out.
+    Intervals [t - period, t) end with the samples; that of t = 0 is empty.  After a change of the
+    rate the first one begins with the last sample of the old rate: no motion is left out.
     """
 
     def __init__(self, values: Mapping[str, Any], period_ns: int, *, since_ns: int = 0,

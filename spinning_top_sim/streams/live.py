@@ -25,9 +25,9 @@ from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.times import NEVER_NS, Times
 
 MOST_SAMPLES, MOST_BYTES = 256, 4 << 20     # of a channel that are computed together
-# What is computed at once: little behind an event, as the next one may come soon.  The motion
-# alone begins with a tiny part, as its pace is not known before it is tried.
-FIRST_SPAN_NS, LONGEST_SPAN_NS, FIRST_STRIDE_NS = 20_000_000, 300_000_000, 1_000
+# What is computed at once: little behind an event, as the next one may come soon.
+FIRST_SPAN_NS, LONGEST_SPAN_NS = 20_000_000, 300_000_000
+FIRST_STRIDE_NS = 1_000     # of the motion, whose pace is not known before it is tried
 GROWTH = 16.0               # of a span over the one before, at most
 PIECE_SECONDS = 5e-3        # of work, between two questions whether to give way
 BLOCKED_SECONDS = 1.0       # a reader that stalls holds every call for 0.1 s: it gets a rest
@@ -92,16 +92,11 @@ class Output:
 
 @dataclass(eq=False)
 class _Group:
-    """
-    The outputs in use of one grid, whose messages are computed together; none: the motion alone.
-
-    computed_ns : how far they are computed [ns]
-    span_ns : how much is computed at once, as far as the pace is known [ns]
-    """
+    """The outputs of one grid, whose messages are computed together; none: the motion alone."""
 
     outputs: Mapping[Channel, Output]
     computed_ns: int
-    span_ns: int
+    span_ns: int            # what the time that there is suffices for
 
     @property
     def most_ns(self) -> int:
@@ -113,8 +108,6 @@ class _Group:
 class LiveSimulation(Simulation):
     """
     A simulation with an output for each channel.
-
-    What is sent does not depend on when it is computed, or on how often `send` is called.
 
     outputs : of each channel, in the order in which the messages of one time are sent
     """
@@ -129,11 +122,7 @@ class LiveSimulation(Simulation):
 
     def log_to(self, write: Callable[[Sequence[LogRows]], object] | None,
                channels: Sequence[Channel] = ()) -> None:
-        """
-        Record these channels after `now_ns`, and no others.
-
-        write : takes their messages; the position of a channel is its number in the log
-        """
+        """Record these channels, numbered in this order, and no others after `now_ns`."""
         self._write = write or self._write
         for output in self.outputs:
             output.log_index = (channels.index(output.channel) if output.channel in channels
@@ -174,8 +163,7 @@ class LiveSimulation(Simulation):
         Send every message due up to a time; return whether that was reached.
 
         publish_from_ns : earlier messages are too late to be published; they are recorded
-        give_way : asked between pieces of work; True ends the call early, and the next one goes
-            on there
+        give_way : asked between pieces of work; True ends the call early
 
         Raises IntegrationError if the motion does not go on; what comes before is sent.
         """

@@ -2,9 +2,8 @@
 """
 The top and the trace of its tip for Foxglove and RViz, in the world frame.
 
-Every message has the whole trace, so that it is complete wherever a viewer starts or jumps in a
-log.  Its points are on the exact path, at multiples of a fixed time step; the last one is the tip
-of the body.
+Every message has the whole trace, as a viewer may start anywhere.  Its points are on the exact
+path, at multiples of a fixed time step; the last one is the tip of the body.
 """
 
 import math
@@ -17,9 +16,8 @@ from spinning_top_sim.physics.attitude import rotated
 from spinning_top_sim.shape import Shape
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import Field, Header, Numbers, Part, Template, Values
-from spinning_top_sim.streams.channel import Channel
+from spinning_top_sim.streams.channel import Channel, Samples
 from spinning_top_sim.streams.messages import NO_ROTATION, ORIGIN, message
-from spinning_top_sim.streams.samples import Samples
 from spinning_top_sim.times import NANOSECONDS, period_ns
 
 CYLINDER, LINE_STRIP, LINE_LIST = 3, 4, 5       # visualization_msgs/Marker

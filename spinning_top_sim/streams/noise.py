@@ -3,7 +3,8 @@
 Random numbers of the sensors.
 
 A number depends on the seed, on its purpose, and on the number or the time of its sample, not on
-what was drawn before.  A jump in time therefore draws as few numbers as the next block does.
+what was drawn before: Philox is a counter-based generator (J. Salmon et al., "Parallel random
+numbers: as easy as 1, 2, 3", SC11).
 """
 
 import enum
@@ -17,12 +18,9 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.times import Times
 
-# Step of the paths, whatever the rate of the sensor is.
-STEP_NS = 1_000_000
-# Number of samples, or steps of a path, whose random numbers are drawn together: a power of two.
-DRAWN_TOGETHER = 512
-# Ratio of the correlation times of two neighbouring parts of a flicker noise.
-SPACING = 8.0
+STEP_NS = 1_000_000     # of the paths, whatever the rate of the sensor is
+DRAWN_TOGETHER = 512    # samples, or steps of a path: a power of two
+SPACING = 8.0           # ratio of neighbouring correlation times of a flicker noise
 
 
 class Kind(enum.IntEnum):
@@ -110,12 +108,7 @@ def _gathered(block: Callable[[int], NDArray[np.float64]], numbers: Times,
 @lru_cache(16)
 def _normal(seed: int, kind: Kind, part: Part, columns: int, block: int,
             count: int = DRAWN_TOGETHER, of_ends: bool = False) -> NDArray[np.float64]:
-    """
-    Return standard normal numbers (count, columns) that depend on the arguments alone.
-
-    Philox is a counter-based generator (J. Salmon et al., "Parallel random numbers: as easy as 1,
-    2, 3", SC11).
-    """
+    """Return standard normal numbers (count, columns) that depend on the arguments alone."""
     counter = [0, int(of_ends), len(Part) * int(kind) + int(part), block]
     return np.random.Generator(np.random.Philox(key=seed, counter=counter)
                                ).standard_normal((count, columns))
@@ -143,8 +136,7 @@ def _begin(path: RandomPath, block: int) -> NDArray[np.float64]:
     """
     Return the processes of a path where a block begins, (processes, 3).
 
-    The block with the number 2^k follows from the block 2^(k-1).  Every other block is half-way
-    between two with fewer digits, so that some log2(block) values are computed.
+    The block 2^k follows from the block 2^(k-1), and every other one from two with fewer digits.
     """
     normal: NDArray[np.float64] = path.draw(block, 1, of_ends=True)[0]
     if block == 0:

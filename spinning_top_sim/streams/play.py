@@ -10,10 +10,9 @@ import numpy as np
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.channel import Channel, Messages
+from spinning_top_sim.streams.channel import Channel, Messages, Samples
 from spinning_top_sim.streams.events import CHANGES, Event
 from spinning_top_sim.streams.imu import LONGEST_NS, Imu
-from spinning_top_sim.streams.samples import Samples
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.streams.trajectory import Trajectory
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, NEVER_NS, check_stamp, period_ns
@@ -68,9 +67,7 @@ class Simulation:
 
     def apply(self, kind: str, **details: Any) -> Event:
         """
-        Let something change the run now; return the event, with the time at which it acts.
-
-        kind, details : of an `Event`, but no 'start'
+        Let something change the run now; return the `Event`, which is no 'start'.
 
         Raises ValueError naming what is off; the run goes on unchanged.
         """
@@ -105,8 +102,7 @@ class Simulation:
         """
         Return the details of a drive to a velocity of the pivot in the world [m/s] from now on.
 
-        It lasts for `pivot.cmd_timeout`.  None if the pivot rests and is to rest.  Raises
-        ValueError.
+        None if the pivot rests and is to rest.  Raises ValueError.
         """
         x, y, z = target = [float(part) for part in velocity]
         if not all(abs(part) <= parameters.FASTEST for part in target):
@@ -127,10 +123,9 @@ class Simulation:
         """
         Return the messages of channels that are due after one time and up to another.
 
-        Where the motion ends before, the block does too.  A message depends on the parameters,
-        the events and its own time alone, never on the block that it is computed in.
-
-        Raises IntegrationError if the motion does not go on at all.
+        A message depends on the parameters, the events and its own time alone, never on the block
+        that it is computed in.  A block ends with the motion; if the motion does not go on at all,
+        this raises IntegrationError.
         """
         last_ns = LAST_STAMP_NS - self.epoch_ns
         if last_ns <= after_ns:
@@ -159,8 +154,7 @@ class Simulation:
         """
         Move on to `until_ns`; yield the messages of these channels on the way, block by block.
 
-        `now_ns` is the end of the block that is yielded.  Raises IntegrationError behind the last
-        block if the motion does not go on.
+        Raises IntegrationError behind the last block if the motion does not go on.
         """
         per_ns = sum(len(channel.encoder) / channel.period_ns for channel in channels)
         span_ns = max(1, int(BLOCK_BYTES / max(per_ns, BLOCK_BYTES / LONGEST_BLOCK_NS)),

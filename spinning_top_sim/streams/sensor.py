@@ -32,10 +32,9 @@ class Sensor:
     """
     A sensor that takes a sample of three axes every `period_ns`.
 
-    White noise is numbered by sample: it depends on the seed and the number alone.  The bias is a
-    path in time that depends on the seed alone: a change of the rate does not change it.  A
-    reading between two samples has the white noise of the one before, as from a driver that
-    repeats the newest sample.  So all streams agree at the times that they have in common.
+    White noise depends on the seed and the number of a sample; a reading between two samples has
+    that of the one before.  The bias is a path in time that depends on the seed alone.  So all
+    streams agree at the times that they have in common.
 
     values, prefix : parameters, and what their names begin with; an error that has none is 0
     kind : tells the random numbers of sensors apart
@@ -130,12 +129,7 @@ def summed(one: Vector, other: Vector) -> Vector:
 
 
 def converted(value: Column, resolution: float, largest: float) -> Column:
-    """
-    Return readings (n,) of an analog-to-digital converter: rounded, then clipped to a range.
-
-    The limits are the largest multiples of the resolution within the range.  A resolution or a
-    range of 0 means none.
-    """
+    """Return values (n,) rounded, then clipped to multiples within a range; 0 means none."""
     limit = largest or math.inf
     if resolution:
         if largest:

@@ -11,11 +11,10 @@ from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.streams import gnss, messages, parameters
 from spinning_top_sim.streams.cdr import Field, Header, Numbers, Template, Values
-from spinning_top_sim.streams.channel import Channel, stamps
+from spinning_top_sim.streams.channel import Channel, Samples
 from spinning_top_sim.streams.imu import Imu, Magnetometer, Mounting
 from spinning_top_sim.streams.markers import markers
 from spinning_top_sim.streams.messages import message
-from spinning_top_sim.streams.samples import Samples
 from spinning_top_sim.streams.sensor import Timing
 from spinning_top_sim.times import NANOSECONDS, period_ns
 
@@ -55,8 +54,8 @@ def _joints(samples: Samples) -> Sequence[Values]:
 def _timing(timing: Timing, samples: Samples) -> Sequence[Values]:
     """Return stamp and true time of each sample of the IMU, and how often it was sent."""
     late_ns, copies = timing(samples.t_ns)
-    return (*np.divmod(stamps(samples, late_ns), NANOSECONDS),
-            *np.divmod(stamps(samples), NANOSECONDS), copies),
+    return (*np.divmod(samples.stamps(late_ns), NANOSECONDS),
+            *np.divmod(samples.stamps(), NANOSECONDS), copies),
 
 
 def _invariants(samples: Samples) -> Sequence[Values]:

@@ -4,14 +4,14 @@
 import contextlib
 import math
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from functools import partial
 from operator import attrgetter
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spinning_top_sim.physics.attitude import Quaternion, Vector
 from spinning_top_sim.physics.pivot import REST, Kinematics, PivotPath, kinematics
@@ -22,6 +22,8 @@ from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.vertical import Posture
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.times import Times
+
+Matrix = NDArray[np.float64]
 
 
 class Trajectory:
@@ -69,8 +71,7 @@ class Trajectory:
         """
         Return the states at times (n,), in the world.
 
-        Raises IntegrationError if the motion does not go on to the last of them; `reached_ns` of
-        the error is the last time that can be had.
+        Raises IntegrationError, which says how far the motion goes, if that is not the last time.
         """
         return joined([piece.states(times) for piece, times in self.pieces(t_ns)])
 
@@ -114,32 +115,29 @@ class Trajectory:
         (u1, u2, u3), (v1, v2, v3) = before.velocity(point), after.velocity(point)
         return v1 - u1, v2 - u2, v3 - u3
 
-    def constants(self, name: str, t_ns: Times) -> NDArray[np.float64]:
+    def _joined(self, of: Callable[[Piece, Times], ArrayLike], t_ns: Times) -> Matrix:
+        """Return what a function of pieces and times (n,) in them returns, (..., n)."""
+        return np.concatenate([of(piece, times) for piece, times in self.pieces(t_ns)], axis=-1)
+
+    def constants(self, name: str, t_ns: Times) -> Matrix:
         """Return `energy`, `l3` or `lz` as it is at the start of the piece of each time, (n,)."""
-        found = self.pieces(t_ns)
-        return np.repeat([getattr(piece, name) for piece, _ in found],
-                         [len(times) for _, times in found])
+        return self._joined(lambda piece, times: np.full(len(times), getattr(piece, name)), t_ns)
 
     def place(self, t_ns: Times) -> Kinematics:
         """Return what the pivot does at times (n,), without its motion being solved."""
-        return Kinematics(*(np.concatenate(rows, axis=1) for rows in zip(*(
-            kinematics(piece.ride, times)
-            for piece, times in self.pieces(t_ns)), strict=True)))
+        return Kinematics(*self._joined(lambda piece, times: kinematics(piece.ride, times), t_ns))
 
     def exact_attitude(self, t_ns: Times) -> Quaternion:
         """Return q(world <- body) of the exact solution at times (n,); NaN: it is not known."""
-        truths = [(times, piece.truth(times)) for piece, times in self.pieces(t_ns)]
-        x, y, z, w = np.concatenate([
-            np.full((4, len(times)), np.nan) if states is None else states.rows_quaternion
-            for times, states in truths], axis=1)
+        def of(piece: Piece, times: Times) -> ArrayLike:
+            states = piece.truth(times)
+            return np.full((4, len(times)), np.nan) if states is None else states.rows_quaternion
+
+        x, y, z, w = self._joined(of, t_ns)
         return x, y, z, w
 
     def then(self, event: Event) -> Self:
-        """
-        Return the trajectory that is the same up to an event, and then follows it.
-
-        Raises ValueError naming what is off with the event.
-        """
+        """Return the trajectory that follows an event from its time on.  Raises ValueError."""
         after, now, t_ns = copy(self), self.after(event.t_ns), event.t_ns
         after._pieces = self._pieces[:self._pieces.index(now) + 1]
         if event.kind == 'drive':
@@ -178,11 +176,7 @@ class Trajectory:
 
 
 def commanded(now: States, l3: float, lz: float) -> ContinuedState:
-    """
-    Return the state in which L3 and Lz have jumped to these values [kg m^2/s].
-
-    now : the state before (n = 1).  Raises ValueError naming what is off.
-    """
+    """Return the state after `now` (n = 1), with L3 and Lz [kg m^2/s].  Raises ValueError."""
     for name, value in (('l3', l3), ('lz', lz)):
         if not math.isfinite(value):
             raise ValueError(f'{name} = {value!r} kg m^2/s: must be finite')
