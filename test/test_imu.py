@@ -28,7 +28,7 @@ def test_readings_are_the_derivatives_of_the_exact_pose(scene):
     values = parameters.checked({**scene_parameters(scene), 'imu.lever_arm': lever_arm,
                                  'imu.rpy': (0.3, -0.7, 1.9)})
     top, start = parameters.top_of(values), parameters.start_state(values)
-    sensor, motion = Mounting.of(values), ExactSolution(top, start)
+    sensor, motion = Mounting(values), ExactSolution(top, start)
     mounting = Rotation.from_euler('xyz', values['imu.rpy'])
     for t in (0.31, 4.05):
         states = motion.states(np.array([round(t * 1e9)]))

@@ -3,8 +3,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
-from itertools import chain, pairwise
+from functools import cached_property
+from itertools import chain
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.integrals import Increments
-from spinning_top_sim.physics.states import Point, States
-from spinning_top_sim.solvers.handover import Piece
+from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.cdr import Template, Values
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.sensor import Errors
-from spinning_top_sim.streams.trajectory import Trajectory
+from spinning_top_sim.streams.trajectory import Trajectory, increments_within
 from spinning_top_sim.times import LAST_STAMP_NS, Times, ns_array
 
 # Messages as rows (n, size): bytes or, of a table, numbers.
@@ -133,34 +132,13 @@ class Samples:
             # Those that may be shorter, reach back or contain a jump are computed one by one.
             single = int(np.searchsorted(
                 times, max(imu.since_ns, piece.start_ns) + period_ns, 'right'))
-            found += [self._increments(*edges) for edges in zip(
+            found += [self.trajectory.increments(*edges, imu.mounting.lever_arm) for edges in zip(
                 imu.begins_ns(times[:single]).tolist(), times[:single].tolist(), strict=True)]
             if single < len(times):
                 begins = range(int(times[single]) - period_ns, int(times[-1]) - period_ns + 1,
                                step_ns)
-                found.append(_within(piece, begins, period_ns, imu.mounting.lever_arm))
+                found.append(increments_within(piece, begins, period_ns, imu.mounting.lever_arm))
         return integrals.joined(found)
-
-    def _increments(self, begin_ns: int, end_ns: int) -> Increments:
-        """Return the increments over an interval that events may divide (n = 1)."""
-        point, trajectory = self._imu.mounting.lever_arm, self.trajectory
-        parts = []
-        edges = {begin_ns, *trajectory.starts(begin_ns, end_ns), end_ns}
-        for begin, end in pairwise(sorted(edges)):
-            # The velocity of the IMU jumps with a command, in the interval that begins there.
-            parts.append(integrals.impulse(trajectory.velocity_jump(begin, point)))
-            parts.append(_within(trajectory.after(begin), range(begin, begin + 1), end - begin,
-                                 point))
-        return reduce(Increments.then, parts or [integrals.impulse(3 * (np.zeros(1),))])
-
-
-def _within(piece: Piece, begins: range, length_ns: int, point: Point) -> Increments:
-    """Return the increments over intervals within a piece, which begin at these times [ns]."""
-    count = integrals.panels(piece.fastest_rate, length_ns)
-    edges = [length_ns * k // count for k in range(count + 1)]
-    return reduce(Increments.then, [integrals.increments(
-        piece.states, range(begins.start + begin, begins.stop + begin, begins.step), end - begin,
-        point, piece.fastest_rate) for begin, end in pairwise(edges)])
 
 
 class Encoder(Protocol):

@@ -166,7 +166,7 @@ class Vibration:
 
 def _noise(profile: Matrix, seed: int, kind: noise.Kind) -> Matrix:
     # The angle of two normal numbers is uniform.
-    normal = noise.white(seed, kind, noise.Part.WHITE, np.arange(LINES), 12)
+    normal = noise.white(seed, kind, np.arange(LINES), 12)
     place, phase = np.arctan2(*normal.reshape(2, 6, -1)).reshape(2, 3, -1) / math.tau + 0.5
     edges = np.linspace(profile[0, 0], profile[-1, 0], LINES + 1)
     powers = np.diff([power_below(profile.tolist(), edge) for edge in edges.tolist()])

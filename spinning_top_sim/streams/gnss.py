@@ -83,4 +83,4 @@ def _measured(values: Mapping[str, Any], deviations: Deviations, kind: Kind,
               samples: Samples, exact: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return measurements (3, n)."""
     return exact if not any(deviations) else exact + np.array([deviations]).T * noise.white(
-        values['seed'], kind, noise.Part.WHITE, samples.t_ns // samples.times.step)
+        values['seed'], kind, samples.t_ns // samples.times.step)

@@ -7,17 +7,16 @@ URDF roll-pitch-yaw.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
-from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.states import Point, States
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.felt import LowPass, Vibration
-from spinning_top_sim.streams.noise import Kind, Part
+from spinning_top_sim.streams.noise import Kind
 from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
 from spinning_top_sim.streams.sensor import Errors, Sensor, summed, transformed
 from spinning_top_sim.times import NANOSECONDS, Times
@@ -26,7 +25,6 @@ from spinning_top_sim.times import NANOSECONDS, Times
 LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
 
 
-@dataclass(frozen=True)
 class Mounting:
     """
     Where a sensor is on the body.
@@ -35,18 +33,15 @@ class Mounting:
     rotation : q(body <- sensor) as columns x, y, z, w with one row; None: the axes of the body
     """
 
-    lever_arm: tuple[float, float, float]
-    rotation: Quaternion | None
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> Self:
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self.lever_arm: Point = values['imu.lever_arm']
         rpy = values['imu.rpy']
         # Rz(yaw) Ry(pitch) Rx(roll)
         (cr, cp, cy), (sr, sp, sy) = (wave(0.5 * np.array(rpy)[:, np.newaxis])
                                       for wave in (np.cos, np.sin))
-        rotation = (cy * cp * sr - sy * sp * cr, cy * sp * cr + sy * cp * sr,
-                    sy * cp * cr - cy * sp * sr, cy * cp * cr + sy * sp * sr)
-        return cls(values['imu.lever_arm'], rotation if any(rpy) else None)
+        self.rotation = (cy * cp * sr - sy * sp * cr, cy * sp * cr + sy * cp * sr,
+                         sy * cp * cr - cy * sp * sr, cy * cp * cr + sy * sp * sr
+                         ) if any(rpy) else None
 
     def orientation(self, states: States) -> Quaternion:
         """Return q(world <- sensor) as columns x, y, z, w."""
@@ -90,7 +85,7 @@ class Imu:
                  first_begin_ns: int = 0) -> None:
         self._values, self.period_ns, self.since_ns = values, period_ns, since_ns
         self._first_begin_ns = first_begin_ns       # of the first interval
-        self.mounting = Mounting.of(values)
+        self.mounting = Mounting(values)
         self.takes_means = values['imu.sampling'] == 'mean'
         self.gyroscope, self.accelerometer = (
             Sensor(values, f'imu.{kind.name.lower()}_', kind, period_ns,
@@ -139,7 +134,7 @@ class Imu:
         if not any(self.orientation_variances):
             return orientation
         x, y, z = np.sqrt(self.orientation_variances)[:, np.newaxis] * noise.white(
-            self._values['seed'], Kind.ORIENTATION, Part.WHITE, t_ns // self.period_ns)
+            self._values['seed'], Kind.ORIENTATION, t_ns // self.period_ns)
         return attitude.product(orientation, attitude.quaternion_of_vector((x, y, z)))
 
     def at_period(self, period_ns: int, now_ns: int) -> 'Imu':
@@ -164,7 +159,7 @@ class Magnetometer(Sensor):
     def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
         super().__init__(values, 'mag.', Kind.MAGNETOMETER, period_ns,
                          matrix=values['mag.soft_iron'], offset=values['mag.hard_iron'])
-        self._field, self._mounting = values['mag.field'], Mounting.of(values)
+        self._field, self._mounting = values['mag.field'], Mounting(values)
         # Of the world, and on the body.
         self._disturbances = [np.reshape(values[f'mag.disturbance.{frame}'], (-1, 5)).tolist()
                               for frame in ('world', 'body')]

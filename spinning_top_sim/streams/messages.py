@@ -30,18 +30,12 @@ EXACT = diagonal(0.0, 0.0, 0.0)
 message = lru_cache(256)(Template)
 
 
-def imu(frame_id: str, orientation: tuple[float, ...], *covariances: tuple[float, ...],
-        ) -> Template:
-    """
-    Return sensor_msgs/Imu.
-
-    orientation, covariances : covariances of orientation, angular velocity and specific force;
-        with UNKNOWN_ORIENTATION there is no orientation, and no field of it
-    """
-    rates, forces = covariances
+def imu(frame_id: str, rates: tuple[float, ...], forces: tuple[float, ...],
+        orientation: tuple[float, ...] = ()) -> Template:
+    """Return sensor_msgs/Imu with these covariances; without an orientation where it has none."""
     return message(
-        Header(frame_id), Numbers('d', NO_ROTATION) if orientation == UNKNOWN_ORIENTATION
-        else Field('orientation', 4), Numbers('d', orientation), Field('angular_velocity', 3),
+        Header(frame_id), Field('orientation', 4) if orientation else Numbers('d', NO_ROTATION),
+        Numbers('d', orientation or UNKNOWN_ORIENTATION), Field('angular_velocity', 3),
         Numbers('d', rates), Field('linear_acceleration', 3), Numbers('d', forces))
 
 

@@ -36,8 +36,8 @@ class Part(enum.IntEnum):
     WHITE, TURN_ON, WALK, GAUSS_MARKOV, FLICKER = range(5)
 
 
-def white(seed: int, kind: Kind, part: Part, numbers: Times, columns: int = 3,
-          ) -> NDArray[np.float64]:
+def white(seed: int, kind: Kind, numbers: Times, columns: int = 3,
+          part: Part = Part.WHITE) -> NDArray[np.float64]:
     """Return standard normal numbers (columns, n) for samples with ascending numbers (n,)."""
     return _gathered(partial(_normal, seed, kind, part, columns), numbers)
 

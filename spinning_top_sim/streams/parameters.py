@@ -17,8 +17,6 @@ from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.streams.parameter import ANY, Effect, Parameter, Range
 
 FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')      # each the parent of the next one
-# Second parameter that switches a stream on.
-OTHER_SWITCH = {'ground_truth_imu_odom': 'increments.enabled'}
 REMOVED = ('pacing', 'max_error', 'publish_clock')      # in logs of 1.x
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 LOWEST_RATE_OF_INTERVALS = 1.0      # of increments and means: the motion is kept for a second
@@ -121,9 +119,9 @@ def _ascend(numbers: Iterable[float]) -> bool:
 
 
 def is_enabled(stream: str, values: Mapping[str, Any]) -> bool:
-    """Return whether the streams with this prefix of their parameters are switched on."""
-    other = OTHER_SWITCH.get(stream)
-    return bool(values[f'{stream}.enabled'] or (other and values[other]))
+    """Return whether streams with this prefix are on; increments bring the truth with them."""
+    return bool(values[f'{stream}.enabled'] or (
+        stream == 'ground_truth_imu_odom' and values['increments.enabled']))
 
 
 def top_of(values: Mapping[str, Any]) -> Top:

@@ -44,7 +44,6 @@ class Simulation:
     """
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
-        self.now_ns = -1
         self._restart(values, epoch_ns)
 
     def _restart(self, values: Mapping[str, Any], epoch_ns: int) -> None:

@@ -21,9 +21,6 @@ from spinning_top_sim.times import NANOSECONDS, Times
 
 # Jitter is cut at this share of the period, so that no stamp is before that of an earlier sample.
 MOST_JITTER = 0.45
-FAULTS = ('imu.stamp_offset', 'imu.stamp_jitter', 'imu.clock_drift', 'imu.drop_rate',
-          'imu.duplicate_rate')
-
 # White noise and bias, (3, n) or (3, 1) each.
 Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -61,7 +58,7 @@ class Sensor:
         self._offset = np.array(offset)[:, np.newaxis] + 0.0
         if turn_on := given('turn_on_bias'):
             self._offset = self._offset + turn_on * noise.white(
-                seed, kind, Part.TURN_ON, np.zeros(1, np.int64))
+                seed, kind, np.zeros(1, np.int64), part=Part.TURN_ON)
         flat = given('bias_instability')
         self._paths = [RandomPath(seed, kind, part, tuple(processes)) for part, processes in (
             (Part.WALK, [(math.inf, given('random_walk'))]),
@@ -77,7 +74,7 @@ class Sensor:
         white, bias = np.zeros((3, 1)), self._offset
         if self._deviation:
             white = self._deviation * noise.white(
-                self._seed, self._kind, Part.WHITE, t_ns // self._period_ns)
+                self._seed, self._kind, t_ns // self._period_ns)
         for path in self._paths:
             bias = bias + path.at(t_ns)
         return white, bias
@@ -104,19 +101,15 @@ class Timing:
         self._jitter_ns = values['imu.stamp_jitter'] * NANOSECONDS
         self._drift = values['imu.clock_drift'] * 1e-6
         # A standard normal number is below these with the probability of the fault.
+        rates = values['imu.drop_rate'], values['imu.duplicate_rate']
         self._dropped_below, self._repeated_below = (
-            NormalDist().inv_cdf(rate) if rate else -np.inf
-            for rate in (values['imu.drop_rate'], values['imu.duplicate_rate']))
-        self.is_right = not any(map(values.get, FAULTS))
+            NormalDist().inv_cdf(rate) if rate else -np.inf for rate in rates)
+        self.is_right = not any((self._offset_ns, self._jitter_ns, self._drift, *rates))
 
     def __call__(self, t_ns: Times) -> tuple[Times, Times]:
-        """
-        Return how late the stamps of samples at times (n,) are [ns], and how often each is sent.
-
-        The latter is 0, 1 or 2.
-        """
-        jitter, drop, repeat = noise.white(self._seed, noise.Kind.TIMING, noise.Part.WHITE,
-                                           t_ns // self._period_ns)
+        """Return how late stamps of samples (n,) are [ns], and how often each is sent: 0 to 2."""
+        jitter, drop, repeat = noise.white(
+            self._seed, noise.Kind.TIMING, t_ns // self._period_ns)
         most = MOST_JITTER * self._period_ns
         errors = self._drift * t_ns + np.clip(self._jitter_ns * jitter, -most, most)
         return self._offset_ns + np.rint(errors).astype(np.int64), np.where(

@@ -92,11 +92,10 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
         return Channel(name, topic, type_name, period, encoder, fields,
                        None if timing is None or timing.is_right else timing)
 
-    # Covariances of orientation, angular velocity and specific force.
+    # Covariances of angular velocity, specific force and orientation.
     noisy = [messages.diagonal(*variances) for variances in (
-        imu.orientation_variances, 3 * (imu.gyroscope.variance,),
-        3 * (imu.accelerometer.variance,))]
-    unknown = messages.UNKNOWN_ORIENTATION
+        3 * (imu.gyroscope.variance,), 3 * (imu.accelerometer.variance,),
+        imu.orientation_variances)]
     magnetometer = Magnetometer(values, period_ns(values['mag.rate']))
     magnetic_field = message(Header(frame), Field('magnetic_field', 3),
                              Field('magnetic_field_covariance', 9))
@@ -111,12 +110,12 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
         channel('joint_states', 'joint_states', 'sensor_msgs/msg/JointState', message(
             Header(''), Numbers('I', (3,)), *JOINTS, Numbers('I', (3,)), Field('position', 3),
             Numbers('I', (3,)), Field('velocity', 3), Numbers('I', (0,))), _joints),
-        channel('imu', 'imu/data_raw', IMU, messages.imu(frame, unknown, *noisy[1:]),
+        channel('imu', 'imu/data_raw', IMU, messages.imu(frame, *noisy[:2]),
                 lambda samples: samples.readings, timed=True),
         channel('imu_data', 'imu/data', IMU, messages.imu(frame, *noisy),
                 lambda samples: (imu.estimated(samples.orientation, samples.t_ns),
                                  *samples.readings), timed=True),
-        channel('imu', 'ground_truth/imu_bias', IMU, messages.imu(frame, unknown, *EXACT[1:]),
+        channel('imu', 'ground_truth/imu_bias', IMU, messages.imu(frame, *EXACT[:2]),
                 lambda samples: [list(bias) for _, bias in samples.errors]),
         channel('ground_truth_imu', 'ground_truth/imu', IMU, messages.imu(frame, *EXACT),
                 lambda samples: (samples.orientation, *samples.exact)),

@@ -6,14 +6,17 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from copy import copy
-from functools import partial
+from functools import partial, reduce
+from itertools import pairwise
 from operator import attrgetter
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spinning_top_sim.physics.attitude import Quaternion, Vector
+from spinning_top_sim.physics import integrals
+from spinning_top_sim.physics.attitude import Quaternion
+from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.pivot import REST, Kinematics, PivotPath, kinematics
 from spinning_top_sim.physics.states import Point, States, joined
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
@@ -106,14 +109,21 @@ class Trajectory:
         return [piece.start_ns for piece in self._pieces[1:]
                 if begin_ns <= piece.start_ns < end_ns]
 
-    def velocity_jump(self, t_ns: int, point: Point) -> Vector:
-        """Return by how much the velocity of a point of the body jumps at a time, (1,) each."""
-        if t_ns not in self._jumps:
-            return np.zeros(1), np.zeros(1), np.zeros(1)
-        moment = np.array([t_ns])
-        before, after = self.evaluate(moment), self.after(t_ns).states(moment)
-        (u1, u2, u3), (v1, v2, v3) = before.velocity(point), after.velocity(point)
-        return v1 - u1, v2 - u2, v3 - u3
+    def increments(self, begin_ns: int, end_ns: int, point: Point) -> Increments:
+        """
+        Return the increments over an interval that events may divide (n = 1).
+
+        A velocity that jumps with a command counts toward the interval that begins there.
+        """
+        parts = []
+        for begin, end in pairwise(sorted({begin_ns, *self.starts(begin_ns, end_ns), end_ns})):
+            jump, piece, moment = np.zeros((3, 1)), self.after(begin), np.array([begin])
+            if begin in self._jumps:
+                jump = (np.stack(piece.states(moment).velocity(point))
+                        - np.stack(self.evaluate(moment).velocity(point)))
+            parts += [integrals.impulse((jump[0], jump[1], jump[2])),
+                      increments_within(piece, range(begin, begin + 1), end - begin, point)]
+        return reduce(Increments.then, parts or [integrals.impulse(3 * (np.zeros(1),))])
 
     def _joined(self, of: Callable[[Piece, Times], ArrayLike], t_ns: Times) -> Matrix:
         """Return what a function of pieces and times (n,) in them returns, (..., n)."""
@@ -188,3 +198,12 @@ def commanded(now: States, l3: float, lz: float) -> ContinuedState:
             f'rad), where lz must equal {pole!r}; command both together')
     return ContinuedState(theta=theta, theta_dot=float(now.theta_dot[0]), phi=float(now.phi[0]),
                           psi=float(now.psi[0]), l3=l3, lz=lz)
+
+
+def increments_within(piece: Piece, begins: range, length_ns: int, point: Point) -> Increments:
+    """Return the increments over intervals within a piece, which begin at these times [ns]."""
+    count = integrals.panels(piece.fastest_rate, length_ns)
+    edges = [length_ns * k // count for k in range(count + 1)]
+    return reduce(Increments.then, [integrals.increments(
+        piece.states, range(begins.start + begin, begins.stop + begin, begins.step), end - begin,
+        point, piece.fastest_rate) for begin, end in pairwise(edges)])

@@ -159,7 +159,7 @@ def correlations(seeds, count):
     """
     kinds, part, numbers, drawn = noise.Kind, noise.Part, np.arange(count), []
     for seed in seeds:
-        columns = [noise.white(seed, kind, part.WHITE, numbers, 3) for kind in kinds]
+        columns = [noise.white(seed, kind, numbers) for kind in kinds]
         # Correlation times far below a step: every step is new.
         columns += [noise.RandomPath(seed, kind, one, ((1e-5, 1.0),)).at(numbers * MILLISECOND)
                     for kind in (kinds.GYROSCOPE, kinds.ACCELEROMETER, kinds.MAGNETOMETER)
