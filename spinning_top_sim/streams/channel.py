@@ -14,8 +14,8 @@ from spinning_top_sim.physics import attitude, integrals
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.integrals import Increments
 from spinning_top_sim.physics.states import States
-from spinning_top_sim.streams.cdr import Template, Values
 from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.messages import Template, Values
 from spinning_top_sim.streams.sensor import Errors
 from spinning_top_sim.streams.trajectory import Trajectory, increments_within
 from spinning_top_sim.times import LAST_STAMP_NS, Times, ns_array

@@ -13,7 +13,6 @@ from typing import Any, Self
 
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.streams import messages, parameters
-from spinning_top_sim.streams.cdr import ENCAPSULATION
 
 COMMANDS, EVENTS = '~/commands', '~/events'
 # Topics and types, recorded behind the channels, in this order.
@@ -79,7 +78,7 @@ class Event:
     @classmethod
     def decoded(cls, data: bytes) -> Self:
         """Return a logged event.  Raises one of MALFORMED for any other message."""
-        begin = len(ENCAPSULATION) + 4
+        begin = len(messages.ENCAPSULATION) + 4
         end = begin + int.from_bytes(data[begin - 4:begin], 'little')       # of the text
         mapping = json.loads(data[begin:end - 1])
         if messages.string(json.dumps(mapping))[:end] != data[:end]:

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.streams import messages, noise
-from spinning_top_sim.streams.cdr import Field, Header, Numbers, Values
 from spinning_top_sim.streams.channel import Channel, Samples
-from spinning_top_sim.streams.messages import message
+from spinning_top_sim.streams.messages import Field, Header, Numbers, Values, message
 from spinning_top_sim.streams.noise import Kind
 from spinning_top_sim.times import NANOSECONDS, Times, period_ns
 

@@ -169,7 +169,9 @@ class LiveSimulation(Simulation):
         """
         while self.now_ns < due_ns:
             if self._ready_ns < due_ns:
-                self._prepare(due_ns)
+                # No further than is computed next: a solver keeps a limited number of steps.
+                self._go_on(self._groups, min([due_ns, *(
+                    one.computed_ns + one.most_ns for one in self._groups)]), PIECE_SECONDS)
             self._send(min(due_ns, self._ready_ns), publish_from_ns)
             if self.now_ns < due_ns and give_way():
                 return False
@@ -180,27 +182,23 @@ class LiveSimulation(Simulation):
         """Time up to which all messages are sent or wait [ns]."""
         return min((group.computed_ns for group in self._groups), default=self._motion.computed_ns)
 
-    def _prepare(self, due_ns: int) -> None:
-        """Compute what is due, or a part of it; raise where all is sent that the motion has."""
-        # No further than what is computed next: a solver keeps a limited number of steps.
-        goal_ns = min([due_ns, *(one.computed_ns + one.most_ns for one in self._groups)])
-        try:
-            self._compute(self._motion, goal_ns, PIECE_SECONDS)
-        except IntegrationError:
-            if self.now_ns >= self._motion.computed_ns:
-                raise
-        for group in self._groups:
-            self._compute(group, min(goal_ns, self._motion.computed_ns), PIECE_SECONDS)
-
     def look_ahead(self, until_ns: int, seconds: float) -> None:
         """Compute some of what is due up to a time, for one grid; it may take so long."""
         behind = min(self._groups, key=attrgetter('computed_ns'), default=self._motion)
-        if behind is self._motion or behind.computed_ns >= until_ns:
-            return
-        goal_ns = behind.computed_ns + min(behind.span_ns, behind.most_ns, LONGEST_SPAN_NS)
-        with contextlib.suppress(IntegrationError):     # `send` meets it when the time has come
-            self._compute(self._motion, goal_ns, 0.5 * seconds)
-            self._compute(behind, min(goal_ns, self._motion.computed_ns), 0.5 * seconds)
+        if behind is not self._motion and behind.computed_ns < until_ns:
+            span_ns = min(behind.span_ns, behind.most_ns, LONGEST_SPAN_NS)
+            with contextlib.suppress(IntegrationError):     # `send` meets it in time
+                self._go_on([behind], behind.computed_ns + span_ns, 0.5 * seconds)
+
+    def _go_on(self, groups: Sequence[_Group], goal_ns: int, seconds: float) -> None:
+        """Compute groups up to a time, or a part; raise where all is sent that the motion has."""
+        try:
+            self._compute(self._motion, goal_ns, seconds)
+        except IntegrationError:
+            if self.now_ns >= self._motion.computed_ns:
+                raise
+        for group in groups:
+            self._compute(group, min(goal_ns, self._motion.computed_ns), seconds)
 
     def _compute(self, group: _Group, until_ns: int, seconds: float) -> None:
         """Compute the messages of a group up to a time, or for about so long."""

@@ -14,10 +14,9 @@ import numpy as np
 
 from spinning_top_sim.physics.attitude import rotated
 from spinning_top_sim.shape import Shape
-from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.cdr import Field, Header, Numbers, Part, Template, Values
+from spinning_top_sim.streams import messages, parameters
 from spinning_top_sim.streams.channel import Channel, Samples
-from spinning_top_sim.streams.messages import NO_ROTATION, ORIGIN, message
+from spinning_top_sim.streams.messages import Field, Header, Numbers, Part, Template, Values
 from spinning_top_sim.times import NANOSECONDS, period_ns
 
 CYLINDER, LINE_STRIP, LINE_LIST = 3, 4, 5       # visualization_msgs/Marker
@@ -76,15 +75,16 @@ def _template(shape: Shape, frame_id: str, trace_points: int) -> Template:
         parts += _marker(2, frame_id, 'trace', LINE_STRIP, (0.5 * width, 0.0, 0.0), TRACE_COLOR,
                          Numbers('I', (trace_points,)),
                          Field('markers[2].points', 3 * trace_points))
-    return message(Numbers('I', (3 if trace_points else 2,)), *parts)
+    return messages.message(Numbers('I', (3 if trace_points else 2,)), *parts)
 
 
 def _marker(number: int, frame_id: str, namespace: str, kind: int, scale: tuple[float, ...],
             color: tuple[float, ...], *points: Part) -> list[Part]:
     """Return a visualization_msgs/Marker; the points of a line strip are in the world."""
     place = f'markers[{number}].pose'
-    pose: list[Part] = [Numbers('d', (*ORIGIN, *NO_ROTATION))] if kind == LINE_STRIP else [
-        Field(f'{place}.position', 3), Field(f'{place}.orientation', 4)]
+    pose: list[Part] = [Field(f'{place}.position', 3), Field(f'{place}.orientation', 4)]
+    if kind == LINE_STRIP:
+        pose = [Numbers('d', (*messages.ORIGIN, *messages.NO_ROTATION))]
     return [
         Header(frame_id), namespace, Numbers('i', (0, kind, 0)),    # id, type, action: add
         *pose, Numbers('d', scale), Numbers('f', color),

@@ -10,11 +10,10 @@ import numpy as np
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.streams import gnss, messages, parameters
-from spinning_top_sim.streams.cdr import Field, Header, Numbers, Template, Values
 from spinning_top_sim.streams.channel import Channel, Samples
 from spinning_top_sim.streams.imu import Imu, Magnetometer, Mounting
 from spinning_top_sim.streams.markers import markers
-from spinning_top_sim.streams.messages import message
+from spinning_top_sim.streams.messages import Field, Header, Numbers, Template, Values, message
 from spinning_top_sim.streams.sensor import Timing
 from spinning_top_sim.times import NANOSECONDS, period_ns
 

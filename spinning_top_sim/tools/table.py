@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.streams.cdr import Values, fill
 from spinning_top_sim.streams.channel import Channel, Rows, Samples
+from spinning_top_sim.streams.messages import Values, fill
 from spinning_top_sim.times import NANOSECONDS, Times
 
 # Names and units of the columns of a table.
