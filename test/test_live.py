@@ -237,7 +237,9 @@ def test_a_reset_gives_the_same_bytes_again_and_keeps_outputs_and_counts():
     ('command', {'l3': 1.0, 'lz': 1e20}, 'no motion'),
     ('state', {'theta': 4.0, 'theta_dot': 0.0, 'phi': 0.0, 'psi': 0.0, 'l3': 1.0, 'lz': 1.0},
      r'theta = 4\.0'),
-    ('epoch', {'epoch_ns': 2 ** 70}, 'must be >= 0 and < 2147483648 s')])
+    ('epoch', {'epoch_ns': 2 ** 70}, 'must be >= 0 and < 2147483648 s'),
+    *((kind, {}, f"event '{kind}': must be one of command, state, drive, parameters, epoch, reset")
+      for kind in ('jump', 'start'))])
 def test_an_event_that_is_refused_leaves_the_run_as_it_was(kind, details, words):
     expected, simulation = play(simulate(), SECOND, 'pose'), simulate()
     taken = record(simulation, 'pose')

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import reason_of
 from spinning_top_sim.streams.channel import Channel, Rows
-from spinning_top_sim.streams.messages import Values, fill
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.streams.topics import ARRAY, INVARIANTS, JOINTS, TIMING, recorded
 from spinning_top_sim.times import NANOSECONDS, Times
