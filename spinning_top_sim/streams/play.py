@@ -17,7 +17,7 @@ from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.streams.trajectory import Trajectory
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, NEVER_NS, check_stamp, period_ns
 
-BLOCK_BYTES = 1_000_000                     # of a block offline
+BLOCK_BYTES = 1_500_000                     # of a block offline
 LONGEST_BLOCK_NS = 100 * NANOSECONDS        # for the sake of progress
 MOST_BLOCKS = 20_000                        # of a run; then they are longer
 
