@@ -29,7 +29,7 @@ MOST_SAMPLES, MOST_BYTES = 256, 4 << 20     # of a channel that are computed tog
 FIRST_SPAN_NS, LONGEST_SPAN_NS = 20_000_000, 300_000_000
 FIRST_STRIDE_NS = 1_000     # of the motion, whose pace is not known before it is tried
 GROWTH = 16.0               # of a span over the one before, at most
-PIECE_SECONDS = 5e-3        # of work, between two questions whether to give way
+PIECE_SECONDS = 1e-2        # of work, half of it the solver's, between two questions to give way
 BLOCKED_SECONDS = 1.0       # a reader that stalls holds every call for 0.1 s: it gets a rest
 
 # Messages of a topic for a log: its number there, stamps (n,) [ns], messages (n, size).
@@ -69,9 +69,12 @@ class Output:
             t_ns, rows = np.concatenate((self._t_ns, t_ns)), np.concatenate((self._rows, rows))
         self._t_ns, self._rows = t_ns, rows
 
+    def is_due(self, until_ns: int) -> bool:
+        return len(self._t_ns) > 0 and bool(self._t_ns[0] <= until_ns)
+
     def take(self, until_ns: int) -> tuple[Times, Rows]:
         """Return what waits up to a time, which waits no longer."""
-        count = int(np.searchsorted(self._t_ns, until_ns, 'right'))
+        count = int(self._t_ns.searchsorted(until_ns, 'right'))
         taken = self._t_ns[:count], self._rows[:count]
         self._t_ns, self._rows = self._t_ns[count:], self._rows[count:]
         return taken
@@ -96,13 +99,14 @@ class _Group:
 
     outputs: Mapping[Channel, Output]
     computed_ns: int
-    span_ns: int            # what the time that there is suffices for
+    span_ns: int = 0        # for which the time that there is suffices
 
     @property
-    def most_ns(self) -> int:
-        """How much may be computed at once [ns]."""
-        return min((max(1, min(MOST_SAMPLES, MOST_BYTES // len(one.encoder))) * one.period_ns
-                    for one in self.outputs), default=NEVER_NS)
+    def piece_ns(self) -> int:
+        """How much is computed at once [ns]."""
+        return min([max(self.span_ns, FIRST_SPAN_NS if self.outputs else FIRST_STRIDE_NS), *(
+            max(1, min(MOST_SAMPLES, MOST_BYTES // len(one.encoder))) * one.period_ns
+            for one in self.outputs)])
 
 
 class LiveSimulation(Simulation):
@@ -116,7 +120,7 @@ class LiveSimulation(Simulation):
         super().__init__(values, epoch_ns)
         self.outputs = [Output(channel) for channel in self.channels]
         self._write: Callable[[Sequence[LogRows]], object] = lambda rows: None
-        self._motion = _Group({}, self.now_ns, FIRST_STRIDE_NS)
+        self._motion = _Group({}, self.now_ns)
         self._groups: list[_Group] = []             # of what is used
         self._used: list[tuple[int, Output]] = []   # with their numbers
 
@@ -136,7 +140,7 @@ class LiveSimulation(Simulation):
         for output, channel in zip(self.outputs, self.channels, strict=True):
             output.channel = channel
         if event.begins_motion or kind == 'reset':
-            self._motion = _Group({}, self.now_ns, FIRST_STRIDE_NS)
+            self._motion = _Group({}, self.now_ns)
         self.refresh()
         return event
 
@@ -148,7 +152,7 @@ class LiveSimulation(Simulation):
         for _, output in self._used:
             output.take(NEVER_NS)
             grids.setdefault(output.channel.grid, {})[output.channel] = output
-        self._groups = [_Group(outputs, self.now_ns, FIRST_SPAN_NS) for outputs in grids.values()]
+        self._groups = [_Group(outputs, self.now_ns) for outputs in grids.values()]
 
     @property
     def lowest_imu_rate(self) -> float:
@@ -171,7 +175,7 @@ class LiveSimulation(Simulation):
             if self._ready_ns < due_ns:
                 # No further than is computed next: a solver keeps a limited number of steps.
                 self._go_on(self._groups, min([due_ns, *(
-                    one.computed_ns + one.most_ns for one in self._groups)]), PIECE_SECONDS)
+                    one.computed_ns + one.piece_ns for one in self._groups)]), PIECE_SECONDS)
             self._send(min(due_ns, self._ready_ns), publish_from_ns)
             if self.now_ns < due_ns and give_way():
                 return False
@@ -186,25 +190,26 @@ class LiveSimulation(Simulation):
         """Compute some of what is due up to a time, for one grid; it may take so long."""
         behind = min(self._groups, key=attrgetter('computed_ns'), default=self._motion)
         if behind is not self._motion and behind.computed_ns < until_ns:
-            span_ns = min(behind.span_ns, behind.most_ns, LONGEST_SPAN_NS)
+            span_ns = min(behind.piece_ns, LONGEST_SPAN_NS)
             with contextlib.suppress(IntegrationError):     # `send` meets it in time
-                self._go_on([behind], behind.computed_ns + span_ns, 0.5 * seconds)
+                self._go_on([behind], behind.computed_ns + span_ns, seconds)
 
     def _go_on(self, groups: Sequence[_Group], goal_ns: int, seconds: float) -> None:
         """Compute groups up to a time, or a part; raise where all is sent that the motion has."""
         try:
-            self._compute(self._motion, goal_ns, seconds)
+            self._compute(self._motion, goal_ns, 0.5 * seconds)
         except IntegrationError:
             if self.now_ns >= self._motion.computed_ns:
                 raise
         for group in groups:
             self._compute(group, min(goal_ns, self._motion.computed_ns), seconds)
+        self.forget()
 
     def _compute(self, group: _Group, until_ns: int, seconds: float) -> None:
         """Compute the messages of a group up to a time, or for about so long."""
         now = begin = time.monotonic()
         while group.computed_ns < until_ns and now < begin + seconds:
-            goal_ns = min(until_ns, group.computed_ns + min(group.span_ns, group.most_ns))
+            goal_ns = min(until_ns, group.computed_ns + group.piece_ns)
             block = self.block([*group.outputs], group.computed_ns, goal_ns)
             for channel, t_ns, rows in block.messages:
                 group.outputs[channel].add(t_ns, rows)
@@ -212,24 +217,25 @@ class LiveSimulation(Simulation):
             group.computed_ns, now = block.until_ns, time.monotonic()
             room = 0.5 * seconds / max(now - called, 1e-6)
             group.span_ns = max(int(done_ns * min(room, GROWTH)),
-                                1 if room < 1.0 else group.span_ns)
+                                0 if room < 1.0 else group.span_ns)
 
     def _send(self, until_ns: int, publish_from_ns: int) -> None:
         """Send what waits up to a time, to the log before others."""
         logged: list[LogRows] = []
         due: list[tuple[int, int, NDArray[np.uint8]]] = []
         for number, output in self._used:
+            if not output.is_due(until_ns):
+                continue
             t_ns, rows = output.take(until_ns)
-            if len(t_ns) and output.log_index is not None:
+            if output.log_index is not None:
                 logged.append((output.log_index, self.epoch_ns + t_ns, rows))
-            if len(t_ns) and output.publish is not None:
-                late = int(np.searchsorted(t_ns, publish_from_ns))
+            if output.publish is not None:
+                late = int(t_ns.searchsorted(publish_from_ns))
                 output.skipped += late
                 due += zip(t_ns[late:].tolist(), repeat(number), rows[late:])
         if logged:
             self._write(logged)
         self.now_ns = until_ns
-        self.forget()
         due.sort(key=itemgetter(0, 1))
         for _, number, row in due:
             self.outputs[number].send(row.tobytes())
