@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-What a sensor feels of the motion: its bandwidth, as data sheets state it, and vibration.
-
-It depends on the motion and on the time of a reading only.
-"""
+"""What a sensor feels of the motion: its bandwidth, as data sheets state it, and vibration."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

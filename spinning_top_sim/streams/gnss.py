@@ -2,8 +2,7 @@
 """
 The satellite receiver (GNSS), with its antenna at the pivot: fixes, velocities, and their truth.
 
-Axes of noise and covariances are those of the world: east, north, up.  docs/sensor.md describes
-delay and outages.
+Axes are those of the world: east, north, up.  docs/sensor.md describes delay and outages.
 """
 
 from collections.abc import Mapping, Sequence

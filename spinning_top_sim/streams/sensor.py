@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The errors of a sensor of three axes and of its clock; docs/sensor.md has the chain.
-
-Names are those of kalibr, "IMU Noise Model".
-"""
+"""The errors of a sensor and of its clock, with kalibr's names; docs/sensor.md has the chain."""
 
 import math
 from collections.abc import Mapping, Sequence
