@@ -113,7 +113,7 @@ def test_ticks_leave_nothing_behind():
         gc.collect()
         return sys.getallocatedblocks()
 
-    run(200)
+    run(2000)           # caches are full
     in_use = [run(64) for _ in range(5)]
     assert min(np.diff(in_use)) < 8         # what a tick leaves, every round shows
 
