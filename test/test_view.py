@@ -15,6 +15,7 @@ from helpers.inspected import rewritten
 from helpers.recordings import write_rows
 from helpers.reference import ROOT
 from scipy.spatial.transform import Rotation
+from spinning_top_sim.view.track import Series, Track, attitude_rows
 
 from spinning_top_sim import solve
 from spinning_top_sim.installation import parameter_files
@@ -26,7 +27,6 @@ from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view import command, plots, shapes, svg, text
-from spinning_top_sim.view.track import Series, Track, attitude_rows
 
 pytestmark = pytest.mark.skipif(find_spec('viser') is None, reason='viser is not there')
 

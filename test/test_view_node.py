@@ -10,12 +10,12 @@ import rclpy
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.simulations import play
+from spinning_top_sim.view.track import Track
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.play import Simulation
-from spinning_top_sim.view.track import Track
 
 VIEW = ('-m', 'spinning_top_sim', 'view', '--no-browser', '--port', '0')
 PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
@@ -26,6 +26,7 @@ def live():
     """A page whose node, in this process, hears nobody."""
     pytest.importorskip('viser')
     from spinning_top_sim.view.live import LiveView
+
     from spinning_top_sim.view.page import Page
     rclpy.init()
     view = LiveView(Page('one', '127.0.0.1', None))

@@ -1,21 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The words of the page as HTML: what one sees, in numbers, the legend, and the whole file."""
+"""The words of the page as HTML: what one sees, in numbers, and the legend."""
 
 import html
 import math
 from collections.abc import Iterable, Sequence
-from pathlib import Path
-from string import Template
-
-import numpy as np
 
 from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
-from spinning_top_sim.view.track import DescribedMotion, Track
+from spinning_top_sim.view.source import Motion, Track
 
-HERE = Path(__file__).parent
-STYLE, LIVE_STYLE = ((HERE / name).read_text('utf-8') for name in ('page.css', 'live.css'))
+NO_SAMPLES = 'no samples yet'
 BEYOND = 'No closed form is in reach of its numbers; the samples are shown as they are.'
 PIVOT_MOVES = 'The pivot moves: where it accelerates, the top moves about another vertical.'
 NEUTRAL = ('The body is not in this log, only its attitude: a grey disc shows it, with its axes '
@@ -52,26 +47,32 @@ def number(value: float) -> str:
     return f'{shown:g}'.replace('-', '−')
 
 
-def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns: int) -> str:
-    """Return headline, sentence and numbers of a top, and stamp and time of what is drawn."""
+def words(track: Track, t_ns: int) -> str:
+    """Return headline, sentences and numbers of a top at a time; and those of its sample."""
+    sample_ns = track.newest(t_ns)
+    if sample_ns is None:
+        return f'<p>{track.name} {NO_SAMPLES}</p>'
+    motion = track.motion_at(t_ns)
     description = motion.description if motion else None
     title, sentence = ((description.name, SENTENCES[description.name]) if description else
                        ('motion', PIVOT_MOVES if motion.pivot_moves else BEYOND) if motion else
                        ('attitude', '' if track.has_body else NEUTRAL))
     rows = [*_rows(track.top, motion)] if motion else []
-    place = track.places(np.array([stamp_ns]))[0]
+    place = track.state(sample_ns).pivot.position[:, 0]
     if place.any():
         rows.append(('Pivot', ', '.join(map(number, place)), 'x, y, z [m]'))
     return ''.join((
-        '<div class="top-words">', f'<p>{html.escape(track.name)}</p>' if track.name else '',
-        f'<h1>{title}</h1>', f'<p>{sentence}</p>' if sentence else '', '<table>',
+        f'<div class="top-words" data-from="{t_ns / NANOSECONDS}">',
+        f'<p>{html.escape(track.name)}</p>' if track.name else '', f'<h1>{title}</h1>',
+        *(f'<p>{html.escape(line)}</p>' for line in (sentence, track.about) if line), '<table>',
         *(f'<tr><td>{label}</td><td>{value}{f"<small>{note}</small>" if note else ""}</td></tr>'
           for label, value, note in rows),
-        f'</table><p class="stamp">t = {since_ns / NANOSECONDS:.3f} s, stamp '
-        f'{stamp_text(stamp_ns)}</p></div>'))
+        f'</table><p class="stamp" data-epoch="{track.epoch_ns}">t = '
+        f'{sample_ns / NANOSECONDS:.3f} s, stamp {stamp_text(track.epoch_ns + sample_ns)}</p>',
+        '</div>'))
 
 
-def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
+def _rows(top: Top, motion: Motion) -> Iterable[tuple[str, str, str]]:
     description = motion.description
     if description is not None:
         low = number(math.degrees(description.theta_min))
@@ -97,12 +98,3 @@ def legend(entries: Sequence[tuple[tuple[int, int, int], str]]) -> str:
     return '<div class="top-legend">' + ''.join(
         f'<div><i style="background:rgb{colour}"></i>{text}</div>'
         for colour, text in entries) + '</div>'
-
-
-def document(title: str, scene: str, legend_html: str, words_html: str,
-             plots_html: Sequence[str]) -> str:
-    """Return a page that works without a server; `scene` is a page for its own frame."""
-    template = Template((HERE / 'file.html').read_text('utf-8'))
-    return template.substitute(
-        title=html.escape(title), style=STYLE, legend=legend_html, words=words_html,
-        plots=''.join(plots_html), scene=scene.replace('&', '&amp;').replace('"', '&quot;'))
