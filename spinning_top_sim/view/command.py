@@ -21,12 +21,11 @@ if TYPE_CHECKING:
     from spinning_top_sim.view.page import Page
 
 DESCRIPTION = """\
-Show a top in the browser: its own simulation, that of a running node, or logs.
+Show a top in the browser: its own simulation, that of a running node, or a log.
 
   spinning-top view --scene wavy             simulates a scene; needs no ROS
   spinning-top view --node                   the running node of a namespace
-  spinning-top view run.mcap                 a log, of this package or another program
-  spinning-top view rk45.mcap exact.mcap     side by side, or one over the other
+  spinning-top view run.mcap                 a log
   spinning-top view run.mcap --html a.html   a file that plays by itself
 
 exit code: 0 ended, also by a signal; 1 a log cannot be read, or a file written;
@@ -59,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add = parser.add_argument
-    add('log', nargs='*', type=Path, help='one or two MCAP files; without: a simulation')
+    add('log', nargs='?', type=Path, help='an MCAP file; without: a simulation')
     scene_file.add_parameters(parser)
     add('--node', action='store_true', help='show the running node instead')
     add('--namespace', metavar='NS', help='of the running node')
@@ -74,19 +73,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Raise ValueError for arguments that do not go together."""
-    kind = 'log' if arguments.log else 'node' if arguments.node else 'simulation'
-    given = {'log': arguments.log, 'node': [arguments.node or None],
-             '--namespace': [arguments.namespace], '--html': [arguments.html],
-             '--scene': [arguments.scene], '--imu': [arguments.imu],
-             '--params': arguments.params, '-p': arguments.param}
-    allowed = {'log': ('log', '--html'), 'node': ('node', '--namespace'),
-               'simulation': ('--html', '--scene', '--imu', '--params', '-p')}[kind]
-    for option, values in given.items():
-        for value in values:
-            if value is not None and option not in allowed:
-                raise ValueError(f'{option} {value}: cannot be given for a {kind}')
-    if len(arguments.log) > 2:
-        raise ValueError(f'{len(arguments.log)} logs: must be one or two')
+    kind, foreign = (('a log', ('node', 'namespace', 'scene', 'imu', 'params', 'param'))
+                     if arguments.log else
+                     ('a node', ('html', 'scene', 'imu', 'params', 'param'))
+                     if arguments.node else ('a simulation', ('namespace',)))
+    for option in foreign:
+        if value := getattr(arguments, option):
+            raise ValueError(f'--{option} {value}: cannot be given for {kind}')
     if arguments.port is not None and not 0 <= arguments.port <= LAST_PORT:
         raise ValueError(f'--port {arguments.port}: must be from 0 to {LAST_PORT}')
 
@@ -98,22 +91,22 @@ def _show(arguments: argparse.Namespace) -> int:
         cli.check_output(arguments.html)
     with needed('the page', 'view'):
         from spinning_top_sim.view import log, player, simulation  # noqa: PLC0415 - slow
-    names, scene, values = arguments.log, '', {}
-    if not names:
+    source: log.LogSource | simulation.OwnSimulation
+    if arguments.log is not None:
+        source = log.LogSource(arguments.log, lambda: _open_page(arguments, arguments.log.name))
+    else:
         scene = str(arguments.scene or next(iter(arguments.params), DEFAULT_SCENE))
         values = parameters.checked({'solver.method': 'exact', **scene_file.given(arguments)})
-    tops = [log.read_log(path, path.stem if len(names) > 1 else '') for path in names]
-    page = _open_page(arguments, ' and '.join(path.name for path in names) or 'spinning top')
-    stopped = threading.Event()
-    with cli.handling(lambda *_: stopped.set()):
-        source = log.LogSource(page, tops) if tops else simulation.OwnSimulation(
-            page, scene, values)
+        source = simulation.OwnSimulation(_open_page(arguments, 'spinning top'), scene, values)
+    try:
         if arguments.html is None:
-            page.show(source, stopped)
+            stopped = threading.Event()
+            with cli.handling(lambda *_: stopped.set()):
+                source.page.show(source, stopped)
         else:
-            said = player.write_file(arguments.html, page, source.player, source.tracks_at)
-            cli.print_line(f'{arguments.html}: {said}')
-        page.close()
+            cli.print_line(f'{arguments.html}: {player.write_file(arguments.html, source)}')
+    finally:
+        source.page.close()
     return cli.OK
 
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import natural_momentum
-from spinning_top_sim.physics.states import States
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.view import body
 from spinning_top_sim.view.source import Motion, Reals, Track
 
 STANDS_TO = math.radians(100.0)     # tilt up to which the pivot stands on a peg; else it hangs
-TRACES = ((217, 72, 43), (30, 138, 76))
-BOUNDS, SPHERE, STAND, FOOT = (122, 82, 179), (190, 200, 215), (120, 126, 136), 0.8
+TRACE, BOUNDS, SPHERE, STAND = (217, 72, 43), (122, 82, 179), (190, 200, 215), (120, 126, 136)
+FOOT = 0.8                      # length of the stand / that of the axis
+ARROWS = {'angular momentum': (20, 120, 70), 'torque': (20, 150, 180)}
 NO_LINES = np.zeros((1, 2, 3), np.float32)
 TRACE_NS = 10 * NANOSECONDS     # length of the trace of the tip
 TRACE_POINTS = 1500             # samples in the trace at most
@@ -53,84 +53,53 @@ def tip_path(track: Track, t_ns: int) -> Lines:
     return lines_through(axis_length(track) * axis + (place - place[-1]))[joined]
 
 
-def _momentum(track: Track, states: States, usual: float) -> attitude.Vector:
-    (w1, w2, w3), top = states.rows_angular_velocity, track.top
-    return top.lambda1 / usual * w1, top.lambda1 / usual * w2, top.lambda3 / usual * w3
-
-
-def _velocity(track: Track, states: States, usual: float) -> attitude.Vector:
-    (w1, w2, w3), least = states.rows_angular_velocity, min(track.top.lambda1, track.top.lambda3)
-    return least / usual * w1, least / usual * w2, least / usual * w3
-
-
-def _torque(track: Track, states: States, _: float) -> attitude.Vector:
-    """In the body: r x m g is along the line of nodes."""
-    sign, (up_1, up_2, height) = np.sign(track.top.gravity_torque), states.rows_vertical
-    return sign * up_2, -sign * up_1, 0.0 * height
-
-
-def _force(track: Track, states: States, _: float) -> attitude.Vector:
-    f1, f2, f3 = states.specific_force(track.values['imu.lever_arm'])
-    unit = abs(track.top.gravity) or 1.0
-    return f1 / unit, f2 / unit, f3 / unit
-
-
-# Of each arrow the colour, and its vector in the body.  The length of the axis, here 1, stands for
-# the usual angular momentum or velocity, for 1 g, and for the torque of gravity when the axis is
-# horizontal.
-ARROWS = {
-    'angular momentum': ((20, 120, 70), _momentum),
-    'angular velocity': ((196, 50, 150), _velocity),
-    'torque': ((20, 150, 180), _torque),
-    'specific force': ((230, 130, 20), _force)}
-
-
 def arrow(track: Track, name: str, t_ns: int) -> Reals | None:
-    """Return one of ARROWS at a sample as a vector (3,) in the world; None: not known."""
-    if not track.has_body:
+    """
+    Return one of ARROWS at a sample as a vector (3,) in the world; None: not known.
+
+    The length of the axis stands for the usual angular momentum, and for the torque of gravity
+    when the axis is horizontal.
+    """
+    states, motion, top = track.state(t_ns), track.motion_at(t_ns), track.top
+    if name == 'torque':        # r x m g, along the line of nodes
+        x, y, _ = states.rows_axis
+        vector = np.ravel(np.sign(top.gravity_torque) * np.array((-y, x, 0.0 * x)))
+    elif motion is None:
         return None
-    states, motion = track.state(t_ns), track.motion_at(t_ns)
-    present = max(abs(motion.l3), abs(motion.lz)) if motion else 0.0
-    usual = max(natural_momentum(track.top), present, 1e-30)
-    vector = np.ravel(np.broadcast_arrays(*attitude.rotated(
-        states.rows_quaternion, ARROWS[name][1](track, states, usual))))
-    return abs(axis_length(track)) * vector if np.isfinite(vector).all() else None
-
-
-def looks(track: Track) -> object:
-    """Return what is equal for tops that look alike."""
-    return track.top, track.has_body
+    else:
+        w1, w2, w3 = states.rows_angular_velocity
+        usual = max(natural_momentum(top), abs(motion.l3), abs(motion.lz), 1e-30)
+        vector = np.ravel(np.broadcast_arrays(*attitude.rotated(states.rows_quaternion, (
+            top.lambda1 * w1, top.lambda1 * w2, top.lambda3 * w3)))) / usual
+    return abs(axis_length(track)) * vector
 
 
 class DrawnTop:
     """
     One top in the scene.
 
-    track : whose samples are drawn; another one must look alike
+    track : whose samples are drawn; may be set to another one of the same top
     """
 
-    def __init__(self, scene: viser.SceneApi, number: int, track: Track) -> None:
-        self.track, self.looks = track, looks(track)
-        name, far = f'/top{number}', axis_length(track)
+    def __init__(self, scene: viser.SceneApi, track: Track) -> None:
+        self.track = track
+        name, far = '/top', axis_length(track)
         radius = abs(far)
         self.root = scene.add_frame(name, show_axes=False)
         self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
                                            opacity=0.12, side='back', cast_shadow=False,
                                            receive_shadow=False)
-        self._body = scene.add_frame(f'{name}/body', show_axes=not track.has_body,
-                                     axes_length=0.7 * radius, axes_radius=0.015 * radius)
-        for part in (body.wheel if track.has_body else body.disc)(track.shape, far):
+        self._body = scene.add_frame(f'{name}/body', show_axes=False)
+        for part in body.wheel(track.shape, far):
             scene.add_mesh_simple(
                 f'{name}/body/{part.name}', part.mesh.vertices, part.mesh.faces,
-                color=part.colour, opacity=0.4 if number else None,
-                flat_shading=part.name != 'axle', side='double')
+                color=part.colour, flat_shading=part.name != 'axle', side='double')
         peg = body.stand(FOOT * radius)
         self._stand = scene.add_mesh_simple(f'{name}/stand', peg.vertices, peg.faces, color=STAND,
                                             side='double')
-        self._colour = np.array(TRACES[number])
         # A trace that begins with one colour for all points would not take others.
         self._trace = scene.add_line_segments(
-            f'{name}/trace', NO_LINES, np.broadcast_to(self._colour, NO_LINES.shape),
+            f'{name}/trace', NO_LINES, np.broadcast_to(np.array(TRACE), NO_LINES.shape),
             thickness=0.018 * radius)
         self._bounds = [scene.add_line_segments(
             f'{name}/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * radius, visible=False)
@@ -138,8 +107,8 @@ class DrawnTop:
         self._arrows = {title: scene.add_arrows(
             f'{name}/{title.replace(" ", "_")}', NO_LINES, colour,
             shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
-            visible=False) for title, (colour, _) in ARROWS.items()}
-        self._limits: tuple[float, float] | None = None         # that are drawn [rad]
+            visible=False) for title, colour in ARROWS.items()}
+        self._motion: Motion | None = None              # whose bounds are drawn
         self._picture: object = None                    # what it shows
 
     def draw(self, t_ns: int, *, trace: bool, bounds: bool, arrows: Set[str]) -> None:
@@ -170,19 +139,17 @@ class DrawnTop:
         if is_longer:
             share = np.linspace(0.35, 1.0, len(lines))[:, np.newaxis, np.newaxis]
             self._trace.colors = np.broadcast_to(255 * (
-                1.0 + share * (self._colour / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
+                1.0 + share * (np.array(TRACE) / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
 
     def _draw_bounds(self, motion: Motion | None, on: bool) -> None:
         description = motion.description if motion else None
         for bound in self._bounds:
             bound.visible = on and description is not None
-        if description is None:
+        if description is None or motion is self._motion:
             return
-        limits = description.theta_min, description.theta_max
-        if limits == self._limits:
-            return
-        self._limits = limits
-        for bound, theta in zip(self._bounds, self._limits, strict=True):
+        self._motion = motion
+        for bound, theta in zip(self._bounds, (description.theta_min, description.theta_max),
+                                strict=True):
             bound.points = circle(axis_length(self.track), theta)
         # A top that comes low hangs from above.
         self._stand.wxyz = (1, 0, 0, 0) if description.theta_max < STANDS_TO else (0, 1, 0, 0)

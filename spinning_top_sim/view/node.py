@@ -160,11 +160,10 @@ class NodeView(Node):
         newest_ns = int(track.stamps_ns[-1])
         track.epoch_ns = self._epoch_ns or track.epoch_ns or newest_ns
         track.drop_before(max(newest_ns - KEPT_NS, min(self._epoch_ns, newest_ns)))
-        track.detect_motion()
         return track.span[1]
 
-    def tracks_at(self, _: int) -> list[SampledTrack]:
-        return [self._track] if self._track is not None and len(self._track.rows) else []
+    def track_at(self, _: int) -> SampledTrack | None:
+        return self._track if self._track is not None and len(self._track.rows) else None
 
     def _take_messages(self, track: SampledTrack) -> None:
         arrived = defaultdict(list)
@@ -187,7 +186,7 @@ class NodeView(Node):
         except ConnectionError:
             self._is_stale = True
             return
-        before, self._track = self._track, SampledTrack('', parameters.checked(dict(zip(
+        before, self._track = self._track, SampledTrack(parameters.checked(dict(zip(
             names, map(parameter_value_to_python, answer.values), strict=True))))
         if before is not None:
             self._track.stamps_ns, self._track.rows = before.stamps_ns, before.rows

@@ -4,11 +4,9 @@
 import math
 import threading
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import viser
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
@@ -17,11 +15,10 @@ from spinning_top_sim.view.drawn import (
     ARROWS,
     BOUNDS,
     FOOT,
+    TRACE,
     TRACE_NS,
-    TRACES,
     DrawnTop,
     axis_length,
-    looks,
 )
 from spinning_top_sim.view.server import Server
 from spinning_top_sim.view.source import Source, Track
@@ -83,14 +80,13 @@ class Page:
             self._trace = gui.add_checkbox('trace of the axis', True)
             self._bounds = gui.add_checkbox('bounds of θ', True)
             self.arrows = {name: gui.add_checkbox(name, False) for name in ARROWS}
-            self._over = gui.add_checkbox('one over the other', False, visible=False)
         panel = gui.add_panel()
         with panel.add_tab('Plots'):
             self._plots = gui.add_html('')
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)
         panel.expand()              # also on a phone, where it is below
-        self._tops: list[DrawnTop] = []
+        self._top: DrawnTop | None = None
         self._number = 0            # of the picture
 
     def close(self) -> None:
@@ -106,74 +102,49 @@ class Page:
             now = time.monotonic()
             seconds = min(now - before, LONGEST_STEP_S) if self.server.get_clients() else 0.0
             t_ns = source.update(seconds)
-            self.draw(t_ns, source.tracks_at(t_ns))
+            if (track := source.track_at(t_ns)) is not None:
+                self.draw(t_ns, track)
             stopped.wait(max(now + 1.0 / RATE - time.monotonic(), 0.0))
             before = now
 
-    def draw(self, t_ns: int, tracks: Sequence[Track]) -> None:
-        """Draw these tops at a time."""
-        if not tracks:
-            return
-        if [top.looks for top in self._tops] != [looks(track) for track in tracks]:
-            self._set_tracks(tracks)
-        for top, track in zip(self._tops, tracks, strict=True):
-            top.track = track
-        arrows = {name for name, switch in self.arrows.items() if switch.value}
-        side = 0.0 if self._over.value else 1.3 * self._size
-        newest = [(track, track.newest(t_ns)) for track in tracks]
-        places = [np.zeros(3) if sample_ns is None else track.state(sample_ns).pivot.position[:, 0]
-                  for track, sample_ns in newest]
-        x, y, z = places[0].tolist()
+    def draw(self, t_ns: int, track: Track) -> None:
+        """Draw a top at a time."""
+        if self._top is None or self._top.track.top != track.top:
+            self._top = self._new_top(track)
+        self._top.track, newest_ns = track, track.newest(t_ns)
         with self.server.atomic():
-            # The picture follows the first top: the ground moves.
-            self._ground.position = (-(x % self._size), -(y % self._size), -FOOT * self._size - z)
-            for k, (top, place) in enumerate(zip(self._tops, places, strict=True)):
-                top.root.position = place - places[0] + (
-                    side * (2 * k - len(self._tops) + 1), 0.0, 0.0)
-                top.draw(t_ns, trace=self._trace.value, bounds=self._bounds.value, arrows=arrows)
+            if newest_ns is not None:       # the picture follows the pivot: the ground moves
+                size = abs(axis_length(track))
+                x, y, z = track.state(newest_ns).pivot.position[:, 0].tolist()
+                self._ground.position = -(x % size), -(y % size), -FOOT * size - z
+            self._top.draw(t_ns, trace=self._trace.value, bounds=self._bounds.value, arrows={
+                name for name, switch in self.arrows.items() if switch.value})
         if self._number % PLOT_EVERY == 0:
             set_content(self._plots, ''.join(map(plots.draw, plots.motion_plots(
-                tracks, t_ns, t_ns - WINDOW_NS, t_ns))))
-            set_content(self._words, ''.join(self.words(t_ns, tracks)))
-            set_content(self._legend, self.legend(tracks))
+                track, t_ns, t_ns - WINDOW_NS, t_ns))))
+            set_content(self._words, text.words(track, t_ns))
+            set_content(self._legend, self.legend())
         self._number += 1
 
-    def _set_tracks(self, tracks: Sequence[Track]) -> None:
-        """Show other tops."""
-        for top in self._tops:
-            top.root.remove()
-        scene = self.server.scene
-        self._tops = [DrawnTop(scene, number, track) for number, track in enumerate(tracks)]
-        size = max(abs(axis_length(track)) for track in tracks)
-        self._number = 0
-        self._over.visible = len(tracks) > 1
-        self._bounds.visible = any(track.has_body for track in tracks)
-        for switch in self.arrows.values():
-            switch.visible = self._bounds.visible
+    def _new_top(self, track: Track) -> DrawnTop:
+        """Return another top in the scene, with its ground and for its size."""
+        if self._top is not None:
+            self._top.root.remove()
+        scene, camera, size = self.server.scene, self.server.initial_camera, abs(
+            axis_length(track))
         self._ground = scene.add_grid(
             '/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
             cell_color=(238, 240, 244), section_color=(228, 231, 236), fade_distance=9 * size,
             fade_from='origin', shadow_opacity=0.1, position=(0.0, 0.0, -FOOT * size))
-        camera = self.server.initial_camera
-        away = size * (5.2 if len(tracks) == 1 else 10.5)
         camera.fov = VIEW_ANGLE
-        camera.position = (0.0, -0.92 * away, 0.39 * away)
+        camera.position = (0.0, -4.8 * size, 2.0 * size)
         camera.look_at = (0.0, 0.0, 0.1 * size)
         camera.near, camera.far = 0.01 * size, 100.0 * size
-        self._size = size
+        return DrawnTop(scene, track)
 
-    def words(self, t_ns: int, tracks: Sequence[Track]) -> list[str]:
-        """Return HTML about the motion and the sample of each top."""
-        return [text.words(track, t_ns) for track in tracks]
-
-    def legend(self, tracks: Sequence[Track]) -> str:
+    def legend(self) -> str:
         """Return HTML about the colours of what is switched on."""
-        entries = []
-        if self._trace.value:
-            entries += [(TRACES[k], f'trace of the axis {track.name}'.rstrip()
-                         + (' (plots: dashed)' if k else '')) for k, track in enumerate(tracks)]
-        if self._bounds.value and any(track.motion_at(0) for track in tracks):
-            entries.append((BOUNDS, 'bounds of θ'))
-        entries += [(ARROWS[name][0], name)
-                    for name, switch in self.arrows.items() if switch.value]
-        return text.legend(entries)
+        return text.legend([(colour, name) for colour, name, switch in (
+            (TRACE, 'trace of the axis', self._trace), (BOUNDS, 'bounds of θ', self._bounds),
+            *((ARROWS[name], name, switch) for name, switch in self.arrows.items()))
+            if switch.value])

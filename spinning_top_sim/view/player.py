@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import SimpleQueue
 from string import Template
+from typing import Protocol
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.view import plots
+from spinning_top_sim.view import plots, text
 from spinning_top_sim.view.page import RATE, STYLE, Page, set_value
-from spinning_top_sim.view.source import Track
+from spinning_top_sim.view.source import Source, Track
 
 SPEEDS = ('0.01', '0.1', '0.25', '0.5', '1', '2', '4', '8')
 STEP_NS = 20_000_000
@@ -99,30 +100,37 @@ class Player:
         self.now_ns = self.motions_ns[behind % len(self.motions_ns)]
 
 
-def write_file(path: Path, page: Page, player: Player,
-          tracks_at: Callable[[int], Sequence[Track]]) -> str:
-    """Write such a file of what a player plays; return its length and size."""
+class Playable(Source, Protocol):
+    """A source with a player."""
+
+    page: Page
+    player: Player
+
+    def track_at(self, t_ns: int) -> Track: ...
+
+
+def write_file(path: Path, source: Playable) -> str:
+    """Write a file that plays by itself what a player plays; return its length and size."""
+    page, player = source.page, source.player
     begin_ns, end_ns = player.begin_ns, player.file_end_ns
     clock = page.server.scene.add_frame('/clock', show_axes=False)
 
     def draw(t_ns: int) -> None:
         clock.position = (t_ns / NANOSECONDS, 0.0, 0.0)      # read by the script of the file
-        page.draw(t_ns, tracks_at(t_ns))
+        page.draw(t_ns, source.track_at(t_ns))
 
     draw(begin_ns)
-    tracks = tracks_at(begin_ns)
-    words = ''.join(f'<div>{"".join(parts)}</div>' for parts in zip(*(
-        page.words(t_ns, tracks) for t_ns in (begin_ns, *player.motions_ns) if t_ns <= end_ns),
-        strict=True))
-    drawn = ''.join(map(plots.draw, plots.motion_plots(tracks, begin_ns, begin_ns, end_ns)))
+    track = source.track_at(begin_ns)
+    words = ''.join(text.words(track, t_ns) for t_ns in (begin_ns, *player.motions_ns)
+                    if t_ns <= end_ns)
+    drawn = ''.join(map(plots.draw, plots.motion_plots(track, begin_ns, begin_ns, end_ns)))
     serializer = page.server.get_scene_serializer()
     for picture in range(1, int((end_ns - begin_ns) / NANOSECONDS * RATE) + 1):
         serializer.insert_sleep(1.0 / RATE)
         draw(begin_ns + round(picture / RATE * NANOSECONDS))
-    scene = serializer.as_html().replace('&', '&amp;').replace('"', '&quot;')
     document = Template(Path(__file__).with_name('file.html').read_text('utf-8')).substitute(
-        title=html.escape(page.title), style=STYLE, legend=page.legend(tracks), words=words,
-        plots=drawn, scene=scene)
+        title=html.escape(page.title), style=STYLE, legend=page.legend(), words=words,
+        plots=drawn, scene=html.escape(serializer.as_html()))
     with open(path, 'x', encoding='utf-8') as file:
         file.write(document)
     return f'{(end_ns - begin_ns) / NANOSECONDS:g} s, {len(document.encode()) / 1e6:.1f} MB'

@@ -8,8 +8,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from spinning_top_sim.physics.top import Top
 from spinning_top_sim.streams.cdr import NANOSECONDS
-from spinning_top_sim.view.source import Reals, Track, effective_potential
+from spinning_top_sim.view.source import Motion, Reals, Track, effective_potential
 
 POINTS = 400                    # in a line at most
 BLUE, RED, GREEN, VIOLET = '#1c6dd0', '#d9482b', '#1e8a4c', '#7a52b3'
@@ -24,7 +25,6 @@ class Line(NamedTuple):
     colour: str
     x: Reals
     y: Reals
-    dash: str = ''
     dots: bool = False
 
 
@@ -45,45 +45,37 @@ class Plot(NamedTuple):
     over: Literal['time', 'tilt'] = 'time'
 
 
-def motion_plots(tracks: Sequence[Track], t_ns: int, begin_ns: int, end_ns: int) -> list[Plot]:
+def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Plot]:
     """
     Return the plots of potential, energies, tilt and precession, as far as there are data.
 
     t_ns : the time that is marked
     begin_ns, end_ns : span of the plots over the time
     """
-    potential, energy, slope, rate = (list[Line]() for _ in range(4))
-    for track, dash in zip(tracks, ('', '5 3'), strict=False):
-        potential += _potential(track, t_ns, dash)
-        times, states = track.states(begin_ns, end_ns, POINTS)
-        seconds, (w1, w2, w3) = times / NANOSECONDS, states.rows_angular_velocity
-        slope.append(Line('θ', RED, seconds, np.degrees(states.theta_folded), dash))
-        if track.has_body:
-            rate.append(Line('φ′', BLUE, seconds, states.phi_dot, dash))
-            # Without the motion of the pivot.
-            kinetic = 0.5 * (track.top.lambda1 * (w1 * w1 + w2 * w2)
-                             + track.top.lambda3 * w3 * w3) + 0.0 * seconds
-            height = track.top.gravity_torque * states.rows_axis[2]
-            energy += [Line('kinetic', RED, seconds, kinetic, dash),
-                       Line('potential', BLUE, seconds, height, dash),
-                       Line('sum', GREEN, seconds, kinetic + height, dash)]
-    now, first = t_ns / NANOSECONDS, tracks[0]
-    newest, motion = first.newest(t_ns), first.motion_at(t_ns)
-    theta = math.nan if newest is None else math.degrees(first.state(newest).theta_folded[0])
-    return [plot for plot in (
-        Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', potential, theta,
+    times, states = track.states(begin_ns, end_ns, POINTS)
+    seconds, (w1, w2, w3), top = times / NANOSECONDS, states.rows_angular_velocity, track.top
+    # Without the motion of the pivot.
+    kinetic = 0.5 * (top.lambda1 * (w1 * w1 + w2 * w2) + top.lambda3 * w3 * w3) + 0.0 * seconds
+    height = top.gravity_torque * states.rows_axis[2]
+    newest, now, motion = track.newest(t_ns), t_ns / NANOSECONDS, track.motion_at(t_ns)
+    theta = math.nan if newest is None else math.degrees(track.state(newest).theta_folded[0])
+    return [
+        Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', _potential(top, motion), theta,
              motion.energy if motion and motion.description else math.nan, 'tilt'),
-        Plot('Energy', 'time t [s]', 'E [J]', energy, now),
-        Plot('Tilt', 'time t [s]', 'θ [deg]', slope, now),
-        Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', rate, now)) if plot.lines]
+        Plot('Energy', 'time t [s]', 'E [J]', [
+            Line('kinetic', RED, seconds, kinetic), Line('potential', BLUE, seconds, height),
+            Line('sum', GREEN, seconds, kinetic + height)], now),
+        Plot('Tilt', 'time t [s]', 'θ [deg]', [
+            Line('θ', RED, seconds, np.degrees(states.theta_folded))], now),
+        Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', [
+            Line('φ′', BLUE, seconds, states.phi_dot)], now)]
 
 
-def _potential(track: Track, t_ns: int, dash: str) -> list[Line]:
+def _potential(body: Top, motion: Motion | None) -> list[Line]:
     """Return V around the bounds of theta, the energy of the axis, and the turning points."""
-    motion = track.motion_at(t_ns)
     if motion is None or motion.description is None:
         return []
-    body, (l3, lz) = track.top, (motion.l3, motion.lz)
+    l3, lz = motion.l3, motion.lz
     theta = np.linspace(1e-3, math.pi - 1e-3, 2000)
     values = effective_potential(body, l3, lz, theta)
     depth = max(motion.energy - float(values.min()), 0.05 * abs(body.gravity_torque),
@@ -95,8 +87,8 @@ def _potential(track: Track, t_ns: int, dash: str) -> list[Line]:
         heights = effective_potential(body, l3, lz, bounds)
     turning = bounds[np.abs(heights - motion.energy) < 1e-3 * depth]
     inside = np.degrees(np.clip(bounds, theta[0], theta[-1]))
-    return [Line('V', BLUE, np.degrees(theta), effective_potential(body, l3, lz, theta), dash),
-            Line('E − L₃²/2λ₃', GREEN, inside, np.full(2, motion.energy), dash),
+    return [Line('V', BLUE, np.degrees(theta), effective_potential(body, l3, lz, theta)),
+            Line('E − L₃²/2λ₃', GREEN, inside, np.full(2, motion.energy)),
             Line('turning points', VIOLET, np.degrees(turning),
                  np.full(len(turning), motion.energy), dots=True)]
 
@@ -161,7 +153,7 @@ def draw(plot: Plot) -> str:
         points = ' '.join(f'{x},{y}' for x, y in places.tolist())
         drawn += [f'<circle cx="{x}" cy="{y}" r="4" fill="{line.colour}"/>'
                   for x, y in places.tolist()] if line.dots else [
-            f'<polyline stroke="{line.colour}" stroke-dasharray="{line.dash}" points="{points}"/>']
+            f'<polyline stroke="{line.colour}" points="{points}"/>']
     if math.isfinite(plot.now):
         dot = '' if math.isnan(plot.point) else f'<circle cy="{up.place(plot.point)}" r="5"/>'
         drawn.append(f'<g class="now" transform="translate({across.place(plot.now)} 0)">'

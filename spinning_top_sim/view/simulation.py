@@ -14,14 +14,13 @@ from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view.page import KEPT_NS, Page, set_value
 from spinning_top_sim.view.player import Player
-from spinning_top_sim.view.source import Motion, Times, Track
+from spinning_top_sim.view.source import Times, Track
 
 PERIOD_NS = 10_000_000          # between the points of a trace
 FILE_S = 20.0                   # length of a file, where `duration` is 0
@@ -84,87 +83,12 @@ def _reach(*numbers: float) -> float:
     return float(f'{reach:.0e}')
 
 
-class TopControls:
-    """
-    The scene and the sliders.
-
-    values : parameters that are shown on them
-    scene : their scene
-    """
-
-    def __init__(self, page: Page, scene: str, values: Mapping[str, Any]) -> None:
-        """Make them; `scene` is the name of a file, or its path."""
-        self._files, name = parameter_files('scene'), Path(scene).stem
-        if scene != name:
-            self._files[name] = Path(scene)
-        gui = page.gui
-        with page.controls:
-            self._scene = gui.add_dropdown('scene', tuple(self._files), initial_value=name)
-        with page.controls, gui.add_folder('Top and start'):
-            self._sliders = [gui.add_slider(f'{label} [{unit}]', 0.0, 1.0, 1.0 / STEPS, 0.0,
-                                            hint=hint) for label, unit, hint in SLIDERS]
-        self.show(name, values)
-
-    def show(self, scene: str, values: Mapping[str, Any]) -> None:
-        """Show these parameters of a scene."""
-        self.scene, self.values = scene, values
-        plain = parameters.checked(read_scene(self._files[scene]))
-        self._plain, self._numbers = numbers_of(plain), numbers_of(values)
-        if self._scene.value != scene:
-            set_value(self._scene, scene)
-        for slider, number, (low, high) in zip(self._sliders, self._numbers, ranges(
-                self._plain, natural_momentum(parameters.top_of(plain))), strict=True):
-            slider.min, slider.max = min(low, number), max(high, number)
-            slider.step = (slider.max - slider.min) / STEPS
-            set_value(slider, number)
-        self._shown = [slider.value for slider in self._sliders]
-
-    def chosen(self) -> tuple[str, dict[str, Any]] | None:
-        """
-        Return scene and parameters that somebody has chosen since the last call; None: none.
-
-        The caller answers by `accept` or `put_back`.  Raises ValueError where there is no such
-        top.
-        """
-        scene, shown = self._scene.value, [slider.value for slider in self._sliders]
-        if scene != self.scene:
-            kept = {name: value for name, value in self.values.items()
-                    if not name.startswith(GROUPS)}
-            return scene, parameters.checked({**kept, **read_scene(self._files[scene])})
-        if shown == self._shown:
-            return None
-        self._numbers = [new if new != old else number for new, old, number in zip(
-            shown, self._shown, self._numbers, strict=True)]
-        self._shown = shown
-        return scene, with_numbers(self.values, self._numbers)
-
-    def accept(self, scene: str, values: Mapping[str, Any]) -> None:
-        """Keep what was chosen.  A slider that somebody moves stays under the hand."""
-        if scene != self.scene:
-            self.show(scene, values)
-        self.values = values
-
-    def put_back(self) -> None:
-        """Show the parameters that hold, instead of those that were refused."""
-        self.show(self.scene, self.values)
-
-    @property
-    def about(self) -> str:
-        """The scene, and what is other than in it."""
-        changed = [label for (label, *_), number, plain in zip(
-            SLIDERS, self._numbers, self._plain, strict=True)
-            if abs(number - plain) > 1e-9 * max(abs(number), abs(plain))]
-        other = f' with another {", ".join(changed)}' if changed else ''
-        return f'Scene {self.scene}{other}; the title names the motion that its numbers make.'
-
-
 class SimulatedTrack(Track):
     """A top whose states are computed when they are asked for.  Raises ValueError like `Top`."""
 
     def __init__(self, values: Mapping[str, Any], about: str) -> None:
-        super().__init__('', values, about=about, epoch_ns=NANOSECONDS)
+        super().__init__(values, about=about, epoch_ns=NANOSECONDS)
         self.trajectory = Simulation(values).trajectory
-        self._described: tuple[Piece, Motion] | None = None
 
     def times(self, begin_ns: int, end_ns: int) -> Times:
         first = max(-(-begin_ns // PERIOD_NS), 0) * PERIOD_NS
@@ -176,11 +100,8 @@ class SimulatedTrack(Track):
     def newest(self, t_ns: int) -> int:
         return t_ns
 
-    def motion_at(self, t_ns: int) -> Motion:
-        piece = self.trajectory.after(t_ns)
-        if self._described is None or self._described[0] is not piece:
-            self._described = piece, Motion.of_piece(piece)
-        return self._described[1]
+    def pivot_moves(self, t_ns: int) -> bool:
+        return self.trajectory.pivot is not None
 
     def go_on(self, t_ns: int) -> int:
         """Solve up to a time, or as far as the motion goes; return the time that is reached."""
@@ -193,40 +114,84 @@ class SimulatedTrack(Track):
 
 
 class OwnSimulation:
-    """The source of a page that simulates a scene."""
+    """The source of a page that simulates a scene: the name of a file, or its path."""
 
     def __init__(self, page: Page, scene: str, values: Mapping[str, Any]) -> None:
-        self._page, self._reached_ns = page, 0
+        self.page, self._reached_ns = page, 0
         self.player = Player(page)
-        self._controls = TopControls(page, scene, values)
-        self._track = SimulatedTrack(values, self._controls.about)
         self.player.file_end_ns = min(self.player.file_end_ns, round(
             (values['duration'] or FILE_S) * NANOSECONDS))
+        self._files, self._scene = parameter_files('scene'), Path(scene).stem
+        if scene != self._scene:
+            self._files[self._scene] = Path(scene)
+        gui = page.gui
+        with page.controls:
+            self._field = gui.add_dropdown('scene', tuple(self._files), initial_value=self._scene)
+        with page.controls, gui.add_folder('Top and start'):
+            self._sliders = [gui.add_slider(f'{label} [{unit}]', 0.0, 1.0, 1.0 / STEPS, 0.0,
+                                            hint=hint) for label, unit, hint in SLIDERS]
+        self._show(values)
+        self._track = SimulatedTrack(values, self._about())
+
+    def _show(self, values: Mapping[str, Any]) -> None:
+        """Show the scene and these parameters on the controls."""
+        plain = parameters.checked(read_scene(self._files[self._scene]))
+        self._plain, self._numbers = numbers_of(plain), numbers_of(values)
+        set_value(self._field, self._scene)
+        for slider, number, (low, high) in zip(self._sliders, self._numbers, ranges(
+                self._plain, natural_momentum(parameters.top_of(plain))), strict=True):
+            slider.min, slider.max = min(low, number), max(high, number)
+            slider.step = (slider.max - slider.min) / STEPS
+            set_value(slider, number)
+        self._shown = [slider.value for slider in self._sliders]
+
+    def _about(self) -> str:
+        """The scene, and what is other than in it."""
+        changed = [label for (label, *_), number, plain in zip(
+            SLIDERS, self._numbers, self._plain, strict=True)
+            if abs(number - plain) > 1e-9 * max(abs(number), abs(plain))]
+        other = f' with another {", ".join(changed)}' if changed else ''
+        return f'Scene {self._scene}{other}; the title names the motion that its numbers make.'
+
+    def _follow_controls(self) -> None:
+        """
+        Begin another motion at t = 0 if somebody has chosen one.
+
+        Raises ValueError where there is none.  A slider stays under the hand that moves it.
+        """
+        scene, shown, values = self._field.value, [one.value for one in self._sliders], None
+        if scene != self._scene:
+            kept = {name: value for name, value in self._track.values.items()
+                    if not name.startswith(GROUPS)}
+            values = parameters.checked({**kept, **read_scene(self._files[scene])})
+            track = SimulatedTrack(values, '')
+            self._scene = scene
+            self._show(values)
+        elif shown != self._shown:
+            self._numbers = [new if new != old else number for new, old, number in zip(
+                shown, self._shown, self._numbers, strict=True)]
+            self._shown = shown
+            track = SimulatedTrack(with_numbers(self._track.values, self._numbers), '')
+        else:
+            return
+        track.about, self._track = self._about(), track
+        self.page.message.content = track.top.objection
+        self._reached_ns = self.player.now_ns = 0
 
     def update(self, seconds: float) -> int:
         try:
-            chosen = self._controls.chosen()
-            if chosen is not None:
-                self._begin(*chosen)
+            self._follow_controls()
         except ValueError as error:
-            self._page.message.content = f'**refused:** {error}'
-            self._controls.put_back()
+            self.page.message.content = f'**refused:** {error}'
+            self._show(self._track.values)
         t_ns = self.player.advance(seconds)
         if t_ns < self._reached_ns:
             self._track = SimulatedTrack(self._track.values, self._track.about)
         self._reached_ns = self._track.go_on(t_ns)
         if self._reached_ns < t_ns:
-            self._page.message.content = f'The equations end at {self._reached_ns * 1e-9:g} s.'
+            self.page.message.content = f'The equations end at {self._reached_ns * 1e-9:g} s.'
             self.player.stop_at(self._reached_ns)
         return self._reached_ns
 
-    def _begin(self, scene: str, values: Mapping[str, Any]) -> None:
-        """Begin another motion at t = 0.  Raises ValueError where there is none."""
-        track = SimulatedTrack(values, '')
-        self._controls.accept(scene, values)
-        track.about, self._track = self._controls.about, track
-        self._page.message.content = track.top.objection
-        self._reached_ns = self.player.now_ns = 0
-
-    def tracks_at(self, t_ns: int) -> list[SimulatedTrack]:
-        return [self._track]
+    def track_at(self, _: int) -> SimulatedTrack:
+        return self._track

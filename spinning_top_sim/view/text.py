@@ -3,8 +3,9 @@
 
 import html
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
+from spinning_top_sim.installation import read_table
 from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.streams.cdr import NANOSECONDS, stamp_text
@@ -13,31 +14,8 @@ from spinning_top_sim.view.source import Motion, Track
 NO_SAMPLES = 'no samples yet'
 BEYOND = 'No closed form is in reach of its numbers; the samples are shown as they are.'
 PIVOT_MOVES = 'The pivot moves: where it accelerates, the top moves about another vertical.'
-NEUTRAL = ('The body is not in this log, only its attitude: a grey disc shows it, with its axes '
-           'x (red), y (green) and z (blue).')
 VERTICAL = 1e-6                 # tilt from a vertical up to which there is no precession [rad]
-# What one sees of each motion, by its name.
-SENTENCES = {
-    'at rest': 'Nothing turns: the axis stays where it is.',
-    'cusps': 'Released without a push: the axis falls, is turned aside, and rises to stand still '
-             'for an instant.',
-    'free top': 'No torque acts: the axis goes round a fixed direction, that of the angular '
-                'momentum.',
-    'hanging': 'The axis hangs straight down, and the body only spins.',
-    'loops': 'Pushed backwards at the start: where the axis is highest it moves backwards, and '
-             'draws loops.',
-    'planar pendulum, rotating': 'Without spin: the axis goes over the top in one vertical plane.',
-    'planar pendulum, swinging': 'Without spin: the axis swings in one vertical plane.',
-    'sleeping': 'The axis stands upright and the spin is fast enough to hold it there.',
-    'sleeping, unstable': 'The axis stands upright, but the spin is too slow: a touch makes it '
-                          'fall.',
-    'spherical pendulum': 'Without spin: the axis swings round the vertical like a weight on a '
-                          'string.',
-    'steady precession': 'The axis goes round the vertical at one tilt and one speed.',
-    'through the bottom': 'The axis passes through the straight-down position in each nutation.',
-    'through the top': 'The axis passes through the upright position in each nutation.',
-    'waves': 'The axis nods up and down while it always goes round the same way.',
-}
+SENTENCES: Mapping[str, str] = read_table('view/motions.toml')      # by name of the motion
 
 
 def number(value: float) -> str:
@@ -51,19 +29,19 @@ def words(track: Track, t_ns: int) -> str:
     """Return headline, sentences and numbers of a top at a time; and those of its sample."""
     sample_ns = track.newest(t_ns)
     if sample_ns is None:
-        return f'<p>{track.name} {NO_SAMPLES}</p>'
+        return f'<p>{NO_SAMPLES}</p>'
     motion = track.motion_at(t_ns)
     description = motion.description if motion else None
     title, sentence = ((description.name, SENTENCES[description.name]) if description else
                        ('motion', PIVOT_MOVES if motion.pivot_moves else BEYOND) if motion else
-                       ('attitude', '' if track.has_body else NEUTRAL))
+                       ('attitude', ''))
     rows = [*_rows(track.top, motion)] if motion else []
     place = track.state(sample_ns).pivot.position[:, 0]
     if place.any():
         rows.append(('Pivot', ', '.join(map(number, place)), 'x, y, z [m]'))
     return ''.join((
         f'<div class="top-words" data-from="{t_ns / NANOSECONDS}">',
-        f'<p>{html.escape(track.name)}</p>' if track.name else '', f'<h1>{title}</h1>',
+        f'<h1>{title}</h1>',
         *(f'<p>{html.escape(line)}</p>' for line in (sentence, track.about) if line), '<table>',
         *(f'<tr><td>{label}</td><td>{value}{f"<small>{note}</small>" if note else ""}</td></tr>'
           for label, value, note in rows),
