@@ -12,7 +12,8 @@ from trimesh.transformations import rotation_matrix
 from spinning_top_sim.shape import Shape
 
 Colour = tuple[int, int, int]
-BLUE, WHITE, GOLD, STEEL = (43, 98, 176), (245, 247, 250), (246, 178, 38), (92, 99, 110)
+BLUE, WHITE, GOLD, STEEL, GREY = (
+    (43, 98, 176), (245, 247, 250), (246, 178, 38), (92, 99, 110), (150, 155, 163))
 SPOKES, SMOOTH = 8, 96              # number of spokes and of the sides of a round
 
 
@@ -39,13 +40,20 @@ def wheel(shape: Shape, length: float) -> list[BodyPart]:
     axle = creation.revolve(np.column_stack((thick[:, 0], thick[:, 1] * np.sign(length))))
     parts = [
         BodyPart('rim', creation.annulus(0.82 * radius, radius, height, sections=SMOOTH), BLUE),
-        BodyPart('marks', trimesh.util.concatenate(marks[1:]), WHITE),
-        BodyPart('mark', trimesh.util.concatenate([marks[0], marked_spoke]), GOLD),
-        BodyPart('spokes', trimesh.util.concatenate([hub, *(spoke.copy().apply_transform(turn)
+        BodyPart('marks', _merged(marks[1:]), WHITE),
+        BodyPart('mark', _merged([marks[0], marked_spoke]), GOLD),
+        BodyPart('spokes', _merged([hub, *(spoke.copy().apply_transform(turn)
                                        for turn in turns[1:])]), STEEL)]
     for part in parts:
         part.mesh.apply_translation(centre)
     return [*parts, BodyPart('axle', axle, STEEL)]
+
+
+def disc(shape: Shape, length: float) -> list[BodyPart]:
+    """Return a grey disc with a hole, for a body that is not known."""
+    radius = abs(length)
+    mesh = creation.annulus(0.25 * radius, 0.5 * radius, 0.03 * radius, sections=SMOOTH)
+    return [BodyPart('disc', mesh.apply_translation((0.0, 0.0, shape.centre)), GREY)]
 
 
 def stand(radius: float) -> trimesh.Trimesh:
@@ -53,3 +61,9 @@ def stand(radius: float) -> trimesh.Trimesh:
     return creation.revolve(radius * np.array(
         [(0, -1), (.2, -1), (.2, -.98), (.05, -.93), (.03, -.6), (.012, -.02), (0, 0)]),
         sections=SMOOTH)
+
+
+def _merged(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    merged = trimesh.util.concatenate(meshes)
+    assert isinstance(merged, trimesh.Trimesh)
+    return merged
