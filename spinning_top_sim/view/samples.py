@@ -68,7 +68,8 @@ class SampledTrack(Track):
 
     def pivot_moves(self, t_ns: int) -> bool:
         index = int(np.searchsorted(self.stamps_ns, t_ns + self.epoch_ns))
-        return bool(np.diff(self.rows[max(index - 1, 0):index + 1, PLACE], axis=0).any())
+        places = np.nan_to_num(self.rows[max(index - 1, 0):index + 1, PLACE])
+        return bool(np.diff(places, axis=0).any())
 
     def at(self, times: Times) -> SampledStates:
         return SampledStates(self.top, times / NANOSECONDS, self.rows[
