@@ -311,7 +311,7 @@ def test_a_log_without_a_top_is_refused(log, tmp_path, capsys):
         types = {topic.name: topic.type_name for topic in reader.topics}
         foreign = write_rows(tmp_path / 'other.mcap', [RecordedTopic('/pose', types['/pose'])], [
             (0, message.log_time, message.data) for message in reader.messages(topics=['/pose'])])
-    with pytest.raises(LogError, match='other.mcap: its metadata'):
+    with pytest.raises(LogError, match=r'other\.mcap: its metadata'):
         logs.LogSource(foreign, lambda: None)
     empty = rewritten(log, tmp_path / 'empty.mcap', lambda topic, number, data: (
         None if topic in ('/ground_truth/odom', '/joint_states', '/pose', '/ground_truth/imu')
@@ -463,6 +463,7 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port(page):
     (['LOG', '--imu', 'bmi088'], '--imu bmi088: cannot be given for a log'),
     (['LOG', '--node'], '--node True: cannot be given for a log'),
     (['--namespace', 'left'], '--namespace left: cannot be given for a simulation'),
+    (['--ros-args', '-r', '__ns:=/left'], '--ros-args -r __ns:=/left: must be with --node'),
     (['-p', 'top.mas:=3'], 'top.mas:=3: there is no parameter top.mas; did you mean top.mass?'),
     (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535')])
 def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):

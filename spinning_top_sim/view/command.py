@@ -44,6 +44,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     arguments = parser.parse_args(own)
     if not arguments.node:
+        if for_ros:
+            parser.error(f'--ros-args {" ".join(for_ros)}: must be with --node')
         return cli.run('view', DESCRIPTION, add_arguments, _show, own)
 
     def prepare(_: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
