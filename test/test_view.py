@@ -273,7 +273,8 @@ def test_a_reset_to_another_top_shows_that_one_from_its_begin_on(page, tmp_path)
             exact.energy[0] - exact.l3[0] ** 2 / (2.0 * top.lambda3))
         assert track.state(since_ns + t_ns).quaternion[0] == pytest.approx(
             exact.quaternion[0], abs=1e-9)
-    assert player.write_file(tmp_path / 'page.html', source).startswith(
+    assert player.write_file(
+        tmp_path / 'page.html', page, source.player, source.track_at).startswith(
         f'{first.span[1] * 1e-9:g} s, ')
 
 
@@ -467,7 +468,8 @@ def test_the_server_is_on_loopback_and_takes_the_next_free_port(page):
     (['-p', 'top.mas:=3'], 'top.mas:=3: there is no parameter top.mas; did you mean top.mass?'),
     (['LOG', '--port', '99999'], '--port 99999: must be from 0 to 65535')])
 def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
-    assert command.main([*(str(log) if word == 'LOG' else word for word in arguments)]) == 2
+    with pytest.raises(SystemExit, match='2'):       # as argparse ends
+        sys.exit(command.main([*(str(log) if word == 'LOG' else word for word in arguments)]))
     assert told in capsys.readouterr().err
 
 

@@ -32,7 +32,6 @@ exit code: 0 ended, also by a signal; 1 a log cannot be read, or a file written;
 2 wrong arguments, or a node that cannot start
 """
 LOOPBACK = '127.0.0.1'
-LAST_PORT = 65535
 DEFAULT_SCENE = 'cusp'
 
 
@@ -82,12 +81,12 @@ def _check(arguments: argparse.Namespace) -> None:
     for option in foreign:
         if value := getattr(arguments, option):
             raise ValueError(f'--{option} {value}: cannot be given for {kind}')
-    if arguments.port is not None and not 0 <= arguments.port <= LAST_PORT:
-        raise ValueError(f'--port {arguments.port}: must be from 0 to {LAST_PORT}')
+    if arguments.port is not None and not 0 <= arguments.port <= 65535:
+        raise ValueError(f'--port {arguments.port}: must be from 0 to 65535')
 
 
 def _show(arguments: argparse.Namespace) -> int:
-    """Show a simulation or logs, or write a file."""
+    """Show a simulation or a log, or write a file."""
     _check(arguments)
     if arguments.html is not None:
         cli.check_output(arguments.html)
@@ -106,18 +105,15 @@ def _show(arguments: argparse.Namespace) -> int:
             with cli.handling(lambda *_: stopped.set()):
                 source.page.show(source, stopped)
         else:
-            cli.print_line(f'{arguments.html}: {player.write_file(arguments.html, source)}')
+            cli.print_line(f'{arguments.html}: ' + player.write_file(
+                arguments.html, source.page, source.player, source.track_at))
     finally:
         source.page.close()
     return cli.OK
 
 
 def _open_page(arguments: argparse.Namespace, title: str) -> Page:
-    """
-    Return the page; print its address, and open it in the browser if there is a desktop.
-
-    Raises OSError if the server cannot start.
-    """
+    """Return the page, opened in the browser of a desktop.  Raises OSError without a server."""
     with needed('the page', 'view'):
         from spinning_top_sim.view.page import Page  # noqa: PLC0415
     if arguments.html is not None:

@@ -10,20 +10,17 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import natural_momentum
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.view import body
-from spinning_top_sim.view.source import Motion, Reals, Track
+from spinning_top_sim.view.source import WINDOW_NS, Motion, Reals, Track
 
 STANDS_TO = math.radians(100.0)     # tilt up to which the pivot stands on a peg; else it hangs
 TRACE, BOUNDS, SPHERE, STAND = (217, 72, 43), (122, 82, 179), (190, 200, 215), (120, 126, 136)
 FOOT = 0.8                      # length of the stand / that of the axis
 ARROWS = {'angular momentum': (20, 120, 70), 'torque': (20, 150, 180)}
 NO_LINES = np.zeros((1, 2, 3), np.float32)
-TRACE_NS = 10 * NANOSECONDS     # length of the trace of the tip
 TRACE_POINTS = 1500             # samples in the trace at most
 REACH = 1.6                     # radius of the sphere of the trace / distance of the tip
 LONGEST_CHORD = 0.5             # of a step of the trace / its radius; a longer step is a jump
-STEPS = 192                     # of a circle
 Lines = NDArray[np.float32]     # (n, 2, 3), as viser takes them
 
 
@@ -39,7 +36,7 @@ def lines_through(points: Reals) -> Lines:
 
 def circle(radius: float, theta: float) -> Lines:
     """Return the lines of the circle of all tips with this tilt."""
-    phi = np.linspace(0.0, math.tau, STEPS + 1)
+    phi = np.linspace(0.0, math.tau, 193)
     return lines_through(radius * np.column_stack((
         math.sin(theta) * np.cos(phi), math.sin(theta) * np.sin(phi),
         np.full_like(phi, math.cos(theta)))))
@@ -47,7 +44,7 @@ def circle(radius: float, theta: float) -> Lines:
 
 def tip_path(track: Track, t_ns: int) -> Lines:
     """Return the lines along which the tip has moved, up to a time, from where the pivot is."""
-    _, states = track.states(t_ns - TRACE_NS, t_ns, TRACE_POINTS)
+    _, states = track.states(t_ns - WINDOW_NS, t_ns, TRACE_POINTS)
     axis, place = np.stack(states.rows_axis, axis=1), states.pivot.position.T
     joined = np.linalg.norm(np.diff(axis, axis=0), axis=1) < LONGEST_CHORD
     return lines_through(axis_length(track) * axis + (place - place[-1]))[joined]
@@ -90,10 +87,9 @@ class DrawnTop:
                                            opacity=0.12, side='back', cast_shadow=False,
                                            receive_shadow=False)
         self._body = scene.add_frame(f'{name}/body', show_axes=False)
-        for part in body.wheel(track.shape, far):
-            scene.add_mesh_simple(
-                f'{name}/body/{part.name}', part.mesh.vertices, part.mesh.faces,
-                color=part.colour, flat_shading=part.name != 'axle', side='double')
+        for part, (mesh, colour) in body.wheel(track.shape, far).items():
+            scene.add_mesh_simple(f'{name}/body/{part}', mesh.vertices, mesh.faces, color=colour,
+                                  flat_shading=part != 'axle', side='double')
         peg = body.stand(FOOT * radius)
         self._stand = scene.add_mesh_simple(f'{name}/stand', peg.vertices, peg.faces, color=STAND,
                                             side='double')

@@ -25,14 +25,14 @@ from spinning_top_sim.nodes.status import EPOCH, SPEED, STATE, TIME
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.topics import NODE_NAME
-from spinning_top_sim.view.page import KEPT_NS, Page, set_content
+from spinning_top_sim.view.page import Page, set_content
 from spinning_top_sim.view.samples import TOPICS, SampledTrack
+from spinning_top_sim.view.source import WINDOW_NS
 
 # Best effort and a short queue, so that a slow page never makes the node wait.
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INBOX = 2000                    # messages that wait for the next picture
-ANSWER_S = 5.0                  # timeout of a service call
-SILENT_S = 5.0                  # timeout of /diagnostics, which come every second
+ANSWER_S = 5.0                  # timeout of a service call, and of /diagnostics
 RESTART_NS = NANOSECONDS        # a step back of the stamps by more is another run
 KINDS = dict(zip(TOPICS, (Odometry, JointState, PoseStamped, Imu), strict=True))
 SERVICES = {'get_parameters': GetParameters, 'set_pause': SetBool, 'step': Trigger,
@@ -147,7 +147,7 @@ class NodeView(Node):
 
     def update(self, _: float) -> int:
         ready = self._clients_of['get_parameters'].service_is_ready()
-        if not ready or time.monotonic() > self._heard_at + SILENT_S:
+        if not ready or time.monotonic() > self._heard_at + ANSWER_S:
             set_content(self._status, f'**{self._name} has ended, or does not answer**')
         if self._is_stale and ready:
             self._read_parameters()
@@ -159,7 +159,7 @@ class NodeView(Node):
             return 0
         newest_ns = int(track.stamps_ns[-1])
         track.epoch_ns = self._epoch_ns or track.epoch_ns or newest_ns
-        track.drop_before(max(newest_ns - KEPT_NS, min(self._epoch_ns, newest_ns)))
+        track.drop_before(max(newest_ns - 2 * WINDOW_NS, min(self._epoch_ns, newest_ns)))
         return track.span[1]
 
     def track_at(self, _: int) -> SampledTrack | None:

@@ -5,39 +5,27 @@ import math
 import threading
 import time
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import viser
 
-from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.view import plots, text
-from spinning_top_sim.view.drawn import (
-    ARROWS,
-    BOUNDS,
-    FOOT,
-    TRACE,
-    TRACE_NS,
-    DrawnTop,
-    axis_length,
-)
+from spinning_top_sim.view.drawn import ARROWS, BOUNDS, FOOT, TRACE, DrawnTop, axis_length
 from spinning_top_sim.view.server import Server
-from spinning_top_sim.view.source import Source, Track
+from spinning_top_sim.view.source import WINDOW_NS, Source, Track
 
 RATE = 30.0                     # pictures per second
 LONGEST_STEP_S = 0.2            # of real time between two pictures; a longer one is not made up
 LAST_WORDS_S = 0.2              # time to send the last texts
 PLOT_EVERY = 6                  # pictures
-WINDOW_NS = 10 * NANOSECONDS    # of the plots
-KEPT_NS = 2 * max(WINDOW_NS, TRACE_NS)       # of what a page needs
 PANEL_WIDTH = 330               # [px]
 VIEW_ANGLE = math.radians(35.0)
 STYLE = Path(__file__).with_name('page.css').read_text('utf-8')
-Value = TypeVar('Value')
 
 
-def set_value(handle: viser.GuiInputHandle[Value], value: Value) -> None:
+def set_value(handle: Any, value: object) -> None:
     """Show a value in an input; viser declares `value` without its setter."""
-    handle.value = value        # type: ignore[misc]
+    handle.value = value
 
 
 def set_content(handle: viser.GuiHtmlHandle | viser.GuiMarkdownHandle, content: str) -> None:
@@ -144,7 +132,8 @@ class Page:
 
     def legend(self) -> str:
         """Return HTML about the colours of what is switched on."""
-        return text.legend([(colour, name) for colour, name, switch in (
-            (TRACE, 'trace of the axis', self._trace), (BOUNDS, 'bounds of θ', self._bounds),
-            *((ARROWS[name], name, switch) for name, switch in self.arrows.items()))
-            if switch.value])
+        switches = ((TRACE, self._trace), (BOUNDS, self._bounds),
+                    *((ARROWS[name], switch) for name, switch in self.arrows.items()))
+        return '<div class="top-legend">' + ''.join(
+            f'<div><i style="background:rgb{colour}"></i>{switch.label}</div>'
+            for colour, switch in switches if switch.value) + '</div>'

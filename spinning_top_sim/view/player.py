@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import SimpleQueue
 from string import Template
-from typing import Protocol
 
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.view import plots, text
 from spinning_top_sim.view.page import RATE, STYLE, Page, set_value
-from spinning_top_sim.view.source import Source, Track
+from spinning_top_sim.view.source import Track
 
 SPEEDS = ('0.01', '0.1', '0.25', '0.5', '1', '2', '4', '8')
 STEP_NS = 20_000_000
@@ -100,27 +99,17 @@ class Player:
         self.now_ns = self.motions_ns[behind % len(self.motions_ns)]
 
 
-class Playable(Source, Protocol):
-    """A source with a player."""
-
-    page: Page
-    player: Player
-
-    def track_at(self, t_ns: int) -> Track: ...
-
-
-def write_file(path: Path, source: Playable) -> str:
+def write_file(path: Path, page: Page, player: Player, track_at: Callable[[int], Track]) -> str:
     """Write a file that plays by itself what a player plays; return its length and size."""
-    page, player = source.page, source.player
     begin_ns, end_ns = player.begin_ns, player.file_end_ns
     clock = page.server.scene.add_frame('/clock', show_axes=False)
 
     def draw(t_ns: int) -> None:
         clock.position = (t_ns / NANOSECONDS, 0.0, 0.0)      # read by the script of the file
-        page.draw(t_ns, source.track_at(t_ns))
+        page.draw(t_ns, track_at(t_ns))
 
     draw(begin_ns)
-    track = source.track_at(begin_ns)
+    track = track_at(begin_ns)
     words = ''.join(text.words(track, t_ns) for t_ns in (begin_ns, *player.motions_ns)
                     if t_ns <= end_ns)
     drawn = ''.join(map(plots.draw, plots.motion_plots(track, begin_ns, begin_ns, end_ns)))

@@ -18,9 +18,9 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.tools.scene_file import read_scene
-from spinning_top_sim.view.page import KEPT_NS, Page, set_value
+from spinning_top_sim.view.page import Page, set_value
 from spinning_top_sim.view.player import Player
-from spinning_top_sim.view.source import Times, Track
+from spinning_top_sim.view.source import WINDOW_NS, Times, Track
 
 PERIOD_NS = 10_000_000          # between the points of a trace
 FILE_S = 20.0                   # length of a file, where `duration` is 0
@@ -64,23 +64,15 @@ def with_numbers(values: Mapping[str, Any], numbers: Sequence[float]) -> dict[st
 
 
 def ranges(numbers: Sequence[float], natural: float) -> list[tuple[float, float]]:
-    """
-    Return the least and the greatest number on each slider.
-
-    natural : sqrt(lambda1 |P|) [kg m^2/s]
-    """
+    """Return the ends of each slider; `natural` is sqrt(lambda1 |P|) [kg m^2/s]."""
+    def reach(*sizes: float) -> float:
+        return float(f'{3.0 * max(map(abs, sizes)):.0e}')       # of one digit
     mass, length, lambda1, lambda3, _, spin, precession = numbers
-    far = _reach(length) or 0.2
-    fast, slow = (_reach(rate, natural / moment) or 10.0 for rate, moment in (
-        (spin, lambda3), (precession, lambda1)))
-    return [(0.0, _reach(mass) or 1.0), (-far, far), (0.1 * lambda1, 4.0 * lambda1),
+    far = reach(length) or 0.2
+    fast = reach(spin, natural / lambda3) or 10.0
+    slow = reach(precession, natural / lambda1) or 10.0
+    return [(0.0, reach(mass) or 1.0), (-far, far), (0.1 * lambda1, 4.0 * lambda1),
             (0.1 * lambda3, 4.0 * lambda3), (0.0, 180.0), (-fast, fast), (-slow, slow)]
-
-
-def _reach(*numbers: float) -> float:
-    """Return about three times the largest of some numbers, rounded to one digit."""
-    reach = 3.0 * max(map(abs, numbers))
-    return float(f'{reach:.0e}')
 
 
 class SimulatedTrack(Track):
@@ -109,7 +101,7 @@ class SimulatedTrack(Track):
             self.trajectory.evaluate(np.array([t_ns]))
         except IntegrationError as error:
             return error.reached_ns
-        self.trajectory.forget(t_ns - KEPT_NS, t_ns - KEPT_NS)
+        self.trajectory.forget(t_ns - 2 * WINDOW_NS, t_ns - 2 * WINDOW_NS)
         return t_ns
 
 
@@ -159,7 +151,7 @@ class OwnSimulation:
 
         Raises ValueError where there is none.  A slider stays under the hand that moves it.
         """
-        scene, shown, values = self._field.value, [one.value for one in self._sliders], None
+        scene, shown = self._field.value, [one.value for one in self._sliders]
         if scene != self._scene:
             kept = {name: value for name, value in self._track.values.items()
                     if not name.startswith(GROUPS)}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The words of the page as HTML: what one sees, in numbers, and the legend."""
+"""The words of the page as HTML: what one sees, in numbers."""
 
 import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from spinning_top_sim.installation import read_table
 from spinning_top_sim.physics.regimes import natural_momentum
@@ -69,10 +69,3 @@ def _rows(top: Top, motion: Motion) -> Iterable[tuple[str, str, str]]:
         'kg m²/s; axis' + ('' if motion.pivot_moves else ', vertical'))
     if least := 2.0 * natural_momentum(top):
         yield 'Stable upright', f'if |L₃| &gt; {number(least)} kg m²/s', ''
-
-
-def legend(entries: Sequence[tuple[tuple[int, int, int], str]]) -> str:
-    """Return what the colours in the scene mean."""
-    return '<div class="top-legend">' + ''.join(
-        f'<div><i style="background:rgb{colour}"></i>{text}</div>'
-        for colour, text in entries) + '</div>'
