@@ -75,15 +75,16 @@ class DrawnTop:
     """
     One top in the scene.
 
-    track : whose samples are drawn; may be set to another one of the same top
+    track : whose samples are drawn; may be set
+    top : that the body looks like
     """
 
     def __init__(self, scene: viser.SceneApi, track: Track) -> None:
-        self.track = track
+        self.track, self.top = track, track.top
         name, far = '/top', axis_length(track)
         radius = abs(far)
         self.root = scene.add_frame(name, show_axes=False)
-        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
+        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=4,
                                            opacity=0.12, side='back', cast_shadow=False,
                                            receive_shadow=False)
         self._body = scene.add_frame(f'{name}/body', show_axes=False)

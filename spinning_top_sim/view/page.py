@@ -17,9 +17,8 @@ from spinning_top_sim.view.source import WINDOW_NS, Source, Track
 RATE = 30.0                     # pictures per second
 LONGEST_STEP_S = 0.2            # of real time between two pictures; a longer one is not made up
 LAST_WORDS_S = 0.2              # time to send the last texts
-PLOT_EVERY = 6                  # pictures
+PLOT_EVERY, SETTLED = 6, 20     # pictures
 PANEL_WIDTH = 330               # [px]
-VIEW_ANGLE = math.radians(35.0)
 STYLE = Path(__file__).with_name('page.css').read_text('utf-8')
 
 
@@ -97,9 +96,12 @@ class Page:
 
     def draw(self, t_ns: int, track: Track) -> None:
         """Draw a top at a time."""
-        if self._top is None or self._top.track.top != track.top:
+        # Meshes take longer than a picture: they wait till a slider rests.
+        if self._top is None or (self._number == SETTLED and self._top.top != track.top):
             self._top = self._new_top(track)
-        self._top.track, newest_ns = track, track.newest(t_ns)
+        if self._top.track is not track:
+            self._top.track, self._number = track, 0
+        newest_ns = track.newest(t_ns)
         with self.server.atomic():
             if newest_ns is not None:       # the picture follows the pivot: the ground moves
                 size = abs(axis_length(track))
@@ -124,7 +126,7 @@ class Page:
             '/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
             cell_color=(238, 240, 244), section_color=(228, 231, 236), fade_distance=9 * size,
             fade_from='origin', shadow_opacity=0.1, position=(0.0, 0.0, -FOOT * size))
-        camera.fov = VIEW_ANGLE
+        camera.fov = math.radians(35.0)
         camera.position = (0.0, -4.8 * size, 2.0 * size)
         camera.look_at = (0.0, 0.0, 0.1 * size)
         camera.near, camera.far = 0.01 * size, 100.0 * size
