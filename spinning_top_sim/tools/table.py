@@ -23,9 +23,9 @@ class Columns:
         return 8 * sum(self._counts)
 
     def encode(self, stamps_ns: Stamps, fields: Sequence[Values]) -> Rows:
-        columns = np.empty((sum(self._counts), len(stamps_ns)))
-        fill([field.T for field in np.split(columns, np.cumsum(self._counts)[:-1])], fields)
-        return columns.T
+        table = np.empty((sum(self._counts), len(stamps_ns)))
+        fill([field.T for field in np.split(table, np.cumsum(self._counts)[:-1])], fields)
+        return table.T
 
 
 def true_states(period_ns: int, *, pivot_moves: bool) -> Channel:
