@@ -20,7 +20,7 @@ MAKEFLAGS += --no-builtin-rules
 
 # DDS stays on this machine.  Its default is to discover nodes in the whole network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
-run view: export ROS_DOMAIN_ID := $(or $(ROS_DOMAIN_ID),77)
+run: export ROS_DOMAIN_ID := $(or $(ROS_DOMAIN_ID),77)
 
 # The ROS of the environment is used, whatever the shell has set.
 ifneq ($(_ROS_WHEELS_BOOTSTRAP_COMPLETE)$(AMENT_PREFIX_PATH),)
@@ -40,6 +40,8 @@ PIP = $(BIN)/python' -m pip --disable-pip-version-check install $(if $(MAKE_TERM
 # Each worker would import the other plug-ins, and rewrite their assertions, in two seconds.
 test coverage: export PYTEST_DISABLE_PLUGIN_AUTOLOAD := 1
 PYTEST = $(BIN)/pytest' -p xdist -n $(WORKERS) --max-worker-restart=0
+# The package and the wheels of ROS.
+WITH_ROS := $(VENV)/.deps-ros-$(ROS) $(VENV)/.package
 INSTALL = @flock --nonblock Makefile true || echo 'Another make installs: waiting for it'; \
     flock Makefile $(MAKE) --silent --no-print-directory
 
@@ -53,7 +55,7 @@ help:
 #:              steady_slow waking_sleeper wavy  with a moving pivot: braking
 #:              elevator free_fall shuttle  or the path of a parameter file
 run:
-	$(INSTALL) '$(VENV)/.deps-plot' '$(VENV)/.package'
+	$(INSTALL) '$(VENV)/.deps-plot' '$(VENV)/.deps-ros-$(ROS)' '$(VENV)/.package'
 	@mkdir -p '$(LOGS)'
 	@echo 'Scene $(SCENE), recording into $(LOGS)/, until Ctrl-C. Another terminal of this machine' \
 	    'listens after:'
@@ -64,12 +66,12 @@ run:
 	@exec $(BIN)/spinning-top' node --scene '$(SCENE)' --ros-args -p record.enabled:=true \
 	    -p 'record.uri:=$(LOGS)/' $(ARGS)
 
-#: make view    simulate a scene and show it in the browser; SCENE=... PORT=8080
+#: make view    simulate a scene in the browser, without ROS; SCENE=... PORT=8080
 view:
 	$(INSTALL) '$(VENV)/.deps-view' '$(VENV)/.package'
 	@exec $(BIN)/spinning-top' view --scene '$(SCENE)' $(if $(PORT),--port '$(PORT)') $(ARGS)
 
-dependencies: $(VENV)/.deps-test $(VENV)/.package
+dependencies: $(VENV)/.deps-test $(WITH_ROS)
 
 #: make test    run the tests; TESTS=test/test_rk45.py ARGS='-k step' WORKERS=0
 test: dependencies
@@ -85,19 +87,19 @@ coverage: dependencies
 	$(BIN)/coverage' report --fail-under=95
 
 #: make lint    run ruff and mypy
-lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(VENV)/.package
+lint: $(VENV)/.deps-test $(VENV)/.deps-lint $(WITH_ROS)
 	$(BIN)/ruff' check . scripts/*
 	$(BIN)/mypy'
 
 #: make docs    write the generated pages and the site in site/
-docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.deps-docs $(VENV)/.package
+docs: $(VENV)/.deps-plot $(VENV)/.deps-test $(VENV)/.deps-docs $(WITH_ROS)
 	for page in interface definitions urdf figures; do $(BIN)/python' docs/$$page.py || exit; done
 	rm -rf site
 	$(BIN)/python' -m sphinx --fail-on-warning --keep-going --nitpicky --quiet docs site
 	@echo 'Open site/index.html'
 
 #: make build   build with colcon in a new workspace, test that, and leave it there
-build: $(VENV)/.deps-colcon $(VENV)/.deps-test $(VENV)/.package
+build: $(VENV)/.deps-colcon $(VENV)/.deps-test $(WITH_ROS)
 	.ci/colcon-build '$(VENV)'
 
 #: make performance-check
@@ -166,7 +168,7 @@ $(VENV)/.deps-ros-%: pyproject.toml $(VENV)/.made
 SOURCES := $(shell find pyproject.toml setup.py setup.cfg package.xml config foxglove launch \
     resource rviz scripts spinning_top_sim urdf -name __pycache__ -prune -o \
     \( -type f -o -type d \) ! -name '.*' ! -name '*~' -print)
-$(VENV)/.package: $(VENV)/.deps-ros-$(ROS) $(SOURCES)
+$(VENV)/.package: $(SOURCES)
 	@echo 'Installing spinning_top_sim into $(VENV)'
 	@rm -rf '$(VENV)/build' '$(VENV)'/lib/python*/site-packages/spinning_top_sim
 	@mkdir '$(VENV)/build'

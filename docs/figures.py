@@ -14,28 +14,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from spinning_top_sim import scene
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State
 from spinning_top_sim.pictures import INK, draw_sphere, draw_tip
 from spinning_top_sim.solvers.exact import ExactSolution
-from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect, simulate
 
 HERE = Path(__file__).parent
 # Caption, file in config/, nutations shown.
 PANELS = (('cusps: released from rest', 'cusp', 5), ('loops: pushed backwards', 'looping', 5),
           ('waves: pushed forwards', 'wavy', 5))
-
-
-def scene(name):
-    """Return top and start state of a scene; each line of its file has a name and a value."""
-    values = {}
-    for line in (HERE.parent / 'config' / f'{name}.yaml').read_text().splitlines():
-        key, _, value = line.partition('#')[0].strip().partition(': ')
-        if key in parameters.BY_NAME:
-            values[key] = float(value)
-    values = parameters.checked(values)
-    return parameters.top_of(values), parameters.start_state(values)
 
 
 def motions(path):

@@ -92,7 +92,7 @@ def _nodes(context: LaunchContext) -> list:
             on['use_sim_time'])
     if on['view']:
         actions.append(Node(package='spinning_top_sim', executable='view', namespace=namespace,
-                            output='screen'))
+                            arguments=['--node'], output='screen'))
     if on['rviz']:
         actions += launch_helpers.rviz(SHARE, values['world_frame'], namespace,
                                        on['use_sim_time'])

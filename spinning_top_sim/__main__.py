@@ -23,7 +23,7 @@ COMMANDS = {
     'ensemble': ('tools.ensemble', 'simulate many tops with sampled parameters'),
     'examine': ('exam.command', 'examine an attitude filter'),
     'grade': ('grade.command', 'compare an IMU with the motion of its body; grade a top'),
-    'view': ('view.command', 'show a running node or a log in the browser'),
+    'view': ('view.command', 'show a simulation, a running node or a log in the browser'),
 }
 INTERRUPTED = 130
 

@@ -28,6 +28,7 @@ STYLE: dict[Any, Any] = {
     'axes.labelsize': 9, 'axes.spines.right': False, 'axes.spines.top': False,
     'axes.titlesize': 11, 'axes.xmargin': 0.0, 'lines.linewidth': 1.2, 'text.color': INK,
     'xtick.labelsize': 8, 'ytick.labelsize': 8}
+LEAST_DRIFT = 1e-12         # that an axis shows
 DISC, DISC_HEIGHT = 0.42, 0.45      # radius of the body's disc and its place on the axis
 
 
@@ -81,13 +82,15 @@ def _outline(motion: Any) -> tuple[Reals, list[float]]:
     return path, [float(tilts.min()), float(tilts.max())]
 
 
-def plot(motion: Any) -> Figure:
+def plot(motion: Any, drift: Reals, begins: Sequence[float] = ()) -> Figure:
     """
     Return a figure of `States`, or of what has its columns; see `States.plot`.
 
-    motion : has t, rows_axis, theta_folded, phi_dot and energy
+    motion : has t, rows_axis, theta_folded and phi_dot
+    drift : relative one of the energy, (n,)
+    begins : times at which other motions begin [s]
     """
-    (path, bounds), energy = _outline(motion), motion.energy
+    path, bounds = _outline(motion)
     with rc_context(STYLE):
         figure = Figure(figsize=(10.0, 7.0), layout='constrained')
         panels = figure.subplot_mosaic(
@@ -110,9 +113,15 @@ def plot(motion: Any) -> Figure:
         panels['rate'].plot(motion.t, motion.phi_dot, color=COLOURS[1])
         panels['rate'].axhline(0.0, color=FAINT, linewidth=0.8, zorder=0)
         panels['rate'].set(title='precession', ylabel="rate φ' [rad/s]", xlabel='t [s]')
-        panels['drift'].plot(motion.t, (energy - energy[0]) / (abs(energy[0]) or 1.0),
-                             color=COLOURS[2])
-        panels['drift'].set(title='energy', ylabel='relative drift', xlabel='t [s]')
+        panels['drift'].plot(motion.t, drift, color=COLOURS[2])
+        # Of an exact motion it is rounding noise.
+        reach = max(LEAST_DRIFT, 1.1 * float(np.max(np.abs(drift), initial=0.0,
+                                                    where=np.isfinite(drift))))
+        panels['drift'].set(title='energy', ylabel='relative drift [1]', xlabel='t [s]',
+                            ylim=(-reach, reach))
+        for name in ('theta', 'rate', 'drift'):
+            for begin in begins:
+                panels[name].axvline(begin, color=FAINT, linewidth=0.8, zorder=0)
     return figure
 
 

@@ -36,7 +36,7 @@ MAY_NOT_IMPORT = {
     'view': ROS | {'scipy'},
 }
 MAY_IMPORT_ROS = {f'{NAME}.{module}' for module in (
-    'exam.live', 'view.live', 'view.node_client', 'view.command')}
+    'exam.live', 'view.node')}
 MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): path
            for path in sorted(PACKAGE.rglob('*.py'))}
 

@@ -228,6 +228,24 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
 
 
+def test_a_page_draws_every_motion_of_the_log(tmp_path, capsys, monkeypatch):
+    figure = pytest.importorskip('matplotlib.figure')
+    drawn = []
+    monkeypatch.setattr(figure.Figure, 'savefig', lambda self, *_, **__: drawn.append(self))
+    log = log_of(tmp_path / 'run.mcap', '--duration', 3, '--command', '1:2.0:1.5',
+                 '--command', '2:1.6:1.7')
+    assert told(capsys, log, '--plot', tmp_path / 'page.png')[0] == 0
+    (page,) = drawn
+    assert page.get_suptitle() == 'run.mcap: cusps, waves, waves (3 of 3 motions, 3 s)'
+    panels = {axes.get_ylabel(): axes for axes in page.axes}
+    tilt = panels['tilt θ [deg]'].lines
+    assert tilt[0].get_xdata()[[0, -1]].tolist() == [0.0, 3.0]
+    assert len(tilt[0].get_xdata()) == 301
+    assert [line.get_xdata()[0] for line in tilt[-2:]] == pytest.approx([1.01, 2.01])
+    # Each motion has its own energy, from which it drifts.
+    assert np.abs(panels['relative drift [1]'].lines[0].get_ydata()).max() < 1e-9
+
+
 @pytest.mark.parametrize('option', ['--plot', '--animate'])
 def test_pictures_overwrite_nothing_and_an_interrupted_one_leaves_no_file(
         short, tmp_path, capsys, monkeypatch, option):

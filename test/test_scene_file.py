@@ -6,6 +6,8 @@ import contextlib
 import pytest
 import yaml
 
+from spinning_top_sim import scene as api_scene
+from spinning_top_sim.installation import parameter_files
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 from spinning_top_sim.tools.simulate import main
@@ -149,3 +151,17 @@ def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):
 def test_frames_that_make_no_tree_are_refused(name, frame, says):
     with pytest.raises(ValueError, match=f'{name} = {frame!r}: must be .*{says}'):
         parameters.checked({name: frame})
+
+
+def test_a_scene_is_the_top_and_the_start_of_its_file(tmp_path):
+    for name in ('cusp', 'wavy', 'sleeping'):
+        values = parameters.checked(read_scene(parameter_files('scene')[name]))
+        expected = parameters.top_of(values), parameters.start_state(values)
+        assert api_scene(name) == expected
+    path = tmp_path / 'mine.yaml'
+    path.write_text('/**: {ros__parameters: {top.mass: 3.0}}')
+    assert api_scene(str(path))[0].mass == 3.0
+    for name, told in (('shuttle', 'scene shuttle: its pivot moves'),
+                       ('lopping', r'^scene lopping: must be the path of a file, or one of brak')):
+        with pytest.raises(ValueError, match=told):
+            api_scene(name)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from spinning_top_sim import scene, solve
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.tools import cli, inspect
 from spinning_top_sim.tools.simulate import main
@@ -60,6 +61,21 @@ def test_a_table_of_the_truth(tmp_path):
                      '-p', 'solver.method:=exact')
     table = np.loadtxt(path, delimiter=',', skiprows=1)
     assert table == pytest.approx(np.loadtxt(exact, delimiter=',', skiprows=1), abs=1e-9)
+
+
+def test_states_write_the_same_table(tmp_path):
+    exact = simulate(tmp_path / 'exact.csv', '--scene', 'looping', '--duration', 1,
+                     '-p', 'solver.method:=exact')
+    motion = solve(*scene('looping'), np.arange(101) * 0.01)
+    motion.to_csv(tmp_path / 'solved.csv')
+    heads, tables = zip(*((path.read_text().splitlines()[0], np.loadtxt(
+        path, delimiter=',', skiprows=1)) for path in (exact, tmp_path / 'solved.csv')),
+        strict=True)
+    assert heads[0] == heads[1]
+    assert tables[1] == pytest.approx(tables[0], rel=1e-12, abs=1e-12)
+    assert np.array_equal(tables[1][:, 7:11], motion.quaternion)        # to the last bit
+    with pytest.raises(FileExistsError):
+        motion.to_csv(tmp_path / 'solved.csv')
 
 
 def test_a_table_has_the_pivot(tmp_path):

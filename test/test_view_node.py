@@ -15,9 +15,9 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.times import NANOSECONDS
-from spinning_top_sim.view.track import Track
+from spinning_top_sim.view.samples import SampledTrack
 
-VIEW = ('-m', 'spinning_top_sim', 'view', '--no-browser', '--port', '0')
+VIEW = ('-m', 'spinning_top_sim', 'view', '--node', '--no-browser', '--port', '0')
 PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
 
 
@@ -25,10 +25,10 @@ PERIODS = {'/pose': 5_000_000, '/ground_truth/odom': 10_000_000}
 def live():
     """A page whose node, in this process, hears nobody."""
     pytest.importorskip('viser')
-    from spinning_top_sim.view.live import LiveView
+    from spinning_top_sim.view.node import NodeView
     from spinning_top_sim.view.page import Page
     rclpy.init()
-    view = LiveView(Page('one', '127.0.0.1', None))
+    view = NodeView(Page('one', '127.0.0.1', None))
     yield view
     view.stop()             # as where the start has failed
     view.destroy_node()
@@ -38,21 +38,26 @@ def live():
 def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypatch):
     """Without ground_truth/odom, and where a new run has an earlier clock."""
     values = parameters.checked({'spin.lz': 1.4})
-    live._client.is_stale, live._track = False, Track('', values)
-    live._page.set_tracks([live._track])
-    for seconds, count in ((100, 1), (200, 0), (300, 1), (5, 1)):
+    live._is_stale, live._track = False, SampledTrack(values)
+    for seconds, topic in ((100, 'ground_truth/odom'), (200, 'joint_states'), (300, 'pose'),
+                           (5, 'ground_truth/odom')):
         epoch_ns = seconds * NANOSECONDS
-        monkeypatch.setattr(live, 'count_publishers', lambda _, number=count: number)
-        live._listen_as_needed()
-        taken = play(Simulation(values, epoch_ns), NANOSECONDS // 2, *live._listeners)
+        monkeypatch.setattr(live, 'count_publishers', lambda name, only=topic: name == only)
+        live._listen()
+        assert live._listener.topic_name == f'/{topic}'
+        taken = play(Simulation(values, epoch_ns), NANOSECONDS // 2, topic)
         live._inbox.extend((topic, data) for topic, _, data in taken)
-        live._draw_once()
-        assert live._track.span[1] == epoch_ns + NANOSECONDS // 2
-        assert live._page._tops[0]._picture[0] == epoch_ns + NANOSECONDS // 2
+        t_ns = live.update(0.0)
+        track = live.track_at(t_ns)
+        assert t_ns + track.epoch_ns == epoch_ns + NANOSECONDS // 2
+        motion = track.motion_at(t_ns)
+        assert (motion is None) is (topic == 'pose')        # which has no rates
+        live._page.draw(t_ns, track)
+        assert live._page._top._picture[1] == t_ns
     # The trace begins with the last reset.
     live._epoch_ns = epoch_ns + NANOSECONDS // 4
-    live._draw_once()
-    assert live._track.span[0] == live._epoch_ns
+    live.update(0.0)
+    assert track.span == (0, NANOSECONDS // 4)
 
 
 def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):

@@ -117,7 +117,8 @@ def run_all(empty, folder, lines):
 REMEDIES = [
     (['node'], "pip install 'ros-jazzy-rclpy"),
     (['replay', 'a.mcap'], "pip install 'ros-jazzy-rclpy"),
-    (['view'], "pip install 'ros-jazzy-rclpy"),
+    (['view', '--node'], "pip install 'ros-jazzy-rclpy"),
+    (['view'], "pip install 'viser"),
     (['view', 'a.mcap'], "pip install 'viser"),
     (['inspect', 'a.mcap', '--plot', 'a.png'], "pip install 'matplotlib"),
     (['simulate', '--duration', '1', '-o', 'b.parquet'], "pip install 'pyarrow"),

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
     from matplotlib.figure import Figure
 
+    from spinning_top_sim.table import FilePath
+
 Point = tuple[float, float, float]
 # Times that are evaluated together: the temporaries of more do not fit into the cache.
 TIMES_TOGETHER = 8192
@@ -257,6 +259,18 @@ class States:
                 a3 * r1 - a1 * r3 + w2 * along - r2 * square + f2,
                 a1 * r2 - a2 * r1 + w3 * along - r3 * square + f3)
 
+    def to_csv(self, path: FilePath) -> None:
+        """
+        Write the columns of `simulate -o FILE.csv`, with a head of names and units.
+
+        Numbers are read back to the last bit.  An existing file raises FileExistsError.
+        """
+        from spinning_top_sim import table  # noqa: PLC0415 - few need it
+        moves = bool(self.pivot.position.any() or self.pivot.velocity.any())
+        rows = np.column_stack(np.broadcast_arrays(*table.columns(
+            self.t, self, pivot_moves=moves)))
+        table.write_csv(path, [rows], table.RIDE_UNITS if moves else table.UNITS)
+
     def plot(self) -> Figure:
         """
         Return a figure of the motion: the path of its axis, tilt, precession rate, energy drift.
@@ -266,7 +280,7 @@ class States:
         """
         with needed('a picture', 'plot'):
             from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
-        return pictures.plot(self)
+        return pictures.plot(self, relative_drift(self.energy, self.energy[:1]))
 
     def animate(self, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
         """

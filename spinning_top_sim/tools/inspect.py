@@ -93,7 +93,7 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
     """Draw the pictures.  Raises LogError, or OSError or ValueError for the name of a file."""
     if arguments.plot is None and arguments.animate is None:
         return
-    if found.shown is None:
+    if not found.shown:
         raise LogError('nothing to draw: no attitude of a top in this log')
     with needed('a picture', 'plot'):
         from spinning_top_sim.tools import log_pictures  # noqa: PLC0415
@@ -101,7 +101,7 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
                        (arguments.animate, log_pictures.animate)):
         if path is not None:
             try:
-                draw(found.path.name, *found.shown, path)
+                draw(found, path)
             except BaseException:       # also KeyboardInterrupt
                 path.unlink(missing_ok=True)
                 raise

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of the samples in a log, as `States.plot` and `States.animate` draw a solution."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,38 +9,53 @@ import numpy as np
 from matplotlib.animation import PillowWriter
 
 from spinning_top_sim import pictures
+from spinning_top_sim.physics.states import relative_drift
+from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.tools.analysis import Attitudes
-from spinning_top_sim.tools.survey import MotionReport
+from spinning_top_sim.tools.survey import MotionReport, Survey
 
-PAGE_NUTATIONS, PAGE_S = 8, 5.0     # duration of the page; in seconds without nutation
 FRAMES_PER_S, LONGEST_S, GIF_PIXELS = 20, 10.0, 640
+MOST_NAMES = 3              # of motions in a title
 
 
-def draw_page(name: str, motion: MotionReport, data: Attitudes, path: Path) -> None:
-    """Draw a page about the first samples of a motion in the log of this name."""
-    assert motion.measured is not None
-    period = motion.measured.nutation_period
-    figure = pictures.plot(_columns(motion, data, PAGE_NUTATIONS * period if period else PAGE_S))
-    figure.suptitle(f'{name}: {motion.exact.name if motion.exact else ""}', fontsize=14)
+def draw_page(found: Survey, path: Path) -> None:
+    """Draw a page about all motions that are measured in a log."""
+    columns, drift = _columns(found.shown)
+    first_ns = found.shown[0][1].stamps_ns[0]
+    begins = [(data.stamps_ns[0] - first_ns) / NANOSECONDS for _, data in found.shown[1:]]
+    figure = pictures.plot(columns, drift, begins)
+    names = [motion.exact.name if motion.exact else 'motion' for motion, _ in found.shown]
+    others = ', ...' if len(names) > MOST_NAMES else ''
+    figure.suptitle(f'{found.path.name}: {", ".join(names[:MOST_NAMES])}{others} '
+                    f'({len(names)} of {len(found.motions)} motions, {columns.t[-1]:.4g} s)',
+                    fontsize=14)
     figure.savefig(path, dpi=120)
 
 
-def animate(_: str, motion: MotionReport, data: Attitudes, path: Path) -> None:
-    """Draw the turning top as a GIF."""
-    pictures.animate(_columns(motion, data, LONGEST_S), FRAMES_PER_S, 1.0).save(
+def animate(found: Survey, path: Path) -> None:
+    """Draw the turning top in the begin of the first motion as a GIF."""
+    motion, data = found.shown[0]
+    begin = data.first(max(2, int(np.searchsorted(data.time, LONGEST_S, 'right'))))
+    pictures.animate(_columns([(motion, begin)])[0], FRAMES_PER_S, 1.0).save(
         path, writer=PillowWriter(fps=FRAMES_PER_S), dpi=GIF_PIXELS / 4.0)     # of 4 inches
 
 
-def _columns(motion: MotionReport, data: Attitudes, seconds: float) -> SimpleNamespace:
-    """Return the first samples, at least two, with the columns of `States` that are drawn."""
-    data = data.first(max(2, int(np.searchsorted(data.time, seconds, 'right'))))
-    top = motion.piece.top
-    unknown = np.full(len(data.time), np.nan)       # such as the rates in a log of poses alone
-    constants = data.constants(top)
+def _columns(shown: Sequence[tuple[MotionReport, Attitudes]],
+             ) -> tuple[SimpleNamespace, pictures.Reals]:
+    """Return the columns of `States` that are drawn, and the drift of the energy in a motion."""
+    every = [data for _, data in shown]
+    first_ns = every[0].stamps_ns[0]
+    drifts = []
+    for motion, data in shown:
+        constants = data.constants(motion.piece.top)    # None in a log of poses alone
+        drifts.append(np.full(len(data.time), np.nan) if constants is None
+                      else relative_drift(constants[0], constants[0][:1]))
     return SimpleNamespace(
-        t=data.time,
-        quaternion=np.stack(data.quaternion, axis=-1),
-        rows_axis=(data.tip.real, data.tip.imag, data.height),
-        theta_folded=np.arccos(np.clip(data.height, -1.0, 1.0)),
-        phi_dot=unknown if data.phi_dot is None else data.phi_dot,
-        energy=unknown if constants is None else constants[0])
+        t=np.concatenate([(data.stamps_ns - first_ns) / NANOSECONDS for data in every]),
+        quaternion=np.concatenate([np.stack(data.quaternion, axis=-1) for data in every]),
+        rows_axis=tuple(np.concatenate(rows) for rows in zip(*(
+            (data.tip.real, data.tip.imag, data.height) for data in every), strict=True)),
+        theta_folded=np.concatenate(
+            [np.arctan2(np.abs(data.tip), data.height) for data in every]),
+        phi_dot=np.concatenate([np.full(len(data.time), np.nan) if data.phi_dot is None
+                                else data.phi_dot for data in every])), np.concatenate(drifts)

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from spinning_top_sim.installation import parameter_files
-from spinning_top_sim.physics.top import shown
+from spinning_top_sim.physics.top import State, Top, shown
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli
 
@@ -108,6 +108,33 @@ def file_of(kind: str, name: str) -> Path:
         raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
                          f'{", ".join(files)}')
     return files.get(name, Path(name))
+
+
+def scene(name: str) -> tuple[Top, State]:
+    """
+    Return the top and the start of a scene, for `solve`.
+
+    Parameters
+    ----------
+    name : str
+        Of a scene that is installed, such as 'looping', or the path of a parameter file.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    ValueError
+        For a name that is not known, a wrong file, or a scene whose pivot moves.
+    """
+    try:
+        path = file_of('scene', name)
+    except ValueError as error:         # which names the option
+        raise ValueError(str(error).removeprefix('--')) from None
+    values = parameters.checked(read_scene(path))
+    if parameters.pivot_path(values) is not None:
+        raise ValueError(f'scene {name}: its pivot moves, which `solve` does not know; '
+                         f'see spinning-top simulate --scene {name}')
+    return parameters.top_of(values), parameters.start_state(values)
 
 
 def read_scene(path: str | Path, node: str = NODE, *, to_ros: bool = False) -> dict[str, object]:

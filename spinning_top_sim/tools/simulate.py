@@ -28,10 +28,11 @@ from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.streams.topics import recorded, resolve_topic
+from spinning_top_sim.table import RIDE_UNITS, UNITS, write_csv
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, period_ns
 from spinning_top_sim.tools import cli, log_exports, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
-from spinning_top_sim.tools.table import RIDE_UNITS, UNITS, true_states, write_csv, write_parquet
+from spinning_top_sim.tools.table import true_states, write_parquet
 
 FORMATS = ('mcap', 'csv', 'parquet')
 

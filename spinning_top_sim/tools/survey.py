@@ -102,8 +102,8 @@ class Survey:
     # not from 0, and the largest error of an attitude [rad]
     drifts: dict[str, dict[str, float]] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
-    # For pictures: the first motion with samples, and the first of these
-    shown: tuple[MotionReport, Attitudes] | None = None
+    # For pictures: the motions that are measured, and the samples of each
+    shown: list[tuple[MotionReport, Attitudes]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -263,4 +263,4 @@ def _measure(found: Survey, motion: MotionReport) -> None:
     except MALFORMED as error:
         found.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
     else:
-        found.shown = found.shown or (motion, data)
+        found.shown.append((motion, data))

@@ -2,7 +2,6 @@
 """The meshes of the body, and of its stand."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -12,22 +11,17 @@ from trimesh.transformations import rotation_matrix
 from spinning_top_sim.shape import Shape
 
 Colour = tuple[int, int, int]
-BLUE, WHITE, GOLD, STEEL, GREY = (
-    (43, 98, 176), (245, 247, 250), (246, 178, 38), (92, 99, 110), (150, 155, 163))
+BLUE, WHITE, GOLD, STEEL = (43, 98, 176), (245, 247, 250), (246, 178, 38), (92, 99, 110)
 SPOKES, SMOOTH = 8, 96              # number of spokes and of the sides of a round
 
 
-class BodyPart(NamedTuple):
-    """A mesh in the frame of the body."""
+def wheel(shape: Shape, length: float) -> dict[str, tuple[trimesh.Trimesh, Colour]]:
+    """
+    Return a spoked wheel with a marked rim, on a tapered axle of a signed length.
 
-    name: str
-    mesh: trimesh.Trimesh
-    colour: Colour
-
-
-def wheel(shape: Shape, length: float) -> list[BodyPart]:
-    """Return a spoked wheel with a marked rim, on a tapered axle of a signed length."""
-    radius, height, centre = shape.radius, shape.height, (0.0, 0.0, shape.centre)
+    As meshes in the frame of the body and their colours, by name.
+    """
+    radius, height = shape.radius, shape.height
     turns = [rotation_matrix(math.tau * k / SPOKES, (0, 0, 1)) for k in range(SPOKES)]
     spoke = creation.box((0.72 * radius, 0.045 * radius, 0.045 * radius))
     spoke.apply_translation((0.46 * radius, 0.0, 0.0))
@@ -38,22 +32,14 @@ def wheel(shape: Shape, length: float) -> list[BodyPart]:
     hub = creation.cylinder(0.11 * radius, max(0.6 * height, 0.1 * radius), sections=SMOOTH)
     thick = abs(length) * np.array([(0, 0), (.024, .1), (.024, .8), (.012, .95), (0, 1)])
     axle = creation.revolve(np.column_stack((thick[:, 0], thick[:, 1] * np.sign(length))))
-    parts = [
-        BodyPart('rim', creation.annulus(0.82 * radius, radius, height, sections=SMOOTH), BLUE),
-        BodyPart('marks', _merged(marks[1:]), WHITE),
-        BodyPart('mark', _merged([marks[0], marked_spoke]), GOLD),
-        BodyPart('spokes', _merged([hub, *(spoke.copy().apply_transform(turn)
-                                       for turn in turns[1:])]), STEEL)]
-    for part in parts:
-        part.mesh.apply_translation(centre)
-    return [*parts, BodyPart('axle', axle, STEEL)]
-
-
-def disc(shape: Shape, length: float) -> list[BodyPart]:
-    """Return a grey disc with a hole, for a body that is not known."""
-    radius = abs(length)
-    mesh = creation.annulus(0.25 * radius, 0.5 * radius, 0.03 * radius, sections=SMOOTH)
-    return [BodyPart('disc', mesh.apply_translation((0.0, 0.0, shape.centre)), GREY)]
+    parts = {
+        'rim': (creation.annulus(0.82 * radius, radius, height, sections=SMOOTH), BLUE),
+        'marks': (_merged(marks[1:]), WHITE), 'mark': (_merged([marks[0], marked_spoke]), GOLD),
+        'spokes': (_merged([hub, *(spoke.copy().apply_transform(turn) for turn in turns[1:])]),
+                   STEEL)}
+    for mesh, _ in parts.values():
+        mesh.apply_translation((0.0, 0.0, shape.centre))
+    return {**parts, 'axle': (axle, STEEL)}
 
 
 def stand(radius: float) -> trimesh.Trimesh:

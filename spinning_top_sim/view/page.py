@@ -1,42 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The page: scene, words and plots, made with viser; the same for logs and for a running node.
-
-On the page are tops whose motions began at different dates.  `page_ns` is a stamp of the first
-one; a stamp of another is `page_ns + shift_ns`, so that the t = 0 of all coincide.
-"""
+"""The page: scene, words and plots, made with viser; the same whatever its source is."""
 
 import math
+import threading
 import time
-from collections.abc import Sequence, Set
-from typing import TypeVar
+from pathlib import Path
+from typing import Any
 
-import numpy as np
 import viser
 
-from spinning_top_sim.times import NANOSECONDS
-from spinning_top_sim.view import body, plots, shapes, svg, text
+from spinning_top_sim.view import plots, text
+from spinning_top_sim.view.drawn import ARROWS, BOUNDS, FOOT, TRACE, DrawnTop, axis_length
 from spinning_top_sim.view.server import Server
-from spinning_top_sim.view.track import QUATERNION, DescribedMotion, Track
+from spinning_top_sim.view.source import WINDOW_NS, Source, Track
 
 RATE = 30.0                     # pictures per second
-CATCH_UP_S = 0.2                # delay up to which late pictures follow each other at once
+LONGEST_STEP_S = 0.2            # of real time between two pictures; a longer one is not made up
 LAST_WORDS_S = 0.2              # time to send the last texts
-PLOT_EVERY = 6                  # pictures
-WINDOW_NS = 10 * NANOSECONDS    # of the plots
+PLOT_EVERY, SETTLED = 6, 20     # pictures
 PANEL_WIDTH = 330               # [px]
-VIEW_ANGLE = math.radians(35.0)
-STANDS_TO = math.radians(100.0)     # tilt up to which the pivot stands on a peg; else it hangs
-TRACES = ((217, 72, 43), (30, 138, 76))
-BOUNDS, SPHERE, STAND, FOOT = (122, 82, 179), (190, 200, 215), (120, 126, 136), 0.8
-NO_LINES = np.zeros((1, 2, 3), np.float32)
-NO_SAMPLES = 'no samples yet'
-Value = TypeVar('Value')
+STYLE = Path(__file__).with_name('page.css').read_text('utf-8')
 
 
-def set_value(handle: viser.GuiInputHandle[Value], value: Value) -> None:
+def set_value(handle: Any, value: object) -> None:
     """Show a value in an input; viser declares `value` without its setter."""
-    handle.value = value        # type: ignore[misc]
+    handle.value = value
 
 
 def set_content(handle: viser.GuiHtmlHandle | viser.GuiMarkdownHandle, content: str) -> None:
@@ -45,101 +33,19 @@ def set_content(handle: viser.GuiHtmlHandle | viser.GuiMarkdownHandle, content: 
         handle.content = content
 
 
-class DrawnTop:
-    """One top in the scene; `shift_ns` is added to the stamp of the page."""
-
-    def __init__(self, scene: viser.SceneApi, number: int, track: Track, shift_ns: int) -> None:
-        self.track, self.shift_ns = track, shift_ns
-        name, far = f'/top{number}', shapes.axis_length(track)
-        radius = abs(far)
-        self.root = scene.add_frame(name, show_axes=False)
-        self._sphere = scene.add_icosphere(f'{name}/sphere', radius, SPHERE, subdivisions=5,
-                                           opacity=0.12, side='back', cast_shadow=False,
-                                           receive_shadow=False)
-        self._body = scene.add_frame(f'{name}/body', show_axes=not track.has_body,
-                                     axes_length=0.7 * radius, axes_radius=0.015 * radius)
-        for part in (body.wheel if track.has_body else body.disc)(track.shape, far):
-            scene.add_mesh_simple(
-                f'{name}/body/{part.name}', part.mesh.vertices, part.mesh.faces,
-                color=part.colour, opacity=0.4 if number else None,
-                flat_shading=part.name != 'axle', side='double')
-        peg = body.stand(FOOT * radius)
-        self._stand = scene.add_mesh_simple(f'{name}/stand', peg.vertices, peg.faces, color=STAND,
-                                            side='double')
-        self._trace = scene.add_line_segments(
-            f'{name}/trace', NO_LINES, TRACES[number], thickness=0.018 * radius)
-        self._bounds = [scene.add_line_segments(
-            f'{name}/bound{k}', NO_LINES, BOUNDS, thickness=0.007 * radius, visible=False)
-            for k in range(2)]
-        self._arrows = {arrow: scene.add_arrows(
-            f'{name}/{arrow.replace(" ", "_")}', NO_LINES, colour,
-            shaft_radius=0.014 * radius, head_radius=0.04 * radius, head_length=0.12 * radius,
-            visible=False) for arrow, (colour, *_) in shapes.ARROWS.items()}
-        self._colour = np.array(TRACES[number])
-        self._limits: tuple[float, float] | None = None         # that are drawn [rad]
-        self._picture: object = None                    # its stamp and switches
-
-    def draw(self, page_ns: int, *, trace: bool, bounds: bool, arrows: Set[str]) -> None:
-        """Draw the newest samples up to a stamp of the page, with some of the parts."""
-        stamp_ns = page_ns + self.shift_ns
-        sample = self.track.attitudes.at(stamp_ns)
-        self.root.visible = sample is not None
-        picture = sample and (sample[0], trace, bounds, arrows)
-        if picture == self._picture:        # as while it is paused
-            return
-        self._picture = picture
-        if sample is None:
-            return
-        x, y, z, w = sample[1][QUATERNION].tolist()
-        self._body.wxyz = (w, x, y, z)
-        self._trace.visible = self._sphere.visible = trace
-        if trace:
-            self._draw_trace(shapes.trace(self.track, stamp_ns))
-        for name, arrow in self._arrows.items():
-            arrow.visible = name in arrows
-            vector = shapes.arrow(self.track, name, stamp_ns) if arrow.visible else None
-            arrow.points = NO_LINES if vector is None else shapes.lines_through(
-                np.vstack((np.zeros(3), vector)))
-        self._draw_bounds(self.track.motion_at(stamp_ns), bounds)
-
-    def _draw_trace(self, lines: shapes.Lines) -> None:
-        """Draw a trace that fades with its age; the colours of a line's points are linear."""
-        lines = lines if len(lines) else NO_LINES
-        if len(lines) != len(self._trace.points):
-            share = np.linspace(0.35, 1.0, len(lines))[:, np.newaxis, np.newaxis]
-            self._trace.colors = np.broadcast_to(255 * (
-                1.0 + share * (self._colour / 255 - 1.0)) ** 2.2, lines.shape).astype(np.uint8)
-        self._trace.points = lines
-
-    def _draw_bounds(self, motion: DescribedMotion | None, on: bool) -> None:
-        description = motion.description if motion else None
-        for bound in self._bounds:
-            bound.visible = on and description is not None
-        if description is None:
-            return
-        limits = description.theta_min, description.theta_max
-        if limits == self._limits:
-            return
-        self._limits = limits
-        for bound, theta in zip(self._bounds, self._limits, strict=True):
-            bound.points = shapes.circle(shapes.axis_length(self.track), theta)
-        # A top that comes low hangs from above.
-        self._stand.wxyz = (1, 0, 0, 0) if description.theta_max < STANDS_TO else (0, 1, 0, 0)
-
-
 class Page:
     """
     The page, with its own server.
 
-    One thread calls `set_tracks` and `draw`.  Threads of viser call what inputs call back: it may
-    set `message` and inputs.
+    One thread calls `draw`.  Threads of viser call what inputs call back: it may set `message`
+    and inputs.
 
     server, gui : of viser
     address : of the page, http://...
     title : such as the name of the log
-    controls : the folder for the controls of the source of the samples
+    controls : the folder for the controls of a source
     message : what was done, or the reason why not
-    arrows : the switches of shapes.ARROWS, by name
+    arrows : the switches of ARROWS, by name
     """
 
     def __init__(self, title: str, host: str, port: int | None) -> None:
@@ -152,25 +58,22 @@ class Page:
         gui.set_panel_label(title)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH)
-        gui.add_html(f'<style>{text.STYLE}{text.LIVE_STYLE}</style>')
-        self._words, self._legend = gui.add_html(f'<p>{NO_SAMPLES}</p>'), gui.add_html('')
+        gui.add_html(f'<style>{STYLE}</style>')
+        self._words = gui.add_html(f'<p>{text.NO_SAMPLES}</p>')
         self.message = gui.add_markdown('')
         self.controls = gui.add_folder('Control')
         with gui.add_folder('Show'):
+            self._legend = gui.add_html('')
             self._trace = gui.add_checkbox('trace of the axis', True)
             self._bounds = gui.add_checkbox('bounds of θ', True)
-            self.arrows = {name: gui.add_checkbox(name, False) for name in shapes.ARROWS}
-            self._over = gui.add_checkbox('one over the other', False, visible=False)
-        self._accuracy_folder = gui.add_folder('Accuracy', expand_by_default=False)
-        with self._accuracy_folder:
-            self._accuracy = gui.add_html('')
+            self.arrows = {name: gui.add_checkbox(name, False) for name in ARROWS}
         panel = gui.add_panel()
         with panel.add_tab('Plots'):
             self._plots = gui.add_html('')
         panel.dock_left()
         panel.set_width(PANEL_WIDTH)
         panel.expand()              # also on a phone, where it is below
-        self._tops: list[DrawnTop] = []
+        self._top: DrawnTop | None = None
         self._number = 0            # of the picture
 
     def close(self) -> None:
@@ -179,78 +82,60 @@ class Page:
         time.sleep(LAST_WORDS_S)
         self.server.stop()
 
-    def set_tracks(self, tracks: Sequence[Track], shifts_ns: Sequence[int] = (0,)) -> None:
-        """Show these tops; a shift is added to a stamp of the page to get the track's."""
-        for top in self._tops:
-            top.root.remove()
-        scene = self.server.scene
-        self._tops = [DrawnTop(scene, number, track, shift_ns) for number, (track, shift_ns)
-                      in enumerate(zip(tracks, shifts_ns, strict=True))]
-        size = self._size = max(abs(shapes.axis_length(track)) for track in tracks)
-        self._over.visible = len(tracks) > 1
-        self._bounds.visible = self._accuracy_folder.visible = any(
-            track.has_body for track in tracks)
-        for switch in self.arrows.values():
-            switch.visible = self._bounds.visible
+    def show(self, source: Source, stopped: threading.Event) -> None:
+        """Draw pictures of a source until the event; time passes while somebody looks at it."""
+        before = time.monotonic()
+        while not stopped.is_set():
+            now = time.monotonic()
+            seconds = min(now - before, LONGEST_STEP_S) if self.server.get_clients() else 0.0
+            t_ns = source.update(seconds)
+            if (track := source.track_at(t_ns)) is not None:
+                self.draw(t_ns, track)
+            stopped.wait(max(now + 1.0 / RATE - time.monotonic(), 0.0))
+            before = now
+
+    def draw(self, t_ns: int, track: Track) -> None:
+        """Draw a top at a time."""
+        # Meshes take longer than a picture: they wait till a slider rests.
+        if self._top is None or (self._number == SETTLED and self._top.top != track.top):
+            self._top = self._new_top(track)
+        if self._top.track is not track:
+            self._top.track, self._number = track, 0
+        newest_ns = track.newest(t_ns)
+        with self.server.atomic():
+            if newest_ns is not None:       # the picture follows the pivot: the ground moves
+                size = abs(axis_length(track))
+                x, y, z = track.state(newest_ns).pivot.position[:, 0].tolist()
+                self._ground.position = -(x % size), -(y % size), -FOOT * size - z
+            self._top.draw(t_ns, trace=self._trace.value, bounds=self._bounds.value, arrows={
+                name for name, switch in self.arrows.items() if switch.value})
+        if self._number % PLOT_EVERY == 0:
+            set_content(self._plots, ''.join(map(plots.draw, plots.motion_plots(
+                track, t_ns, t_ns - WINDOW_NS, t_ns))))
+            set_content(self._words, text.words(track, t_ns))
+            set_content(self._legend, self.legend())
+        self._number += 1
+
+    def _new_top(self, track: Track) -> DrawnTop:
+        """Return another top in the scene, with its ground and for its size."""
+        if self._top is not None:
+            self._top.root.remove()
+        scene, camera, size = self.server.scene, self.server.initial_camera, abs(
+            axis_length(track))
         self._ground = scene.add_grid(
             '/ground', infinite_grid=True, cell_size=0.5 * size, section_size=size,
             cell_color=(238, 240, 244), section_color=(228, 231, 236), fade_distance=9 * size,
             fade_from='origin', shadow_opacity=0.1, position=(0.0, 0.0, -FOOT * size))
-        camera = self.server.initial_camera
-        away = size * (5.2 if len(tracks) == 1 else 10.5)
-        camera.fov = VIEW_ANGLE
-        camera.position = (0.0, -0.92 * away, 0.39 * away)
+        camera.fov = math.radians(35.0)
+        camera.position = (0.0, -4.8 * size, 2.0 * size)
         camera.look_at = (0.0, 0.0, 0.1 * size)
         camera.near, camera.far = 0.01 * size, 100.0 * size
-
-    def draw(self, page_ns: int, epoch_ns: int) -> None:
-        """Draw all tops at a stamp of the page [ns]; `epoch_ns` is that of t = 0."""
-        arrows = {name for name, switch in self.arrows.items() if switch.value}
-        side = 0.0 if self._over.value else 1.3 * self._size
-        places = [top.track.places(np.array([page_ns + top.shift_ns]))[0] for top in self._tops]
-        with self.server.atomic():
-            if places:          # the picture follows the first top: the ground moves
-                x, y, z = places[0]
-                self._ground.position = (-(x % self._size), -(y % self._size),
-                                         -FOOT * self._size - z)
-            for k, (top, place) in enumerate(zip(self._tops, places, strict=True)):
-                top.root.position = place - places[0] + (
-                    side * (2 * k - len(self._tops) + 1), 0.0, 0.0)
-                top.draw(page_ns, trace=self._trace.value, bounds=self._bounds.value,
-                         arrows=arrows)
-        if self._number % PLOT_EVERY == 0:
-            tops = self.plotted(page_ns, epoch_ns, page_ns - WINDOW_NS, page_ns)
-            set_content(self._plots, ''.join(map(svg.draw, plots.motion_plots(tops))))
-            set_content(self._accuracy, ''.join(map(svg.draw, plots.accuracy_plots(tops))))
-            set_content(self._words, self.words(page_ns, epoch_ns))
-            set_content(self._legend, self.legend())
-        self._number += 1
-
-    def plotted(self, page_ns: int, epoch_ns: int, begin_ns: int,
-                end_ns: int) -> list[plots.Plotted]:
-        """Return what is plotted of the tops at a stamp, for a span of stamps of the page."""
-        return [plots.Plotted(
-            top.track, stamp_ns=page_ns + top.shift_ns, begin_ns=begin_ns + top.shift_ns,
-            end_ns=end_ns + top.shift_ns, epoch_ns=epoch_ns + top.shift_ns) for top in self._tops]
-
-    def words(self, page_ns: int, epoch_ns: int) -> str:
-        """Return HTML about the motions and the samples that are drawn."""
-        parts = []
-        for track, shift_ns in ((top.track, top.shift_ns) for top in self._tops):
-            sample = track.attitudes.at(page_ns + shift_ns)
-            parts.append(f'<p>{track.name} {NO_SAMPLES}</p>' if sample is None else text.words(
-                track, track.motion_at(page_ns + shift_ns), sample[0],
-                sample[0] - shift_ns - epoch_ns))
-        return ''.join(parts)
+        return DrawnTop(scene, track)
 
     def legend(self) -> str:
         """Return HTML about the colours of what is switched on."""
-        entries = []
-        if self._trace.value:
-            entries += [(TRACES[k], f'trace of the axis {top.track.name}'.rstrip()
-                         + (' (plots: dashed)' if k else '')) for k, top in enumerate(self._tops)]
-        if self._bounds.value and any(top.track.motions for top in self._tops):
-            entries.append((BOUNDS, 'bounds of θ'))
-        entries += [(shapes.ARROWS[name][0], name)
-                    for name, switch in self.arrows.items() if switch.value]
-        return text.legend(entries)
+        switches = ((TRACE, self._trace), (BOUNDS, self._bounds),
+                    *((ARROWS[name], switch) for name, switch in self.arrows.items()))
+        return '<div class="top-legend">' + ''.join(
+            f'<div><i style="background:rgb{colour}"></i>{switch.label}</div>'
+            for colour, switch in switches if switch.value) + '</div>'

@@ -1,95 +1,81 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plots beside the scene."""
+"""The plots beside the scene, as SVG: so a page of viser has them, and a file without it."""
 
+import html
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spinning_top_sim.streams.topics import INVARIANTS
+from spinning_top_sim.physics.top import Top
 from spinning_top_sim.times import NANOSECONDS
-from spinning_top_sim.view import shapes
-from spinning_top_sim.view.svg import Line, Plot
-from spinning_top_sim.view.track import (
-    PRECESSION,
-    Series,
-    Track,
-    effective_potential,
-    energies,
-)
+from spinning_top_sim.view.source import Motion, Reals, Track, effective_potential
 
-Reals = NDArray[np.float64]
 POINTS = 400                    # in a line at most
-LEAST = 1e-17                   # is drawn for 0 on a logarithmic axis
 BLUE, RED, GREEN, VIOLET = '#1c6dd0', '#d9482b', '#1e8a4c', '#7a52b3'
+FLAT = 1e-3                     # least range of an axis / the greatest value
+WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 340, 172, 46, 332, 38, 140        # [px]
 
 
-class Plotted(NamedTuple):
-    """A track, the stamp that is drawn, the span that is plotted, and the stamp of t = 0 [ns]."""
+class Line(NamedTuple):
+    """A line through points, or with `dots` the points alone; its name is in the legend."""
 
-    track: Track
-    stamp_ns: int
-    begin_ns: int
-    end_ns: int
-    epoch_ns: int
-
-    def seconds(self, stamps_ns: NDArray[np.int64]) -> Reals:
-        """Return the times of stamps (n,) [ns] since t = 0 [s]."""
-        return (stamps_ns - self.epoch_ns) / NANOSECONDS
-
-    def part(self, samples: Series) -> tuple[Reals, Reals]:
-        """Return times (n,) [s] and rows (n, width) of some samples in the span."""
-        stamps_ns, rows = samples.part(self.begin_ns, self.end_ns).thinned(POINTS)
-        return self.seconds(stamps_ns), rows
+    name: str
+    colour: str
+    x: Reals
+    y: Reals
+    dots: bool = False
 
 
-def motion_plots(tops: Sequence[Plotted]) -> list[Plot]:
-    """Return the plots of potential, energies, tilt and precession, as far as there are data."""
-    potential, energy, tilt, rate = (list[Line]() for _ in range(4))
-    for top, dash in zip(tops, ('', '5 3'), strict=False):
-        potential += _potential(top, dash)
-        stamps_ns, axis, _ = shapes.trace_points(top.track, top.begin_ns, top.end_ns)
-        stamps_ns, axis = Series(stamps_ns, axis).thinned(POINTS)
-        tilt.append(Line('θ', RED, top.seconds(stamps_ns), shapes.tilt(axis), dash))
-        times, rows = top.part(top.track.rates)
-        if len(rows):
-            rate.append(Line('φ′', BLUE, times, rows[:, PRECESSION], dash))
-            kinetic, height = energies(top.track.top, rows)
-            energy += [Line('kinetic', RED, times, kinetic, dash),
-                       Line('potential', BLUE, times, height, dash),
-                       Line('sum', GREEN, times, kinetic + height, dash)]
-    now = float(tops[0].seconds(np.array(tops[0].stamp_ns)))
-    present = tops[0].track.attitudes.at(tops[0].stamp_ns)
-    motion = tops[0].track.motion_at(tops[0].stamp_ns)
-    theta = float(shapes.tilt(shapes.axis_of(present[1]))[0]) if present else math.nan
-    return [plot for plot in (
-        Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', potential, theta,
+class Plot(NamedTuple):
+    """
+    A plot with a mark at x = now.
+
+    point : where the mark has a point; NaN: nowhere
+    over : what x is, the time [s] or the tilt [deg]
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    lines: list[Line]
+    now: float
+    point: float = math.nan
+    over: Literal['time', 'tilt'] = 'time'
+
+
+def motion_plots(track: Track, t_ns: int, begin_ns: int, end_ns: int) -> list[Plot]:
+    """
+    Return the plots of potential, energies, tilt and precession, as far as there are data.
+
+    t_ns : the time that is marked
+    begin_ns, end_ns : span of the plots over the time
+    """
+    times, states = track.states(begin_ns, end_ns, POINTS)
+    seconds, (w1, w2, w3), top = times / NANOSECONDS, states.rows_angular_velocity, track.top
+    # Without the motion of the pivot.
+    kinetic = 0.5 * (top.lambda1 * (w1 * w1 + w2 * w2) + top.lambda3 * w3 * w3) + 0.0 * seconds
+    height = top.gravity_torque * states.rows_axis[2]
+    newest, now, motion = track.newest(t_ns), t_ns / NANOSECONDS, track.motion_at(t_ns)
+    theta = math.nan if newest is None else math.degrees(track.state(newest).theta_folded[0])
+    return [
+        Plot('Effective potential V(θ)', 'tilt θ [deg]', 'V [J]', _potential(top, motion), theta,
              motion.energy if motion and motion.description else math.nan, 'tilt'),
-        Plot('Energy', 'time t [s]', 'E [J]', energy, now),
-        Plot('Tilt', 'time t [s]', 'θ [deg]', tilt, now),
-        Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', rate, now)) if plot.lines]
+        Plot('Energy', 'time t [s]', 'E [J]', [
+            Line('kinetic', RED, seconds, kinetic), Line('potential', BLUE, seconds, height),
+            Line('sum', GREEN, seconds, kinetic + height)], now),
+        Plot('Tilt', 'time t [s]', 'θ [deg]', [
+            Line('θ', RED, seconds, np.degrees(states.theta_folded))], now),
+        Plot('Precession rate', 'time t [s]', 'φ′ [rad/s]', [
+            Line('φ′', BLUE, seconds, states.phi_dot)], now)]
 
 
-def accuracy_plots(tops: Sequence[Plotted]) -> list[Plot]:
-    """Return the plots of the drift of the energy and of the error of the orientation."""
-    now = float(tops[0].seconds(np.array(tops[0].stamp_ns)))
-    parts = [top.part(top.track.samples['~/invariants']) for top in tops]
-    return [Plot(title, 'time t [s]', y_label, [
-        Line('', RED, times, np.log10(np.maximum(np.abs(rows[:, column]), LEAST)), dash)
-        for (times, rows), dash in zip(parts, ('', '5 3'), strict=False)], now)
-        for title, y_label, column in (
-            ('Energy drift, relative', 'log₁₀', INVARIANTS.index('energy_drift')),
-            ('Orientation error', 'log₁₀ [rad]', INVARIANTS.index('orientation_error')))]
-
-
-def _potential(top: Plotted, dash: str) -> list[Line]:
+def _potential(body: Top, motion: Motion | None) -> list[Line]:
     """Return V around the bounds of theta, the energy of the axis, and the turning points."""
-    motion = top.track.motion_at(top.stamp_ns)
     if motion is None or motion.description is None:
         return []
-    body, (l3, lz) = top.track.top, (motion.l3, motion.lz)
+    l3, lz = motion.l3, motion.lz
     theta = np.linspace(1e-3, math.pi - 1e-3, 2000)
     values = effective_potential(body, l3, lz, theta)
     depth = max(motion.energy - float(values.min()), 0.05 * abs(body.gravity_torque),
@@ -101,7 +87,75 @@ def _potential(top: Plotted, dash: str) -> list[Line]:
         heights = effective_potential(body, l3, lz, bounds)
     turning = bounds[np.abs(heights - motion.energy) < 1e-3 * depth]
     inside = np.degrees(np.clip(bounds, theta[0], theta[-1]))
-    return [Line('V', BLUE, np.degrees(theta), effective_potential(body, l3, lz, theta), dash),
-            Line('E − L₃²/2λ₃', GREEN, inside, np.full(2, motion.energy), dash),
+    return [Line('V', BLUE, np.degrees(theta), effective_potential(body, l3, lz, theta)),
+            Line('E − L₃²/2λ₃', GREEN, inside, np.full(2, motion.energy)),
             Line('turning points', VIOLET, np.degrees(turning),
                  np.full(len(turning), motion.energy), dots=True)]
+
+
+class _Axis:
+    """An axis from `low` to `high`, which are at two pixels."""
+
+    def __init__(self, parts: Sequence[Reals], margin: float, first: int, last: int) -> None:
+        values = np.concatenate(parts)
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        least = max(FLAT * max(abs(low), abs(high)), 1e-12)
+        add = margin * (high - low) + (least if high - low < least else 0.0)
+        self.low, self.high, self._first, self._last = low - add, high + add, first, last
+
+    def place(self, value: Reals | float) -> Reals:
+        """Return the pixels of values."""
+        share = (np.asarray(value) - self.low) / (self.high - self.low)
+        return (self._first + share * (self._last - self._first)).round(1)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        """Return the pixels of round numbers, and how these are written."""
+        span = (self.high - self.low) / 5.0
+        step = 10.0 ** math.floor(math.log10(span))
+        step *= next((factor for factor in (1, 2, 5) if span <= factor * step), 10)
+        digits = max(0, -math.floor(math.log10(step) + 1e-9))
+        numbers = step * np.arange(math.ceil(self.low / step - 1e-9),
+                                   math.floor(self.high / step + 1e-9) + 1)
+        return [(float(self.place(number)), f'{number:.{digits}f}'.replace('-', '−')
+                 if digits < 7 else f'{number:.7g}') for number in numbers.tolist()]
+
+
+def draw(plot: Plot) -> str:
+    """
+    Return a plot as an SVG element, or '' without data.
+
+    `data-x` has the ends of its x axis, and `data-px` their pixels.  The classes are plot, title,
+    grid and now; others style them.
+    """
+    lines = [line for line in plot.lines if np.isfinite(line.y).any()]
+    if not lines:
+        return ''
+    across = _Axis([line.x for line in lines], 0.0, LEFT, RIGHT)
+    up = _Axis([line.y for line in lines], 0.08, BOTTOM, TOP)
+    names = {line.name: line.colour for line in lines}
+    drawn = [
+        f'<svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{plot.title}" '
+        f'data-over="{plot.over}" data-x="{across.low:.9g} {across.high:.9g}" '
+        f'data-px="{LEFT} {RIGHT}"><text class="title" x="8" y="14">{plot.title}</text>'
+        f'<text x="8" y="28">{plot.y_label}</text><text x="{(LEFT + RIGHT) / 2}" '
+        f'y="{HEIGHT - 5}" text-anchor="middle">{plot.x_label}</text>'
+        f'<text x="{RIGHT}" y="28" text-anchor="end">', *(
+            f'<tspan fill="{colour}" dx="9">●</tspan><tspan dx="3">{html.escape(name)}</tspan>'
+            for name, colour in names.items() if len(names) > 1), '</text>']
+    for x, number in across.ticks():
+        drawn.append(f'<path class="grid" d="M{x} {TOP}V{BOTTOM}"/>'
+                     f'<text x="{x}" y="{BOTTOM + 13}" text-anchor="middle">{number}</text>')
+    for y, number in up.ticks():
+        drawn.append(f'<path class="grid" d="M{LEFT} {y}H{RIGHT}"/>'
+                     f'<text x="{LEFT - 5}" y="{y + 3}" text-anchor="end">{number}</text>')
+    for line in lines:
+        places = np.column_stack((across.place(line.x), up.place(line.y)))[np.isfinite(line.y)]
+        points = ' '.join(f'{x},{y}' for x, y in places.tolist())
+        drawn += [f'<circle cx="{x}" cy="{y}" r="4" fill="{line.colour}"/>'
+                  for x, y in places.tolist()] if line.dots else [
+            f'<polyline stroke="{line.colour}" points="{points}"/>']
+    if math.isfinite(plot.now):
+        dot = '' if math.isnan(plot.point) else f'<circle cy="{up.place(plot.point)}" r="5"/>'
+        drawn.append(f'<g class="now" transform="translate({across.place(plot.now)} 0)">'
+                     f'<path d="M0 {TOP}V{BOTTOM}"/>{dot}</g>')
+    return ''.join([*drawn, '</svg>'])

@@ -1,48 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The words of the page as HTML: what one sees, in numbers, the legend, and the whole file."""
+"""The words of the page as HTML: what one sees, in numbers."""
 
 import html
 import math
-from collections.abc import Iterable, Sequence
-from pathlib import Path
-from string import Template
+from collections.abc import Iterable, Mapping
 
-import numpy as np
-
+from spinning_top_sim.installation import read_table
 from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.top import Top
 from spinning_top_sim.times import NANOSECONDS, stamp_text
-from spinning_top_sim.view.track import DescribedMotion, Track
+from spinning_top_sim.view.source import Motion, Track
 
-HERE = Path(__file__).parent
-STYLE, LIVE_STYLE = ((HERE / name).read_text('utf-8') for name in ('page.css', 'live.css'))
+NO_SAMPLES = 'no samples yet'
 BEYOND = 'No closed form is in reach of its numbers; the samples are shown as they are.'
 PIVOT_MOVES = 'The pivot moves: where it accelerates, the top moves about another vertical.'
-NEUTRAL = ('The body is not in this log, only its attitude: a grey disc shows it, with its axes '
-           'x (red), y (green) and z (blue).')
 VERTICAL = 1e-6                 # tilt from a vertical up to which there is no precession [rad]
-# What one sees of each motion, by its name.
-SENTENCES = {
-    'at rest': 'Nothing turns: the axis stays where it is.',
-    'cusps': 'Released without a push: the axis falls, is turned aside, and rises to stand still '
-             'for an instant.',
-    'free top': 'No torque acts: the axis goes round a fixed direction, that of the angular '
-                'momentum.',
-    'hanging': 'The axis hangs straight down, and the body only spins.',
-    'loops': 'Pushed backwards at the start: where the axis is highest it moves backwards, and '
-             'draws loops.',
-    'planar pendulum, rotating': 'Without spin: the axis goes over the top in one vertical plane.',
-    'planar pendulum, swinging': 'Without spin: the axis swings in one vertical plane.',
-    'sleeping': 'The axis stands upright and the spin is fast enough to hold it there.',
-    'sleeping, unstable': 'The axis stands upright, but the spin is too slow: a touch makes it '
-                          'fall.',
-    'spherical pendulum': 'Without spin: the axis swings round the vertical like a weight on a '
-                          'string.',
-    'steady precession': 'The axis goes round the vertical at one tilt and one speed.',
-    'through the bottom': 'The axis passes through the straight-down position in each nutation.',
-    'through the top': 'The axis passes through the upright position in each nutation.',
-    'waves': 'The axis nods up and down while it always goes round the same way.',
-}
+SENTENCES: Mapping[str, str] = read_table('view/motions.toml')      # by name of the motion
 
 
 def number(value: float) -> str:
@@ -52,26 +25,32 @@ def number(value: float) -> str:
     return f'{shown:g}'.replace('-', '−')
 
 
-def words(track: Track, motion: DescribedMotion | None, stamp_ns: int, since_ns: int) -> str:
-    """Return headline, sentence and numbers of a top, and stamp and time of what is drawn."""
+def words(track: Track, t_ns: int) -> str:
+    """Return headline, sentences and numbers of a top at a time; and those of its sample."""
+    sample_ns = track.newest(t_ns)
+    if sample_ns is None:
+        return f'<p>{NO_SAMPLES}</p>'
+    motion = track.motion_at(t_ns)
     description = motion.description if motion else None
     title, sentence = ((description.name, SENTENCES[description.name]) if description else
                        ('motion', PIVOT_MOVES if motion.pivot_moves else BEYOND) if motion else
-                       ('attitude', '' if track.has_body else NEUTRAL))
+                       ('attitude', ''))
     rows = [*_rows(track.top, motion)] if motion else []
-    place = track.places(np.array([stamp_ns]))[0]
+    place = track.state(sample_ns).pivot.position[:, 0]
     if place.any():
         rows.append(('Pivot', ', '.join(map(number, place)), 'x, y, z [m]'))
     return ''.join((
-        '<div class="top-words">', f'<p>{html.escape(track.name)}</p>' if track.name else '',
-        f'<h1>{title}</h1>', f'<p>{sentence}</p>' if sentence else '', '<table>',
+        f'<div class="top-words" data-from="{t_ns / NANOSECONDS}">',
+        f'<h1>{title}</h1>',
+        *(f'<p>{html.escape(line)}</p>' for line in (sentence, track.about) if line), '<table>',
         *(f'<tr><td>{label}</td><td>{value}{f"<small>{note}</small>" if note else ""}</td></tr>'
           for label, value, note in rows),
-        f'</table><p class="stamp">t = {since_ns / NANOSECONDS:.3f} s, stamp '
-        f'{stamp_text(stamp_ns)}</p></div>'))
+        f'</table><p class="stamp" data-epoch="{track.epoch_ns}">t = '
+        f'{sample_ns / NANOSECONDS:.3f} s, stamp {stamp_text(track.epoch_ns + sample_ns)}</p>',
+        '</div>'))
 
 
-def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
+def _rows(top: Top, motion: Motion) -> Iterable[tuple[str, str, str]]:
     description = motion.description
     if description is not None:
         low = number(math.degrees(description.theta_min))
@@ -90,19 +69,3 @@ def _rows(top: Top, motion: DescribedMotion) -> Iterable[tuple[str, str, str]]:
         'kg m²/s; axis' + ('' if motion.pivot_moves else ', vertical'))
     if least := 2.0 * natural_momentum(top):
         yield 'Stable upright', f'if |L₃| &gt; {number(least)} kg m²/s', ''
-
-
-def legend(entries: Sequence[tuple[tuple[int, int, int], str]]) -> str:
-    """Return what the colours in the scene mean."""
-    return '<div class="top-legend">' + ''.join(
-        f'<div><i style="background:rgb{colour}"></i>{text}</div>'
-        for colour, text in entries) + '</div>'
-
-
-def document(title: str, scene: str, legend_html: str, words_html: str,
-             plots_html: Sequence[str]) -> str:
-    """Return a page that works without a server; `scene` is a page for its own frame."""
-    template = Template((HERE / 'file.html').read_text('utf-8'))
-    return template.substitute(
-        title=html.escape(title), style=STYLE, legend=legend_html, words=words_html,
-        plots=''.join(plots_html), scene=scene.replace('&', '&amp;').replace('"', '&quot;'))

@@ -51,7 +51,7 @@ class Visit:
                 urllib.parse.urlsplit(asked.url).hostname))
         self.page.goto(address if '://' in address else Path(address).as_uri())
         self.scene = self.page.frames[1] if framed else self.page
-        self.wait("window.__viserMutable?.nodePoseData['/top0/body']")
+        self.wait("window.__viserMutable?.nodePoseData['/top/body']")
 
     def __enter__(self):
         return self
@@ -63,7 +63,7 @@ class Visit:
         """Wait until a JavaScript expression is true; return it."""
         return self.scene.wait_for_function(condition, timeout=PATIENCE_MS).json_value()
 
-    def attitude(self, name='/top0/body'):
+    def attitude(self, name='/top/body'):
         """Return the quaternion x, y, z, w with which a node of the scene is drawn."""
         w, *xyz = self.scene.evaluate(f'window.__viserMutable.nodePoseData[{name!r}].wxyz')
         return [*xyz, w]

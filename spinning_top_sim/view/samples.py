@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A top as published samples show it, from a running node or from a log."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from spinning_top_sim.physics.pivot import Kinematics
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.streams.topics import all_channels
+from spinning_top_sim.times import NANOSECONDS, period_ns
+from spinning_top_sim.tools.analysis import RATES, attitudes_of
+from spinning_top_sim.view.source import Reals, Times, Track
+
+# The topics that tell the attitude, the one that tells most first.
+TOPICS = ('ground_truth/odom', 'joint_states', 'pose', 'ground_truth/imu')
+# Columns of a sample: q(world <- body) as x, y, z, w, the angular velocity in the body, the place
+# of the pivot.  NaN: not known.
+QUATERNION, OMEGA, PLACE, WIDTH = slice(0, 4), slice(4, 7), slice(7, 10), 10
+
+
+class SampledStates(States):
+    """States by samples, without forces.  What follows from a rate that is not known is NaN."""
+
+    method = 'samples'
+
+    def __init__(self, top: Top, t: Reals, rows: Reals) -> None:
+        super().__init__(top, State(theta=0.0, l3=0.0, lz=0.0), len(t))
+        (x, y, z, w), (w1, w2, w3) = rows[:, QUATERNION].T, rows[:, OMEGA].T
+        self.t, self.rows_quaternion, self.transverse_velocity = t, (x, y, z, w), (w1, w2)
+        self._l3 = self.l3 = top.lambda3 * w3
+        place = np.nan_to_num(rows[:, PLACE].T)
+        self.pivot = Kinematics(place, 0.0 * place, 0.0 * place)
+        up_1, up_2, height = self.rows_vertical
+        across = w1 * up_1 + w2 * up_2
+        self.lz = top.lambda1 * across + self._l3 * height
+        with np.errstate(divide='ignore', invalid='ignore'):        # at a pole
+            self.phi_dot = across / (up_1 ** 2 + up_2 ** 2)
+
+
+class SampledTrack(Track):
+    """
+    The samples of a top.
+
+    begin_ns : of a log, the time from which on this is the top
+    """
+
+    def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
+        super().__init__(values, epoch_ns=epoch_ns)
+        self.stamps_ns, self.rows = np.empty(0, np.int64), np.empty((0, WIDTH))
+        self.begin_ns = 0
+        self._imu = Imu(values, period_ns(values['imu.rate']))
+        self.templates = {channel.topic: channel.template for channel in all_channels(
+            values, self._imu) if channel.topic in TOPICS}
+
+    def times(self, begin_ns: int, end_ns: int) -> Times:
+        begin, end = np.searchsorted(self.stamps_ns, [begin_ns + self.epoch_ns,
+                                                      end_ns + self.epoch_ns + 1])
+        return self.stamps_ns[begin:end] - self.epoch_ns
+
+    def newest(self, t_ns: int) -> int | None:
+        index = int(np.searchsorted(self.stamps_ns, t_ns + self.epoch_ns, 'right')) - 1
+        return None if index < 0 else int(self.stamps_ns[index]) - self.epoch_ns
+
+    def pivot_moves(self, t_ns: int) -> bool:
+        index = int(np.searchsorted(self.stamps_ns, t_ns + self.epoch_ns))
+        places = np.nan_to_num(self.rows[max(index - 1, 0):index + 1, PLACE])
+        return bool(np.diff(places, axis=0).any())
+
+    def at(self, times: Times) -> SampledStates:
+        return SampledStates(self.top, times / NANOSECONDS, self.rows[
+            np.searchsorted(self.stamps_ns, times + self.epoch_ns)])
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """The times of the first and the last sample, if there are samples."""
+        return int(self.stamps_ns[0]) - self.epoch_ns, int(self.stamps_ns[-1]) - self.epoch_ns
+
+    def add(self, stamps_ns: Times, rows: Reals) -> None:
+        """Add samples with stamps (n,) [ns] in any order; of equal stamps the first is kept."""
+        self.stamps_ns, order = np.unique(np.concatenate((self.stamps_ns, stamps_ns)),
+                                          return_index=True)
+        self.rows = np.concatenate((self.rows, rows))[order]
+
+    def add_messages(self, topic: str, messages: Sequence[bytes],
+                     stamps_ns: Sequence[int] | None = None) -> None:
+        """
+        Add serialized messages of one of TOPICS; by default with the stamps in them.
+
+        Those whose quaternion is no attitude are left out.
+        """
+        template, data = self.templates[topic], b''.join(messages)
+        stamps = template.stamps_ns(data) if stamps_ns is None else np.array(stamps_ns, np.int64)
+        fields = template.decode(data)
+        found = attitudes_of(topic, self._imu, stamps, fields)
+        assert found is not None
+        rows = np.full((len(found.stamps_ns), WIDTH), np.nan)
+        rows[:, QUATERNION] = found.rows[:4].T
+        if found.omega is not None:
+            rows[:, OMEGA] = found.rows[RATES].T
+        if topic in ('pose', 'ground_truth/odom'):
+            rows[:, PLACE] = fields[0][np.isin(stamps, found.stamps_ns)]
+        self.add(found.stamps_ns, rows)
+
+    def drop_before(self, stamp_ns: int) -> None:
+        """Drop the samples before a stamp [ns]."""
+        kept = self.stamps_ns >= stamp_ns
+        self.stamps_ns, self.rows = self.stamps_ns[kept], self.rows[kept]

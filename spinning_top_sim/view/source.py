@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the page shows: a top as a function of time, wherever it comes from.
+
+Times are integer nanoseconds since t = 0.
+"""
+
+import contextlib
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.regimes import Description, natural_momentum
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.shape import Shape
+from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.vertical import state_of
+from spinning_top_sim.streams import parameters
+from spinning_top_sim.times import NANOSECONDS
+
+Times = NDArray[np.int64]
+Reals = NDArray[np.float64]
+WINDOW_NS = 10 * NANOSECONDS    # of traces and plots; twice this is kept
+SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
+SAME = 1e-6                 # relative difference between the constants of one motion
+
+
+@dataclass(frozen=True)
+class Motion:
+    """
+    What stays the same while a top moves.
+
+    l3, lz, energy : constants [kg m^2/s], and the energy lambda1 theta'^2/2 + V(theta) [J]
+    description : None if it has no closed form
+    pivot_moves : whether the pivot moves: then L3 alone is constant
+    """
+
+    l3: float
+    lz: float
+    energy: float
+    description: Description | None
+    pivot_moves: bool
+
+    @classmethod
+    def through(cls, sample: States, *, pivot_moves: bool) -> Self:
+        """Return the motion through a sample; one that is special but for rounding is special."""
+        top = sample.top
+        state = state_of(top, sample.quaternion[0], np.ravel(np.broadcast_arrays(
+            *attitude.rotated(sample.rows_quaternion, sample.rows_angular_velocity))))
+        dust = SNAP * max(abs(state.l3), abs(state.lz), natural_momentum(top))
+        l3, lz = (0.0 if abs(value) < dust else value for value in (state.l3, state.lz))
+        lz = next((pole for pole in (l3, -l3) if abs(lz - pole) < dust), lz)
+        theta_dot = state.theta_dot if top.lambda1 * abs(state.theta_dot) > dust else 0.0
+        description = None
+        with contextlib.suppress(ArithmeticError, ValueError):
+            if not pivot_moves:
+                description = ExactSolution(top, State(
+                    theta=state.theta, theta_dot=theta_dot, l3=l3, lz=lz)).describe(SNAP)
+        height = effective_potential(top, state.l3, state.lz, np.array([state.theta]))
+        return cls(state.l3, state.lz, 0.5 * top.lambda1 * state.theta_dot ** 2
+                   + float(height[0]), description, pivot_moves)
+
+
+class Track(ABC):
+    """
+    One top on the page.
+
+    values : checked parameters of the run
+    about : where it comes from, in a sentence; '' if the title of the page says it
+    epoch_ns : stamp of t = 0 [ns]
+    """
+
+    def __init__(self, values: Mapping[str, Any], about: str = '', epoch_ns: int = 0) -> None:
+        self.values, self.about, self.epoch_ns = values, about, epoch_ns
+        self.top = parameters.top_of(values)
+        self.shape = Shape(self.top)
+        self._known: tuple[tuple[float, ...], Motion] | None = None     # the newest motion
+
+    @abstractmethod
+    def times(self, begin_ns: int, end_ns: int) -> Times:
+        """Return the times (n,) of samples in a span, both ends included."""
+
+    @abstractmethod
+    def at(self, times: Times) -> States:
+        """Return the states at some of these times."""
+
+    @abstractmethod
+    def newest(self, t_ns: int) -> int | None:
+        """Return the time of the newest sample up to a time, None if there is none."""
+
+    @abstractmethod
+    def pivot_moves(self, t_ns: int) -> bool:
+        """Return whether the pivot moves at the time of a sample."""
+
+    def state(self, t_ns: int) -> States:
+        """Return the state (n = 1) at the time of a sample."""
+        return self.at(np.array([t_ns]))
+
+    def states(self, begin_ns: int, end_ns: int, most: int) -> tuple[Times, States]:
+        """Return at most so many evenly chosen samples in a span, with the last one."""
+        times = self.times(begin_ns, end_ns)
+        stride = max(1, -(-len(times) // most))
+        chosen = times[(len(times) - 1) % stride::stride]
+        return chosen, self.at(chosen)
+
+    def motion_at(self, t_ns: int) -> Motion | None:
+        """Return the motion at a time, by the newest sample; None if its rates are not known."""
+        newest_ns = self.newest(t_ns)
+        sample = None if newest_ns is None else self.state(newest_ns)
+        if newest_ns is None or sample is None or not np.isfinite(sample.energy[0]):
+            return None
+        moves, natural = self.pivot_moves(newest_ns), natural_momentum(self.top)
+        constants = tuple(0.0 if moves and name != 'l3' else float(getattr(sample, name)[0])
+                          for name in ('energy', 'l3', 'lz'))
+        if self._known is None or moves != self._known[1].pivot_moves or any(
+                abs(a - b) > SAME * max(abs(a), abs(b), least) for a, b, least in zip(
+                    constants, self._known[0], (abs(self.top.gravity_torque), natural, natural),
+                    strict=True)):
+            self._known = constants, Motion.through(sample, pivot_moves=moves)
+        return self._known[1]
+
+
+class Source(Protocol):
+    """What a page shows, and the controls that it has put there."""
+
+    def update(self, seconds: float) -> int:
+        """Do what the controls ask for, let real time pass [s]; return the time to draw."""
+
+    def track_at(self, t_ns: int) -> Track | None:
+        """Return the top that is there at a time, None if there is none yet."""
+
+
+def effective_potential(top: Top, l3: float, lz: float, theta: Reals) -> Reals:
+    """
+    Return V(theta) [J] of lambda1 theta'^2/2 + V(theta) = E - L3^2/(2 lambda3); theta: (n,).
+
+    It is (Lz - L3 cos theta)^2/(2 lambda1 sin^2 theta) + P cos(theta).
+    """
+    phi_dot = attitude.precession_rate(top, l3, lz, np.cos(0.5 * theta) ** 2,
+                                       np.sin(0.5 * theta) ** 2)
+    return (0.5 * top.lambda1 * (phi_dot * np.sin(theta)) ** 2
+            + top.gravity_torque * np.cos(theta))
