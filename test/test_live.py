@@ -4,11 +4,11 @@
 import gc
 import itertools
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.simulations import (
+    EPOCH_NS,
     MILLISECOND,
     SECOND,
     calls_of,
@@ -26,6 +26,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams import live, parameters
 from spinning_top_sim.streams.channel import Channel
+from spinning_top_sim.streams.live import LiveSimulation
 
 PERIOD_NS = 10 * MILLISECOND        # of most topics
 
@@ -43,10 +44,10 @@ def total(samples):
     return counts
 
 
-def test_the_log_gets_an_instant_before_subscribers_and_those_that_fail_get_a_rest(monkeypatch):
+def test_the_log_gets_an_instant_before_subscribers_and_those_that_fail_get_a_rest():
     expected, clock = play(simulate(), SECOND, 'pose', 'joint_states'), [1000.0]
-    monkeypatch.setattr(live, 'time', SimpleNamespace(monotonic=lambda: clock[0]))
-    simulation, tried, logged = simulate(), [], []
+    simulation = LiveSimulation(parameters.checked({}), EPOCH_NS, lambda: clock[0])
+    tried, logged = [], []
     taken = record(simulation, 'pose', 'joint_states')
 
     def fail(data):

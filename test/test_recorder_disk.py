@@ -254,12 +254,9 @@ def test_what_is_handed_over_is_on_the_disk_within_max_loss(
         on_disk = written
         flushes += 1
 
-    monkeypatch.setattr(recorder_module, 'time', SimpleNamespace(
-        monotonic=lambda: now, strftime=time.strftime))
-    monkeypatch.setattr(recorder_module, 'threading', SimpleNamespace(
-        Event=Event, Thread=Thread, TIMEOUT_MAX=threading.TIMEOUT_MAX))
     recorder = Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, max_loss=max_loss,
-                        min_free_bytes=0)
+                        min_free_bytes=0, clock=lambda: now,
+                        threads=SimpleNamespace(Event=Event, Thread=Thread))
     pwrite, open_file = os.pwrite, recorder._open
 
     def open_at_once():

@@ -43,6 +43,7 @@ class Output:
 
     publish : takes each message in time, and may raise; None while there are no subscribers
     log_index : number of the topic in the log, None if it is not recorded
+    clock : returns steady time [s]
     sent, skipped, failed : messages that were published, that were too late for that, and that
         `publish` refused
     """
@@ -50,6 +51,7 @@ class Output:
     channel: Channel
     publish: Callable[[bytes], object] | None = None
     log_index: int | None = None
+    clock: Callable[[], float] = time.monotonic
     sent: int = 0
     skipped: int = 0
     failed: int = 0
@@ -59,7 +61,7 @@ class Output:
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
     _data: bytes = b''
     _cursor: int = 0
-    _blocked_until: float = 0.0     # on the monotonic clock [s]
+    _blocked_until: float = 0.0     # on the clock
 
     @property
     def is_used(self) -> bool:
@@ -97,11 +99,11 @@ class Output:
     def send(self, message: bytes) -> None:
         """Publish a message; what the middleware refuses is counted."""
         assert self.publish is not None
-        if time.monotonic() >= self._blocked_until:
+        if self.clock() >= self._blocked_until:
             try:
                 self.publish(message)
             except Exception:       # rclpy raises RCLError, which it does not export
-                self._blocked_until = time.monotonic() + BLOCKED_SECONDS
+                self._blocked_until = self.clock() + BLOCKED_SECONDS
             else:
                 self.sent += 1
                 return
@@ -115,11 +117,14 @@ class LiveSimulation(Simulation):
     What is sent does not depend on when it is computed, or on how often `send` is called.
 
     outputs : of each channel, in the order in which the messages of one time are sent
+    clock : returns steady time [s]
     """
 
-    def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
+    def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0,
+                 clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(values, epoch_ns)
-        self.outputs = [Output(channel) for channel in self.channels]
+        self.outputs = [Output(channel, clock=clock) for channel in self.channels]
+        self._clock = clock
         self._write: Callable[[Sequence[LogRows]], object] = lambda rows: None
         self._used: list[tuple[int, Output]] = []   # outputs in use, with their numbers
         self._groups: list[_Group] = []             # of these
@@ -213,12 +218,12 @@ class LiveSimulation(Simulation):
         behind = min(self._groups, key=lambda group: group.computed_ns, default=None)
         if behind is None or behind.computed_ns >= until_ns:
             return
-        begin = time.monotonic()
+        begin = self._clock()
         goal_ns = min(behind.computed_ns + self._span_ns, behind.furthest_ns)
         with contextlib.suppress(IntegrationError):     # `send` meets it when the time has come
             self._go_ahead(goal_ns, 0.5 * seconds)
             self._compute(behind, min(goal_ns, self._reached_ns))
-        taken = time.monotonic() - begin
+        taken = self._clock() - begin
         if taken < 0.5 * seconds:
             self._span_ns = min(2 * self._span_ns, LONGEST_SPAN_NS)
         elif taken > 0.8 * seconds:
@@ -226,12 +231,12 @@ class LiveSimulation(Simulation):
 
     def _go_ahead(self, until_ns: int, seconds: float) -> None:
         """Let the solver go on up to a time, or for about so long."""
-        now = begin = time.monotonic()
+        now = begin = self._clock()
         while self._reached_ns < until_ns and now < begin + seconds:
             goal_ns = min(until_ns, self._reached_ns + self._stride_ns)
             stride_ns, called = goal_ns - self._reached_ns, now
             self._reached_ns = self.reach(self._reached_ns, goal_ns)
-            now = time.monotonic()
+            now = self._clock()
             self._stride_ns = max(1, int(stride_ns * min(
                 GROWTH, 0.5 * seconds / max(now - called, 1e-6))))
         self.forget()
