@@ -92,10 +92,23 @@ def check_output(*paths: Path | None) -> None:
     """Raise OSError if one of these files cannot be made, such as because it exists."""
     for path in filter(None, paths):
         try:
-            open(path, 'xb').close()
+            with new_file(path, 'xb'):
+                pass
             path.unlink()
         except OSError as error:
             raise OSError(f'cannot write {path}: {why_not_written(path, error)}') from error
+
+
+@contextlib.contextmanager
+def new_file(path: Path, mode: str = 'x') -> Iterator[Any]:
+    """Open a new file.  An OSError in writing it names it, and removes it: it is not whole."""
+    file = open(path, mode, encoding=None if 'b' in mode else 'utf-8')  # noqa: SIM115
+    try:
+        with file:
+            yield file
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def printable(text: str) -> str:

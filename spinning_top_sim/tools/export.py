@@ -50,7 +50,8 @@ def _run(arguments: argparse.Namespace) -> int:
     text = model(parameters.checked(scene_file.given(arguments)), arguments.model,
                  names[0] if names else 'spinning_top')
     cli.check_output(arguments.output)
-    arguments.output.write_text(text, encoding='utf-8')
+    with cli.new_file(arguments.output) as file:
+        file.write(text)
     return cli.OK
 
 

@@ -77,7 +77,7 @@ def write(reader: LogReader, run: RunDescription,
     for kind, path in exports:
         lines = KINDS[kind][1](reader, run)
         first = next(lines, '')         # a run that is refused leaves no file
-        with open(path, 'x', encoding='utf-8') as file:
+        with cli.new_file(path) as file:
             file.write(first)
             file.writelines(lines)
         yield f'{path}: {kind}'

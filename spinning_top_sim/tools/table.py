@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from spinning_top_sim.installation import needed
 from spinning_top_sim.streams.cdr import NANOSECONDS, Values, fill
 from spinning_top_sim.streams.channel import Channel, Rows, Samples, Stamps
+from spinning_top_sim.tools import cli
 
 # Names and units of the columns of a table.
 UNITS = {
@@ -54,7 +55,7 @@ def _true(samples: Samples, pivot_moves: bool) -> Sequence[NDArray[np.float64]]:
 def write_csv(path: Path, blocks: Iterable[NDArray[np.float64]],
               units: Mapping[str, str]) -> None:
     """Write rows with a head of names and units.  An existing file raises FileExistsError."""
-    with open(path, 'x', encoding='utf-8') as file:
+    with cli.new_file(path) as file:
         file.write(','.join(f'{name} [{unit}]' for name, unit in units.items()) + '\n')
         for rows in blocks:
             # csv.writer looks for what to quote in every number, and takes a third longer.
@@ -69,6 +70,6 @@ def write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]],
         from pyarrow import parquet  # noqa: PLC0415
     schema = pa.schema([pa.field(name, pa.float64(), metadata={'unit': unit})
                         for name, unit in units.items()])
-    with open(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
+    with cli.new_file(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
         for rows in blocks:
             writer.write_table(pa.table(list(rows.T), schema=schema))

@@ -17,7 +17,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.cdr import NANOSECONDS
 from spinning_top_sim.streams.play import Block
-from spinning_top_sim.tools import recorded_run
+from spinning_top_sim.tools import cli, recorded_run
 from spinning_top_sim.tools.foreign_messages import LAYOUTS, decode
 from spinning_top_sim.view import plots, svg, text
 from spinning_top_sim.view.page import CATCH_UP_S, RATE, Page, set_value
@@ -236,6 +236,6 @@ class Player:
             self.draw(picture / RATE)
         document = text.document(page.title, serializer.as_html(), page.legend(), words, [
             svg.draw(plot) for plot in (*plots.motion_plots(tops), *plots.accuracy_plots(tops))])
-        with open(path, 'x', encoding='utf-8') as file:
+        with cli.new_file(path) as file:
             file.write(document)
         return f'{seconds:g} of {self.length:g} s, {len(document.encode()) / 1e6:.1f} MB'

@@ -50,6 +50,13 @@ class Plan:
     ends_ms: int
     kill_at: int | None = None
 
+    @property
+    def is_calm(self):
+        """Whether no tick is late, and nothing holds the loop up."""
+        return not self.follows and {one.name for one in self.actions} <= {
+            'command', 'put', 'drive', 'start_recording', 'stop_recording', 'listen', 'leave',
+            'step_date'}
+
     def only(self, numbers):
         """Return the plan with these of its actions."""
         return replace(self, actions=tuple(self.actions[k] for k in numbers))
