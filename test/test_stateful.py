@@ -104,7 +104,7 @@ def test_any_order_of_evaluation_events_and_forgetting_gives_the_same_bits():
 
 
 class Node(RuleBasedStateMachine):
-    """A node in this process, by its services, parameters and topics, beside what it should say."""
+    """A node in this process, by services, parameters and topics, beside what it should say."""
 
     @initialize()
     def begin(self):

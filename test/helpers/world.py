@@ -92,7 +92,7 @@ class World:
         self._lost_ticks = self._cost_ns = self._cost_until_ns = 0
         self._date_ns = self._jump_ns = self._stops_at_ns = 0
         self._lag_ns = None                     # of a second /clock
-        self._is_second = False
+        self._is_second, self._steered, self.was_full = False, (), False
         self.path, self.is_over, self.deleted = None, False, set()
         self.disk = Disk(machine, kill_at=plan.kill_at)
         self.simulation = Observed(self, self.values)
@@ -175,6 +175,10 @@ class World:
     def drive(self, *velocity):
         self.loop.drive(velocity)
 
+    def steer(self, *velocity):
+        """Ask for a velocity at each tick from now on, or no more."""
+        self._steered = velocity
+
     def pause(self):
         self.loop.pause()
 
@@ -244,12 +248,18 @@ class World:
             self._tick_until(self._begin_ns + action.at_ms * MILLISECOND)
             with contextlib.suppress(ValueError, RuntimeError):
                 getattr(self, action.name)(*action.arguments)
+                if action.name in ('command', 'put'):
+                    self._check_time()
         end_ns = max(self.machine.now_ns, self._begin_ns + self.plan.ends_ms * MILLISECOND)
         self._tick_until(end_ns)
         if self.plan.ends != 'close':
             raise Killed
         self._be_quiet()
         self.recording.close()
+        for log in self.logs:
+            is_closed = log.recorder.state in ('closed', 'failed')
+            said = log.recorder.close(0.0).error or ''
+            assert is_closed or f'{log.path.name} could not be closed within 0 s' in said
         self.is_over = True
 
     def _tick_until(self, until_ns):
@@ -268,15 +278,31 @@ class World:
                 self._tick()
 
     def _tick(self):
+        if self._steered:
+            self.loop.drive(self._steered)
         self.loop.tick()
+        self._check_time()
         self.recording.check()
         for log in self.logs:
             assert log.recorder.counters.queued <= MOST_QUEUED
         if self.recording.is_on:
             recorder = self.logs[-1].recorder
             is_slow = recorder.possible_loss > self.values['record.max_loss']
-            assert is_slow == (self.recording.warning is not None)
+            warning = self.recording.warning or ''
+            name = self.logs[-1].path.name
+            assert is_slow == (f'{name} is slow: a power loss would' in warning)
             assert self.disk.is_disturbed or not is_slow, 'an undisturbed disk is not slow'
+
+    def _check_time(self):
+        """Where nothing holds the loop up, all is sent that is due, and no more."""
+        loop = self.loop
+        self.was_full |= not self.recording.has_room()
+        assert (loop.state is LoopState.FAILED) == (loop.failure is not None)
+        if (self.plan.is_calm and loop.state is LoopState.RUNNING
+                and not self.was_full and self.recording.has_room()):
+            date_ns = DATE_NS + self.machine.now_ns - self._begin_ns
+            due_ns = int((date_ns - self.epoch_ns) * self.values['time_scale'])
+            assert abs(loop.now_ns - max(due_ns, 0)) <= 2, 'what is due is sent'
 
     def _be_quiet(self):
         """What is due is sent, by the clock alone, once all is quiet again."""

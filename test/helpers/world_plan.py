@@ -15,6 +15,10 @@ STREAMS = {'pose': ('pose',), 'joint_states': ('joint_states',),
            'markers': ('markers',), 'mag': ('imu/mag', 'ground_truth/mag')}
 ALWAYS_ON = ('ground_truth_imu',)       # by default: switched off here
 SCENES = ('cusp', 'cusp', 'looping', 'sleeping', 'shuttle', 'near_separatrix')
+CALM = frozenset(('command', 'put', 'drive', 'steer', 'start_recording', 'stop_recording',
+                  'listen', 'leave', 'step_date'))
+FALLS = {'solver.method': 'rk45', 'solver.equations': 'euler', 'initial.theta': 0.5,
+         'initial.theta_dot': -3.0, 'spin.l3': 0.2, 'spin.lz': -0.2}    # through a pole
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EINTR)
 
 
@@ -53,9 +57,7 @@ class Plan:
     @property
     def is_calm(self):
         """Whether no tick is late, and nothing holds the loop up."""
-        return not self.follows and {one.name for one in self.actions} <= {
-            'command', 'put', 'drive', 'start_recording', 'stop_recording', 'listen', 'leave',
-            'step_date'}
+        return not self.follows and CALM.issuperset(one.name for one in self.actions)
 
     def only(self, numbers):
         """Return the plan with these of its actions."""
@@ -66,8 +68,11 @@ def plan_of(seed):
     chance = random.Random(seed)
     values, topics = _values(chance)
     ends_ms = chance.choice((300, 500, 900))
-    follows = chance.random() < 0.25
+    is_calm = chance.random() < 0.2
+    follows = not is_calm and chance.random() < 0.25
     kinds = [*_kinds(chance, topics, values, follows)]
+    if is_calm:
+        kinds = [(weight, kind) for weight, kind in kinds if kind()[0] in CALM]
     names, weights = zip(*((kind, weight) for weight, kind in kinds), strict=True)
     actions = [Action(chance.randrange(ends_ms), *make())
                for make in chance.choices(names, weights, k=chance.choice((2, 5, 9, 15)))]
@@ -101,6 +106,8 @@ def _values(chance):
                    'imu.gyroscope_random_walk': 0.001}
         if chance.random() < 0.5:
             values |= {'imu.drop_rate': 0.2, 'imu.duplicate_rate': 0.1, 'imu.stamp_jitter': 0.001}
+    if chance.random() < 0.07:
+        values |= FALLS
     if chance.random() < 0.1:
         values['duration'] = chance.uniform(0.05, 0.5)
     return values, [topic for name in streams for topic in STREAMS[name]]
@@ -136,6 +143,7 @@ def _kinds(chance, topics, values, follows):
     yield 4, lambda: ('command', (momentum(), momentum()))
     yield 1, lambda: ('put', (chance.choice((0.0, 0.3, 2.0, 9.0)), momentum(), momentum()))
     yield 3, lambda: ('drive', velocity())
+    yield 1, lambda: ('steer', chance.choice(((), (0.5, 0.0, 0.0), (0.0, 0.2, 0.1))))
     yield 1, lambda: ('pause', ())
     yield 2, lambda: ('resume', ())
     yield 1, lambda: ('step', (chance.choice((1, 10_000_000, 123_456_789)),))
