@@ -6,7 +6,6 @@ And nothing is left that claims to be whole and is not.
 """
 
 import errno
-import os
 import random
 import resource
 
@@ -24,17 +23,17 @@ from spinning_top_sim.tools import ensemble_part, ensemble_spec, export, inspect
 FAILURES = (errno.ENOSPC, errno.EIO, errno.EINTR, None)
 
 
-def each_failing(act, check):
+def each_failing(act, check, more=()):
     """Let each call fail in each way; `check` takes what comes of it, and what has failed."""
     with Calls() as calls:
         ordinary = act('ordinary')
     check(ordinary, None)
     assert calls.names
     for number, name in enumerate(calls.names, start=1):
-        for error in FAILURES if 'write' in name else FAILURES[:-1]:
+        for error in (*more, *(FAILURES if 'write' in name else FAILURES[:-1])):
             with Calls(number, error):
                 found = act(f'{number}_{error}')
-            check(found, f'{name}, call {number}, fails with {error and os.strerror(error)}')
+            check(found, f'{name}, call {number}, fails with {error}')
 
 
 def command(main, *arguments):
@@ -103,6 +102,30 @@ def all_or_nothing(act, tmp_path, capsys, is_whole):
     each_failing(done, check)
 
 
+def test_of_a_log_of_simulate(tmp_path, capsys):
+    """What was computed before is in the log, or there is none."""
+    def act(name):
+        path = tmp_path / f'{name}.mcap'
+        code = command(simulate.main, '--duration', 0.1, '--command', '0.05:1.7:1.4', '--quiet',
+                       '-p', 'record.streams:=[pose]', '-o', path)
+        return code, path, capsys.readouterr().err
+
+    _, path, _ = act('expected')
+    expected = seen_by_us(path)
+
+    def check(found, failure):
+        code, path, said = found
+        kept = seen_by_us(path) if path.exists() else []
+        if code == 0:
+            assert kept == expected, failure
+            return
+        assert code == (130 if 'Interrupt' in failure else 1), failure
+        assert said.count('\n') == 1 and (code == 130 or path.name in said), (failure, said)
+        assert kept == expected[:len(kept)], failure
+
+    each_failing(act, check, more=[KeyboardInterrupt])
+
+
 def test_of_a_recovery(tmp_path, short, capsys):
     torn = tmp_path / 'torn.mcap'
     torn.write_bytes(short.read_bytes()[:-10_000])
@@ -116,16 +139,16 @@ def test_of_a_recovery(tmp_path, short, capsys):
                    is_whole)
 
 
-@pytest.mark.parametrize('kind', ['tum', 'euroc', 'euroc_imu', 'kalibr', 'csv', 'parquet', 'urdf'])
+@pytest.mark.parametrize('kind', ['euroc', 'csv', 'parquet', 'urdf'])
 def test_of_an_export(tmp_path, capsys, kind):
-    log = log_of(tmp_path / 'run.mcap', '--duration', 0.3, *(
+    log = log_of(tmp_path / 'run.mcap', '--duration', 0.1, *(
         f'-p{name}' for name in ('ground_truth_imu_odom.enabled:=true', *(
             f'imu.{kind}_{noise}:=0.01' for kind in ('gyroscope', 'accelerometer')
             for noise in ('noise_density', 'random_walk')))))
 
     def act(path):
         if kind in ('csv', 'parquet'):
-            return command(simulate.main, '--duration', 0.3, '--quiet', '--format', kind,
+            return command(simulate.main, '--duration', 0.1, '--quiet', '--format', kind,
                            '-o', path)
         if kind == 'urdf':
             return command(export.main, '--model', kind, '-o', path)

@@ -15,7 +15,7 @@ class Calls:
     Counts the calls within the `with`, and lets one fail.
 
     fails : number of that call, from 1 on; None: none
-    error : the `errno` of the failure; None: of a write, that it writes but a part
+    error : the `errno` of the failure, or KeyboardInterrupt; None: a write writes but a part
     names : of the calls so far
     """
 
@@ -43,6 +43,8 @@ class Calls:
         self.names.append(name)
         if len(self.names) != self._fails:
             return False
+        if self._error is KeyboardInterrupt:
+            raise KeyboardInterrupt
         if self._error is not None:
             raise OSError(self._error, os.strerror(self._error), path)
         return True

@@ -81,6 +81,8 @@ def plan_of(seed):
             actions.append(Action(0, 'listen', (topic,)))
     if chance.random() < 0.7:
         actions.append(Action(chance.choice((0, 0, 50)), 'start_recording'))
+    if 'solver.equations' in values:        # it falls, stands still, and begins again
+        actions.append(Action(ends_ms - 50, 'reset', (None,)))
     ends = chance.choice(('close', 'close', 'kill', 'cut'))
     return Plan(seed, values, follows, tuple(sorted(actions, key=lambda one: one.at_ms)), ends,
                 ends_ms, chance.randrange(4, 60) if chance.random() < 0.3 and ends != 'close'
