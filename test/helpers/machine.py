@@ -146,7 +146,8 @@ class _File:
     """What was done to a file: data at an offset, or None and a size."""
 
     changes: list = field(default_factory=list)
-    synced: int = 0             # so many of these are on the disk for sure
+    synced: int = 0             # so many of these are on the disk for sure,
+    doubtful: set = field(default_factory=set)      # but for those whose sync has failed
     is_listed: bool = False     # so is its name
 
 
@@ -173,12 +174,16 @@ class Disk:
     faults : of class Fault, that are to come
     size : bytes of a file that go onto the disk
     calls : how many there were
+    is_slow : whether all calls take long
     is_disturbed : whether one has failed, or taken long
+    is_misused : whether a file was closed while it was being synced
     """
 
-    def __init__(self, machine, kill_at=None):
-        self.faults, self.size, self.calls, self.is_disturbed = [], 1 << 60, 0, False
+    def __init__(self, machine, kill_at=None, *, is_slow=False):
+        self.faults, self.size, self.calls = [], 1 << 60, 0
+        self.is_disturbed, self.is_misused = is_slow, False
         self._machine, self._kill_at, self._files = machine, kill_at, {}
+        self._times = 20 if is_slow else 1
         self._real = {name: getattr(os, name) for name in CALLS}
 
     def __enter__(self):
@@ -213,7 +218,8 @@ class Disk:
         if file is None or not (file.is_listed or random.random() < 0.5):
             return None
         kept = [change for number, change in enumerate(file.changes)
-                if number < file.synced or random.random() < 0.6]
+                if (number < file.synced and number not in file.doubtful)
+                or random.random() < 0.6]
         left = bytearray(_image(kept))
         if kept and len(kept) > file.synced and random.random() < 0.3:      # half a write
             data, offset = kept[-1]
@@ -232,7 +238,7 @@ class Disk:
             raise Killed
         # One in eight takes long, as it does where others use the disk.
         machine.sleep(machine.random.randrange(
-            duration_ns if machine.random.random() < 0.875 else 2 * MILLISECOND))
+            self._times * (duration_ns if machine.random.random() < 0.875 else 2 * MILLISECOND)))
         if self.calls == self._kill_at:
             return Fault(name, 'kill', part=machine.random.random())
         for fault in self.faults:
@@ -280,7 +286,11 @@ class Disk:
         path = os.readlink(f'/proc/self/fd/{descriptor}')
         file = None if Path(path).is_dir() else self._file(descriptor)
         written = file and len(file.changes)
-        self._after(self._before('fsync', 8 * MILLISECOND))
+        fault = self._before('fsync', 8 * MILLISECOND)
+        self.is_misused |= not os.path.exists(f'/proc/self/fd/{descriptor}')
+        if file is not None and fault.kind == 'error':
+            file.doubtful.update(range(file.synced, written))
+        self._after(fault)
         if file is not None:
             file.synced = max(file.synced, written)
         else:

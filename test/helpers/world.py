@@ -94,7 +94,7 @@ class World:
         self._lag_ns = None                     # of a second /clock
         self._is_second, self._steered, self.was_full = False, (), False
         self.path, self.is_over, self.deleted = None, False, set()
-        self.disk = Disk(machine, kill_at=plan.kill_at)
+        self.disk = Disk(machine, plan.kill_at, is_slow=plan.is_slow)
         self.simulation = Observed(self, self.values)
         self.start = dict(self.values), self.simulation.trajectory.lz
         self.recording = Recording(self.simulation, self._topics, threads=machine,

@@ -26,7 +26,7 @@ from spinning_top_sim.streams.topics import resolve_topic
 from spinning_top_sim.tools.recorded_run import read_run_description
 from spinning_top_sim.tools.verify import compare
 
-SLACK_NS = 10 * MILLISECOND     # between a time that is noted here, and that of the recorder
+SLACK_NS = 4 * MILLISECOND     # between a time that is noted here, and that of the recorder
 
 
 class Findings:
@@ -87,6 +87,7 @@ class Findings:
         self._last_stamp_ns = self._run.epoch_ns + now_ns
         applied = self._run.apply(event.kind, **event.details)
         assert applied.as_mapping() == event.as_mapping()
+        assert event.sent_ns >= 0 or not event.begins_motion, 't = 0 is sent before'
         self._motion += event.kind == 'reset'
         if self._log:
             self._log.events.append((at_ns, event))
@@ -131,6 +132,7 @@ class Findings:
 
     def _compare_counters(self):
         world, loop = self._world, self._world.loop
+        assert not world.disk.is_misused, 'a file is closed while it is being synced'
         assert world.simulation.now_ns <= (round(world.values['duration'] * SECOND) or math.inf)
         if world.plan.is_calm and not world.was_full:
             outputs = world.simulation.outputs

@@ -44,6 +44,7 @@ class Plan:
     ends : 'close', 'kill' or 'cut' (the power)
     ends_ms : when
     kill_at : or in which call of the disk
+    is_slow : whether the disk is
     """
 
     seed: int
@@ -53,6 +54,7 @@ class Plan:
     ends: str
     ends_ms: int
     kill_at: int | None = None
+    is_slow: bool = False
 
     @property
     def is_calm(self):
@@ -86,7 +88,7 @@ def plan_of(seed):
     ends = chance.choice(('close', 'close', 'kill', 'cut'))
     return Plan(seed, values, follows, tuple(sorted(actions, key=lambda one: one.at_ms)), ends,
                 ends_ms, chance.randrange(4, 60) if chance.random() < 0.3 and ends != 'close'
-                else None)
+                else None, is_slow=chance.random() < 0.15)
 
 
 def _values(chance):
