@@ -78,7 +78,7 @@ def test_of_a_recording(tmp_path):
     each_failing(act, check)
 
 
-def all_or_nothing(act, tmp_path, capsys, is_whole):
+def all_or_nothing(act, tmp_path, capsys, is_whole, more=()):
     """
     After each failure the command says so in a line that names the file, and leaves none.
 
@@ -94,12 +94,13 @@ def all_or_nothing(act, tmp_path, capsys, is_whole):
         if code in (0, 3):
             assert is_whole(path), failure
         else:
-            assert failure and code in (1, 2) and said.count('\n') == 1, (failure, said)
-            assert path.name in said, (failure, said)
+            is_interrupted = 'Interrupt' in failure
+            assert code == (130 if is_interrupted else 1), (failure, said)
+            assert said.count('\n') == 1 and (is_interrupted or path.name in said), (failure, said)
             assert not path.exists() or is_whole(path) or (
                 'unlink' in failure and not path.stat().st_size), failure
 
-    each_failing(done, check)
+    each_failing(done, check, more)
 
 
 def test_of_a_log_of_simulate(tmp_path, capsys):
@@ -136,7 +137,7 @@ def test_of_a_recovery(tmp_path, short, capsys):
             return reader.whole and seen_by_us(path) == expected
 
     all_or_nothing(lambda path: command(recover.main, torn, '-o', path), tmp_path, capsys,
-                   is_whole)
+                   is_whole, more=[KeyboardInterrupt])
 
 
 @pytest.mark.parametrize('kind', ['euroc', 'csv', 'parquet', 'urdf'])

@@ -30,7 +30,7 @@ from spinning_top_sim.streams.topics import resolve_topic
 DATE_NS, SOURCE_NS = 1_700_000_000 * SECOND, 500 * SECOND
 QUIET_MS = 60               # at the end, in which nothing happens
 QUEUE_BYTES = 20_000        # of the recorder, so that it is full sooner
-MOST_QUEUED = 4000          # messages, with all that one tick may add
+MOST_QUEUED = 10_000        # messages: a chunk, the queue, and what one tick may add
 
 
 @dataclass

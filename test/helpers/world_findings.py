@@ -20,6 +20,7 @@ from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recovery import recover
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.events import COMMANDS, EVENTS, Event
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.streams.topics import resolve_topic
@@ -73,7 +74,7 @@ class Findings:
 
     def _play(self, until_ns):
         run, values = self._run, self._world.values
-        wanted = [one for one in run.channels if values[f'{one.name}.enabled']]
+        wanted = [one for one in run.channels if parameters.is_enabled(one.name, values)]
         for block in run.play(wanted, until_ns):
             for channel, times_ns, rows in block.messages:
                 self._sent[channel.topic] += [

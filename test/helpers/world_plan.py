@@ -12,7 +12,8 @@ from helpers.reference import scene_parameters
 STREAMS = {'pose': ('pose',), 'joint_states': ('joint_states',),
            'imu': ('imu/data_raw', 'ground_truth/imu_bias'), 'clock': ('/clock',),
            'invariants': ('~/invariants',), 'ground_truth_odom': ('ground_truth/odom',),
-           'markers': ('markers',), 'mag': ('imu/mag', 'ground_truth/mag')}
+           'markers': ('markers',), 'mag': ('imu/mag', 'ground_truth/mag'),
+           'increments': ('imu/dq', 'imu/dv'), 'gnss': ('gnss/fix',)}
 ALWAYS_ON = ('ground_truth_imu',)       # by default: switched off here
 SCENES = ('cusp', 'cusp', 'looping', 'sleeping', 'shuttle', 'near_separatrix')
 CALM = frozenset(('command', 'put', 'drive', 'steer', 'start_recording', 'stop_recording',
@@ -103,13 +104,17 @@ def _values(chance):
               'markers.trace_length': 0.2}
     for name in (*STREAMS, *ALWAYS_ON):
         values[f'{name}.enabled'] = name in streams
-        if name in streams:
+        if name in streams and name != 'increments':
             values[f'{name}.rate'] = chance.choice((33.0, 50.0, 100.0, 250.0))
     if 'imu' in streams:
         values |= {'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.gyroscope_noise_density': 0.01,
                    'imu.gyroscope_random_walk': 0.001}
         if chance.random() < 0.5:
             values |= {'imu.drop_rate': 0.2, 'imu.duplicate_rate': 0.1, 'imu.stamp_jitter': 0.001}
+    if 'gnss' in streams:
+        values |= {'gnss.rate': 50.0, 'gnss.latency': 0.03, 'gnss.outages': [0.05, 0.1]}
+    if 'increments' in streams:
+        values |= {'imu.sampling': 'mean', 'imu.rate': 200.0}
     if chance.random() < 0.07:
         values |= FALLS
     if chance.random() < 0.1:
@@ -153,7 +158,7 @@ def _kinds(chance, topics, values, follows):
     yield 1, lambda: ('step', (chance.choice((1, 10_000_000, 123_456_789)),))
     yield 2, lambda: ('reset', (chance.choice((None, None, True, False)),))
     yield 2, lambda: ('change', ({f'{name}.rate': chance.choice((20.0, 33.0, 100.0, 400.0))
-                                  for name in STREAMS if values[f'{name}.enabled']},))
+                                  for name in STREAMS if f'{name}.rate' in values},))
     yield 1, lambda: ('change', ({'time_scale': chance.choice((0.3, 1.0, 2.0))},))
     yield 1, lambda: ('change', ({'tick_rate': chance.choice((20.0, 100.0, 300.0))},))
     yield 3, lambda: ('start_recording', ())
