@@ -242,7 +242,8 @@ class Findings:
                 assert recover(reader, whole, lambda done: None) == sum(map(len, kept.values()))
                 with LogReader(whole) as recovered:
                     assert recovered.whole and _messages(recovered) == kept
-            self._verify(reader, kept)
+            if self._world.plan.seed % 2:       # it computes the run a third time
+                self._verify(reader, kept)
             return reader.whole, kept
         return False, {}
 

@@ -70,7 +70,7 @@ class Plan:
 def plan_of(seed):
     chance = random.Random(seed)
     values, topics = _values(chance)
-    ends_ms = chance.choice((300, 500, 900))
+    ends_ms = chance.choice((200, 400, 700))
     is_calm = chance.random() < 0.2
     follows = not is_calm and chance.random() < 0.25
     kinds = [*_kinds(chance, topics, values, follows)]
@@ -78,7 +78,7 @@ def plan_of(seed):
         kinds = [(weight, kind) for weight, kind in kinds if kind()[0] in CALM]
     names, weights = zip(*((kind, weight) for weight, kind in kinds), strict=True)
     actions = [Action(chance.randrange(ends_ms), *make())
-               for make in chance.choices(names, weights, k=chance.choice((2, 5, 9, 15)))]
+               for make in chance.choices(names, weights, k=chance.choice((2, 4, 8, 12)))]
     for topic in topics:
         if chance.random() < 0.6:
             actions.append(Action(0, 'listen', (topic,)))
@@ -93,7 +93,7 @@ def plan_of(seed):
 
 
 def _values(chance):
-    streams = chance.sample([*STREAMS], chance.choice((1, 1, 2, 3)))
+    streams = chance.sample([*STREAMS], chance.choice((1, 1, 1, 2)))
     values = {**scene_parameters(chance.choice(SCENES)),
               'solver.method': chance.choice(('rk45', 'exact', 'exact')),
               'tick_rate': chance.choice((50.0, 100.0, 200.0)),
@@ -105,7 +105,7 @@ def _values(chance):
     for name in (*STREAMS, *ALWAYS_ON):
         values[f'{name}.enabled'] = name in streams
         if name in streams and name != 'increments':
-            values[f'{name}.rate'] = chance.choice((33.0, 50.0, 100.0, 250.0))
+            values[f'{name}.rate'] = chance.choice((33.0, 50.0, 100.0))
     if 'imu' in streams:
         values |= {'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.gyroscope_noise_density': 0.01,
                    'imu.gyroscope_random_walk': 0.001}
@@ -157,7 +157,7 @@ def _kinds(chance, topics, values, follows):
     yield 2, lambda: ('resume', ())
     yield 1, lambda: ('step', (chance.choice((1, 10_000_000, 123_456_789)),))
     yield 2, lambda: ('reset', (chance.choice((None, None, True, False)),))
-    yield 2, lambda: ('change', ({f'{name}.rate': chance.choice((20.0, 33.0, 100.0, 400.0))
+    yield 2, lambda: ('change', ({f'{name}.rate': chance.choice((20.0, 33.0, 100.0, 250.0))
                                   for name in STREAMS if f'{name}.rate' in values},))
     yield 1, lambda: ('change', ({'time_scale': chance.choice((0.3, 1.0, 2.0))},))
     yield 1, lambda: ('change', ({'tick_rate': chance.choice((20.0, 100.0, 300.0))},))
