@@ -173,14 +173,14 @@ class Disk:
     kill_at : number of the call in which the process is killed
     faults : of class Fault, that are to come
     size : bytes of a file that go onto the disk
-    calls : how many there were
+    calls, failures : how many there were; failures of files, not of folders
     is_slow : whether all calls take long
     is_disturbed : whether one has failed, or taken long
     is_misused : whether a file was closed while it was being synced
     """
 
     def __init__(self, machine, kill_at=None, *, is_slow=False):
-        self.faults, self.size, self.calls = [], 1 << 60, 0
+        self.faults, self.size, self.calls, self.failures = [], 1 << 60, 0, 0
         self.is_disturbed, self.is_misused = is_slow, False
         self._machine, self._kill_at, self._files = machine, kill_at, {}
         self._times = 20 if is_slow else 1
@@ -250,12 +250,13 @@ class Disk:
                 return fault
         return Fault(name, 'none')
 
-    def _after(self, fault):
+    def _after(self, fault, *, is_file=True):
         if fault.kind == 'stop':
             self._machine.sleep()
         if fault.kind == 'kill':
             raise Killed
         if fault.kind == 'error':
+            self.failures += is_file
             raise OSError(fault.value, os.strerror(fault.value))
 
     def _file(self, descriptor):
@@ -266,6 +267,7 @@ class Disk:
         room = self.size - offset
         if room <= 0:
             self.is_disturbed = True
+            self.failures += 1
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         data = bytes(data[:room])
         if fault.kind in ('short', 'stop', 'kill', 'error'):
@@ -290,7 +292,7 @@ class Disk:
         self.is_misused |= not os.path.exists(f'/proc/self/fd/{descriptor}')
         if file is not None and fault.kind == 'error':
             file.doubtful.update(range(file.synced, written))
-        self._after(fault)
+        self._after(fault, is_file=file is not None)
         if file is not None:
             file.synced = max(file.synced, written)
         else:

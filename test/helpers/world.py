@@ -258,6 +258,7 @@ class World:
         self.recording.close()
         for log in self.logs:
             is_closed = log.recorder.state in ('closed', 'failed')
+            assert is_closed or self.disk.is_disturbed, 'a log is closed'
             said = log.recorder.close(0.0).error or ''
             assert is_closed or f'{log.path.name} could not be closed within 0 s' in said
         self.is_over = True

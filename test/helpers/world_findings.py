@@ -205,8 +205,12 @@ class Findings:
         if state == 'closed':
             counters = recorder.counters
             assert (counters.lost, counters.queued, counters.error) == (0, 0, None)
+            assert not world.disk.failures or len(world.logs) > 1, 'a failure is told'
         elif state == 'failed' and log.path.exists():
             assert total == recorder.counters.messages
+            # A failure in writing the summary costs that alone.
+            if world.disk.failures == 1 and not world.was_killed:
+                assert is_whole or not recorder.counters.lost, 'the log could have been finished'
         if not is_cut:
             self._check_boundary(log, count)
         if state == 'failed':
