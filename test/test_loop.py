@@ -24,18 +24,22 @@ class Run:
 
     def __init__(self, **values):
         self.now_ns, self.step_ns, self.room, self.told = 77, 0, True, []
+        self.counted = 0            # how often subscribers were
         self.simulation = simulate(**values)
         self.values, self._taken = self.simulation.values, []
-        recording = SimpleNamespace(has_room=lambda: self.room, wait_for_room=lambda: None,
-                                    is_on=True, write=self.told.append)
+        recording = SimpleNamespace(has_room=lambda *_: self.room, is_on=True,
+                                    write=self.told.append)
         self.loop = Loop(
-            self.simulation, self.values, recording, SimulatedClock(self.values['time_scale']),
-            date=lambda: DATE_NS + self.now_ns - 77, update_subscribers=lambda: None,
-            warn=self.told.append, error=self.told.append, source=self.read, steady=self.read)
+            self.simulation, self.values, recording, SimulatedClock(
+                lambda: DATE_NS + self.now_ns - 77, self.told.append, steady=self.read),
+            update_subscribers=self.count, warn=self.told.append, error=self.told.append)
         self.simulation.log_to(lambda entries: self._taken.extend(
             stamp_ns for _, stamps_ns, _ in entries for stamp_ns in stamps_ns.tolist()),
             [channel(self.simulation, 'pose')])
         self.loop.start()
+
+    def count(self):
+        self.counted += 1
 
     def read(self):
         self.now_ns += self.step_ns
@@ -58,6 +62,10 @@ class Run:
         for _ in range(count):
             self.tick()
         return self
+
+
+def command(run, l3):
+    run.loop.change('command', lambda: {'l3': l3, 'lz': 1.0})
 
 
 def grid(until_ns, period_ns=POSE_NS):
@@ -105,6 +113,12 @@ def test_a_step_is_exact_while_clocks_go_on_or_says_what_is_left(monkeypatch):
         before = run.loop.now_ns
         run.loop.step(length_ns)
         assert run.loop.now_ns - before == length_ns
+    run.step_ns = 0
+    run.loop.step(30 * SECOND)                      # in several pieces
+    run.room = False
+    with pytest.raises(RuntimeError, match='takes too long'):
+        run.loop.step(30 * SECOND)
+    run.room = True
     monkeypatch.setattr(module, 'STEP_BUDGET_NS', 150_000)
     run.step_ns, before = 100_000, run.loop.now_ns
     with pytest.raises(RuntimeError, match=r'takes too long, \d+\.\d+ s are left') as error:
@@ -190,7 +204,7 @@ def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
     assert run.times == grid(stands_at)
     assert sum('until ~/reset' in told for told in run.told) == 1
     assert run.simulation.state().theta[0] >= 0.0, 'it can be described'
-    for act in (lambda: run.loop.command(1.0, 1.0), lambda: run.loop.step(POSE_NS),
+    for act in (lambda: command(run, 1.0), lambda: run.loop.step(POSE_NS),
                 run.loop.resume):
         with pytest.raises((ValueError, RuntimeError), match=f'stands still: .*{reason}'):
             act()
@@ -204,6 +218,12 @@ def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
         assert run.loop.failure is None and run.ticks(404).loop.now_ns > stands_at
 
 
+def test_a_change_before_the_first_sample_sends_that_to_those_who_listen():
+    run = Run(start_paused=True)
+    command(run, 2.0)
+    assert run.counted == 1 and run.times == [0]
+
+
 def test_of_the_velocities_in_twenty_milliseconds_the_last_one_counts():
     run = Run()
     for number in range(1, 12):
@@ -211,3 +231,8 @@ def test_of_the_velocities_in_twenty_milliseconds_the_last_one_counts():
         run.tick()
     assert [(event.t_ns, event.details['x']) for event in run.simulation.history] == [
         (5_000_000, 1.0), (25_000_000, 5.0), (45_000_000, 9.0)]
+    run.loop.reset(run.values)
+    run.loop.drive((12.0, 0.0, 0.0))
+    run.tick(20_000_000)
+    (event,) = run.simulation.history
+    assert event.t_ns < 20_000_000, 'a new motion does not wait for the last one'

@@ -21,7 +21,7 @@ from rosbags.rosbag2 import Reader
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder
-from spinning_top_sim.recording.writer import McapWriter
+from spinning_top_sim.recording.writer import McapWriter, log_head
 
 
 def is_indexed(path):
@@ -34,7 +34,7 @@ def test_too_little_space_leaves_no_file(tmp_path):
     recorder = opened(Recorder(f'{tmp_path}/run.mcap', TOPICS, METADATA, min_free_bytes=10 ** 30))
     write(recorder, 0, 1, b'')
     assert recorder.state == 'failed' and recorder.path is None
-    assert re.fullmatch(rf'cannot record to {tmp_path}/run\.mcap: \d+ bytes are free .* 10{{30}}',
+    assert re.fullmatch(rf'cannot write {tmp_path}/run\.mcap: \d+ bytes are free .* 10{{30}}',
                         recorder.error)
     summary = recorder.close()
     assert (summary.path, summary.lost, summary.messages) == (None, 1, 0)
@@ -55,7 +55,7 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
     for uri, reason in (('run.mcap', 'it exists, and nothing is overwritten'),
                         ('none/a.mcap', f'there is no directory {tmp_path}/none')):
         recorder = opened(Recorder(uri, TOPICS, METADATA, min_free_bytes=0))
-        assert recorder.error == f'cannot record to {tmp_path}/{uri}: {reason}'
+        assert recorder.error == f'cannot write {tmp_path}/{uri}: {reason}'
     assert 'run.mcap' in opened(Recorder('run.mcap/', TOPICS, METADATA)).error
     recorder = opened(Recorder('twice.mcap', [TOPICS[0], TOPICS[0]], {}))
     assert recorder.error == "topic '/top/pose' is listed twice: once is allowed"
@@ -104,7 +104,7 @@ def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_
 
 def test_a_chunk_for_which_there_is_no_room_leaves_room_for_the_summary(tmp_path):
     """The kernel sets the limit, as a quota does."""
-    file = McapWriter(tmp_path / 'run.mcap', TOPICS, METADATA, compression='none')
+    file = McapWriter(tmp_path / 'run.mcap', log_head(TOPICS, METADATA), compression='none')
     file.add(*rows_of(0, 10))
     file.flush()
     file.add(*rows_of(10, 1000))

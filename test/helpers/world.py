@@ -12,7 +12,7 @@ import contextlib
 import functools
 import random
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 from unittest import mock
 
@@ -102,10 +102,9 @@ class World:
         follows = plan.follows
         self.loop = Loop(
             self.simulation, self.values, self.recording,
-            SimulatedClock(self.values['time_scale'],
-                           (lambda: 1 + (self._lag_ns is not None)) if follows else None),
-            date=self._source if follows else self._date,
-            source=self._source if follows else self.read_clock_ns, steady=self.read_clock_ns,
+            SimulatedClock(self._source if follows else self._date, self.told.append,
+                           (lambda: 1 + (self._lag_ns is not None)) if follows else None,
+                           self.read_clock_ns),
             warn=self.told.append, error=self.told.append,
             update_subscribers=self._update_subscribers)
 
@@ -167,10 +166,10 @@ class World:
         self._lag_ns = None if self._lag_ns is not None else lag_ms * MILLISECOND
 
     def command(self, l3, lz):
-        self.loop.command(l3, lz)
+        self.loop.change('command', lambda: {'l3': l3, 'lz': lz})
 
     def put(self, theta, l3, lz):
-        self.loop.set_state(lambda now: State(theta=theta, l3=l3, lz=lz))
+        self.loop.change('state', lambda: asdict(State(theta=theta, l3=l3, lz=lz)))
 
     def drive(self, *velocity):
         self.loop.drive(velocity)
