@@ -78,15 +78,16 @@ def test_of_a_recording(tmp_path):
     each_failing(act, check)
 
 
-def all_or_nothing(act, tmp_path, capsys, is_whole, more=()):
+def all_or_nothing(act, tmp_path, capsys, is_whole, suffix, more=()):
     """
     After each failure the command says so in a line that names the file, and leaves none.
 
     act : takes a path, and returns the exit code
+    suffix : of its name
     is_whole : takes the path of a file; where it is whole, a failure may come too late to matter
     """
     def done(name):
-        path = tmp_path / name
+        path = tmp_path / f'{name}.{suffix}'
         return act(path), path, capsys.readouterr().err
 
     def check(found, failure):
@@ -137,7 +138,7 @@ def test_of_a_recovery(tmp_path, short, capsys):
             return reader.whole and seen_by_us(path) == expected
 
     all_or_nothing(lambda path: command(recover.main, torn, '-o', path), tmp_path, capsys,
-                   is_whole, more=[KeyboardInterrupt])
+                   is_whole, 'mcap', more=[KeyboardInterrupt])
 
 
 @pytest.mark.parametrize('kind', ['euroc', 'csv', 'parquet', 'urdf'])
@@ -149,15 +150,15 @@ def test_of_an_export(tmp_path, capsys, kind):
 
     def act(path):
         if kind in ('csv', 'parquet'):
-            return command(simulate.main, '--duration', 0.1, '--quiet', '--format', kind,
-                           '-o', path)
+            return command(simulate.main, '--duration', 0.1, '--quiet', '-o', path)
         if kind == 'urdf':
             return command(export.main, '--model', kind, '-o', path)
         return command(inspect.main, log, '--export', f'{kind}:{path}')
 
-    expected = tmp_path / 'expected'
+    expected = tmp_path / f'expected.{kind}'
     assert act(expected) == 0
-    all_or_nothing(act, tmp_path, capsys, lambda path: path.read_bytes() == expected.read_bytes())
+    all_or_nothing(act, tmp_path, capsys,
+                   lambda path: path.read_bytes() == expected.read_bytes(), kind)
 
 
 def test_of_a_part_of_an_ensemble(tmp_path):
