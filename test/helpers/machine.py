@@ -252,6 +252,7 @@ class Disk:
 
     def _after(self, fault, *, is_file=True):
         if fault.kind == 'stop':
+            self.failures += 1
             self._machine.sleep()
         if fault.kind == 'kill':
             raise Killed
