@@ -4,11 +4,11 @@
 import gc
 import itertools
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.simulations import (
+    EPOCH_NS,
     MILLISECOND,
     SECOND,
     calls_of,
@@ -22,10 +22,10 @@ from helpers.simulations import (
 
 from spinning_top_sim import solve
 from spinning_top_sim.solvers import dormand_prince
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams import live, parameters
 from spinning_top_sim.streams.channel import Channel
+from spinning_top_sim.streams.live import LiveSimulation
 
 PERIOD_NS = 10 * MILLISECOND        # of most topics
 
@@ -43,10 +43,10 @@ def total(samples):
     return counts
 
 
-def test_the_log_gets_an_instant_before_subscribers_and_those_that_fail_get_a_rest(monkeypatch):
+def test_the_log_gets_an_instant_before_subscribers_and_those_that_fail_get_a_rest():
     expected, clock = play(simulate(), SECOND, 'pose', 'joint_states'), [1000.0]
-    monkeypatch.setattr(live, 'time', SimpleNamespace(monotonic=lambda: clock[0]))
-    simulation, tried, logged = simulate(), [], []
+    simulation = LiveSimulation(parameters.checked({}), EPOCH_NS, lambda: clock[0])
+    tried, logged = [], []
     taken = record(simulation, 'pose', 'joint_states')
 
     def fail(data):
@@ -149,23 +149,6 @@ def test_a_clock_alone_solves_nothing(monkeypatch):
     assert output(simulation, '/clock').sent == 191
 
 
-def test_a_subscriber_gets_the_next_samples_of_the_grid_and_no_backlog():
-    simulation = simulate()
-    simulation.send(SECOND + 3)
-    taken = publish(simulation, 'pose')
-    simulation.send(2 * SECOND)
-    assert len(taken) == 100
-    output(simulation, 'pose').publish = None
-    simulation.refresh()
-    assert not any(one.is_used for one in simulation.outputs)
-    simulation.send(5 * SECOND)
-    again, recorded = publish(simulation, 'pose'), record(simulation, 'pose')
-    simulation.send(5 * SECOND + PERIOD_NS)
-    assert again == [('pose', data) for _, _, data in recorded]
-    assert times(recorded, 'pose') == [5 * SECOND + PERIOD_NS]
-    assert len(taken) == 100
-
-
 @pytest.mark.parametrize('ahead', [False, True])
 def test_late_samples_are_recorded_and_counted_but_not_published(ahead, monkeypatch):
     simulation = simulate()
@@ -214,22 +197,6 @@ def test_motions_are_forgotten_when_nothing_reaches_back_to_them(method):
     assert kept == list(range(kept[0], 10 * SECOND + 1, SECOND // 10))
 
 
-def test_a_reset_gives_the_same_bytes_again_and_keeps_outputs_and_counts():
-    simulation = simulate()
-    taken, published = record(simulation), publish(simulation, 'pose')
-    simulation.send(SECOND)
-    first = list(taken)
-    simulation.apply('command', l3=0.5, lz=0.1)
-    simulation.send(2 * SECOND)
-    simulation.look_ahead(3 * SECOND, 1e-2)
-    event = simulation.apply('reset', parameters=simulation.values, epoch_ns=simulation.epoch_ns)
-    assert (event.t_ns, event.sent_ns, simulation.now_ns) == (0, 2 * SECOND, -1)
-    del taken[:]
-    simulation.send(SECOND)
-    assert sorted(taken) == sorted(first) and simulation.history == []
-    assert output(simulation, 'pose').sent == len(published) == 101 + 100 + 101
-
-
 @pytest.mark.parametrize(('kind', 'details', 'words'), [
     ('reset', {'initial.theta': 0.0, 'spin.lz': 0.5}, 'pole'),
     ('reset', {'spin.l3': 1e20, 'spin.lz': 1e20}, r'1e\+20'),
@@ -250,20 +217,3 @@ def test_an_event_that_is_refused_leaves_the_run_as_it_was(kind, details, words)
         simulation.apply(kind, **details)
     simulation.send(SECOND)
     assert taken == expected and simulation.history == []
-
-
-def test_what_comes_before_the_end_of_a_motion_is_sent():
-    """The paper's equations end at the pole, which the wheel that stands upright falls through."""
-    falls = {'solver.equations': 'euler', 'spin.lz': 1.6, 'pose.rate': 2000.0}
-    simulation, beside = simulate(falls), simulate(falls)
-    taken = record(simulation, 'pose')
-    for one in range(1, 100):
-        simulation.look_ahead(one * MILLISECOND, 1e-3)
-    with pytest.raises(IntegrationError, match='leapt over a pole') as failure:
-        simulation.send(5 * SECOND)
-    reached_ns = failure.value.reached_ns
-    assert simulation.now_ns == reached_ns > 10 * MILLISECOND
-    assert taken == play(beside, reached_ns, 'pose')
-    with pytest.raises(IntegrationError, match='leapt over a pole'):
-        play(beside, 5 * SECOND, 'pose')
-    assert beside.now_ns == reached_ns

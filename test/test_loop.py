@@ -224,20 +224,6 @@ def test_a_change_before_the_first_sample_sends_that_to_those_who_listen():
     assert run.counted == 1 and run.times == [0]
 
 
-def test_events_come_after_what_is_due_and_refused_ones_change_nothing():
-    run = Run().ticks(4)
-    run.now_ns += 3_000_000
-    command(run, 2.0)
-    (event,) = run.told
-    assert (event.kind, event.t_ns, event.details) == ('command', 23_000_000,
-                                                       {'l3': 2.0, 'lz': 1.0})
-    for act, said in ((lambda: command(run, float('nan')), 'nan'),
-                      (lambda: run.loop.drive((0.0, 0.0, 1e9)), r'1000000000\.0')):
-        with pytest.raises(ValueError, match=said):
-            act()
-    assert (run.loop.commands, run.kinds) == (1, ['command'])
-
-
 def test_of_the_velocities_in_twenty_milliseconds_the_last_one_counts():
     run = Run()
     for number in range(1, 12):
@@ -250,10 +236,3 @@ def test_of_the_velocities_in_twenty_milliseconds_the_last_one_counts():
     run.tick(20_000_000)
     (event,) = run.simulation.history
     assert event.t_ns < 20_000_000, 'a new motion does not wait for the last one'
-
-
-def test_a_time_scale_holds_from_its_moment_on():
-    run = Run().ticks(4)
-    run.loop.set_pace({**run.values, 'time_scale': 10.0})
-    run.tick()
-    assert run.loop.now_ns == 4 * TICK_NS + 10 * TICK_NS

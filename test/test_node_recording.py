@@ -8,16 +8,12 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import Twist
 from helpers.node_harness import PATIENCE_S
 from helpers.node_logs import events_in, log_of, verified
 from helpers.own_node import OwnNode
-from helpers.reference import scene_parameters
-from helpers.simulations import EPOCH_NS, SECOND
 
 from spinning_top_sim.recording import recorder
 from spinning_top_sim.recording.writer import McapWriter
-from spinning_top_sim.tools import simulate
 
 
 @pytest.fixture
@@ -104,54 +100,3 @@ def test_a_recording_that_fails_is_told_once_and_gives_way_to_the_next(
     assert ['not recording' in errors[0], 'recording stopped' in errors[1]] == [True, True]
     assert len(errors) == 2 and precious.read_bytes() == b'precious'
     assert verified(tmp_path / 'third.mcap')['identical']
-
-
-NOISE = {'imu.gyroscope_noise_density': 0.01, 'imu.lever_arm': [0.1, -0.2, 0.3], 'seed': 7}
-
-
-@pytest.mark.parametrize(('scene', 'method'), [
-    ('shuttle', 'exact'), ('near_separatrix', 'exact'), ('looping', 'rk45'), ('braking', 'rk45')])
-def test_a_live_run_is_that_of_simulate_and_verifies_to_the_last_bit(tmp_path, scene, method):
-    """With commands, velocities, resets, changes of rates, and a recording from the middle."""
-    values = {**scene_parameters(scene), **NOISE, 'solver.method': method}
-    with OwnNode(tmp_path, start_paused=True, **values) as node:
-        def drive(x):
-            message = Twist()
-            message.linear.x = x
-            node.node._on_velocity(message)
-
-        l3, lz = node.get('spin.l3', 'spin.lz')
-        node.simulation.epoch_ns = EPOCH_NS
-        assert node.switch('record', True).success
-        node.step(70)
-        node.command(l3 + 0.1, lz + 0.05)
-        node.step(30)
-        assert node.switch('record', False).success
-        assert node.set(record__uri=f'{tmp_path}/part.mcap').successful
-        assert node.set(imu__rate=125.0, pose__rate=33.0).successful
-        drive(0.5)
-        node.step(10)
-        assert node.switch('record', True).success
-        node.step(10)
-        node.command(l3, lz)
-        drive(-0.2)
-        node.step(10)
-        assert node.set(imu__rate=250.0, joint_states__rate=50.0).successful
-        node.step(7)
-        assert node.trigger('reset').success
-        node.step(5)
-        node.command(l3, lz + 0.01)
-        drive(0.0)
-        node.step(20)
-    live, part = tmp_path / 'run.mcap', tmp_path / 'part.mcap'
-    assert verified(live)['identical'] and verified(part)['identical']
-    kinds = {event['event'] for event in events_in(log_of(part)[0])}
-    assert kinds >= {'start', 'command', 'parameters', 'reset', 'drive'}
-    offline = tmp_path / 'offline.mcap'
-    assert simulate.main([
-        '-o', str(offline), '--quiet', '--scene', scene, '--duration', '1', '--epoch',
-        f'{EPOCH_NS // SECOND}', '--command', f'0.7:{l3 + 0.1!r}:{lz + 0.05!r}',
-        *(word for name, value in values.items() for word in ('-p', f'{name}:={value}'))]) == 0
-    (live, _), (offline, _) = log_of(live), log_of(offline)
-    assert {name: rows for name, rows in live.items() if not name.endswith('/events')} == {
-        name: rows for name, rows in offline.items() if not name.endswith('/events')}

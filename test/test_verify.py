@@ -11,16 +11,14 @@ import pytest
 from helpers.inspected import as_json, log_of, rewritten, told
 from helpers.logs import flipped
 from helpers.reference import ROOT
-from helpers.simulations import MILLISECOND, SECOND, drive, publish, simulate
+from helpers.simulations import SECOND
 from mcap.reader import make_reader
 
-from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import messages, parameters
-from spinning_top_sim.streams.events import TOPICS, Event
+from spinning_top_sim.streams.events import Event
 from spinning_top_sim.streams.parameter import Effect
-from spinning_top_sim.streams.topics import resolve_topic
 from spinning_top_sim.tools import recorded_run
 
 
@@ -110,63 +108,6 @@ def test_another_machine_is_warned_of(short, capsys, monkeypatch):
     verdict = verified(capsys, short)
     assert verdict['identical']
     assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
-
-
-NOISY = {'imu.gyroscope_noise_density': 0.01, 'imu.lever_arm': (0.1, -0.2, 0.3),
-         'imu.sampling': 'mean', 'increments.enabled': True, 'gnss.enabled': True,
-         'gnss.latency': 0.03, 'gnss.outages': (0.05, 0.1), 'pivot.cmd_timeout': 0.05}
-
-
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
-def test_live_logs_verify(method, tmp_path, capsys):
-    """From the start, and from the middle with every kind of event before and after."""
-    pytest.importorskip('pymap3d')
-    simulation = simulate(NOISY, solver__method=method)
-    values, recording = simulation.values, Recording(simulation, lambda channels: [
-        (resolve_topic(name, '/'), type_name, {}) for name, type_name in (
-            *((one.topic, one.type_name) for one in channels), *TOPICS.items())])
-
-    def act(kind, **details):
-        recording.write(simulation.apply(kind, **details))
-        go_on()
-
-    def go_on():
-        for _ in range(7):
-            simulation.send(simulation.now_ns + 10 * MILLISECOND)
-            simulation.look_ahead(simulation.now_ns + 50 * MILLISECOND, 1e-3)
-
-    def everything():
-        publish(simulation, 'pose')
-        act('command', l3=1.65, lz=1.4)
-        act('parameters', **{'imu.rate': 125.0, 'pose.rate': 50.0})
-        for velocity in ((0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 1.0, 0.0)):
-            recording.write(drive(simulation, *velocity))
-            simulation.send(simulation.now_ns + 12_345_678)
-        act('state', theta=1.0, theta_dot=0.2, phi=0.3, psi=0.0, l3=1.6, lz=1.2)
-        act('epoch', epoch_ns=simulation.epoch_ns + 5 * SECOND)
-
-    whole, part = tmp_path / 'whole.mcap', tmp_path / 'part.mcap'
-    recording.start({**values, 'record.uri': str(whole)})
-    everything()
-    assert 'stopped' not in recording.close()
-    recording.start({**values, 'imu.rate': 125.0, 'pose.rate': 50.0, 'record.uri': str(part)})
-    everything()
-    act('reset', epoch_ns=simulation.epoch_ns + SECOND,
-        parameters={**values, 'imu.gyroscope_noise_density': 0.02})
-    everything()
-    recording.close()
-    causes = ['command', 'drive', 'state', 'epoch']
-    for path, expected in ((whole, ['start', *causes]), (part, [
-            'start', *causes, 'reset', *causes])):
-        code, content = as_json(capsys, path, '--verify')
-        verdict = content['verify']
-        assert verdict['identical'] and code == 0, verdict
-        assert sum(verdict['compared'].values()) > 300
-        assert [motion['cause'] for motion in content['motions']] == [
-            cause for cause in expected if cause != 'epoch']
-        assert all(topic['missing'] == 0
-                   for topic in content['topics'].values() if topic['stream'])
-        assert all(error['max'] < 1e-9 for error in content['orientation_error'].values())
 
 
 def test_a_log_of_1_is_read_and_verified_by_1(capsys):

@@ -26,13 +26,14 @@ class Recording:
     Records a simulation into one log at a time; the recorder's own thread uses the disk.
 
     topics : returns the topics of channels, and after them those of events
+    options : further arguments of each `Recorder`
     error : why the last recording stopped early or did not start
     """
 
     def __init__(self, simulation: LiveSimulation,
-                 topics: Callable[[Sequence[Channel]], list[Topic]]) -> None:
+                 topics: Callable[[Sequence[Channel]], list[Topic]], **options: Any) -> None:
         self.error: str | None = None
-        self._simulation, self._topics = simulation, topics
+        self._simulation, self._topics, self._options = simulation, topics, options
         self._recorder: Recorder | None = None
         # Logs that are being opened or closed: the states meanwhile, and what tells who waits.
         self._requests: list[tuple[Recorder, Sequence[str], Callable[[], object]]] = []
@@ -53,7 +54,7 @@ class Recording:
             run_metadata(simulation.values, simulation.epoch_ns, simulation.now_ns,
                          [event.as_mapping() for event in simulation.history], values),
             max_loss=values['record.max_loss'], compression=values['record.compression'],
-            min_free_bytes=values['record.min_free_bytes'])
+            min_free_bytes=values['record.min_free_bytes'], **self._options)
         self.error, self._events_index = None, len(channels)
         simulation.log_to(recorder.write, channels)
         self.write(Event('start', max(simulation.now_ns, 0), simulation.now_ns))

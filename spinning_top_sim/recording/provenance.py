@@ -7,6 +7,8 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 from spinning_top_sim.installation import version
 
 METADATA_NAME = 'spinning_top_sim'
@@ -49,7 +51,14 @@ def environment() -> dict[str, str]:
         'version': version(),
         'platform': f'{platform.machine()} {platform.system()} '
                     f'{platform.python_implementation()} {platform.python_version()} '
-                    f'{sys.byteorder}',
+                    f'{sys.byteorder}{_vectors()}',
         'libraries': json.dumps({name: found for name in LIBRARIES
                                  if (found := version(name)) != 'unknown'}),
     }
+
+
+def _vectors() -> str:
+    """Return ' AVX-512' where NumPy uses it: sines and exponentials have other last bits then."""
+    config: Any = np.show_config(mode='dicts')
+    found = config['SIMD Extensions'].get('found', ())
+    return ' AVX-512' * any(name == 'X86_V4' or name.startswith('AVX512') for name in found)

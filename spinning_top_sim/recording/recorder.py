@@ -14,10 +14,10 @@ import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -60,17 +60,20 @@ class Recorder:
     max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
     compression : 'zstd', 'lz4' or 'none'
     min_free_bytes : the recording stops if the disk has less left than this
+    threads, clock : make threads and events as `threading` does, and return steady time [s]
     """
 
     def __init__(self, uri: str, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
                  max_loss: float = 0.5, compression: str = 'zstd',
-                 min_free_bytes: int = 100_000_000) -> None:
+                 min_free_bytes: int = 100_000_000, threads: Any = threading,
+                 clock: Callable[[], float] = time.monotonic) -> None:
         self.state: Literal['opening', 'recording', 'closed', 'failed'] = 'opening'
         self.error: str | None = None
         self.path: Path | None = None       # known once the file is open
         self._uri, self._topics, self._metadata = uri, topics, metadata
         self._max_loss, self._compression = max_loss, compression
         self._min_free_bytes = min_free_bytes
+        self._threads, self._clock = threads, clock
         self._file: McapWriter | None = None
         # Appending to a deque and taking from its other end need no lock between threads.
         self._queue: deque[tuple[Sequence[Rows], int]] = deque()     # rows, and their bytes
@@ -78,14 +81,14 @@ class Recorder:
         self._offered = 0                       # messages handed over, ever
         self._accepting = True
         # (time, bytes): what had left the queue by that time is on the disk.
-        self._on_disk = time.monotonic(), 0
+        self._on_disk = clock(), 0
         self._sync_error: Exception | None = None
         self._syncing: threading.Thread | None = None
-        self._wake, self._taken = threading.Event(), threading.Event()
+        self._wake, self._taken = threads.Event(), threads.Event()
         # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
         # exit handler runs before daemons are stopped and closes the file properly.
         atexit.register(self.close)
-        self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
+        self._thread = threads.Thread(target=self._run, name='recorder', daemon=True)
         self._thread.start()
 
     @property
@@ -99,7 +102,7 @@ class Recorder:
         since, bytes_on_disk = self._on_disk
         if self.state in ('closed', 'failed') or self._bytes_in == bytes_on_disk:
             return 0.0
-        return time.monotonic() - since
+        return self._clock() - since
 
     @property
     def warning(self) -> str | None:
@@ -213,11 +216,11 @@ class Recorder:
 
     def _record(self, file: McapWriter) -> None:
         interval = self._max_loss / 2.0
-        next_flush = time.monotonic() + interval
+        next_flush = self._clock() + interval
         while True:
             self._wake.clear()
             closing = not self._accepting  # read before the queue: once set, nothing more comes
-            now = time.monotonic()
+            now = self._clock()
             for _ in range(len(self._queue)):
                 rows, size = self._queue.popleft()
                 for one in rows:
@@ -238,7 +241,7 @@ class Recorder:
                     file.finish()
                     return
                 self._begin_sync(file, now)
-            self._wake.wait(max(0.0, next_flush - time.monotonic()))
+            self._wake.wait(max(0.0, next_flush - self._clock()))
 
     def _begin_sync(self, file: McapWriter, now: float) -> None:
         if self._syncing is not None and self._syncing.is_alive():
@@ -247,7 +250,7 @@ class Recorder:
         if self._bytes_out == self._on_disk[1]:
             self._on_disk = written
         else:
-            self._syncing = threading.Thread(
+            self._syncing = self._threads.Thread(
                 target=self._sync, args=(file, written), name='recorder sync', daemon=True)
             self._syncing.start()
 

@@ -235,8 +235,12 @@ class McapWriter:
             self._write([summary, zlib.crc32(summary).to_bytes(4, 'little'), MCAP0_MAGIC])
             self.sync()
             _sync_directory(self._path.parent)
+        except OSError as error:
+            error.filename = str(self._path)
+            raise
         finally:
-            self._file.close()
+            with contextlib.suppress(OSError):      # all is on the disk, or another error is told
+                self._file.close()
 
     def _write(self, blocks: Iterable[bytes]) -> None:
         """Write whole records that come in blocks, or none of them."""

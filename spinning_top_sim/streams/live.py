@@ -43,6 +43,7 @@ class Output:
 
     publish : takes each message in time, and may raise; None while there are no subscribers
     log_index : number of the topic in the log, None if it is not recorded
+    clock : returns steady time [s]
     sent, skipped, failed : messages that were published, that were too late for that, and that
         `publish` refused
     """
@@ -50,13 +51,14 @@ class Output:
     channel: Channel
     publish: Callable[[bytes], object] | None = None
     log_index: int | None = None
+    clock: Callable[[], float] = time.monotonic
     sent: int = 0
     skipped: int = 0
     failed: int = 0
     # What waits to be sent: times [ns] and messages.
     _t_ns: Times = field(default_factory=lambda: np.empty(0, np.int64))
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
-    _blocked_until: float = 0.0     # on the monotonic clock [s]
+    _blocked_until: float = 0.0     # on the clock
 
     @property
     def is_used(self) -> bool:
@@ -82,11 +84,11 @@ class Output:
     def send(self, message: bytes) -> None:
         """Publish a message; what the middleware refuses is counted."""
         assert self.publish is not None
-        if time.monotonic() >= self._blocked_until:
+        if self.clock() >= self._blocked_until:
             try:
                 self.publish(message)
             except Exception:       # rclpy raises RCLError, which it does not export
-                self._blocked_until = time.monotonic() + BLOCKED_SECONDS
+                self._blocked_until = self.clock() + BLOCKED_SECONDS
             else:
                 self.sent += 1
                 return
@@ -114,11 +116,14 @@ class LiveSimulation(Simulation):
     A simulation with an output for each channel.
 
     outputs : of each channel, in the order in which the messages of one time are sent
+    clock : returns steady time [s]
     """
 
-    def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
+    def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0,
+                 clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(values, epoch_ns)
-        self.outputs = [Output(channel) for channel in self.channels]
+        self.outputs = [Output(channel, clock=clock) for channel in self.channels]
+        self._clock = clock
         self._write: Callable[[Sequence[LogRows]], object] = lambda rows: None
         self._motion = _Group({}, self.now_ns)
         self._groups: list[_Group] = []             # of what is used
@@ -207,14 +212,14 @@ class LiveSimulation(Simulation):
 
     def _compute(self, group: _Group, until_ns: int, seconds: float) -> None:
         """Compute the messages of a group up to a time, or for about so long."""
-        now = begin = time.monotonic()
+        now = begin = self._clock()
         while group.computed_ns < until_ns and now < begin + seconds:
             goal_ns = min(until_ns, group.computed_ns + group.piece_ns)
             block = self.block([*group.outputs], group.computed_ns, goal_ns)
             for channel, t_ns, rows in block.messages:
                 group.outputs[channel].add(t_ns, rows)
             done_ns, called = block.until_ns - group.computed_ns, now
-            group.computed_ns, now = block.until_ns, time.monotonic()
+            group.computed_ns, now = block.until_ns, self._clock()
             room = 0.5 * seconds / max(now - called, 1e-6)
             group.span_ns = max(int(done_ns * min(room, GROWTH)),
                                 0 if room < 1.0 else group.span_ns)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
+from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import text_of, why_not_written
 
@@ -92,7 +93,8 @@ def check_output(*paths: Path | None) -> None:
     """Raise OSError if one of these files cannot be made, such as because it exists."""
     for path in filter(None, paths):
         try:
-            open(path, 'xb').close()
+            with new_file(path, 'xb'):
+                pass
             path.unlink()
         except OSError as error:
             raise OSError(f'cannot write {path}: {why_not_written(path, error)}') from error

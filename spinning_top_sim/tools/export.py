@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed, share
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.states import States
@@ -50,7 +51,8 @@ def _run(arguments: argparse.Namespace) -> int:
     text = model(parameters.checked(scene_file.given(arguments)), arguments.model,
                  names[0] if names else 'spinning_top')
     cli.check_output(arguments.output)
-    arguments.output.write_text(text, encoding='utf-8')
+    with new_file(arguments.output) as file:
+        file.write(text)
     return cli.OK
 
 

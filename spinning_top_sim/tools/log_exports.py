@@ -18,6 +18,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from spinning_top_sim.files import new_file
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.times import stamp_text
@@ -77,7 +78,7 @@ def write(reader: LogReader, run: RunDescription,
     for kind, path in exports:
         lines = KINDS[kind][1](reader, run)
         first = next(lines, '')         # a run that is refused leaves no file
-        with open(path, 'x', encoding='utf-8') as file:
+        with new_file(path) as file:
             file.write(first)
             file.writelines(lines)
         yield f'{path}: {kind}'

@@ -8,6 +8,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from string import Template
 
+from spinning_top_sim.files import new_file
 from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.view import plots, text
 from spinning_top_sim.view.page import RATE, STYLE, Page, set_value
@@ -120,6 +121,6 @@ def write_file(path: Path, page: Page, player: Player, track_at: Callable[[int],
     document = Template(Path(__file__).with_name('file.html').read_text('utf-8')).substitute(
         title=html.escape(page.title), style=STYLE, legend=page.legend(), words=words,
         plots=drawn, scene=html.escape(serializer.as_html()))
-    with open(path, 'x', encoding='utf-8') as file:
+    with new_file(path) as file:
         file.write(document)
     return f'{(end_ns - begin_ns) / NANOSECONDS:g} s, {len(document.encode()) / 1e6:.1f} MB'

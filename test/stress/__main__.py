@@ -3,6 +3,7 @@
 Stress tests: random inputs and faults, for so long or so many.
 
     python test/stress tops --count 100000      both solvers on random tops
+    python test/stress world --count 100000     loop, recorder and log in a simulated world
     python test/stress logs --seconds 600       damaged logs, and what reads them
     python test/stress nodes --seconds 600      extreme parameters and commands at a real node
     python test/stress grade --count 100        simulators with a defect, and right ones
@@ -18,7 +19,7 @@ from pathlib import Path
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
 sys.path.remove(str(Path(__file__).parent))     # its modules are those of a package
 
-from stress import runner, tops  # noqa: E402
+from stress import runner, tops, world  # noqa: E402
 
 
 def main():
@@ -30,7 +31,10 @@ def main():
     parser.add_argument('--count', type=int, help='how many seeds')
     parser.add_argument('--seconds', type=float, help='how long')
     parser.add_argument('--processes', type=int, default=None)
+    parser.add_argument('--only', help='of a world: the numbers of the actions that happen')
     options = parser.parse_args()
+    if options.only:
+        return world.repeat(options.first, options.only)
     if options.part == 'tops':
         return tops.stress(options.first, options.count or 100_000, options.processes)
     if options.count is None and options.seconds is None:

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Each system call of what writes a file fails once, in every way: nothing promised is lost.
+
+And nothing is left that claims to be whole and is not.
+"""
+
+import errno
+import random
+import resource
+
+import pytest
+from helpers.failing_calls import Calls
+from helpers.inspected import log_of
+from helpers.logs import seen_by_us
+from helpers.machine import Machine
+from helpers.recordings import METADATA, TOPICS, rows_of
+
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import Recorder
+from spinning_top_sim.tools import ensemble_part, ensemble_spec, export, inspect, recover, simulate
+
+FAILURES = (errno.ENOSPC, errno.EIO, errno.EINTR, None)
+
+
+def each_failing(act, check, more=()):
+    """Let each call fail in each way; `check` takes what comes of it, and what has failed."""
+    with Calls() as calls:
+        ordinary = act('ordinary')
+    check(ordinary, None)
+    assert calls.names
+    for number, name in enumerate(calls.names, start=1):
+        for error in (*more, *(FAILURES if 'write' in name else FAILURES[:-1])):
+            with Calls(number, error):
+                found = act(f'{number}_{error}')
+            check(found, f'{name}, call {number}, fails with {error}')
+
+
+def command(main, *arguments):
+    try:
+        return main([*map(str, arguments)])
+    except SystemExit as stopped:
+        return stopped.code
+
+
+def test_of_a_recording(tmp_path):
+    def act(name):
+        machine, path = Machine(random.Random(1)), tmp_path / f'{name}.mcap'
+
+        def live():
+            nonlocal recorder
+            recorder = Recorder(str(path), TOPICS, METADATA, max_loss=0.1, min_free_bytes=0,
+                                threads=machine, clock=machine.clock)
+            for number in range(20):
+                recorder.write([rows_of(5 * number, 5 * number + 5)])
+                machine.sleep(20_000_000)
+            recorder.close()
+
+        recorder = None
+        machine.run(live)
+        return recorder, path
+
+    def check(found, failure):
+        recorder, path = found
+        counters = recorder.counters
+        assert counters.messages + counters.lost == 100 and counters.queued == 0, failure
+        if recorder.path is None:
+            assert not path.exists() and failure, failure
+            return
+        kept = [stamp for _, stamp, _ in seen_by_us(path)]
+        assert kept == list(range(counters.messages)), failure
+        if recorder.error is None:      # one that closes the directory, or was made good
+            with LogReader(path) as reader:
+                assert reader.whole and len(kept) == 100, failure
+        else:
+            assert str(path) in recorder.error and counters.lost >= 0, failure
+
+    each_failing(act, check)
+
+
+def all_or_nothing(act, tmp_path, capsys, is_whole, suffix, more=()):
+    """
+    After each failure the command says so in a line that names the file, and leaves none.
+
+    act : takes a path, and returns the exit code
+    suffix : of its name
+    is_whole : takes the path of a file; where it is whole, a failure may come too late to matter
+    """
+    def done(name):
+        path = tmp_path / f'{name}.{suffix}'
+        return act(path), path, capsys.readouterr().err
+
+    def check(found, failure):
+        code, path, said = found
+        if code in (0, 3):
+            assert is_whole(path), failure
+        else:
+            is_interrupted = 'Interrupt' in failure
+            assert code == (130 if is_interrupted else 1), (failure, said)
+            assert said.count('\n') == 1 and (is_interrupted or path.name in said), (failure, said)
+            assert not path.exists() or is_whole(path) or (
+                'unlink' in failure and not path.stat().st_size), failure
+
+    each_failing(done, check, more)
+
+
+def test_of_a_log_of_simulate(tmp_path, capsys):
+    """What was computed before is in the log, or there is none."""
+    def act(name):
+        path = tmp_path / f'{name}.mcap'
+        code = command(simulate.main, '--duration', 0.1, '--command', '0.05:1.7:1.4', '--quiet',
+                       '-p', 'record.streams:=[pose]', '-o', path)
+        return code, path, capsys.readouterr().err
+
+    _, path, _ = act('expected')
+    expected = seen_by_us(path)
+
+    def check(found, failure):
+        code, path, said = found
+        kept = seen_by_us(path) if path.exists() else []
+        if code == 0:
+            assert kept == expected, failure
+            return
+        assert code == (130 if 'Interrupt' in failure else 1), failure
+        assert said.count('\n') == 1 and (code == 130 or path.name in said), (failure, said)
+        assert kept == expected[:len(kept)], failure
+
+    each_failing(act, check, more=[KeyboardInterrupt])
+
+
+def test_of_a_recovery(tmp_path, short, capsys):
+    torn = tmp_path / 'torn.mcap'
+    torn.write_bytes(short.read_bytes()[:-10_000])
+    expected = seen_by_us(torn)
+
+    def is_whole(path):
+        with LogReader(path) as reader:
+            return reader.whole and seen_by_us(path) == expected
+
+    all_or_nothing(lambda path: command(recover.main, torn, '-o', path), tmp_path, capsys,
+                   is_whole, 'mcap', more=[KeyboardInterrupt])
+
+
+@pytest.mark.parametrize('kind', ['euroc', 'csv', 'parquet', 'urdf'])
+def test_of_an_export(tmp_path, capsys, kind):
+    log = log_of(tmp_path / 'run.mcap', '--duration', 0.1, *(
+        f'-p{name}' for name in ('ground_truth_imu_odom.enabled:=true', *(
+            f'imu.{kind}_{noise}:=0.01' for kind in ('gyroscope', 'accelerometer')
+            for noise in ('noise_density', 'random_walk')))))
+
+    def act(path):
+        if kind in ('csv', 'parquet'):
+            return command(simulate.main, '--duration', 0.1, '--quiet', '-o', path)
+        if kind == 'urdf':
+            return command(export.main, '--model', kind, '-o', path)
+        return command(inspect.main, log, '--export', f'{kind}:{path}')
+
+    expected = tmp_path / f'expected.{kind}'
+    assert act(expected) == 0
+    all_or_nothing(act, tmp_path, capsys,
+                   lambda path: path.read_bytes() == expected.read_bytes(), kind)
+
+
+def test_of_a_part_of_an_ensemble(tmp_path):
+    pytest.importorskip('pyarrow')
+    specification = ensemble_spec.parse({
+        'runs': 2, 'duration': 0.1, 'sample': {'spin.l3': {'uniform': [1.0, 2.0]}},
+        'streams': ['pose']}, 'specification')
+
+    def computed(folder):
+        (folder / 'data').mkdir(parents=True, exist_ok=True)
+        return ensemble_part.compute_part(specification, 0, str(folder))
+
+    def content(folder):
+        return [path.read_bytes() for path in (folder / 'data').glob('part-*')]
+
+    assert computed(tmp_path / 'expected') == {}
+    (expected,) = content(tmp_path / 'expected')
+
+    def act(name):
+        folder = tmp_path / f'part_{name}'
+        try:
+            return computed(folder), folder
+        except OSError:
+            return None, folder
+
+    def check(found, failure):
+        failed, folder = found
+        assert content(folder) == [expected] if failed is not None else failure, failure
+        assert computed(folder) == {} and content(folder) == [expected], failure
+
+    each_failing(act, check)
+    # Arrow writes without Python: a disk that is full after so many bytes.
+    for most in range(0, len(expected), len(expected) // 20):
+        folder, limits = tmp_path / f'full_{most}', resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
+        try:
+            with pytest.raises(OSError, match='File too large'):
+                computed(folder)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert content(folder) == []
+        assert computed(folder) == {} and content(folder) == [expected]
