@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
 from spinning_top_sim.streams.channel import Channel, Rows
 from spinning_top_sim.streams.messages import Values, fill
@@ -45,6 +46,6 @@ def write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]],
         from pyarrow import parquet  # noqa: PLC0415
     schema = pa.schema([pa.field(name, pa.float64(), metadata={'unit': unit})
                         for name, unit in units.items()])
-    with open(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
+    with new_file(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
         for rows in blocks:
             writer.write_table(pa.table(list(rows.T), schema=schema))
