@@ -6,10 +6,11 @@ import array
 import contextlib
 import difflib
 import re
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 
@@ -22,6 +23,10 @@ NODE = '/spinning_top'      # the full name of the node where no other is asked 
 # Parameters that rclpy declares for every node, and those that it declares for publishers.
 OF_RCLPY = 'use_sim_time', 'start_type_description_service'
 ROS_PARAMETERS = (*OF_RCLPY, 'qos_overrides')
+# What most people need first: help shows these, and --help-parameters the others too.
+MOST_USED = ('top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'initial.theta',
+             'spin.l3', 'spin.lz', 'solver.method', 'duration', 'time_scale', 'seed',
+             'record.enabled', 'record.uri')
 
 
 class _Loader(yaml.SafeLoader):
@@ -75,6 +80,39 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
                         help='parameter file as for the node; may be repeated')
     parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
                         help='one parameter; may be repeated')
+    parser.add_argument('--help-parameters', action=_ListParameters, nargs=0,
+                        help='list all parameters, and end')
+
+
+class _ListParameters(argparse.Action):
+    def __call__(self, *_: object) -> NoReturn:
+        with cli.reader_may_end():
+            print('Most used:')
+            for name in MOST_USED:
+                print(_described(name))
+            print('\nOthers:')
+            for name in parameters.BY_NAME:
+                if name not in MOST_USED:
+                    print(_described(name))
+        raise SystemExit(cli.OK)
+
+
+def _described(name: str) -> str:
+    parameter = parameters.BY_NAME[name]
+    return f'  {name}  (default {_default(name)})\n' + textwrap.indent(
+        textwrap.fill(parameter.describe(), 74), 6 * ' ')
+
+
+def _default(name: str) -> object:
+    default = parameters.BY_NAME[name].default
+    return 'unset' if default is None else list(default) if isinstance(default, tuple) else default
+
+
+def most_used() -> str:
+    """Return a line for each of the parameters that most people need first."""
+    return '\n'.join(textwrap.fill(
+        f'{name} ({_default(name)}): {parameters.BY_NAME[name].text.partition(";")[0]}', 78,
+        initial_indent='  ', subsequent_indent=6 * ' ') for name in MOST_USED)
 
 
 def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = False,
