@@ -25,6 +25,7 @@ from spinning_top_sim.tools.identify import in_words
 SMALL, LARGE = 0.02, 0.3
 # Step of a kick, when filters have no high gains of a start, and longest delay of its answer.
 EARLY, LATEST = 360, 30
+FIT = 0.1       # deviation of turns from a matrix that one about other axes may explain
 LEAST = 1e-6                    # share of an error that is corrected, if any
 SETTLED = 800                   # uneven steps after which a filter has settled from its start
 
@@ -72,22 +73,15 @@ def with_kicks(run: Run, kicks: Sequence[Kick]) -> Run:
 def rates(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Rates:
     """Identify the use of the rates from starts without and with kicks about the vertical."""
     apart = np.array([increments(other.estimates) - increments(one.estimates)
-                      for one, other in zip(still, moved, strict=True)])[:, EARLY:]
+                      for one, other in zip(still, moved, strict=True)])[:, EARLY:EARLY + LATEST]
     turns = _turns(still, moved)
     moves = np.cumsum(apart, axis=1)                # (starts, samples, 3)
     size = np.median(np.linalg.norm(moves, axis=2), axis=0)
-    # At once, or when it is greatest: an unstable filter goes on.
-    whole = 0 if abs(size[0] / np.linalg.norm(turns[0]) - 1.0) < 0.1 else int(
-        np.argmax(size[:LATEST] >= 0.97 * np.max(size[:LATEST])))
-    # An attitude that is predicted goes too far at first, and back at once.
-    back = size[whole] - size[whole + 1]
-    if back > 0.25 * size[whole] and abs(size[whole + 1] - size[whole + 2]) < 0.2 * back:
-        whole += 1
-    delay = float(np.sum(1.0 - size[:whole] / max(size[whole], 1e-300)))
-    matrix, left = _fit(moves[:, whole], turns)
+    delay = float(np.sum(1.0 - size / max(size[-1], 1e-300)))
+    matrix, left = _fit(moves[:, -1], turns)
     world = Rotation.from_quat([one.estimates[EARLY] for one in moved])
-    of_world, left_of_world = _fit(world.apply(moves[:, whole]), turns)
-    if in_world := left_of_world < 0.3 * left and left > 0.1:
+    of_world, left_of_world = _fit(world.apply(moves[:, -1]), turns)
+    if in_world := left_of_world < left and left > FIT:
         matrix, left = of_world, left_of_world
     return Rates(matrix, left, in_world, delay)
 

@@ -1,86 +1,104 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Whether a filter learns a bias of the gyroscope, and what it says of it.
+What a constant bias of the gyroscope does to a filter, and what the filter says of it.
 
-The bias comes in a rest with the x axis up, when the filter has settled.  Its effect on the
-attitude grows, and falls again if it is learned.  Then the sensor is turned: x is level.
+A right filter either has no estimate of it, and its error stays at the bias times its time
+constant; or it learns it, and error and estimate are right in the end.  Evidence against it is an
+estimate that has settled elsewhere or moves away, an error that has settled although the filter
+learns, and one that grows faster and faster.  What still moves cannot be judged.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.motions import NEAR, X_UP, Motion, Reals, Run, euler
 
-BIAS = np.array((0.012, -0.011, 0.018))     # of the gyroscope [rad/s]
-SIZE = float(np.linalg.norm(BIAS))
-RESTS_S = 20.0, 160.0           # slow filters get a longer time
-LEFT = 0.3                      # of the largest effect, where a bias counts as learned
-# An effect of 0.1 deg for 1 deg/s does not matter [rad].
-NO_EFFECT = 0.1 * SIZE
-# Share of the largest effect by which one rises or falls in the last quarter, if it does.
-MOVES = 0.01
-LEAST = 0.1                     # share of a bias in an estimate that learns it
+# Of the gyroscope [rad/s], 0.7 deg/s in all: so large are those of consumer devices at power-on.
+BIAS = np.array((0.006, -0.0055, 0.009))
+RESTS_S = 20.0, 160.0   # a filter that still moves gets the longer one
+LEFT = 0.3              # share that may be left: integrals that leak keep as much
+STEADY = 0.01           # what changes by less in half of a rest has settled
 
 
-class Effect(NamedTuple):
-    """An effect about an axis of the sensor: what is left of the largest one, whether it moves."""
+class Course(NamedTuple):
+    """
+    About a level axis in a rest, from the begin to the end: gravity shows these errors.
+
+    error : of the attitude, by the bias (n,) [rad]
+    apart : of the reported bias from the true one, over it (m,); empty: there is none
+    """
 
     axis: int
-    left: float
-    falls: bool
-    rises: bool
-    samples: int        # of the rest
+    error: Reals
+    apart: Reals
 
 
-def effects(feed: Callable[[Sequence[Run]], list[Outcome]], lead_s: float, heading: bool,
-            ) -> tuple[Outcome, list[Effect]]:
-    """Return the outcome with a bias, and its effects, in rests as long as the filter needs."""
+class Effects(NamedTuple):
+    """The courses in all rests, and the last bias that is reported with and without one."""
+
+    courses: Sequence[Course]
+    said: Reals
+    said_without: Reals
+
+    @property
+    def learns(self) -> bool:
+        """Whether the filter has an estimate: it reports one, or an error falls by itself."""
+        return any(len(one.apart) or last(one.error) < 0.5 * np.max(one.error)
+                   for one in self.courses[:2])
+
+
+def effects(feed: Callable[[Sequence[Run]], list[Outcome]], least: float) -> Effects:
+    """Return the effects of a bias; errors below `least` [rad] are none."""
     for seconds in RESTS_S:
-        motion = Motion(euler(NEAR)).rest(lead_s).turn(euler(X_UP)).rest(seconds)
-        motion.turn(euler(NEAR)).rest(seconds)
-        (_, *rests), run = motion.of('rest'), motion.run('bias')
-        rates = run.gyroscope.copy()
-        rates[rests[0].begin:] += BIAS
-        (outcome,) = feed([replace(run, gyroscope=rates)])
-        sizes = []              # of the effects about axes, level or of a known heading
-        for part, axes in zip(rests, (range(1 - heading, 3), (0, 1)), strict=True):
-            rows = slice(part.begin, part.end)
-            truth = Rotation.from_quat(run.truth[rows])
-            error = (truth.inv() * Rotation.from_quat(outcome.estimates[rows])).as_rotvec()
-            if not heading:
-                up = truth[0].inv().apply((0.0, 0.0, 1.0))
-                error = error - np.outer(error @ up, up)
-            sizes += [(axis, np.abs(error[:, axis])) for axis in axes]
-        largest = max(float(np.max(size)) for _, size in sizes)
-        found = [_effect(axis, size, largest) for axis, size in sizes]
-        if not any(one.left > LEFT for one in found):
+        motion = Motion(euler(NEAR)).rest(seconds).turn(euler(X_UP)).rest(seconds)
+        run = motion.run('no bias')
+        without, outcome = feed([run, replace(run, name='bias', gyroscope=run.gyroscope + BIAS)])
+        apart = (Rotation.from_quat(without.estimates).inv()
+                 * Rotation.from_quat(outcome.estimates)).as_rotvec()
+        courses = []
+        for part, axes in zip(motion.of('rest'), ((0, 1), (1, 2)), strict=True):
+            told = outcome.biases[part.begin:part.end]
+            told = np.abs(told[np.isfinite(told[:, 0])] / BIAS - 1.0)
+            up = Rotation.from_quat(run.truth[part.begin]).inv().apply((0.0, 0.0, 1.0))
+            error = apart[part.begin:part.end]
+            error = np.abs(error - np.outer(error @ up, up))
+            error[error < least] = 0.0
+            courses += [Course(axis, error[:, axis], told[:, axis]) for axis in axes]
+        if all(settled(one.error) or last(one.error) <= LEFT * np.max(one.error)
+               for one in courses) and not any(
+                   len(one.apart) and last(one.apart) > LEFT for one in courses):
             break
-    return outcome, found
+    return Effects(courses, _said(outcome), _said(without))
 
 
-def _effect(axis: int, size: Reals, largest: float) -> Effect:
-    if largest < NO_EFFECT:
-        return Effect(axis, 0.0, False, False, len(size))
-    last, before = float(size[-1]), float(size[-len(size) // 4])
-    return Effect(axis, last / largest, last < before - MOVES * largest,
-                  last > before + MOVES * largest, len(size))
-
-
-def said_bias(outcome: Outcome) -> Reals:
-    """Return the last bias that a filter has told (3,) [rad/s], NaN if none."""
+def _said(outcome: Outcome) -> Reals:
     known = outcome.biases[np.isfinite(outcome.biases[:, 0])]
-    last: Reals = known[-1] if len(known) else np.full(3, np.nan)
-    return last
+    said: Reals = known[-1] if len(known) else np.full(3, math.nan)
+    return said
 
 
-def still_learned(outcome: Outcome) -> NDArray[np.bool_]:
-    """Return about which axes the bias that a filter tells still grows to the true one (3,)."""
-    shares = said_bias(outcome) / BIAS
-    before = said_bias(outcome.part(slice(len(outcome.run.dt) * 3 // 4))) / BIAS
-    return (shares > 1.02 * before) & (shares > LEAST) & (shares < 1.3)
+def last(course: Reals) -> float:
+    """Return the largest value in the last quarter."""
+    return float(np.max(course[3 * len(course) // 4:]))
+
+
+def settled(course: Reals) -> bool:
+    """Return whether a course has come to an end, be it the right one or not."""
+    half = course[len(course) // 2:]
+    return bool(np.ptp(half) <= STEADY * np.max(half))
+
+
+def growth(course: Reals) -> float:
+    """
+    Return the largest value of the second half over that of the first.
+
+    It is at most 2 where a course from 0 grows slower and slower, as in a filter of first order.
+    """
+    first, second = np.array_split(course, 2)
+    return float(np.max(second) / max(np.max(first), 1e-300))

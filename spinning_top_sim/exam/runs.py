@@ -84,9 +84,9 @@ class Exam:
         return bool(np.max(np.abs(one - other)) > 1e-6)
 
     @cached_property
-    def bias(self) -> tuple[Outcome, list[bias.Effect]]:
+    def bias(self) -> bias.Effects:
         """The effects of a bias."""
-        return bias.effects(self.fed, self.lead_s, self.heading)
+        return bias.effects(self.fed, STILL)
 
     def errors(self, name: str = 'excitation') -> Errors:
         """Return the errors in the excitation; without north, the heading from when settled on."""
