@@ -4,11 +4,10 @@ What a constant bias of the gyroscope does to a filter, and what the filter says
 
 A right filter either has no estimate of it, and its error stays at the bias times its time
 constant; or it learns it, and error and estimate are right in the end.  Evidence against it is an
-estimate that has settled elsewhere or moves away, an error that has settled although the filter
-learns, and one that grows faster and faster.  What still moves cannot be judged.
+estimate that has settled elsewhere or moves away, an error that has settled beside an estimate,
+and one that grows faster and faster.  What still moves cannot be judged.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -17,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
-from spinning_top_sim.exam.motions import NEAR, X_UP, Motion, Reals, Run, euler
+from spinning_top_sim.exam.motions import NEAR, STILL, X_UP, Motion, Reals, Run, euler
 
 # Of the gyroscope [rad/s], 0.7 deg/s in all: so large are those of consumer devices at power-on.
 BIAS = np.array((0.006, -0.0055, 0.009))
@@ -38,23 +37,21 @@ class Course(NamedTuple):
     error: Reals
     apart: Reals
 
+    @property
+    def left(self) -> float:
+        """What is left of the largest error in the end; errors below STILL are none."""
+        return last(self.error) / float(np.max(self.error)) * (last(self.error) > STILL)
+
 
 class Effects(NamedTuple):
-    """The courses in all rests, and the last bias that is reported with and without one."""
+    """The courses about x and y in a rest, y and z in another, and what is reported last (3,)."""
 
     courses: Sequence[Course]
     said: Reals
-    said_without: Reals
-
-    @property
-    def learns(self) -> bool:
-        """Whether the filter has an estimate: it reports one, or an error falls by itself."""
-        return any(len(one.apart) or last(one.error) < 0.5 * np.max(one.error)
-                   for one in self.courses[:2])
 
 
-def effects(feed: Callable[[Sequence[Run]], list[Outcome]], least: float) -> Effects:
-    """Return the effects of a bias; errors below `least` [rad] are none."""
+def effects(feed: Callable[[Sequence[Run]], list[Outcome]]) -> Effects:
+    """Return the effects of a bias in rests that are as long as the filter needs."""
     for seconds in RESTS_S:
         motion = Motion(euler(NEAR)).rest(seconds).turn(euler(X_UP)).rest(seconds)
         run = motion.run('no bias')
@@ -67,20 +64,13 @@ def effects(feed: Callable[[Sequence[Run]], list[Outcome]], least: float) -> Eff
             told = np.abs(told[np.isfinite(told[:, 0])] / BIAS - 1.0)
             up = Rotation.from_quat(run.truth[part.begin]).inv().apply((0.0, 0.0, 1.0))
             error = apart[part.begin:part.end]
-            error = np.abs(error - np.outer(error @ up, up))
-            error[error < least] = 0.0
+            error = np.abs(error - np.outer(error @ up, up))    # none about the vertical
             courses += [Course(axis, error[:, axis], told[:, axis]) for axis in axes]
-        if all(settled(one.error) or last(one.error) <= LEFT * np.max(one.error)
-               for one in courses) and not any(
-                   len(one.apart) and last(one.apart) > LEFT for one in courses):
+        if all(last(one.apart) <= LEFT and one.left <= LEFT if len(one.apart)
+               else settled(one.error) for one in courses):
             break
-    return Effects(courses, _said(outcome), _said(without))
-
-
-def _said(outcome: Outcome) -> Reals:
     known = outcome.biases[np.isfinite(outcome.biases[:, 0])]
-    said: Reals = known[-1] if len(known) else np.full(3, math.nan)
-    return said
+    return Effects(courses, known[-1] if len(known) else np.empty(0))
 
 
 def last(course: Reals) -> float:
@@ -101,4 +91,4 @@ def growth(course: Reals) -> float:
     It is at most 2 where a course from 0 grows slower and slower, as in a filter of first order.
     """
     first, second = np.array_split(course, 2)
-    return float(np.max(second) / max(np.max(first), 1e-300))
+    return float(np.max(second) / max(np.max(first), STILL))

@@ -49,6 +49,7 @@ TURN_RATE, FAST_RATE = 2.6, 12.0                        # [rad/s]
 # their bias.
 SLOW_RATE, RIPPLE = 0.15, 0.3
 REST_S, MOTION_S = 2.5, 12.0
+STILL = math.radians(0.05)      # an attitude that moves by less is at rest [rad]
 NEVER_ZERO = 1e-6               # [rad/s]; some filters take no step while the rates are zero
 # Lengths of uneven steps, as multiples of the first one [s].
 STEPS, SHORTEST = (1, 2, 6, 1, 5, 2, 1, 3), 0.0025

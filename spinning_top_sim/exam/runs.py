@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, motions
 from spinning_top_sim.exam.feeding import Feed, MakeFilter, Outcome
-from spinning_top_sim.exam.motions import NEAR, RATE, Motion, Run
+from spinning_top_sim.exam.motions import NEAR, RATE, STILL, Motion, Run
 from spinning_top_sim.tools.conventions import Convention, Errors, errors_of
 
-# A filter is settled if it has turned by less than STILL [rad] in the second half of a rest at
-# the start; slow ones get longer ones.
-LEADS_S, STILL = (10.0, 40.0, 160.0), math.radians(0.05)
+# A filter is settled if it is STILL in the second half of a rest at the start; slow ones get
+# longer ones.
+LEADS_S = 10.0, 40.0, 160.0
 ARM, ARM_AFTER_S = (0.1, 0.0, 0.0), 4.0     # of the IMU [m], and when it comes in the top's motion
 FIELD_TURN = math.radians(3.0)              # of the field about the vertical
 NOISE_LEAD_S, NOISE_S = 6.0, 20.0           # rest and motion of the noisy runs
@@ -86,7 +86,7 @@ class Exam:
     @cached_property
     def bias(self) -> bias.Effects:
         """The effects of a bias."""
-        return bias.effects(self.fed, STILL)
+        return bias.effects(self.fed)
 
     def errors(self, name: str = 'excitation') -> Errors:
         """Return the errors in the excitation; without north, the heading from when settled on."""
