@@ -18,23 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import increments
-from spinning_top_sim.exam.motions import RATE, Reals, Run
+from spinning_top_sim.exam.motions import RATE, ROUNDING, Reals, Run
 from spinning_top_sim.tools.identify import in_words
 
-# Kicks [rad]; the large one shows how a step is integrated.
-SMALL, LARGE = 0.02, 0.3
-# Step of a kick, when filters have no high gains of a start, and longest delay of its answer.
-EARLY, LATEST = 360, 30
-FIT = 0.1       # deviation of turns from a matrix that one about other axes may explain
-LEAST = 1e-6                    # share of an error that is corrected, if any
-SETTLED = 800                   # uneven steps after which a filter has settled from its start
-
-
-class Kick(NamedTuple):
-    """A turn of the gyroscope alone (3,) [rad] at a sample."""
-
-    sample: int
-    turn: Reals
+SMALL, LARGE = 0.02, 0.3        # kicks [rad]: to first order; and that a step of first order misses
+# Sample of a kick in a start, from the end: filters have no high gains of a start any more, and
+# there is time for late answers.
+EARLY = -40
+FIT = 0.1                       # deviation from a matrix, relative, that another one may explain
 
 
 class Rates(NamedTuple):
@@ -62,18 +53,17 @@ class Rates(NamedTuple):
         return f'a rate about {text}' + (', axes of the world' if self.in_world else '')
 
 
-def with_kicks(run: Run, kicks: Sequence[Kick]) -> Run:
-    """Return the run with kicks."""
+def with_kick(run: Run, sample: int, turn: Reals) -> Run:
+    """Return the run with a kick, a turn of the gyroscope alone (3,) [rad]."""
     gyroscope = run.gyroscope.copy()
-    for kick in kicks:
-        gyroscope[kick.sample] += kick.turn / run.dt[kick.sample]
-    return replace(run, name=f'{run.name}, kicks', gyroscope=gyroscope)
+    gyroscope[sample] += turn / run.dt[sample]
+    return replace(run, name=f'{run.name}, kick', gyroscope=gyroscope)
 
 
 def rates(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Rates:
     """Identify the use of the rates from starts without and with kicks about the vertical."""
     apart = np.array([increments(other.estimates) - increments(one.estimates)
-                      for one, other in zip(still, moved, strict=True)])[:, EARLY:EARLY + LATEST]
+                      for one, other in zip(still, moved, strict=True)])[:, EARLY:]
     turns = _turns(still, moved)
     moves = np.cumsum(apart, axis=1)                # (starts, samples, 3)
     size = np.median(np.linalg.norm(moves, axis=2), axis=0)
@@ -112,11 +102,13 @@ def _fit(answers: Reals, turns: Reals) -> tuple[Reals, float]:
 
 def kicked_steps(still: Outcome) -> Run:
     """Return a run of uneven steps with kicks about what the filter takes for the vertical."""
-    lengths, run = still.run.dt.round(6), still.run
-    up = Rotation.from_quat(still.estimates[SETTLED]).inv().apply((0.0, 0.0, 1.0))
-    places = [SETTLED + 20 * k + int(np.argmax(lengths[SETTLED + 20 * k:] == length))
-              for k, length in enumerate(np.unique(lengths))]      # one of each length
-    return with_kicks(run, [Kick(k, SMALL * RATE * run.dt[k] * up) for k in places])
+    run, lengths = still.run, still.run.dt.round(6)
+    place = 4 * len(lengths) // 5                   # the filter is settled from its start
+    up = Rotation.from_quat(still.estimates[place]).inv().apply((0.0, 0.0, 1.0))
+    for length in np.unique(lengths):
+        place += 20 + int(np.argmax(lengths[place + 20:] == length))
+        run = with_kick(run, place, SMALL * RATE * length * up)         # as fast for each length
+    return run
 
 
 def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
@@ -137,7 +129,7 @@ def kicked_starts(runs: Sequence[Run], axis: Sequence[float],
     """
     turns = [Rotation.from_quat(one[EARLY - 1]).inv().apply(axis)
              for one in attitudes or [run.truth for run in runs]]
-    return [with_kicks(run, [Kick(EARLY, size * (-1) ** k * turn)])
+    return [with_kick(run, EARLY, size * (-1) ** k * turn)
             for k, (run, turn) in enumerate(zip(runs, turns, strict=True))]
 
 
@@ -155,4 +147,4 @@ def pull(outcomes: Sequence[Outcome], axes: slice) -> float:
     first, way = errors[:, 0], errors[:, 1] - errors[:, 0]
     size, length = np.linalg.norm(first, axis=1), np.linalg.norm(way, axis=1)
     cosines = -np.sum(first * way, axis=1) / np.maximum(size * length, 1e-300)
-    return float(np.mean(np.where(length > LEAST * size, cosines, 0.0)))
+    return float(np.mean(np.where(length > ROUNDING * size, cosines, 0.0)))

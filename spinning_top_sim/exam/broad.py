@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spinning_top_sim.exam.feeding import NORM_TOLERANCE, Feed, MakeFilter, feed_apart
+from spinning_top_sim.exam.feeding import TOLERANCE, Feed, MakeFilter, feed_apart
 from spinning_top_sim.exam.motions import Run
 from spinning_top_sim.exam.scored import ScoredRun, report_of
 from spinning_top_sim.installation import needed
@@ -79,7 +79,7 @@ def read_trial(path: Path) -> ScoredRun:
     gyroscope, accelerometer, magnetometer, truth, movement = readings
     # The truth is NaN where the cameras do not see the sensor.
     counts = np.flatnonzero((movement[:, 0] != 0.0)
-                            & (np.abs(np.linalg.norm(truth, axis=1) - 1.0) < NORM_TOLERANCE))
+                            & (np.abs(np.linalg.norm(truth, axis=1) - 1.0) < TOLERANCE))
     if not (0.0 < rate < np.inf and len(counts) and np.all(np.isfinite(readings[:3]))):
         raise ValueError(f'{path}: must have a sampling_rate > 0, finite readings, and movement '
                          'with opt_quat')

@@ -15,23 +15,22 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, measures
 from spinning_top_sim.exam.measures import degrees
-from spinning_top_sim.exam.motions import RATE, Reals
+from spinning_top_sim.exam.motions import RATE, ROUNDING, Reals
 from spinning_top_sim.exam.runs import Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import AXES, rms
 from spinning_top_sim.tools.report import Mark
 
-# Without noise a right filter has no error; what is left is its own rounding and settling.
+# Without noise a right filter has no error; what is left is its own rounding and settling [deg].
 CLEAN_DEG = 0.3
-GROSS_DEG = 5.0         # an error at rest that another convention may explain
-ODD = 0.2               # deviation of an answer to the rates beyond delays and integration
-SURE = 0.98             # cosine of the way after a kick to that to the truth, if right
-# A right filter that corrects before it turns lags by a step, on the top by 2.3 deg.
-NOISY_DEG = 5.0
-TURNS_OFF = 0.003       # a step of first order is 0.0075 off
+GAIN_OFF = 0.02         # of turns: less than sensors differ in scale
+TURNS_OFF = 0.003       # of large turns; a step of first order is 0.0075 off
+DELAY = 0.25            # samples: half of what a mean of two steps is late
+STRAY = 0.02            # 1 - cosine of a way: 11 deg from the straight one
 FOLLOWS = 0.7           # half of the power: the filter is faster than the motion
-GROWS = 2.0 + 2.0 * bias.STEADY
+GROWS = 2.0 + 2.0 * bias.STEADY         # see bias.growth
+NOISY_DEG = 5.0         # a right filter that corrects first lags a step, on the top 2.3 deg
 
 
 class Measured(NamedTuple):
@@ -72,20 +71,17 @@ def repeat(exam: Exam) -> Measured:
 def convention(exam: Exam) -> Measured:
     """Read the attitudes at the rests in every convention; undo the one that fits."""
     told, rests = exam.outcomes('excitation')[0].estimates, _rests(exam)
-    truth, heading = exam.run.truth[rests], 'absolute' if exam.heading else 'any'
-    before = math.degrees(conventions.error_of(told[rests], truth, heading))
-    if before < GROSS_DEG:
-        return Measured(before, '', limit=math.inf)
-    found = conventions.best(told[rests], truth, heading)
-    after, as_told = math.degrees(found.after), _rates(exam).off_identity
+    found = conventions.best(told[rests], exam.run.truth[rests],
+                             'absolute' if exam.heading else 'any')
+    before, after, as_told = *np.degrees((found.before, found.after)), _rates(exam).off_identity
     if found.convention.parts and after < max(0.1 * before, CLEAN_DEG):
         exam.read_in(found.convention)
         # What is taken for axes of the sensor may be a sensor that is read wrongly.
-        if _rates(exam).off_identity > max(as_told, ODD):
+        if _rates(exam).off_identity > max(as_told, answers.FIT):
             exam.read_in(conventions.Convention())
     name = exam.convention.name
     return Measured(before, f'read as {name}, the error at rest falls from {before:.3g} to '
-                    f'{after:.2g} deg; the other checks undo it', limit=None if name else math.inf)
+                    f'{after:.2g} deg; the other checks undo it', limit=None if name else math.nan)
 
 
 def gyroscope(exam: Exam) -> Measured:
@@ -97,10 +93,7 @@ def gyroscope(exam: Exam) -> Measured:
                         f'otherwise, by {found.left:.2g} of them, differently in each attitude',
                         'accuracy')
     # What comes late has lost something on its way.
-    return Measured(off if off > ODD or abs(found.delay) < DELAY else 0.0, str(found))
-
-
-DELAY = 0.25            # samples; the half of a trapezoid is found
+    return Measured(off if off > answers.FIT or abs(found.delay) < DELAY else 0.0, str(found))
 
 
 def delay(exam: Exam) -> Measured:
@@ -126,7 +119,7 @@ def large_turns(exam: Exam) -> Measured:
     trembles = max(float(np.max(np.abs(measures.increments(one.estimates[answers.EARLY - 1:]))))
                    for one in exam.outcomes('starts')) / answers.LARGE
     turn = f'a turn of {answers.LARGE:g} rad in one step'
-    if off > ODD:
+    if off > answers.FIT:
         return Measured(off, f'{turn}, {answers.LARGE * RATE:g} rad/s, moves the attitude '
                         f'otherwise, by {off:.2g} of it; a small one does not', 'gyroscope')
     return Measured(off, f'{turn} is {off:.2%} off the rotation; a step of first order is '
@@ -159,7 +152,7 @@ def errors_by_field(exam: Exam) -> Measured | None:
         return Measured(worst, evidence)
     right = answers.pull(exam.outcomes('turns with field'), slice(2, 3))
     return Measured(worst, f'{evidence}; {_way(right, "north")}',
-                    'accuracy' if right > SURE else '')
+                    'accuracy' if right > 1.0 - STRAY else '')
 
 
 def heading_answer(exam: Exam) -> Measured | None:
@@ -275,15 +268,15 @@ FIRST = 'invalid_output', 'nondeterministic'
 INPUTS = (*FIRST, 'gyroscope', 'timing', 'accuracy')
 ALL = (*INPUTS, 'accelerometer', 'magnetometer')
 CHECKS = (
-    Check('nondeterministic', 'repeat_rad', 1e-6, 'of two filters, same readings', repeat),
-    Check('convention', 'convention_deg', GROSS_DEG, 'at rest, as it is told', convention, FIRST),
-    Check('gyroscope', 'rates_off', 0.02, 'matrix of the rates off the identity', gyroscope,
+    Check('nondeterministic', 'repeat_rad', ROUNDING, 'of two filters, same readings', repeat),
+    Check('convention', 'convention_deg', CLEAN_DEG, 'at rest, as it is told', convention, FIRST),
+    Check('gyroscope', 'rates_off', GAIN_OFF, 'matrix of the rates off the identity', gyroscope,
           FIRST),
     Check('timing', 'delay_samples', DELAY, 'of the attitude behind the gyroscope', delay, INPUTS),
-    Check('timing', 'steps_off', 0.02, 'turns in steps of 2.5 to 15 ms', steps, INPUTS),
+    Check('timing', 'steps_off', GAIN_OFF, 'turns in steps of 2.5 to 15 ms', steps, INPUTS),
     Check('integration', 'large_turn_off', TURNS_OFF, 'turns of 0.3 rad in a step', large_turns,
           INPUTS),
-    Check('accelerometer', 'tilt_way', 1.0 - SURE, '1 - cosine of the way to the vertical',
+    Check('accelerometer', 'tilt_way', STRAY, '1 - cosine of the way to the vertical',
           way_of_tilt, INPUTS),
     Check('magnetometer', 'rest_heading_deg', CLEAN_DEG, 'without noise', errors_by_field,
           (*INPUTS, 'integration', 'accelerometer')),

@@ -19,10 +19,10 @@ from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.tools.cli import one_line
 
 READ_EVERY = 10                 # updates after which covariance and bias are read
-NORM_TOLERANCE = 1e-3           # of a quaternion: some filters normalise to first order
-ASYMMETRIC = 0.01               # relative difference of a covariance from its transpose
-# The longest time that runs may take, and that they may take in addition for each update [s].
-LONGEST_S, UPDATE_S = 10.0, 0.01
+# Of a norm of 1, and of the symmetry of a covariance: some filters normalise to first order.
+TOLERANCE = 1e-3
+ANSWER_S = 5.0                  # a program may take as long for an answer
+UPDATE_S = 0.01                 # an update may take, in the mean, as long as a sample lasts
 INTERRUPTED = threading.Event()     # ends the exam of a node; rclpy loses KeyboardInterrupts
 
 
@@ -127,7 +127,7 @@ def feed_apart(make_filter: MakeFilter, runs: Sequence[Run]) -> list[Outcome]:
         process.start()
     sender.close()
     updates = sum(len(run.dt) for run in runs)
-    patience = LONGEST_S + UPDATE_S * updates
+    patience = ANSWER_S + UPDATE_S * updates
     try:
         if not receiver.poll(patience):
             raise InvalidOutputError(f'{runs[0].name}: {updates} updates take more than '
@@ -159,13 +159,13 @@ def invalid(quaternions: Reals, covariances: Reals) -> tuple[int, str] | None:
     """Return the first row of (n, 4) or (n, 3, 3) that is invalid, and why; NaN: unknown."""
     with np.errstate(over='ignore'):
         norms = np.linalg.norm(quaternions, axis=1)
-    for k in np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))[:1].tolist():
+    for k in np.flatnonzero(~(np.abs(norms - 1.0) <= TOLERANCE))[:1].tolist():
         return k, f'the quaternion is {quaternions[k].tolist()}: its norm must be 1'
     for k in np.flatnonzero(~np.all(np.isnan(covariances), axis=(1, 2))).tolist():
         matrix = covariances[k]
         size = float(np.max(np.abs(matrix)))
-        if not (np.isfinite(size) and np.max(np.abs(matrix - matrix.T)) <= ASYMMETRIC * size
-                and np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] >= -1e-5 * size):
+        if not (np.isfinite(size) and np.max(np.abs(matrix - matrix.T)) <= TOLERANCE * size
+                and np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] >= -TOLERANCE * size):
             return k, (f'the covariance is {matrix.tolist()}: must be symmetric and have no '
                        'negative eigenvalue')
     return None

@@ -22,7 +22,15 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
 
 from spinning_top_sim.exam.examiner import examine
-from spinning_top_sim.exam.feeding import INTERRUPTED, MakeFilter, NodeError, Outcome, feed
+from spinning_top_sim.exam.feeding import (
+    ANSWER_S,
+    INTERRUPTED,
+    READ_EVERY,
+    MakeFilter,
+    NodeError,
+    Outcome,
+    feed,
+)
 from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.tools import cli
@@ -36,9 +44,8 @@ except ImportError:
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start
-ANSWER_S = 5.0                  # for an answer
-AGAIN_S, FIRST = 0.3, 20        # for the first one; how often its sample is sent again
-ALONE_EVERY = 50                # samples after which other publishers are looked for
+# The first sample is sent again so often, after this time each: endpoints match within seconds.
+AGAIN, AGAIN_S = 20, 0.3
 ATTEMPTS = 3                    # at a run in which messages are lost
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 NAME, FRAME = 'examine', 'imu_link'
@@ -165,7 +172,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         The first ones are published again, later, until there is an answer: the node may not yet
         be matched, or have no step to take.
         """
-        for _ in range(1 if self._answered else FIRST):
+        for _ in range(1 if self._answered else AGAIN):
             self._publish(gyroscope, accelerometer, magnetometer, dt)
             if self._wait(lambda: self._now_ns in self._answers,
                           ANSWER_S if self._answered else AGAIN_S):
@@ -173,7 +180,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         else:
             self._check_alone()
             if not self._answered:
-                raise RuntimeError(f'it answers none of {FIRST} samples')
+                raise RuntimeError(f'it answers none of {AGAIN} samples')
             if not self._reliable:
                 raise LostError
             raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
@@ -181,7 +188,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         message = self._answers.pop(self._now_ns)
         self._answers.clear()
         self._answered += 1
-        if self._answered % ALONE_EVERY == 0:
+        if self._answered % READ_EVERY == 0:
             self._check_alone()
         matrix = np.array(message.orientation_covariance).reshape(3, 3)
         self.covariance = None if matrix[0, 0] == NO_ORIENTATION else matrix

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from spinning_top_sim.exam.feeding import Outcome, invalid
 from spinning_top_sim.exam.measures import degrees, nees_of
 from spinning_top_sim.exam.motions import Reals, Run
+from spinning_top_sim.exam.scored import USELESS_DEG
 from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.tools import conventions
@@ -35,11 +36,10 @@ from spinning_top_sim.tools.report import Finding, Mark, Report
 TRUTHS = ('ground_truth/imu', 'ground_truth/odom', 'pose')
 ODOMETRY_OF_SENSOR = 'ground_truth/imu_odom'
 LONGEST_GAP_S = 0.1             # of the truth, across which it is interpolated
-GROSS, USELESS = np.radians((3.0, 10.0))    # errors that are a convention; that are a fault
-LATE, EARLY = 0.75, -1.5        # steps; a node may predict by one
+# Steps by which stamps may be late, or early, because a node may predict the next attitude.
+LATE, EARLY = 0.75, -1.5
 EXPLAINED = 0.25                # most of an error that its cause leaves
-THINNED = 10                    # every so many attitudes are compared in all conventions
-FEWEST = 100                    # attitudes in a log that can be judged
+FEWEST = 100                    # attitudes that can be judged, and that show a convention
 
 
 class Stamped(NamedTuple):
@@ -184,10 +184,11 @@ def _delay(outcome: Outcome, absolute: bool) -> tuple[float, float, float]:
 def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
     """Find the convention, the delay, and what is left, in the second half."""
     settled = outcome.part(slice(len(outcome.run.dt) // 2, None))
-    best = conventions.best(settled.estimates[::THINNED], settled.run.truth[::THINNED],
+    rows = np.linspace(0, len(settled.run.dt) - 1, FEWEST // 2, dtype=int)
+    best = conventions.best(settled.estimates[rows], settled.run.truth[rows],
                             'absolute' if absolute else 'steady')
     findings, name = [], best.convention.name
-    if name and best.before > GROSS and best.after < EXPLAINED * best.before:
+    if name and best.after < EXPLAINED * best.before:
         findings.append(Finding('convention', f'read as {name}, the error falls from '
                                 f'{degrees(best.before)} to {degrees(best.after)}; all measures '
                                 'are those after this correction'))
@@ -205,9 +206,9 @@ def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
     value, nees = rms(errors.whole), nees_of([outcome])
     marks = {'tilt_rms_deg': Mark(math.degrees(rms(errors.tilt)), meaning='in the second half'),
              'heading_rms_deg': Mark(math.degrees(rms(errors.heading))),
-             'error_rms_deg': Mark(math.degrees(value), math.degrees(USELESS)),
+             'error_rms_deg': Mark(math.degrees(value), USELESS_DEG),
              'stamp_offset_s': Mark(seconds, meaning='> 0: late')}
-    if not findings and value > USELESS:
+    if not findings and math.degrees(value) > USELESS_DEG:
         findings.append(Finding('accuracy', f'the error is {degrees(value)} rms'))
     if nees is not None:
         marks['nees'] = Mark(nees.ratio, nees.high, nees.band)

@@ -35,24 +35,24 @@ TAKEN = ('imu.gyroscope_', 'imu.accelerometer_', 'imu.bias_', 'mag.field', 'mag.
          'mag.enabled')
 OF_SCENES = 'imu.bandwidth', 'imu.vibration.', 'mag.disturbance.'
 
-# A wheel on a pivot 2 cm below its centre: 4 rad/s of spin, slow precession and large nutation.
+# A wheel on a pivot 2 cm below its centre, which starts at a tilt of 0.7 rad: 4 rad/s of spin, slow
+# precession and large nutation.
 WHEEL = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.02, gravity=GRAVITY)
-SPIN, TILT = 0.6, 0.7           # L3 [kg m^2/s] and theta at the start [rad]
+START = {'theta': 0.7, 'theta_dot': 0.0, 'l3': 0.6, 'lz': 0.6 * math.cos(0.7)}
 # Yaw, pitch and roll [deg]: near the identity, where many filters start, so that slow ones settle
 # soon; and with another axis of the sensor level.
 NEAR, X_UP = (4.0, 3.0, -2.5), (20.0, -80.0, 10.0)
-# Turns about an axis of the sensor [deg], each followed by a rest; the last two are fast.
-TURNS = ((0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0),
-         (1, 110.0), (2, -120.0), (0, 220.0), (1, -200.0))
-TURN_RATE, FAST_RATE = 2.6, 12.0                        # [rad/s]
-# So slow that a threshold would drop it; it ripples, because some filters take a steady one for
-# their bias.
-SLOW_RATE, RIPPLE = 0.15, 0.3
-REST_S, MOTION_S = 2.5, 12.0
+# Turns about an axis of the sensor [deg] at a rate [rad/s], each followed by a rest: those that
+# any filter sees, two as fast as a hand turns, and one so slow that a threshold would drop it.
+TURNS = (*(('turn', axis, angle, 2.6) for axis, angle in (
+    (0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0), (1, 110.0),
+    (2, -120.0))), ('fast', 0, 220.0, 12.0), ('fast', 1, -200.0, 12.0), ('slow', 1, 60.0, 0.15))
+RIPPLE = 0.3            # of the slow turn: some filters take a steady one for their bias
+REST_S, TOP_S = 2.5, 12.0       # a time constant of fast filters; some nutations
 STILL = math.radians(0.05)      # an attitude that moves by less is at rest [rad]
-NEVER_ZERO = 1e-6               # [rad/s]; some filters take no step while the rates are zero
-# Lengths of uneven steps, as multiples of the first one [s].
-STEPS, SHORTEST = (1, 2, 6, 1, 5, 2, 1, 3), 0.0025
+ROUNDING = float(np.finfo(np.float32).eps)      # of filters in single precision, relative
+NEVER_ZERO = 1e-6       # [rad/s]; some filters take no step while the rates are zero
+STEPS = 0.0025, 0.005, 0.015, 0.0025, 0.0125, 0.005, 0.0025, 0.0075     # uneven ones [s]
 
 
 @dataclass(frozen=True)
@@ -114,24 +114,23 @@ class Motion:
         n = round(seconds * RATE)
         return self._add('rest', Rotation.from_quat(np.tile(self._now.as_quat(), (n, 1))))
 
-    def turn(self, goal: Rotation | tuple[int, float], rate: float = TURN_RATE,
-             kind: str = 'turn', ripple: float = 0.0) -> 'Motion':
+    def turn(self, goal: Rotation | tuple[int, float], rate: float = 2.6,
+             kind: str = 'turn') -> 'Motion':
         """Add a turn to an attitude, or about an axis of the sensor by an angle [deg]."""
         vector = (self._now.inv() * goal).as_rotvec() if isinstance(goal, Rotation) else (
             math.radians(goal[1]) * np.eye(3)[goal[0]])
         n = max(2, math.ceil(float(np.linalg.norm(vector)) / rate * RATE))
         share = np.arange(1.0, n + 1.0)
-        share[:-1:2] += ripple
+        share[:-1:2] += RIPPLE * (kind == 'slow')
         return self._add(kind, self._now * Rotation.from_rotvec(
             share[:, np.newaxis] / n * vector))
 
     def top(self, seconds: float, seed: int = 0) -> 'Motion':
         """Add a turn to the start of the wheel's motion, and the motion; `seed` varies it."""
         phi, psi = np.random.default_rng(seed).uniform(-math.pi, math.pi, 2).tolist()
-        start = State(theta=TILT, theta_dot=0.0, phi=phi, psi=psi, l3=SPIN,
-                      lz=SPIN * math.cos(TILT))
         t = np.arange(1.0, round(seconds * RATE) + 1.0) / RATE
-        turns = Rotation.from_quat(solve(WHEEL, start, t, method='exact').quaternion)
+        turns = Rotation.from_quat(solve(WHEEL, State(**START, phi=phi, psi=psi), t,
+                                         method='exact').quaternion)
         return self.turn(turns[0])._add('top', turns)
 
     def run(self, name: str) -> Run:
@@ -154,13 +153,11 @@ def perfect(name: str, attitudes: Rotation, dt: Reals) -> Run:
 
 
 def excitation(lead_s: float) -> Motion:
-    """Return turns about each axis between rests, slow and fast, and the motion of a top."""
-    motion = Motion(euler(NEAR)).rest(lead_s).rest(REST_S)
-    for axis, angle in TURNS:
-        fast = abs(angle) > 180.0
-        motion.turn((axis, angle), *((FAST_RATE, 'fast') if fast else (TURN_RATE, 'turn')))
-        motion.rest(REST_S)
-    return motion.turn((1, 60.0), SLOW_RATE, 'slow', RIPPLE).top(MOTION_S).rest(REST_S)
+    """Return turns about each axis between rests, and the motion of a top."""
+    motion = Motion(euler(NEAR)).rest(lead_s)
+    for kind, axis, angle, rate in TURNS:
+        motion.rest(REST_S).turn((axis, angle), rate, kind)
+    return motion.top(TOP_S).rest(REST_S)
 
 
 def starts() -> list[Run]:
@@ -171,7 +168,7 @@ def starts() -> list[Run]:
 def uneven(count: int) -> Run:
     """Return a rest in so many steps of different lengths."""
     turns = Rotation.from_quat(np.tile(euler(NEAR).as_quat(), (count + 1, 1)))
-    return perfect('uneven steps', turns, SHORTEST * np.resize(STEPS, count))
+    return perfect('uneven steps', turns, np.resize(STEPS, count))
 
 
 def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: float) -> Run:

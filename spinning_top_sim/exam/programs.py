@@ -12,11 +12,10 @@ from typing import NoReturn
 
 import numpy as np
 
-from spinning_top_sim.exam.feeding import InvalidOutputError
+from spinning_top_sim.exam.feeding import ANSWER_S, InvalidOutputError
 from spinning_top_sim.exam.motions import Reals
 from spinning_top_sim.tools.cli import one_line
 
-ANSWER_S = 5.0                  # within which a line must come
 LONGEST_LINE = 4096             # bytes; an answer has less than a tenth of that
 # Of the numbers of an answer.
 SHAPES = {'attitude': 4, 'bias': 3, 'covariance': (3, 3)}

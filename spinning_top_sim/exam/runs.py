@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, motions
 from spinning_top_sim.exam.feeding import Feed, MakeFilter, Outcome
-from spinning_top_sim.exam.motions import NEAR, RATE, STILL, Motion, Run
+from spinning_top_sim.exam.motions import NEAR, RATE, ROUNDING, STILL, Motion, Run
 from spinning_top_sim.tools.conventions import Convention, Errors, errors_of
 
 # A filter is settled if it is STILL in the second half of a rest at the start; slow ones get
@@ -81,7 +81,7 @@ class Exam:
     def heading(self) -> bool:
         """Whether the field changes attitudes: only then the heading is judged against north."""
         one, other = (self.outcomes(name)[0].estimates for name in ('excitation', 'field turned'))
-        return bool(np.max(np.abs(one - other)) > 1e-6)
+        return bool(np.max(np.abs(one - other)) > ROUNDING)
 
     @cached_property
     def bias(self) -> bias.Effects:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter
 from spinning_top_sim.exam.measures import Rmse, rmse
-from spinning_top_sim.exam.motions import Run
+from spinning_top_sim.exam.motions import ROUNDING, Run
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
 # A mean error above that, and above the gyroscope's alone, is a fault: more than that of any
@@ -43,7 +43,7 @@ def report_of(make_filter: MakeFilter, runs: Iterable[ScoredRun], total: int, ki
                 part = run.part(slice(ASKED))
                 one, other = feed(make_filter, [part, replace(
                     part, magnetometer=part.magnetometer[:, [1, 2, 0]])])
-                whole = bool(np.max(np.abs(one.estimates - other.estimates)) > 1e-6)
+                whole = bool(np.max(np.abs(one.estimates - other.estimates)) > ROUNDING)
             outcome = feed(make_filter, [run])[0].part(counts)
         except InvalidOutputError as error:
             failed.append(str(error))
