@@ -61,7 +61,7 @@ def trial_of(what: Path | tuple[int, int]) -> ScoredRun:
 def error_of(job: tuple[str, Path | tuple[int, int]]) -> Rmse:
     name, what = job
     try:
-        run, counts, _ = trial_of(what)
+        run, counts = trial_of(what)
         outcome = feed(FILTERS[name], [run])[0].part(counts)
     except InvalidOutputError as error:
         print(f'{name}: {error}')

@@ -198,7 +198,7 @@ def test_a_filter_that_needs_a_field_is_told():
     (partial(sys.exit, 3), 'raises SystemExit: 3')])
 def test_a_filter_that_never_returns_or_crashes_is_told(monkeypatch, short, said, says):
     if says.endswith(' s'):
-        monkeypatch.setattr(feeding, 'LONGEST_S', 1.0)
+        monkeypatch.setattr(feeding, 'ANSWER_S', 1.0)
         monkeypatch.setattr(feeding, 'UPDATE_S', 0.0)
     with pytest.raises(feeding.InvalidOutputError, match=says):
         feeding.feed_apart(partial(Bad, said), [short])

@@ -79,7 +79,7 @@ def test_a_run_that_loses_messages_begins_again_and_the_exam_ends_with_a_line(
 
 
 def test_another_publisher_is_told_whenever_it_comes(run, monkeypatch):
-    monkeypatch.setattr(live, 'ALONE_EVERY', 1)
+    monkeypatch.setattr(live, 'READ_EVERY', 1)
     with live.NodeExam(NODE, 'imu/data') as node:
         filter_ = node.start()
         readings = run.gyroscope[0], run.accelerometer[0], run.magnetometer[0], 0.01

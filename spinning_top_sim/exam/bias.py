@@ -20,7 +20,7 @@ from spinning_top_sim.exam.motions import NEAR, STILL, X_UP, Motion, Reals, Run,
 
 # Of the gyroscope [rad/s], 0.7 deg/s in all: so large are those of consumer devices at power-on.
 BIAS = np.array((0.006, -0.0055, 0.009))
-RESTS_S = 20.0, 160.0   # a filter that still moves gets the longer one
+RESTS_S = 20.0, 80.0    # a filter that still moves gets the longer one
 LEFT = 0.3              # share that may be left: integrals that leak keep as much
 STEADY = 0.01           # what changes by less in half of a rest has settled
 

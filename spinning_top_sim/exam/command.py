@@ -74,8 +74,11 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.page is not None:
         with needed('a page', 'plot'):
             from spinning_top_sim.exam.page import draw_page  # noqa: PLC0415
-    with _interruptible(), _progress() as show:
-        report = _report(kind, getattr(arguments, kind), options, show)
+    judge = _judge(kind, getattr(arguments, kind))
+    with _interruptible(), cli.progress('examined', 100.0, '%') as bar:
+        if kind != 'log':
+            options['show'] = lambda done, total: bar(100.0 * done / total)
+        report = judge(**options)
     code = printed(report, arguments.json)
     if arguments.page is not None:
         draw_page(report, arguments.page)
@@ -94,7 +97,7 @@ def _options(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     shown, taken = kind if kind == 'log' else f'--{kind}', KINDS[kind]
     if 'topic' in taken and 'topic' not in options:
         raise ValueError(f'{shown} needs --topic')
-    if 'data' in options and kind in ('filter', 'command'):
+    if 'data' in options and taken is OF_FILTER:
         shown, taken = '--data', ('data',)
     for name in options:
         if name not in taken:
@@ -108,27 +111,30 @@ def _options(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     return kind, options
 
 
-def _report(kind: str, subject: Any, options: dict[str, Any], show: Any) -> Report:
+def _judge(kind: str, subject: Any) -> Callable[..., Report]:
+    """Return what examines the subject with its options; it has imported what it needs."""
     if kind == 'log':
         with needed('it'):
             from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
-        return examine_log(subject, options['topic'], options.get('truth'),
-                           options.get('heading'))
+        return lambda topic, truth=None, heading=None: examine_log(
+            subject, topic, truth, heading)
     if kind == 'node':
         with needed('the exam of a node', 'ros'):
             from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415
-        return examine_node(subject, show=show, **options)
+        return partial(examine_node, subject)
     make_filter: Callable[[], Filter] = partial(Program, subject)
     how, name = feed, subject
     if kind == 'filter' and subject in FILTERS:
-        with needed(f'the filter {subject}'):
-            FILTERS[subject]()          # imports its package before the exam
         make_filter = FILTERS[subject]
+        with needed(f'the filter {subject}'):
+            make_filter()
     elif kind == 'filter':
         make_filter, how, name = _own_filter(subject), feed_apart, None
-    if 'data' in options:
-        return examine_data(make_filter, options['data'], subject=name, feed=how, show=show)
-    return examine(make_filter, subject=name, feed=how, show=show, **options)
+
+    def judge(data: Path | None = None, **options: Any) -> Report:
+        exam = examine if data is None else partial(examine_data, folder=data)
+        return exam(make_filter, subject=name, feed=how, **options)
+    return judge
 
 
 @contextlib.contextmanager
@@ -143,19 +149,6 @@ def _interruptible() -> Iterator[None]:
             yield
     finally:
         INTERRUPTED.clear()
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Callable[[float, float], None]]:
-    """Yield what shows how much is done, and the time that is left."""
-    with contextlib.ExitStack() as stack:
-        bars: list[Callable[[float], None]] = []
-
-        def show(done: float, total: float) -> None:
-            if not bars:
-                bars.append(stack.enter_context(cli.progress('examined', total, 'parts')))
-            bars[0](done)
-        yield show
 
 
 def _own_filter(given: str) -> Callable[[], Filter]:

@@ -18,8 +18,8 @@ from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.report import Finding, Mark, Report
 from spinning_top_sim.tools.scene_file import read_scene
 
-# Seeds of the noisy runs.
-SEEDS = {'quick': range(3), 'full': range(10), 'field': range(1)}
+SEEDS = {'quick': 3, 'full': 10, 'field': 1}        # of the noisy runs, or of the scenes
+
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
             imu: Mapping[str, Any] | str | Path | None = None,
@@ -74,7 +74,7 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
     values = checked_imu(imu, level)
-    numbers = list(SEEDS[level]) if seeds is None else _seed_numbers(seeds)
+    numbers = _seed_numbers(SEEDS[level] if seeds is None else seeds)
     feed = feed or (feed_apart if isolated else feed_here)
     show = show or (lambda done, total: None)
     subject = one_line(subject or getattr(make_filter, '__name__', 'filter'))

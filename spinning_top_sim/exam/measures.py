@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
-from spinning_top_sim.exam.motions import Reals, Run
+from spinning_top_sim.exam.motions import Reals
 from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import autocorrelation_time, rms
 
@@ -32,15 +31,6 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
     total = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).magnitude()
     errors = errors_of(estimates, truth)
     return Rmse(*(math.degrees(rms(one)) for one in (total, errors.heading, errors.tilt)))
-
-
-def gyroscope_alone(run: Run, rows: slice | NDArray[np.intp]) -> Rmse:
-    """Return the errors, to first order, of the gyroscope integrated from the truth."""
-    apart = run.dt[:, np.newaxis] * run.gyroscope - increments(run.truth)
-    error = np.cumsum(Rotation.from_quat(run.truth[1:]).apply(apart[1:]), axis=0)
-    error = np.concatenate((np.zeros((1, 3)), error))[rows]
-    return Rmse(*(math.degrees(rms(np.linalg.norm(part, axis=1)))
-                  for part in (error, error[:, 2:], error[:, :2])))
 
 
 def increments(quaternions: Reals) -> Reals:
@@ -75,40 +65,37 @@ def nees_of(outcomes: Sequence[Outcome]) -> Nees | None:
     """
     Return the normalised squared error of the tilt (Bar-Shalom et al. 2001, 5.4.2).
 
-    The covariance may refer to the axes of the sensor or of the world: the assumption with the
-    greater likelihood counts.  One error of each autocorrelation time is independent.  None: there
-    is no covariance, or it has no inverse.  The first quarter of each outcome does not count.
+    The covariance may refer to the axes of the sensor or of the world: the assumption that suits
+    better counts.  One error of each autocorrelation time is independent.  None: there is no
+    covariance, or it has no inverse.  The first quarter of each outcome does not count.
     """
     last = [one.part(slice(len(one.run.dt) // 4, None)) for one in outcomes]
     known = [one.part(np.flatnonzero(np.isfinite(one.covariances[:, 0, 0]))) for one in last]
     found = []
     for in_sensor in (True, False):
-        try:
-            squares, sizes = zip(*(_squares(one, in_sensor) for one in known if len(one.run.dt)),
-                                 strict=True)
-        except (np.linalg.LinAlgError, ValueError):
+        squares = [_squares(one, in_sensor) for one in known if len(one.run.dt)]
+        if not squares or not np.all(np.isfinite(np.concatenate(squares))):
             continue
-        mean = max(float(np.mean(np.concatenate(squares))), 1e-300)
+        ratio = 0.5 * max(float(np.mean(np.concatenate(squares))), 1e-300)
         count = sum(len(one) / autocorrelation_time(one) for one in squares)
         spread = math.exp(SIGMAS / math.sqrt(count))
-        # Negative log-likelihood for the best common factor of the covariances.
-        unlikely = 2.0 * math.log(mean) + float(np.mean(sizes))
-        found.append((unlikely, Nees(0.5 * mean, 1.0 / (LARGE * spread), SMALL * spread)))
-    return min(found)[1] if found else None
+        found.append(Nees(ratio, 1.0 / (LARGE * spread), SMALL * spread))
+    return min(found, key=lambda one: abs(math.log(one.ratio)), default=None)
 
 
-def _squares(outcome: Outcome, in_sensor: bool) -> tuple[Reals, float]:
-    """Return e^T P^-1 e of the tilts e (n,), and the mean log-determinant of P."""
+def _squares(outcome: Outcome, in_sensor: bool) -> Reals:
+    """Return e^T P^-1 e of the tilts e (n,), NaN without an inverse."""
     estimated, p = Rotation.from_quat(outcome.estimates), outcome.covariances
     if in_sensor:
         turn = estimated.as_matrix()
         p = turn @ p @ turn.transpose(0, 2, 1)
     x, y, _ = (estimated * Rotation.from_quat(outcome.run.truth).inv()).apply((0.0, 0.0, 1.0)).T
-    tilt, p = np.stack((-y, x), axis=1), p[:, :2, :2]
-    if np.any(np.linalg.det(p) <= 0.0):
-        raise np.linalg.LinAlgError
-    return (np.einsum('ni,ni->n', tilt, np.linalg.solve(p, tilt[:, :, np.newaxis])[:, :, 0]),
-            float(np.mean(np.log(np.linalg.det(p)))))
+    (a, b), (_, c) = p[:, :2, :2].transpose(1, 2, 0)
+    determinant = a * c - b * b
+    with np.errstate(all='ignore'):
+        squares: Reals = np.where(determinant > 0.0, (
+            c * y * y + 2.0 * b * x * y + a * x * x) / determinant, np.nan)
+    return squares
 
 
 def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:

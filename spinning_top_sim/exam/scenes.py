@@ -16,7 +16,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Feed, MakeFilter
-from spinning_top_sim.exam.measures import gyroscope_alone
 from spinning_top_sim.exam.motions import GRAVITY, Reals, Run
 from spinning_top_sim.exam.scored import ScoredRun, report_of
 from spinning_top_sim.streams import parameters
@@ -102,8 +101,7 @@ def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> ScoredRun:
                          turns.inv().apply(acceleration + UP))
     step = np.full(len(moves) // 2, 1e-9 * PERIOD_NS)
     run = Run(scene.name, step, turns[1::2].as_quat(), *readings)
-    counts = np.flatnonzero(moves[1::2] > 0.5)
-    return ScoredRun(run, counts, gyroscope_alone(run, counts))
+    return ScoredRun(run, np.flatnonzero(moves[1::2] > 0.5))
 
 
 def _device(random: np.random.Generator, scene: Scene,
