@@ -21,11 +21,10 @@ from spinning_top_sim.exam.measures import increments
 from spinning_top_sim.exam.motions import RATE, ROUNDING, Reals, Run
 from spinning_top_sim.tools.identify import in_words
 
-SMALL, LARGE = 0.02, 0.3        # kicks [rad]: to first order; and that a step of first order misses
-# Sample of a kick in a start, from the end: filters have no high gains of a start any more, and
-# there is time for late answers.
+SMALL, LARGE = 0.02, 0.3        # kicks [rad], of first order; that a step of first order misses
+# Sample of a kick in a rest, from its end: there is time for late answers.
 EARLY = -40
-FIT = 0.1                       # deviation from a matrix, relative, that another one may explain
+FIT = 0.2       # of an effect: what a matrix may leave of it, if the matrix is what is wrong
 
 
 class Rates(NamedTuple):
@@ -61,11 +60,11 @@ def with_kick(run: Run, sample: int, turn: Reals) -> Run:
 
 
 def rates(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Rates:
-    """Identify the use of the rates from starts without and with kicks about the vertical."""
+    """Identify the use of the rates from rests without and with kicks about the vertical."""
     apart = np.array([increments(other.estimates) - increments(one.estimates)
                       for one, other in zip(still, moved, strict=True)])[:, EARLY:]
     turns = _turns(still, moved)
-    moves = np.cumsum(apart, axis=1)                # (starts, samples, 3)
+    moves = np.cumsum(apart, axis=1)                # (rests, samples, 3)
     size = np.median(np.linalg.norm(moves, axis=2), axis=0)
     delay = float(np.sum(1.0 - size / max(size[-1], 1e-300)))
     matrix, left = _fit(moves[:, -1], turns)
@@ -83,7 +82,7 @@ def _turns(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Reals:
 
 
 def off_rotation(still: Sequence[Outcome], moved: Sequence[Outcome]) -> float:
-    """Return how far the answers to kicks at the start are off them, relative, the median."""
+    """Return how far the answers to large kicks are off them, relative, the median."""
     found = [(increments(other.estimates) - increments(one.estimates))[EARLY]
              for one, other in zip(still, moved, strict=True)]
     return float(np.median(_off(np.array(found), _turns(still, moved))))
@@ -120,31 +119,27 @@ def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
     return dict(sorted(zip(still.run.dt[steps].round(6).tolist(), gains.tolist(), strict=True)))
 
 
-def kicked_starts(runs: Sequence[Run], axis: Sequence[float],
-                  attitudes: Sequence[Reals] | None = None, size: float = SMALL) -> list[Run]:
+def kicked(still: Sequence[Outcome], axis: Sequence[float], size: float = SMALL) -> Reals:
+    """Return kicks to and fro about an axis of the world, where filters take it to be (n, 3)."""
+    return np.array([size * (-1) ** k * Rotation.from_quat(one.estimates[EARLY - 1]).inv().apply(
+        axis) for k, one in enumerate(still)])
+
+
+def pull(first: Reals, last: Reals) -> float:
     """
-    Return runs with a kick about an axis of the world, to and fro.
+    Return whether errors go straight to zero: the cosine of the angle between the ways, weighted.
 
-    attitudes : that say where this axis is; default: the true ones
+    first, last : errors before and after (n, axes); 0: they do not fall at all
     """
-    turns = [Rotation.from_quat(one[EARLY - 1]).inv().apply(axis)
-             for one in attitudes or [run.truth for run in runs]]
-    return [with_kick(run, EARLY, size * (-1) ** k * turn)
-            for k, (run, turn) in enumerate(zip(runs, turns, strict=True))]
-
-
-def pull(outcomes: Sequence[Outcome], axes: slice) -> float:
-    """
-    Return where filters go after a kick at the start, in rests in many attitudes.
-
-    axes : of the error in the world: the tilt, or the heading
-
-    It is the cosine of the angle between this way and that to the truth, in the mean: 1 if right,
-    0 if a filter does not go.
-    """
-    errors = np.array([(Rotation.from_quat(one.estimates) * Rotation.from_quat(
-        one.run.truth).inv()).as_rotvec()[[EARLY, -1], axes] for one in outcomes])
-    first, way = errors[:, 0], errors[:, 1] - errors[:, 0]
+    way = last - first
     size, length = np.linalg.norm(first, axis=1), np.linalg.norm(way, axis=1)
-    cosines = -np.sum(first * way, axis=1) / np.maximum(size * length, 1e-300)
-    return float(np.mean(np.where(length > ROUNDING * size, cosines, 0.0)))
+    if np.sum(np.linalg.norm(last, axis=1)) >= (1.0 - ROUNDING) * np.sum(size):
+        return 0.0
+    return float(-np.sum(first * way) / np.sum(size * length))
+
+
+def tilts(still: Sequence[Outcome], moved: Sequence[Outcome]) -> list[Reals]:
+    """Return the tilts by kicks at once, and those at the end, about axes of the world (n, 2)."""
+    return [np.array([(Rotation.from_quat(other.estimates[k]) * Rotation.from_quat(
+        one.estimates[k]).inv()).as_rotvec()[:2] for one, other in zip(still, moved, strict=True)])
+        for k in (EARLY, -1)]

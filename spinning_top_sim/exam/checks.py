@@ -14,8 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, measures
+from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import degrees
-from spinning_top_sim.exam.motions import RATE, ROUNDING, Reals
+from spinning_top_sim.exam.motions import RATE, ROUNDING, Motion, Reals
 from spinning_top_sim.exam.runs import Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import errors_of
@@ -27,7 +28,8 @@ CLEAN_DEG = 0.3
 GAIN_OFF = 0.02         # of turns: less than sensors differ in scale
 TURNS_OFF = 0.003       # of large turns; a step of first order is 0.0075 off
 DELAY = 0.25            # samples: half of what a mean of two steps is late
-STRAY = 0.02            # 1 - cosine of a way: 11 deg from the straight one
+# 1 - cosine of a way: 11 deg from the straight one; where errors are not small, twice that.
+STRAY, FAR = 0.02, 0.04
 FOLLOWS = 0.7           # half of the power: the filter is faster than the motion
 GROWS = 2.0 + 2.0 * bias.STEADY         # see bias.growth
 NOISY_DEG = 5.0         # a right filter that corrects first lags a step, on the top 2.3 deg
@@ -88,12 +90,14 @@ def gyroscope(exam: Exam) -> Measured:
     """Identify the matrix from turns that the gyroscope reads to those of the attitude."""
     found = _rates(exam)
     off = found.off_identity
-    if found.left > max(0.5, 0.3 * off):
+    if found.left > 0.5:
         return Measured(max(off, found.left), f'turns of the gyroscope move the attitude '
                         f'otherwise, by {found.left:.2g} of them, differently in each attitude',
                         'accuracy')
-    # What comes late has lost something on its way.
-    return Measured(off if off > answers.FIT or abs(found.delay) < DELAY else 0.0, str(found))
+    # What comes late has lost something on its way; what differs otherwise is no matrix.
+    whole = off > answers.FIT or abs(found.delay) < DELAY
+    return Measured(off, str(found), limit=None if whole and found.left < answers.FIT * off
+                    else math.nan)
 
 
 def delay(exam: Exam) -> Measured:
@@ -114,10 +118,10 @@ def steps(exam: Exam) -> Measured:
 
 def large_turns(exam: Exam) -> Measured:
     """Compare large turns in one step with the closed form of the rotation."""
-    off = answers.off_rotation(exam.outcomes('starts'), exam.outcomes('large turns'))
+    off = answers.off_rotation(exam.rests('attitudes'), exam.rests('large turns'))
     # Corrections of a fixed size make an attitude tremble at rest.
     trembles = max(float(np.max(np.abs(measures.increments(one.estimates[answers.EARLY - 1:]))))
-                   for one in exam.outcomes('starts')) / answers.LARGE
+                   for one in exam.rests('attitudes')) / answers.LARGE
     turn = f'a turn of {answers.LARGE:g} rad in one step'
     if off > answers.FIT:
         return Measured(off, f'{turn}, {answers.LARGE * RATE:g} rad/s, moves the attitude '
@@ -128,31 +132,32 @@ def large_turns(exam: Exam) -> Measured:
 
 def way_of_tilt(exam: Exam) -> Measured:
     """Turn the gyroscope alone: gravity leads the tilt back, straight and in every attitude."""
-    right = answers.pull(exam.outcomes('tilts'), slice(2))
-    tilt = float(np.max(exam.clean.tilt[_rests(exam)]))
-    return Measured(1.0 - right, f'{_way(right, "the vertical")}; at rest the tilt is up to '
-                    f'{degrees(tilt)} off', others={
-                        'rest_tilt_deg': Mark(math.degrees(tilt), CLEAN_DEG, 'without noise')})
+    still, moved = exam.rests('attitudes'), exam.outcomes('tilts')
+    off = 1.0 - answers.pull(*answers.tilts(still[:len(moved)], moved))
+    limit, text, tilt = STRAY, 'after a kick of the gyroscope', _worst(exam, 'tilt')
+    errors = _errors(exam.outcomes('attitudes')[0], exam.attitudes)
+    if off < STRAY and max(map(_size, errors)) > CLEAN_DEG:
+        off, limit, text = 1.0 - answers.pull(*(one[:, :2] for one in errors)), FAR, 'at rest'
+    return Measured(off, f'{text} the way leads to the vertical by {1.0 - off:.2f} (1: straight, '
+                    f'0: not at all); at rest the tilt is up to {tilt:.3g} deg off', limit=limit,
+                    others={'rest_tilt_deg': Mark(tilt, CLEAN_DEG, 'without noise')})
 
 
 def errors_by_field(exam: Exam) -> Measured | None:
     """Judge the heading at rest, and a tilt that the field causes."""
     if not exam.heading:
         return None
-    rests = _rests(exam)
-    tilt, heading = (np.degrees(rows[rests]) for rows in exam.clean)
-    worst = float(np.max(np.abs(heading)))
-    evidence = f'at rest the heading is off by {min(heading):.3g} to {max(heading):.3g} deg'
-    if np.max(tilt) > max(worst, CLEAN_DEG):
-        alone = float(np.max(np.degrees(exam.errors('no field').tilt[rests])))
-        return Measured(np.max(tilt), f'at rest the tilt is up to {np.max(tilt):.3g} deg off, '
-                        f'without the magnetometer {alone:.3g} deg',
-                        '' if alone < 0.5 * np.max(tilt) else 'accuracy')
-    if worst <= CLEAN_DEG:
-        return Measured(worst, evidence)
-    right = answers.pull(exam.outcomes('turns with field'), slice(2, 3))
-    return Measured(worst, f'{evidence}; {_way(right, "north")}',
-                    'accuracy' if right > 1.0 - STRAY else '')
+    tilt, heading = _worst(exam, 'tilt'), _worst(exam, 'heading')
+    if tilt > max(heading, CLEAN_DEG):
+        alone = _worst(exam, 'tilt', 'no field')
+        return Measured(tilt, f'at rest the tilt is up to {tilt:.3g} deg off, without the '
+                        f'magnetometer {alone:.3g} deg',
+                        '' if alone < 0.5 * tilt else 'accuracy')
+    right = answers.pull(*(one[:, 2:] for one in _errors(exam.outcomes('excitation')[0],
+                                                         exam.motion)))
+    return Measured(heading, f'at rest the heading is up to {heading:.3g} deg off, and its way '
+                    f'leads to north by {right:.2f} (1: straight, 0: not at all)',
+                    'accuracy' if right > 1.0 - FAR else '')
 
 
 def heading_answer(exam: Exam) -> Measured | None:
@@ -194,7 +199,7 @@ def lever_arm(exam: Exam) -> Measured:
 
 
 def effect_of_bias(exam: Exam) -> Measured:
-    """Judge the error that a bias leaves: it ends, or stays at what a gain without estimate has."""
+    """Judge the error that a bias leaves: it ends, or stays where a filter has no estimate."""
     found = exam.bias
     judged = [one for one in found.courses if len(one.apart) and bias.settled(one.error)]
     judged += [one for one in found.courses[:2] if bias.growth(one.error) > GROWS]
@@ -252,16 +257,30 @@ def _rests(exam: Exam) -> list[int]:
 
 
 def _rates(exam: Exam) -> answers.Rates:
-    return answers.rates(exam.outcomes('starts'), exam.outcomes('turns'))
+    return answers.rates(exam.rests('attitudes'), exam.rests('turns'))
 
 
 def _in_degrees(rates: Reals) -> str:
     return ', '.join(f'{rate:.2g}' for rate in np.degrees(rates))
 
 
-def _way(right: float, goal: str) -> str:
-    return (f'after a kick of the gyroscope the way leads to {goal} by {right:.2f} (1: straight, '
-            '0: not at all)')
+def _worst(exam: Exam, which: str, name: str = '') -> float:
+    """Return the largest error at rest [deg], without or with a field."""
+    errors = exam.errors(name) if name else exam.clean
+    return math.degrees(np.max(np.abs(getattr(errors, which)[_rests(exam)])))
+
+
+def _errors(outcome: Outcome, motion: Motion) -> list[Reals]:
+    """Return the errors at begin and end of the rests, about axes of the world (n, 3) [rad]."""
+    error = (Rotation.from_quat(outcome.estimates)
+             * Rotation.from_quat(outcome.run.truth).inv()).as_rotvec()
+    return [error[[part.begin for part in motion.of('rest')[1:]]],
+            error[[part.end - 1 for part in motion.of('rest')[1:]]]]
+
+
+def _size(errors: Reals) -> float:
+    """Return the largest tilt [deg]."""
+    return math.degrees(np.max(np.linalg.norm(errors[:, :2], axis=1)))
 
 
 FIRST = 'invalid_output', 'nondeterministic'

@@ -35,8 +35,8 @@ TAKEN = ('imu.gyroscope_', 'imu.accelerometer_', 'imu.bias_', 'mag.field', 'mag.
          'mag.enabled')
 OF_SCENES = 'imu.bandwidth', 'imu.vibration.', 'mag.disturbance.'
 
-# A wheel on a pivot 2 cm below its centre, which starts at a tilt of 0.7 rad: 4 rad/s of spin, slow
-# precession and large nutation.
+# A wheel on a pivot 2 cm below its centre, which starts at a tilt of 0.7 rad: 4 rad/s of spin,
+# slow precession and large nutation.
 WHEEL = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.02, gravity=GRAVITY)
 START = {'theta': 0.7, 'theta_dot': 0.0, 'l3': 0.6, 'lz': 0.6 * math.cos(0.7)}
 # Yaw, pitch and roll [deg]: near the identity, where many filters start, so that slow ones settle
@@ -160,9 +160,12 @@ def excitation(lead_s: float) -> Motion:
     return motion.top(TOP_S).rest(REST_S)
 
 
-def starts() -> list[Run]:
-    """Return short rests in many attitudes."""
-    return [Motion(turn).rest(4.0).run('start') for turn in Rotation.random(6, random_state=4)]
+def attitudes(lead_s: float) -> Motion:
+    """Return a rest, and short rests in many attitudes."""
+    motion = Motion(euler(NEAR)).rest(lead_s)
+    for turn in Rotation.random(6, random_state=4):
+        motion.turn(turn).rest(4.0)
+    return motion
 
 
 def uneven(count: int) -> Run:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, motions
 from spinning_top_sim.exam.feeding import Feed, MakeFilter, Outcome
-from spinning_top_sim.exam.motions import NEAR, RATE, ROUNDING, STILL, Motion, Run
+from spinning_top_sim.exam.motions import NEAR, RATE, ROUNDING, STILL, Motion, Part, Reals, Run
 from spinning_top_sim.tools.conventions import Convention, Errors, errors_of
 
 # A filter is settled if it is STILL in the second half of a rest at the start; slow ones get
@@ -44,6 +44,11 @@ class Exam:
             self.done[name] = self.fed(RUNS[name](self))
         return self.done[name]
 
+    def rests(self, name: str) -> list[Outcome]:
+        """Return the outcomes in the rests of 'attitudes', or of the same with kicks."""
+        return [self.outcomes(name)[0].part(slice(part.begin, part.end))
+                for part in self.attitudes.of('rest')[1:]]
+
     def fed(self, runs: Sequence[Run]) -> list[Outcome]:
         """Return the outcomes of other runs, in our convention."""
         told = self._feed(self._make_filter, runs)
@@ -71,6 +76,11 @@ class Exam:
     def motion(self) -> Motion:
         """The excitation."""
         return motions.excitation(self.lead_s)
+
+    @cached_property
+    def attitudes(self) -> Motion:
+        """Rests in many attitudes, in which a filter is kicked when it has settled."""
+        return motions.attitudes(self.lead_s)
 
     @cached_property
     def run(self) -> Run:
@@ -123,17 +133,28 @@ def _begin(exam: Exam) -> list[Run]:
     return [replace(exam.run, name='force of the begin', accelerometer=force, magnetometer=field)]
 
 
-def _starts() -> list[Run]:
-    return [run.without_field() for run in motions.starts()]
+def _kicks(exam: Exam, axis: tuple[float, float, float], size: float = answers.SMALL,
+           ) -> list[tuple[Part, Reals]]:
+    """Return the rests of 'attitudes', and kicks in them."""
+    return list(zip(exam.attitudes.of('rest')[1:], answers.kicked(
+        exam.rests('attitudes'), axis, size), strict=True))
 
 
 def _turns(exam: Exam, size: float) -> list[Run]:
-    """Return starts with kicks about what the filter takes for the vertical."""
-    said = [one.estimates for one in exam.outcomes('starts')]
-    return answers.kicked_starts(_starts(), UPRIGHT, said, size)
+    """Return the run with a kick about the vertical in each attitude: nothing leads it back."""
+    run = exam.outcomes('attitudes')[0].run
+    for part, turn in _kicks(exam, (0.0, 0.0, 1.0), size):
+        run = answers.with_kick(run, part.end + answers.EARLY, turn)
+    return [run]
 
 
-UPRIGHT, LEVEL = (0.0, 0.0, 1.0), (0.6, 0.8, 0.0)
+def _tilts(exam: Exam) -> list[Run]:
+    """Return runs with one kick each: what leads it back goes on for long."""
+    run = exam.outcomes('attitudes')[0].run
+    return [answers.with_kick(run.part(slice(part.end)), answers.EARLY, turn)
+            for part, turn in _kicks(exam, (0.6, 0.8, 0.0))[:3]]
+
+
 RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     'twice': lambda exam: 2 * [motions.noisy('twice', motions.CALIBRATED, 0, 1.0, 1.0)],
     'excitation': lambda exam: [exam.run],
@@ -142,11 +163,10 @@ RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     'no field': lambda exam: [exam.run.without_field()],
     'uneven': lambda exam: [motions.uneven(1000).without_field()],
     'uneven turns': lambda exam: [answers.kicked_steps(exam.outcomes('uneven')[0])],
-    'starts': lambda exam: _starts(),
+    'attitudes': lambda exam: [exam.attitudes.run('attitudes').without_field()],
     'turns': lambda exam: _turns(exam, answers.SMALL),
     'large turns': lambda exam: _turns(exam, answers.LARGE),
-    'tilts': lambda exam: answers.kicked_starts(_starts(), LEVEL),
-    'turns with field': lambda exam: answers.kicked_starts(motions.starts(), UPRIGHT),
+    'tilts': _tilts,
     'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM, ARM_AFTER_S)],
     'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
                                          NOISE_S) for seed in exam.seeds]}
