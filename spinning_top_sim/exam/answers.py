@@ -125,15 +125,17 @@ def kicked(still: Sequence[Outcome], axis: Sequence[float], size: float = SMALL)
         axis) for k, one in enumerate(still)])
 
 
-def pull(first: Reals, last: Reals) -> float:
+def pull(errors: Sequence[Reals], least: float = ROUNDING) -> float:
     """
     Return whether errors go straight to zero: the cosine of the angle between the ways, weighted.
 
-    first, last : errors before and after (n, axes); 0: they do not fall at all
+    errors : before and after (n, axes)
+    least : share by which they must fall, else 0 is returned
     """
+    first, last = errors
     way = last - first
     size, length = np.linalg.norm(first, axis=1), np.linalg.norm(way, axis=1)
-    if np.sum(np.linalg.norm(last, axis=1)) >= (1.0 - ROUNDING) * np.sum(size):
+    if np.sum(np.linalg.norm(last, axis=1)) >= (1.0 - least) * np.sum(size):
         return 0.0
     return float(-np.sum(first * way) / np.sum(size * length))
 

@@ -17,7 +17,7 @@ from spinning_top_sim.exam import answers, bias, measures
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import degrees
 from spinning_top_sim.exam.motions import RATE, ROUNDING, Motion, Reals
-from spinning_top_sim.exam.runs import Exam
+from spinning_top_sim.exam.runs import FIELD_TURN, Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import AXES, rms
@@ -29,7 +29,8 @@ GAIN_OFF = 0.02         # of turns: less than sensors differ in scale
 TURNS_OFF = 0.003       # of large turns; a step of first order is 0.0075 off
 DELAY = 0.25            # samples: half of what a mean of two steps is late
 # 1 - cosine of a way: 11 deg from the straight one; where errors are not small, twice that.
-STRAY, FAR = 0.02, 0.04
+STRAY = 0.02
+FAR = 2.0 * STRAY
 FOLLOWS = 0.7           # half of the power: the filter is faster than the motion
 GROWS = 2.0 + 2.0 * bias.STEADY         # see bias.growth
 NOISY_DEG = 5.0         # a right filter that corrects first lags a step, on the top 2.3 deg
@@ -119,25 +120,27 @@ def steps(exam: Exam) -> Measured:
 def large_turns(exam: Exam) -> Measured:
     """Compare large turns in one step with the closed form of the rotation."""
     off = answers.off_rotation(exam.rests('attitudes'), exam.rests('large turns'))
-    # Corrections of a fixed size make an attitude tremble at rest.
-    trembles = max(float(np.max(np.abs(measures.increments(one.estimates[answers.EARLY - 1:]))))
-                   for one in exam.rests('attitudes')) / answers.LARGE
     turn = f'a turn of {answers.LARGE:g} rad in one step'
     if off > answers.FIT:
         return Measured(off, f'{turn}, {answers.LARGE * RATE:g} rad/s, moves the attitude '
                         f'otherwise, by {off:.2g} of it; a small one does not', 'gyroscope')
     return Measured(off, f'{turn} is {off:.2%} off the rotation; a step of first order is '
-                    f'{answers.LARGE ** 2 / 12:.2%} off', limit=max(TURNS_OFF, trembles))
+                    f'{answers.LARGE ** 2 / 12:.2%} off',
+                    limit=max(TURNS_OFF, _trembles(exam) / answers.LARGE))
 
 
 def way_of_tilt(exam: Exam) -> Measured:
     """Turn the gyroscope alone: gravity leads the tilt back, straight and in every attitude."""
     still, moved = exam.rests('attitudes'), exam.outcomes('tilts')
-    off = 1.0 - answers.pull(*answers.tilts(still[:len(moved)], moved))
-    limit, text, tilt = STRAY, 'after a kick of the gyroscope', _worst(exam, 'tilt')
+    off = 1.0 - answers.pull(answers.tilts(still[:len(moved)], moved))
+    trembles, text = _trembles(exam), 'after a kick of the gyroscope'
+    limit = max(STRAY, trembles / answers.SMALL)
+    tilt = _worst(exam, 'tilt')
     errors = _errors(exam.outcomes('attitudes')[0], exam.attitudes)
-    if off < STRAY and max(map(_size, errors)) > CLEAN_DEG:
-        off, limit, text = 1.0 - answers.pull(*(one[:, :2] for one in errors)), FAR, 'at rest'
+    if off < limit and max(map(_size, errors)) > (
+            CLEAN_DEG + math.degrees(trembles)):
+        right = answers.pull([one[:, :2] for one in errors], bias.STEADY)
+        off, limit, text = 1.0 - right, FAR, 'at rest'
     return Measured(off, f'{text} the way leads to the vertical by {1.0 - off:.2f} (1: straight, '
                     f'0: not at all); at rest the tilt is up to {tilt:.3g} deg off', limit=limit,
                     others={'rest_tilt_deg': Mark(tilt, CLEAN_DEG, 'without noise')})
@@ -153,8 +156,8 @@ def errors_by_field(exam: Exam) -> Measured | None:
         return Measured(tilt, f'at rest the tilt is up to {tilt:.3g} deg off, without the '
                         f'magnetometer {alone:.3g} deg',
                         '' if alone < 0.5 * tilt else 'accuracy')
-    right = answers.pull(*(one[:, 2:] for one in _errors(exam.outcomes('excitation')[0],
-                                                         exam.motion)))
+    errors = _errors(exam.outcomes('excitation')[0], exam.motion)
+    right = answers.pull([one[:, 2:] for one in errors], bias.STEADY)
     return Measured(heading, f'at rest the heading is up to {heading:.3g} deg off, and its way '
                     f'leads to north by {right:.2f} (1: straight, 0: not at all)',
                     'accuracy' if right > 1.0 - FAR else '')
@@ -166,9 +169,9 @@ def heading_answer(exam: Exam) -> Measured | None:
         return None
     one, other = (exam.errors(name).heading for name in ('excitation', 'field turned'))
     moved = np.angle(np.exp(1j * (other - one)))
-    share = float(moved[-1] - moved[len(moved) // 2 - 1]) / math.radians(6.0)
-    return Measured(1.0 - share, 'of a turn of the field by 6 deg the heading follows '
-                    f'{share:.2g} within {len(moved) / 2.0 / RATE:.0f} s')
+    share = float(moved[-1] - moved[len(moved) // 2 - 1]) / (2.0 * FIELD_TURN)
+    return Measured(1.0 - share, f'of a turn of the field by {degrees(2.0 * FIELD_TURN)} the '
+                    f'heading follows {share:.2g} within {len(moved) / 2.0 / RATE:.0f} s')
 
 
 def clean(exam: Exam) -> Measured:
@@ -184,10 +187,9 @@ def clean(exam: Exam) -> Measured:
 
 def lever_arm(exam: Exam) -> Measured:
     """Move the IMU off the axis: the tilt must not follow the specific force."""
-    (part,) = exam.motion.of('top')
-    (with_arm,) = exam.outcomes('arm')
-    # From a second after it comes; the last differences are one-sided.
-    rows = slice(part.begin + round(5.0 * RATE), part.end - 2)
+    ((part,), (with_arm,)) = exam.motion.of('top'), exam.outcomes('arm')
+    # When it has come; the last differences are one-sided.
+    rows = slice((part.begin + part.end) // 2, part.end - 2)
     still = exam.outcomes('excitation')[0].estimates[rows]
     tilt = rms(errors_of(with_arm.estimates[rows], still).tilt)
     east, north, up = Rotation.from_quat(exam.run.truth[rows]).apply(
@@ -204,7 +206,7 @@ def effect_of_bias(exam: Exam) -> Measured:
     judged = [one for one in found.courses if len(one.apart) and bias.settled(one.error)]
     judged += [one for one in found.courses[:2] if bias.growth(one.error) > GROWS]
     worst = max(judged, key=lambda one: one.left, default=None)
-    tilt = max(bias.last(one.error) for one in found.courses) / float(np.linalg.norm(bias.BIAS))
+    tilt = max(bias.last(one.error) / abs(bias.BIAS[one.axis]) for one in found.courses)
     return Measured(worst.left if worst else 0.0, '' if worst is None else (
         f'a bias of {_in_degrees(bias.BIAS)} deg/s turns the attitude about {AXES[worst.axis]} by '
         f'{degrees(bias.last(worst.error))} in the end, {worst.left:.0%} of the largest effect: '
@@ -262,6 +264,12 @@ def _rates(exam: Exam) -> answers.Rates:
 
 def _in_degrees(rates: Reals) -> str:
     return ', '.join(f'{rate:.2g}' for rate in np.degrees(rates))
+
+
+def _trembles(exam: Exam) -> float:
+    """Return the largest turn of a step in rests [rad]: corrections may have a fixed size."""
+    return float(max(np.max(np.abs(measures.increments(one.estimates[answers.EARLY:])))
+                     for one in exam.rests('attitudes')))
 
 
 def _worst(exam: Exam, which: str, name: str = '') -> float:

@@ -65,37 +65,37 @@ def nees_of(outcomes: Sequence[Outcome]) -> Nees | None:
     """
     Return the normalised squared error of the tilt (Bar-Shalom et al. 2001, 5.4.2).
 
-    The covariance may refer to the axes of the sensor or of the world: the assumption that suits
-    better counts.  One error of each autocorrelation time is independent.  None: there is no
-    covariance, or it has no inverse.  The first quarter of each outcome does not count.
+    The covariance may refer to the axes of the sensor or of the world: the assumption with the
+    greater likelihood counts.  One error of each autocorrelation time is independent.  None: there
+    is no covariance, or it has no inverse.  The first quarter of each outcome does not count.
     """
     last = [one.part(slice(len(one.run.dt) // 4, None)) for one in outcomes]
     known = [one.part(np.flatnonzero(np.isfinite(one.covariances[:, 0, 0]))) for one in last]
     found = []
     for in_sensor in (True, False):
-        squares = [_squares(one, in_sensor) for one in known if len(one.run.dt)]
-        if not squares or not np.all(np.isfinite(np.concatenate(squares))):
+        pairs = [_squares(one, in_sensor) for one in known if len(one.run.dt)]
+        if not pairs or not np.all(np.isfinite(np.concatenate([size for _, size in pairs]))):
             continue
-        ratio = 0.5 * max(float(np.mean(np.concatenate(squares))), 1e-300)
-        count = sum(len(one) / autocorrelation_time(one) for one in squares)
+        mean = max(float(np.mean(np.concatenate([squares for squares, _ in pairs]))), 1e-300)
+        count = sum(len(one) / autocorrelation_time(one) for one, _ in pairs)
         spread = math.exp(SIGMAS / math.sqrt(count))
-        found.append(Nees(ratio, 1.0 / (LARGE * spread), SMALL * spread))
-    return min(found, key=lambda one: abs(math.log(one.ratio)), default=None)
+        # Negative log-likelihood for the best common factor of the covariances.
+        unlikely = 2.0 * math.log(mean) + float(np.mean([np.mean(size) for _, size in pairs]))
+        found.append((unlikely, Nees(0.5 * mean, 1.0 / (LARGE * spread), SMALL * spread)))
+    return min(found)[1] if found else None
 
 
-def _squares(outcome: Outcome, in_sensor: bool) -> Reals:
-    """Return e^T P^-1 e of the tilts e (n,), NaN without an inverse."""
+def _squares(outcome: Outcome, in_sensor: bool) -> tuple[Reals, Reals]:
+    """Return e^T P^-1 e of the tilts e (n,), and the logarithms of det P, NaN if not positive."""
     estimated, p = Rotation.from_quat(outcome.estimates), outcome.covariances
     if in_sensor:
         turn = estimated.as_matrix()
         p = turn @ p @ turn.transpose(0, 2, 1)
     x, y, _ = (estimated * Rotation.from_quat(outcome.run.truth).inv()).apply((0.0, 0.0, 1.0)).T
     (a, b), (_, c) = p[:, :2, :2].transpose(1, 2, 0)
-    determinant = a * c - b * b
     with np.errstate(all='ignore'):
-        squares: Reals = np.where(determinant > 0.0, (
-            c * y * y + 2.0 * b * x * y + a * x * x) / determinant, np.nan)
-    return squares
+        determinant = a * c - b * b
+        return (c * y * y + 2.0 * b * x * y + a * x * x) / determinant, np.log(determinant)
 
 
 def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:

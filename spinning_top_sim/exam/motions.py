@@ -195,12 +195,12 @@ def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: 
     return replace(run, gyroscope=rates, accelerometer=force, magnetometer=field)
 
 
-def with_arm(motion: Motion, run: Run, arm: Sequence[float], after_s: float) -> Run:
-    """Return the run with the IMU at a point [m] from some time of the motion of a top on."""
+def with_arm(motion: Motion, run: Run, arm: Sequence[float]) -> Run:
+    """Return the run with the IMU at a point [m] in the motion of a top."""
     (part,) = motion.of('top')
-    turns = Rotation.from_quat(run.truth[part.begin:part.end])
-    place = turns.apply(arm)
-    acceleration = np.gradient(np.gradient(place, 1.0 / RATE, axis=0), 1.0 / RATE, axis=0)
-    after, force = round(after_s * RATE), run.accelerometer.copy()
-    force[part.begin + after:part.end] += turns.inv().apply(acceleration)[after:]
+    rows = slice(part.begin, part.end)
+    turns, force = Rotation.from_quat(run.truth[rows]), run.accelerometer.copy()
+    acceleration = np.gradient(np.gradient(turns.apply(arm), 1.0 / RATE, axis=0), 1.0 / RATE,
+                               axis=0)
+    force[rows] += turns.inv().apply(acceleration)
     return replace(run, name='lever arm', accelerometer=force)

@@ -18,7 +18,7 @@ from spinning_top_sim.tools.conventions import Convention, Errors, errors_of
 # A filter is settled if it is STILL in the second half of a rest at the start; slow ones get
 # longer ones.
 LEADS_S = 10.0, 40.0, 160.0
-ARM, ARM_AFTER_S = (0.1, 0.0, 0.0), 4.0     # of the IMU [m], and when it comes in the top's motion
+ARM = 0.1, 0.0, 0.0                         # of the IMU [m]
 FIELD_TURN = math.radians(3.0)              # of the field about the vertical
 NOISE_LEAD_S, NOISE_S = 6.0, 20.0           # rest and motion of the noisy runs
 
@@ -167,6 +167,6 @@ RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     'turns': lambda exam: _turns(exam, answers.SMALL),
     'large turns': lambda exam: _turns(exam, answers.LARGE),
     'tilts': _tilts,
-    'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM, ARM_AFTER_S)],
+    'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM)],
     'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
                                          NOISE_S) for seed in exam.seeds]}
