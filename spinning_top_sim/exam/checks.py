@@ -101,11 +101,13 @@ def gyroscope(exam: Exam) -> Measured:
                     else math.nan)
 
 
-def delay(exam: Exam) -> Measured:
-    """Identify the delay with which the attitude follows the gyroscope."""
-    found = _rates(exam).delay
-    return Measured(abs(found), f'the attitude follows the gyroscope {abs(found):.3g} samples '
-                    f'{"late" if found > 0.0 else "ahead"}')
+def delay(exam: Exam) -> Measured | None:
+    """Identify the delay with which the attitude follows the gyroscope, if it does follow."""
+    found = _rates(exam)
+    if found.off_identity > GAIN_OFF:
+        return None
+    return Measured(abs(found.delay), f'the attitude follows the gyroscope {abs(found.delay):.3g} '
+                    f'samples {"late" if found.delay > 0.0 else "ahead"}')
 
 
 def steps(exam: Exam) -> Measured:
