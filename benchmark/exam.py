@@ -31,7 +31,7 @@ PACKAGES = ('numpy', 'scipy', 'vqf', 'ahrs', 'imufusion')
 SEEDS = 3                       # of an exam
 COLUMNS = (('tilt [deg]', 'tilt_rms_deg'), ('heading [deg]', 'heading_rms_deg'),
            ('lever arm [deg]', 'lever_arm_deg'), ('turns [1]', 'large_turn_off'),
-           ('bias left [1]', 'bias_left'))
+           ('bias [s]', 'bias_tilt_s'))
 HEADS = ('filter', *(head for head, _ in COLUMNS), 'faults')
 
 
