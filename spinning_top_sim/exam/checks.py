@@ -139,8 +139,9 @@ def way_of_tilt(exam: Exam) -> Measured:
     limit = max(STRAY, trembles / answers.SMALL)
     tilt = _worst(exam, 'tilt')
     errors = _errors(exam.outcomes('attitudes')[0], exam.attitudes)
+    # A filter that never settles has errors at rest for other reasons.
     if off < limit and max(map(_size, errors)) > (
-            CLEAN_DEG + math.degrees(trembles)):
+            CLEAN_DEG + math.degrees(trembles)) and exam.settles:
         right = answers.pull([one[:, :2] for one in errors], bias.STEADY)
         off, limit, text = 1.0 - right, FAR, 'at rest'
     return Measured(off, f'{text} the way leads to the vertical by {1.0 - off:.2f} (1: straight, '
@@ -157,12 +158,12 @@ def errors_by_field(exam: Exam) -> Measured | None:
         alone = _worst(exam, 'tilt', 'no field')
         return Measured(tilt, f'at rest the tilt is up to {tilt:.3g} deg off, without the '
                         f'magnetometer {alone:.3g} deg',
-                        '' if alone < 0.5 * tilt else 'accuracy')
+                        '' if alone < 0.5 * tilt and exam.settles else 'accuracy')
     errors = _errors(exam.outcomes('excitation')[0], exam.motion)
     right = answers.pull([one[:, 2:] for one in errors], bias.STEADY)
     return Measured(heading, f'at rest the heading is up to {heading:.3g} deg off, and its way '
                     f'leads to north by {right:.2f} (1: straight, 0: not at all)',
-                    'accuracy' if right > 1.0 - FAR else '')
+                    'accuracy' if right > 1.0 - FAR or not exam.settles else '')
 
 
 def heading_answer(exam: Exam) -> Measured | None:

@@ -65,12 +65,17 @@ class Exam:
     @cached_property
     def lead_s(self) -> float:
         """How long the filter rests at the start until it is settled [s]."""
-        for seconds in LEADS_S[:-1]:
-            (outcome,) = self.fed([Motion(motions.euler(NEAR)).rest(seconds).run('rest')])
-            turns = Rotation.from_quat(outcome.estimates[len(outcome.estimates) // 2:])
-            if float(np.max((turns[0].inv() * turns).magnitude())) < STILL:
-                return seconds
-        return LEADS_S[-1]
+        return next((one for one in LEADS_S[:-1] if self._settles_in(one)), LEADS_S[-1])
+
+    @cached_property
+    def settles(self) -> bool:
+        """Whether the filter settles at all: one that is unstable, or very slow, does not."""
+        return self.lead_s < LEADS_S[-1] or self._settles_in(LEADS_S[-1])
+
+    def _settles_in(self, seconds: float) -> bool:
+        (outcome,) = self.fed([Motion(motions.euler(NEAR)).rest(seconds).run('rest')])
+        turns = Rotation.from_quat(outcome.estimates[len(outcome.estimates) // 2:])
+        return float(np.max((turns[0].inv() * turns).magnitude())) < STILL
 
     @cached_property
     def motion(self) -> Motion:
