@@ -105,7 +105,7 @@ def test_a_level_is_a_part_of_full_and_has_a_verdict(monkeypatch):
     assert asked.passed and 0.0 < asked.measures['field_rms_deg'] < 10.0
     assert 'field_rms_deg' in examine(Vqf, 'full', seeds=1, isolated=False).measures
     still = examine(type('Still', (), {'update': lambda *_: (0.0, 0.0, 0.0, 1.0)}), 'field')
-    assert still.faults == ['accuracy'] and 'the mean error is' in str(still.found)
+    assert still.faults == ['accuracy'] and 'the mean tilt error is' in str(still.found)
     # Without a field the heading is unknown.
     tilt = examine(partial(Vqf, magnetic=False), 'field')
     assert tilt.passed and tilt.measures['field_rms_deg'] > 10.0

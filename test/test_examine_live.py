@@ -127,7 +127,7 @@ def test_a_node_that_does_not_start_or_answer_is_told(run, plain, monkeypatch):
         node.start()
     monkeypatch.setattr(live, 'AGAIN_S', 0.05)
     with (live.NodeExam(plain(left_out=range(99)), 'imu/data') as node,
-          pytest.raises(feeding.InvalidOutputError, match='answers no sample within')):
+          pytest.raises(feeding.InvalidOutputError, match='answers none of 20 samples')):
         node.feed(node.start, [run])
     monkeypatch.setattr(live, 'PATIENCE_S', 0.5)
     with (live.NodeExam(f'{sys.executable} -c "import time; time.sleep(9)"', 'imu/data') as node,

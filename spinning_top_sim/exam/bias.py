@@ -56,15 +56,15 @@ def effects(feed: Callable[[Sequence[Run]], list[Outcome]]) -> Effects:
         motion = Motion(euler(NEAR)).rest(seconds).turn(euler(X_UP)).rest(seconds)
         run = motion.run('no bias')
         without, outcome = feed([run, replace(run, name='bias', gyroscope=run.gyroscope + BIAS)])
-        apart = (Rotation.from_quat(without.estimates).inv()
-                 * Rotation.from_quat(outcome.estimates)).as_rotvec()
+        # Where they take the vertical to be, about axes of the sensor; the heading may drift.
+        ups = [Rotation.from_quat(one.estimates).inv().apply((0.0, 0.0, 1.0))
+               for one in (without, outcome)]
+        tilt = np.abs(np.cross(*ups))
         courses = []
         for part, axes in zip(motion.of('rest'), ((0, 1), (1, 2)), strict=True):
             told = outcome.biases[part.begin:part.end]
             told = np.abs(told[np.isfinite(told[:, 0])] / BIAS - 1.0)
-            up = Rotation.from_quat(run.truth[part.begin]).inv().apply((0.0, 0.0, 1.0))
-            error = apart[part.begin:part.end]
-            error = np.abs(error - np.outer(error @ up, up))    # none about the vertical
+            error = tilt[part.begin:part.end]
             courses += [Course(axis, error[:, axis], told[:, axis]) for axis in axes]
         if all(last(one.apart) <= LEFT and one.left <= LEFT if len(one.apart)
                else settled(one.error) for one in courses):

@@ -44,7 +44,8 @@ except ImportError:
 
 IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start
-AGAIN_S = 0.3                   # after which the first sample is sent again
+# The first sample is sent again so often, after this time each: endpoints match within seconds.
+AGAIN, AGAIN_S = 20, 0.3
 ATTEMPTS = 3                    # at a run in which messages are lost
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 NAME, FRAME = 'examine', 'imu_link'
@@ -171,7 +172,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         The first ones are published again, later, until there is an answer: the node may not yet
         be matched, or have no step to take.
         """
-        for _ in range(1 if self._answered else int(ANSWER_S / AGAIN_S)):
+        for _ in range(1 if self._answered else AGAIN):
             self._publish(gyroscope, accelerometer, magnetometer, dt)
             if self._wait(lambda: self._now_ns in self._answers,
                           ANSWER_S if self._answered else AGAIN_S):
@@ -179,7 +180,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         else:
             self._check_alone()
             if not self._answered:
-                raise RuntimeError(f'it answers no sample within {ANSWER_S:g} s')
+                raise RuntimeError(f'it answers none of {AGAIN} samples')
             if not self._reliable:
                 raise LostError
             raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
