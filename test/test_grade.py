@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.grade import Body, Start, grade, grade_trajectory
-from spinning_top_sim.grade.motion import InvalidTrajectoryError
+from spinning_top_sim.grade.simulators import InvalidTrajectoryError
 from spinning_top_sim.grade.pytest_plugin import pass_grade  # noqa: F401, a fixture
 from spinning_top_sim.grade.scenes import SCENES, WHEEL
 

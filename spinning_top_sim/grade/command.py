@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
 from spinning_top_sim.grade import files, grade_readings, grade_trajectory
-from spinning_top_sim.grade.effects import STANDARD_GRAVITY, Imu
-from spinning_top_sim.grade.grader import EARLY, TOLERANCE
+from spinning_top_sim.grade.columns import STANDARD_GRAVITY, Imu
+from spinning_top_sim.grade.simulators import EARLY, TOLERANCE
 from spinning_top_sim.grade.logs import own_attitudes, read_log
 from spinning_top_sim.grade.scenes import Body, Start
 from spinning_top_sim.streams import parameters

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
-from spinning_top_sim.grade.effects import Imu
+from spinning_top_sim.grade.columns import Imu
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.tools.kinematics import Reals

@@ -4,7 +4,7 @@
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from spinning_top_sim.tools import cli
@@ -87,6 +87,13 @@ class Report:
     def measures(self) -> dict[str, float]:
         """Values of the marks by name; NaN: could not be measured."""
         return {name: mark.value for name, mark in self.marks.items()}
+
+    def plus(self, *others: 'Report') -> 'Report':
+        """Return this report with what others have found, measured and noted."""
+        every = self, *others
+        return replace(self, found=[one for report in every for one in report.found],
+                       marks={name: one for report in every for name, one in report.marks.items()},
+                       notes=[one for report in every for one in report.notes])
 
     def __str__(self) -> str:
         lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.faults)}',
