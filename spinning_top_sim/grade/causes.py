@@ -85,11 +85,12 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
     for last in (False, False, True):
         compared = comparison.compare(lag)
         found, residual = Causes(comparison, compared, exact_gravity, slack).find()
-        undone = [one for one in found if one.name and one.undo is not None and not last]
-        faults.extend(undone or found)
-        if not undone:
+        undo = [one.undo for one in found if one.name and one.undo is not None]
+        if last or not undo:
             break
-        comparison.undo(undone[0].undo)
+        faults.extend(one for one in found if one.name and one.undo is not None)
+        comparison.undo(undo[0])
+    faults.extend(found)
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)),
              **_marks(comparison, compared, lag)}
     if comparison.density:
@@ -194,10 +195,7 @@ class Causes:
     def _matrix(self, matrix: Reals) -> Verdict | None:
         """Judge a matrix by which the readings are what they should be, multiplied."""
         size = abs(float(np.linalg.det(matrix))) ** (1.0 / 3.0)
-        unit, times = next(((f', in {name}', one) for name, (factor, one) in [
-            (name, (factor, one)) for name, factor in self.comparison.units.items()
-            for one in (1.0 / factor, factor)] if factor != 1.0 and abs(size / one - 1.0) < OF_UNIT),
-            ('', 1.0))
+        unit, times = self._unit_of(size)
         shape, change = matrix / times, float(np.max(np.abs(matrix - AXES)))
         if np.array_equal(matrix, matrix[0, 0] * AXES):
             return self._scale(float(matrix[0, 0]), unit, times)
@@ -219,6 +217,14 @@ class Causes:
         rows = '; '.join(map(listed, matrix))
         return Verdict('matrix' * (change > self.strange), f'the readings are the matrix [{rows}] '
                        'times what they should be', change)
+
+    def _unit_of(self, size: float) -> tuple[str, float]:
+        """Return the unit of readings that are so many times too large, in words, and a size."""
+        for name, factor in self.comparison.units.items():
+            for times in (1.0 / factor, factor):        # the other: it is converted twice
+                if factor != 1.0 and abs(size / times - 1.0) < OF_UNIT:
+                    return f', in {name}', times
+        return '', 1.0
 
     def _scale(self, factor: float, unit: str, times: float) -> Verdict | None:
         text = f'the readings are {factor:.4g} times what they should be'
@@ -359,9 +365,8 @@ def _noise_faults(comparison: Comparison, residual: Reals, density: float | None
     if not comparison.noisy:            # all that is left is noise of the readings
         parts = [part * size for part, size in zip(np.split(
             residual, np.cumsum(comparison.counts)[:-1]), comparison.sizes, strict=True)]
-        left = rms(np.array([white(part) for part in parts]))
-        # A cause that is found may have left some fast motion.
-        noise = left if left < 1.2 * noise else noise
+        # Either has fast motion, too: that of the reading, or of what no cause explains.
+        noise = min(noise, rms(np.array([white(part) for part in parts])))
         residual = np.concatenate(parts)
     exists = noise > NOISY * float(np.min(comparison.sizes))
     band = NOISE_BAND + FOUR_SIGMA * SPREAD / math.sqrt(residual.size)

@@ -27,7 +27,7 @@ TIMES = {'s': Decimal(1), 'ms': Decimal('1e-3'), 'us': Decimal('1e-6'), 'ns': De
          'iso': Decimal('1e-9')}
 # Columns of each part of a motion, and factors of their units by name, the first by default.
 PARTS: dict[str, tuple[str, Mapping[str, Any]]] = {
-    't': ('t', TIMES), 'attitudes': ('qx qy qz qw', {'': 1.0}),
+    't': ('t', TIMES), 'attitudes': ('qx qy qz qw', {'1': 1.0}),
     'positions': ('px py pz', LENGTHS),
     **{name: (' '.join(f'{letter}{axis}' for axis in 'xyz'), READINGS[name].units)
        for name, letter in zip(READINGS, 'gam', strict=True)}}
@@ -64,7 +64,8 @@ class Recorded:
     run: Any = None
     notes: list[str] = field(default_factory=list)
 
-    def add(self, kind: str, source: str, times: Reals, values: Reals, rows: Sequence[str]) -> None:
+    def add(self, kind: str, source: str, times: Reals, values: Reals,
+            rows: Sequence[str]) -> None:
         """
         Add a part whose times are in seconds from the first stamp of the file.
 
@@ -200,7 +201,7 @@ def _unit(name: str, unit: str, where: str) -> str:
     """Return a unit by its name.  Raises ValueError."""
     unit = unit.translate(_SIGNS)
     if unit not in UNITS[name]:
-        raise ValueError(f"{where}: the unit must be {', '.join(filter(None, UNITS[name]))}: say "
+        raise ValueError(f"{where}: the unit must be {', '.join(UNITS[name])}: say "
                          f"--columns '{name}=COLUMN:UNIT'")
     return unit
 
@@ -302,7 +303,8 @@ def _add(recorded: Recorded, table: Table, said: Chosen) -> None:
                              f"--columns '{what}'" + (
                                  f' with a UNIT of {", ".join(units)}' if len(units) > 1 else
                                  '; Euler angles are not read'))
-        source = ', '.join(f'{column} [{unit}]' if unit and f'[{unit}]' not in column else column
+        source = ', '.join(f'{column} [{unit}]' if unit != '1' and f'[{unit}]' not in column else
+                           column
                            for name in names.split() for column, unit in chosen[name])
         if kind == 't':
             stamps: Any = sum(units[unit] * np.array([*table.times(column, unit)], object)
@@ -335,6 +337,6 @@ def _ours(columns: Mapping[str, Sequence[Any]]) -> Chosen:
             raise ValueError(f"{column}: say which column is {name}: --columns "
                              f"'{name}={column}:UNIT'")
         unit = re.search(r'\[(.*)\]', column)
-        found[name] = [(column, _unit(name, unit[1], column) if unit and unit[1] not in (
-            '', '1') else next(iter(UNITS[name])))]
+        found[name] = [(column, _unit(name, unit[1], column) if unit and unit[1] else next(iter(
+            UNITS[name])))]
     return found

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from spinning_top_sim.grade.causes import judge
 from spinning_top_sim.grade.columns import KINDS, READINGS
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.physics.top import State
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.cli import one_line, progress
@@ -27,7 +27,6 @@ TOLERANCE = math.radians(0.1)
 EARLY = 24              # samples at the start by which a convention is known
 WRONG, RIGHT = math.radians(10.0), 0.2      # of their error, in ours, and as a share in another
 MOST = 0.7              # that the top turns in a step [rad]: in longer ones rates are not known
-LEAST_SAMPLES = 30
 NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 
 
@@ -77,68 +76,28 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
         raise ValueError(f'dt = {dt!r} s: must be in (0, 1]')
     if not scenes:
         raise ValueError(f'scenes = {scenes!r}: must have one at least')
-    judgement = Judgement(one_line(subject or getattr(run, '__name__', type(run).__name__)), dt,
-                          body, tolerance)
+    judgement, notes = Judgement(body, dt, tolerance), list[str]()
     with progress('graded', len(scenes), 'scenes') as show:
         for number, scene in enumerate(scenes):
             show(number)
             start = scene.start_of(body, seed)
             if dt * max(*map(abs, start.rates), abs(start.l3) / body.lambda1) > MOST:
-                judgement.notes.append(f'{scene.name}: the top turns by more than {MOST:g} rad in '
-                                       'a step: not graded')
+                notes.append(f'{scene.name}: the top turns by more than {MOST:g} rad in a step: '
+                             'not graded')
                 continue
             try:
                 judgement.run(run, scene, start)
             except InvalidTrajectoryError as error:
                 judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
-    if not judgement.motions and not judgement.faults:
+    if len(notes) == len(scenes):
         raise ValueError(f'dt = {dt!r} s: the top turns by more than {MOST:g} rad in a step')
-    return judgement.report()
+    subject = one_line(subject or getattr(run, '__name__', type(run).__name__))
+    return Report(subject, judgement.faults, {}, notes).plus(*judgement.reports())
 
 
-def grade_trajectory(trajectory: Any, top: Top, start: State, *,
-                     times: Any = None, dt: float | None = None, tolerance: float = TOLERANCE,
-                     subject: str = 'trajectory', **imu: Any) -> Report:
-    """
-    Grade a motion that exists.
-
-    Parameters
-    ----------
-    trajectory : mapping, object or (n, 4) array
-        As `run` of `grade` returns it.
-    top : Top or Body
-        The top; a `Body` has the IMU, too.
-    start : State
-        At t = 0.
-    times : (n,) array, optional
-        Times [s], equally spaced; default: the `t` of the trajectory.
-    dt : float, optional
-        Step of the simulator [s]; default: the time between two samples.
-    tolerance, subject : float, str
-        As of `grade`.
-    **imu :
-        Parameters of `Body` beside those of the top: `lever_arm`, `mounting`, ...
-
-    Raises
-    ------
-    ValueError
-        Naming what is no motion, and why.
-    """
-    if dt is not None and not 0.0 < dt < math.inf:
-        raise ValueError(f'dt = {dt!r} s: must be > 0, or None')
-    told = told_motion(trajectory, times)
-    judgement = Judgement(subject, dt or told.step, Body.of(top, **imu), tolerance)
-    judgement.motions.append(judgement.motion(subject, start, told))
-    return judgement.report()
-
-
-def told_motion(said: Any, times: Any = None) -> Stretch:
-    """
-    Return the motion that a run has said, by default at its `t`.
-
-    Raises InvalidTrajectoryError.
-    """
-    names = 't', 'attitudes', *KINDS, 'covariance'
+def told_motion(said: Any, times: Reals) -> Stretch:
+    """Return the motion that a run has said.  Raises InvalidTrajectoryError."""
+    names = 'attitudes', *KINDS, 'covariance'
     if not isinstance(said, Mapping):
         said = {name: getattr(said, name, None) for name in names} if (
             hasattr(said, 'attitudes')) else {'attitudes': said}
@@ -146,30 +105,21 @@ def told_motion(said: Any, times: Any = None) -> Stretch:
     if 'attitudes' not in said:
         raise InvalidTrajectoryError(f'what is returned has {sorted(said) or "nothing"}: must '
                                      'have attitudes')
-    times = said.get('t') if times is None else times
-    if times is None:
-        raise InvalidTrajectoryError('times = None: must be given, the trajectory has no t')
-    t = _numbers('times', times, (np.size(times),))
-    if len(t) < LEAST_SAMPLES:
-        raise InvalidTrajectoryError(f'{len(t)} times: must be {LEAST_SAMPLES} at least')
-    steps, usual = np.diff(t), np.median(np.diff(t))
-    for at in np.flatnonzero(~(np.abs(steps - usual) <= 1e-3 * usual) | (steps <= 0.0))[:1]:
-        raise InvalidTrajectoryError(f'times[{at + 1}] - times[{at}] = {steps[at]:g} s where '
-                                     f'{usual:g} s is usual: must be equally spaced, > 0')
-    attitudes = _numbers('attitudes', said['attitudes'], (len(t), 4))
+    attitudes = _numbers('attitudes', said['attitudes'], (len(times), 4))
     norms = np.linalg.norm(attitudes, axis=1)
-    for at in np.flatnonzero(~(np.abs(norms - 1.0) < NORM))[:1]:
+    for at in np.flatnonzero(np.abs(norms - 1.0) > NORM)[:1]:
         raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
                                      'must be 1')
-    told = said.get('covariance', {})
+    told, noisy = said.get('covariance', {}), [name for name in KINDS if KINDS[name].density]
     if not isinstance(told, Mapping):
-        told = {name: told for name, kind in READINGS.items() if kind.density}
-    if others := [*map(str, told.keys() - {'gyroscope', 'accelerations'})]:
-        raise InvalidTrajectoryError(f'covariance of {", ".join(others)}: must be of gyroscope'
-                                     ' or accelerations')
-    readings = {name: _numbers(name, said[name], (len(t), 3)) for name in KINDS if name in said}
+        told = dict.fromkeys(noisy, told)
+    if others := [*map(str, told.keys() - {*noisy})]:
+        raise InvalidTrajectoryError(f'covariance of {", ".join(others)}: must be of '
+                                     f'{" or ".join(noisy)}')
+    readings = {name: _numbers(name, said[name], (len(times), 3)) for name in KINDS
+                if name in said}
     return Stretch(
-        t, Rotation.from_quat(attitudes), np.zeros((len(t), 3)), readings,
+        times, Rotation.from_quat(attitudes), np.zeros((len(times), 3)), readings,
         {name: white(values, jumps=False) for name, values in readings.items()},
         covariance={name: _numbers(f'covariance of {name}', matrix, (3, 3))
                     for name, matrix in told.items()})
@@ -188,50 +138,28 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
     return numbers
 
 
+@dataclass
 class Motion:
-    """
-    A motion beside the exact one from the same state.
+    """What is told of a motion from a start, and its angles to the exact attitudes (n,) [rad]."""
 
-    told : what is said of it
-    errors : angles to the exact attitudes (n,) [rad]
-    """
-
-    def __init__(self, name: str, body: Body, start: State, told: Stretch) -> None:
-        self.name, self.body, self.told = name, body, told
-        self.solution = ExactSolution(body, start)
-        self.truth: Reals = self.solution.states_at_seconds(told.t).quaternion
-        self.errors: Reals = (Rotation.from_quat(self.truth).inv() * told.rotation).magnitude()
-        self.worst = float(np.max(self.errors))
+    name: str
+    start: State
+    told: Stretch
+    errors: Reals
 
     @property
-    def slack(self) -> float:
-        """By how much readings may differ from attitudes: half a step may be between them."""
-        first, second = self.told.rotation[0], self.told.rotation[1]
-        told = self.told.rates is not None
-        return 0.0 if told else float(0.5 * (first.inv() * second).magnitude()) ** 2
-
-    @property
-    def marks(self) -> dict[str, float]:
-        """The largest error, and the largest relative changes of the constants of the motion."""
-        smoothed = Smoothed(self.told, 1)
-        body, w, up = self.body, smoothed.rates, smoothed.turn[:, 2]
-        momenta = w * body.inertia
-        values = {'energy': 0.5 * np.sum(momenta * w, axis=1) + body.gravity_torque * up[:, 2],
-                  'l3': momenta[:, 2], 'lz': np.sum(momenta * up, axis=1)}
-        first = self.solution.states_at_seconds(np.zeros(1))
-        return {'total_error_deg': math.degrees(self.worst), **{
-            f'{name}_drift': float(np.max(np.abs(relative_drift(
-                value, float(getattr(first, name)[0]))))) for name, value in values.items()}}
+    def worst(self) -> float:
+        """The largest error [rad]."""
+        return float(np.max(self.errors))
 
 
 class Judgement:
-    """What is found of motions beside exact ones; `report` judges them."""
+    """Motions of a body beside the exact ones; `reports` judges them."""
 
-    def __init__(self, subject: str, dt: float, body: Body, tolerance: float) -> None:
-        self.subject, self.dt, self.body, self.tolerance = subject, dt, body, tolerance
+    def __init__(self, body: Body, dt: float, tolerance: float) -> None:
+        self.body, self.dt, self.tolerance = body, dt, tolerance
         self.motions: list[Motion] = []
         self.faults: list[Finding] = []
-        self.notes: list[str] = []
         self.orders: dict[str, float] = {}
 
     def run(self, run: Simulate, scene: Scene, start: Start) -> None:
@@ -250,43 +178,50 @@ class Judgement:
         if not self.motions and not np.array_equal(told[0].matrices, motion_of(self.dt).matrices):
             self.faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of the '
                                        'same run twice differ'))
-        same = [self.motion(scene.name, start, one) for one in told]
+        same = [self.beside_truth(scene.name, start, one) for one in told]
         self.motions.append(same[0])
         errors = [one.worst for one in same]
         if len(same) > 1 and min(errors) > 1e-9:        # beyond rounding: errors ~ dt^p
             self.orders[scene.name] = -float(np.polyfit(
                 np.log(scene.divided), np.log(errors), 1)[0])
 
-    def motion(self, name: str, start: State, told: Stretch) -> Motion:
+    def beside_truth(self, name: str, start: State, told: Stretch) -> Motion:
         """Return a motion; a convention of its attitudes, or a step, is told and undone."""
-        motion, early = Motion(name, self.body, start, told), slice(0, EARLY)
+        solution, early = ExactSolution(self.body, start), slice(0, EARLY)
+
+        def motion_of(late: int) -> Motion:
+            truth = Rotation.from_quat(solution.states_at_seconds(
+                told.t - late * self.dt).quaternion)
+            return Motion(name, start, told, (truth.inv() * told.rotation).magnitude())
+
+        motion = motion_of(0)
         error = float(np.max(motion.errors[early]))
-        for steps in (1, -1) if error > min(WRONG, 2.0 * self.tolerance) else ():
-            other = Motion(name, self.body, start, replace(told, t=told.t + steps * self.dt))
+        for late in (-1, 1) if error > min(WRONG, 2.0 * self.tolerance) else ():
+            other = motion_of(late)
             if np.max(other.errors[early]) < RIGHT * error and (
                     np.median(other.errors) < RIGHT * np.median(motion.errors)):
-                self._tell('early' if steps > 0 else 'late', f'{name}: the attitudes are those of '
-                           f'one step {"after" if steps > 0 else "before"}', -float(steps))
+                self._tell('late' if late > 0 else 'early', f'{name}: the attitudes are those of '
+                           f'one step {"before" if late > 0 else "after"}', float(late))
                 return other
         if error > WRONG:
             q = told.rotation.as_quat()
-            found = conventions.best(q[early], motion.truth[early])
+            found = conventions.best(q[early], solution.states_at_seconds(
+                told.t[early]).quaternion)
             if found.convention.parts and found.after < RIGHT * found.before:
-                self._tell('convention', f'{name}: attitudes are told as '
-                           f'{found.convention.name}; this is undone', found.before)
-                return Motion(name, self.body, start, replace(
-                    told, rotation=Rotation.from_quat(found.convention.undo(q))))
+                self._tell('convention', f'{name}: attitudes are told as {found.convention.name}; '
+                           'this is undone', found.before)
+                told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
+                return motion_of(0)
         return motion
 
     def _tell(self, name: str, evidence: str, number: float) -> None:
         if name not in [fault.name for fault in self.faults]:
             self.faults.append(Finding(name, evidence, number))
 
-    def report(self) -> Report:
-        """Return the report on the motions."""
-        whole = Report(self.subject, self.faults, {}, self.notes)
+    def reports(self) -> Iterator[Report]:
+        """Yield what is wrong with the motions and with each reading."""
         if not self.motions:
-            return whole
+            return
         of_rates = self._readings('rates').found
         first = of_rates[0].name if of_rates else ''
         if first in ('', 'rates_scale', 'rates_in_world'):      # rates that are told are known
@@ -295,24 +230,40 @@ class Judgement:
                 if rates is not None and first == 'rates_in_world':
                     rates = motion.told.rotation.inv().apply(rates)
                 motion.told = replace(motion.told, rates=rates)
-        of_motions = Report('', [
-            *of_rates, *(fault for fault in self._of_motions() if not (
-                first == 'rates_scale' and fault.name == 'inaccurate'))], {
-            **{f'{measure}: {motion.name}': Mark(value, math.degrees(self.tolerance) if (
-                measure == 'total_error_deg') else math.nan)
-                for motion in self.motions for measure, value in motion.marks.items()},
-            **{f'order: {motion.name}': Mark(self.orders.get(motion.name, math.nan))
-               for motion in self.motions}},
-            [] if READINGS.keys() & self.motions[0].told.readings.keys() else [
-                'no readings: the IMU is not graded'])
-        return whole.plus(of_motions, *map(self._readings, READINGS))
+        yield Report('rates', of_rates)
+        found = [fault for fault in self._of_motions() if not (
+            first == 'rates_scale' and fault.name == 'inaccurate')]
+        yield Report('motions', found, {
+            name: mark for motion in self.motions for name, mark in self._marks(motion)}, [
+                'no readings: the IMU is not graded'] * READINGS.keys().isdisjoint(
+                    self.motions[0].told.readings))
+        yield from map(self._readings, READINGS)
 
     def _readings(self, kind: str) -> Report:
-        return judge(kind, [motion.told for motion in self.motions], self.body, self.body.gravity,
-                     slack=max(motion.slack for motion in self.motions) * (kind != 'rates'))
+        told = [motion.told for motion in self.motions]
+        # Where no rates are told, half a step may be between readings and attitudes.
+        slack = 0.0 if told[0].rates is not None or kind == 'rates' else max(
+            float(0.5 * (one.rotation[0].inv() * one.rotation[1]).magnitude()) for one in told)
+        return judge(kind, told, self.body, self.body.gravity, slack=slack ** 2)
+
+    def _marks(self, motion: Motion) -> Iterator[tuple[str, Mark]]:
+        """Yield the largest error, and relative changes of the constants of the motion."""
+        yield f'total_error_deg: {motion.name}', Mark(math.degrees(motion.worst),
+                                                      math.degrees(self.tolerance))
+        smoothed = Smoothed(motion.told, 1)
+        w, up = smoothed.rates, smoothed.turn[:, 2]
+        momenta = w * self.body.inertia
+        first = ExactSolution(self.body, motion.start).states_at_seconds(np.zeros(1))
+        for name, values in (
+                ('energy', 0.5 * np.sum(momenta * w, axis=1)
+                 + self.body.gravity_torque * up[:, 2]),
+                ('l3', momenta[:, 2]), ('lz', np.sum(momenta * up, axis=1))):
+            yield f'{name}_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
+                values, float(getattr(first, name)[0]))))))
+        if motion.name in self.orders:
+            yield f'order: {motion.name}', Mark(self.orders[motion.name])
 
     def _of_motions(self) -> Iterator[Finding]:
-        """Yield what is wrong with the motions."""
         worst = max(self.motions, key=lambda motion: motion.worst)
         if worst.worst <= self.tolerance:
             return
