@@ -111,6 +111,7 @@ def _left(comparison: Comparison) -> float:
     """Return the share of a reading that is not the right one, in any unit."""
     if not comparison.motions:
         return 0.0
-    found, _, residual = comparison.compare(0).fit(['total', *comparison.always, *OFFSETS])
+    comparison.compare(0)
+    found, _, residual = comparison.fit(['total', *comparison.always, *OFFSETS])
     right = any(abs((1.0 + found[0]) * size - 1.0) < 0.1 for size in comparison.units.values())
     return rms(residual) if right else 1.0

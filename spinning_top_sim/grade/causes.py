@@ -19,7 +19,6 @@ from spinning_top_sim.grade.columns import (
     ENTRIES,
     LENGTHS,
     STANDARD_GRAVITY,
-    Compared,
     Comparison,
     Imu,
 )
@@ -33,6 +32,7 @@ from spinning_top_sim.tools.identify import (
     compressed,
     explain,
     instead,
+    parts,
     rms,
     verdicts,
 )
@@ -83,8 +83,8 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
             f'{abs(late):.3g} steps ({1e3 * abs(late) * comparison.own_step:.3g} ms) '
             f'{"before" if late > 0.0 else "after"}', late))
     for last in (False, False, True):
-        compared = comparison.compare(lag)
-        found, residual = Causes(comparison, compared, exact_gravity, slack).find()
+        comparison.compare(lag)
+        found, residual = Causes(comparison, exact_gravity, slack).find()
         undo = [one.undo for one in found if one.name and one.undo is not None]
         if last or not undo:
             break
@@ -92,14 +92,14 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
         comparison.undo(undo[0])
     faults.extend(found)
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)),
-             **_marks(comparison, compared, lag)}
+             **_marks(comparison, lag)}
     if comparison.density:
         if {'reading_scale', 'inaccurate', 'matrix', 'rates_in_world'}.isdisjoint(
                 one.name for one in found):
             faults.extend(_noise_faults(
                 comparison, residual, getattr(imu, comparison.density),
                 stretches[0].covariance.get(kind)))
-        notes.extend(_untold(comparison, compared))
+        notes.extend(_untold(comparison))
     return Report(kind, [Finding(one.name, f'{kind}: {one.evidence}', one.number)
                          for one in faults if one.name], marks, notes)
 
@@ -116,9 +116,8 @@ def listed(values: Iterable[float]) -> str:
 class Causes:
     """What may be wrong with readings; `find` finds what is."""
 
-    def __init__(self, comparison: Comparison, compared: Compared, exact_gravity: bool,
-                 slack: float) -> None:
-        self.comparison, self.compared, self.kind = comparison, compared, comparison.kind
+    def __init__(self, comparison: Comparison, exact_gravity: bool, slack: float) -> None:
+        self.comparison, self.kind = comparison, comparison.kind
         self.exact_gravity, self.noisy = exact_gravity, comparison.noisy
         self.arm_known = not comparison.always
         self.least = (OF_STEPS if self.kind == 'rates' else STRANGE) + slack
@@ -126,7 +125,7 @@ class Causes:
 
     def find(self) -> tuple[list[Verdict], Reals]:
         """Return the faults, and what they leave of the discrepancy."""
-        compared, always = self.compared, self.comparison.always
+        compared, always = self.comparison, self.comparison.always
         residual = compared.fit(always).residual
         doubt = FOUR_SIGMA * SPREAD / math.sqrt(residual.size)
         most = compared.floor * math.sqrt(SAME_POWER + 2.0 * doubt)
@@ -137,19 +136,14 @@ class Causes:
             return [], residual
         chosen = explain(*compressed(compared.target, compared.effects), [*self._causes()],
                          math.hypot(compared.floor, 0.5 * self.least), always)
-        while True:                             # without what may be chance
+        while True:
             found, sigma, residual = compared.fit([*always, *(
                 name for cause in chosen for name in cause.effects)])
-            end, chance = len(found), None
-            for cause in reversed(chosen):
-                first = end - len(cause.effects)
-                if not np.any(np.abs(found[first:end]) > SURE * sigma[first:end]):
-                    chance = cause
-                    break
-                end = first
-            if chance is None:
+            sure = np.abs(found) > SURE * sigma
+            chance = [cause for cause, of in parts(chosen, len(always)) if not np.any(sure[of])]
+            if not chance:
                 break
-            chosen.remove(chance)
+            chosen.remove(chance[-1])
         rest = beyond(residual, most)
         if rest > max(UNEXPLAINED * before, self.strange, 2.0 * compared.floor,
                       (ROUGH + 2.0 * compared.floor) * self.noisy):
@@ -157,7 +151,7 @@ class Causes:
                 return [], residual
             return [Verdict('inaccurate', f'{100.0 * rest:.3g} % of the reading is not that of '
                             'the motion', rest)], residual
-        return verdicts(chosen, found, len(always)), residual
+        return [*filter(None, verdicts(chosen, found, len(always)))], residual
 
     def _causes(self) -> Iterator[Cause]:
         if self.kind == 'accelerations':
@@ -177,7 +171,7 @@ class Causes:
 
     def _causes_of_forces(self) -> Iterator[Cause]:
         for name in TERMS:
-            if name in self.compared.effects and (self.arm_known or name in (
+            if name in self.comparison.effects and (self.arm_known or name in (
                     'gravity', 'linear', 'motion')):
                 yield Cause([name], partial(self._term, name))
         yield Cause(['difference'], self._difference)
@@ -189,8 +183,8 @@ class Causes:
 
     def _clear(self, name: str) -> bool:
         """Return whether an effect is much larger than its noise."""
-        return self.kind != 'accelerations' or rms(self.compared.effects[name]) > (
-            ROUNDING + CLEARLY * self.compared.noise.get(name, 0.0))
+        return self.kind != 'accelerations' or rms(self.comparison.effects[name]) > (
+            ROUNDING + CLEARLY * self.comparison.noise.get(name, 0.0))
 
     def _matrix(self, matrix: Reals) -> Verdict | None:
         """Judge a matrix by which the readings are what they should be, multiplied."""
@@ -245,8 +239,8 @@ class Causes:
                 found[:3] + field) < NEAR * np.linalg.norm(field):
             return Verdict('reading_in_world', 'the field does not turn with the IMU')
         # Where w x (w x r) is not known its mean seems to be a bias.
-        coarse = self.noisy and 'centripetal' in self.compared.effects and SURE * (
-            self.compared.fit(['centripetal', *self.comparison.always]).sigma[0]) > TELLS
+        coarse = self.noisy and 'centripetal' in self.comparison.effects and SURE * (
+            self.comparison.fit(['centripetal', *self.comparison.always]).sigma[0]) > TELLS
         si = next(iter(self.comparison.units))
         return Verdict('bias' * (not coarse), f'a constant ({listed(offset)}) {si} is added',
                        float(np.linalg.norm(offset)))
@@ -262,7 +256,7 @@ class Causes:
 
     def _term(self, term: str, found: Reals) -> Verdict | None:
         share, (what, missing) = 1.0 + float(found[-1]), TERMS[term]
-        if term == 'motion' and self.arm_known and 'linear' not in self.compared.effects:
+        if term == 'motion' and self.arm_known and 'linear' not in self.comparison.effects:
             missing = 'no_lever_arm'
         if self.noisy and not self._clear(term):
             return None                         # a term of noise seems to be missing
@@ -315,24 +309,25 @@ class Causes:
         return None
 
 
-def _marks(comparison: Comparison, compared: Compared, lag: int) -> dict[str, Mark]:
+def _marks(comparison: Comparison, lag: int) -> dict[str, Mark]:
     """Return what the sensor is found to be, with intervals of 95 %."""
     kind, always = comparison.kind, comparison.always
-    marks = {f'{kind}_discrepancy': Mark(beyond(compared.target, compared.floor)),
+    marks = {f'{kind}_discrepancy': Mark(beyond(comparison.target, comparison.floor)),
              f'{kind}_noise': Mark(comparison.reading_noise)}
     if always:
         what, values = ('field', comparison.field) if kind == 'magnetometer' else (
             'lever_arm', comparison.arm)
         marks.update({f'{what}_{axis}': Mark(float(value), meaning=_interval(deviation))
                       for axis, value, deviation in zip(
-                          'xyz', values, compared.fit(always).sigma, strict=True)})
+                          'xyz', values, comparison.fit(always).sigma, strict=True)})
     if comparison.density:
         first, matrix = len(always), AXES
-        found, sigma, _ = compared.fit([*always, *MATRIX, *OFFSETS])
+        found, sigma, _ = comparison.fit([*always, *MATRIX, *OFFSETS])
         if kind == 'gyroscope' and np.all(sigma < np.inf):  # undone, it is smoothed as the motion
             matrix = AXES + found[first:first + 9].reshape(3, 3)
             comparison.undo(matrix)
-            found, sigma, _ = comparison.compare(lag).fit([*always, *MATRIX, *OFFSETS])
+            comparison.compare(lag)
+            found, sigma, _ = comparison.fit([*always, *MATRIX, *OFFSETS])
         matrix = matrix @ (AXES + found[first:first + 9].reshape(3, 3))
         names = [f'matrix_{"xyz"[i]}{"xyz"[j]}' for i, j in ENTRIES] + [
             f'bias_{axis}' for axis in 'xyz']
@@ -342,12 +337,12 @@ def _marks(comparison: Comparison, compared: Compared, lag: int) -> dict[str, Ma
     return marks
 
 
-def _untold(comparison: Comparison, compared: Compared) -> Iterator[str]:
+def _untold(comparison: Comparison) -> Iterator[str]:
     """Yield what cannot be told of the readings, and the poses that could tell it."""
     # What is not known is the arm, of both terms together.
     terms = [name for name in (('total',) if comparison.angles else ('centripetal', 'linear'))
-             if name in compared.effects and rms(compared.effects[name]) > 0.0]
-    _, sigma, _ = compared.fit([*terms, *comparison.always])
+             if name in comparison.effects and rms(comparison.effects[name]) > 0.0]
+    _, sigma, _ = comparison.fit([*terms, *comparison.always])
     turns, places = (max(one.body.sigma.get(name, 0.0) for one in comparison.motions)
                      for name in ('attitudes', 'positions'))
     for name, deviation in zip(terms, sigma.tolist(), strict=False):

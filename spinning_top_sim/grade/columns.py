@@ -80,10 +80,17 @@ class Imu:
     accelerometer_noise_density: float | None = None
 
 
-class Compared(NamedTuple):
+class Comparison:
     """
-    Readings beside what they should be, stretch after stretch, over the rms of the readings.
+    Readings of a kind beside a motion, which is smoothed as far as the noise asks for.
 
+    `compare` sets the last four, of all stretches together, over the rms of their readings:
+
+    arm, field : as given, or as last found
+    always : names of effects whose size is not known, even of a right reading
+    sizes, counts : rms and number of the readings of each stretch
+    units, density : as of its `Kind`
+    own_step, steps : interval of the sensor [s], and its samples per sample that is compared
     target : what a right reading does not explain (N, 3)
     effects : by name, changes of the reading by an effect of size 1 (N, 3)
     floor, noise : rms of the noise of a component of the target, and of effects by name
@@ -93,27 +100,6 @@ class Compared(NamedTuple):
     effects: Mapping[str, Reals]
     floor: float
     noise: Mapping[str, float]
-
-    def fit(self, names: Sequence[str]) -> Fit:
-        """Return the best coefficients of effects."""
-        if not names:
-            return Fit(np.empty(0), np.empty(0), self.target)
-        # Noise of an effect of several axes or entries stands by its first word.
-        return fit(self.target, [self.effects[name] for name in names],
-                   [self.noise.get(name, self.noise.get(name.split()[0], 0.0)) for name in names],
-                   [name not in ACROSS for name in names])
-
-
-class Comparison:
-    """
-    Readings of a kind in the stretches of a motion, smoothed as far as the noise asks for.
-
-    arm, field : as given, or as last found
-    always : names of effects whose size is not known, even of a right reading
-    sizes, counts : rms and number of the readings of each stretch
-    units, density : as of its `Kind`
-    own_step, steps : interval of the sensor [s], and its samples per sample that is compared
-    """
 
     def __init__(self, kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> None:
         self.kind, self.gravity, self.angles = kind, gravity, kind in ANGLES
@@ -178,34 +164,43 @@ class Comparison:
         return [(one.rate if self.angles else one.vector)(np.roll(reading, -lag, axis=0))
                 for one, reading in zip(self.motions, self.readings, strict=True)]
 
-    def compare(self, lag: int) -> Compared:
-        """Return what is compared, of readings that are `lag` samples late."""
-        found = self._compared(lag)
+    def compare(self, lag: int) -> None:
+        """Compare readings that are `lag` samples late."""
+        self._compare(lag)
         if not self.always:
-            return found
-        more, _ = fitted(found.target, [found.effects[name] for name in self.always])
+            return
+        more, _ = fitted(self.target, [self.effects[name] for name in self.always])
         if self.kind == 'magnetometer':
             self.field = self.field + more
         else:
             self.arm = self.arm + more
-        return self._compared(lag)
+        self._compare(lag)
 
-    def _compared(self, lag: int) -> Compared:
+    def _compare(self, lag: int) -> None:
         keep = slice(abs(lag), -abs(lag) or None)       # what a roll has not wrapped
         parts = [(motion.smooth[keep], motion, reading, size) for motion, reading, size in zip(
             self.motions, self.read_at(lag), self.sizes, strict=True)]
         self.counts = [int(np.count_nonzero(good)) for good, *_ in parts]
-        readings, effects = pooled((reading[keep][good] / size, {
-            name: effect[keep][good] / size for name, effect in self.effects(motion).items()})
+        readings, self.effects = pooled((reading[keep][good] / size, {
+            name: effect[keep][good] / size for name, effect in self.columns(motion).items()})
             for good, motion, reading, size in parts)
+        self.target = readings - self.effects['total']
         noises = [self.noises(one) for one in self.motions]
-        noise = {name: rms(np.array([one[name] for one in noises]) / self.sizes)
-                 for name in noises[0]}
-        reading = self.reading_noise * rms(gain(self.motions[0].width) / self.sizes)
-        return Compared(readings - effects['total'], effects, math.hypot(noise['total'], reading),
-                        noise)
+        self.noise = {name: rms(np.array([one[name] for one in noises]) / self.sizes)
+                      for name in noises[0]}
+        self.floor = math.hypot(self.noise['total'], self.reading_noise * rms(
+            gain(self.motions[0].width) / self.sizes))
 
-    def effects(self, motion: Smoothed) -> dict[str, Reals]:
+    def fit(self, names: Sequence[str]) -> Fit:
+        """Return the best coefficients of effects."""
+        if not names:
+            return Fit(np.empty(0), np.empty(0), self.target)
+        # Noise of an effect of several axes or entries stands by its first word.
+        return fit(self.target, [self.effects[name] for name in names],
+                   [self.noise.get(name, self.noise.get(name.split()[0], 0.0)) for name in names],
+                   [name not in ACROSS for name in names])
+
+    def columns(self, motion: Smoothed) -> dict[str, Reals]:
         """Return the terms of a right reading, their sum `total`, and effects of defects."""
         if self.angles:
             effects = {'total': motion.rates}

@@ -54,7 +54,7 @@ def faults_of(body: Body, motions: Sequence[Stretch], dt: float) -> list[Verdict
         return []
     found, residual = fitted(target, [effects[name] for name in names])
     explained = rms(residual) < EXPLAINED * rms(target)
-    return [one for one in verdicts(chosen, found) if one.name and explained]
+    return [one for one in verdicts(chosen, found) if one and one.name and explained]
 
 
 def _terms(body: Body, motion: Stretch, dt: float) -> tuple[Reals, Mapping[str, Reals]]:

@@ -9,7 +9,7 @@ What is not understood is refused in one line, with what to type.
 import csv
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -123,33 +123,27 @@ class Table(NamedTuple):
     columns: Mapping[str, Sequence[Any]]
     rows: Sequence[str]
 
-    def times(self, column: str, unit: str) -> Iterator[Decimal]:
-        """Yield times, as nanoseconds of a date.  Raises ValueError."""
-        for row, cell in zip(self.rows, self.columns[column], strict=True):
-            text = str(cell).strip()
-            try:
-                time = Decimal(int(np.datetime64(text.removesuffix('Z'), 'ns').astype(int))) if (
-                    unit == 'iso') else Decimal(text)
-            except (InvalidOperation, ValueError):
-                time = Decimal('NaN')
-            if not time.is_finite():
-                raise ValueError(
-                    f"{row}: {column} = {text[:40]!r} is no time: correct it, or cut the line off;"
-                    f" of a date say --columns 't={column}:iso'")
-            yield time
-
-    def numbers(self, column: str) -> Iterator[float]:
-        """Yield numbers, NaN of an empty cell.  Raises ValueError."""
+    def cells(self, column: str, parse: Callable[[str], Any]) -> list[Any]:
+        """Return the parsed cells of a column, NaN of an empty one.  Raises ValueError."""
+        found: list[Any] = []
         for row, cell in zip(self.rows, self.columns[column], strict=True):
             text = '' if cell is None else str(cell).strip()
             try:
-                value = math.nan if text in ('', 'nan', 'NaN') else float(text)
-            except ValueError:
+                value = parse(text) if text and '_' not in text else math.nan
+            except (InvalidOperation, ValueError):
                 value = math.inf
-            if math.isinf(value) or '_' in text:
-                raise ValueError(f'{row}: {column} = {text[:40]!r} is no number: correct it, leave'
-                                 ' it empty, or cut the line off')
-            yield value
+            if math.isinf(value) or '_' in text or (math.isnan(value) and parse is not float):
+                raise ValueError(f'{row}: {column} = {text[:40]!r} is no ' + (
+                    'number: correct it, leave it empty, or cut the line off' if parse is float
+                    else 'time: correct it, or cut the line off; of a date say --columns '
+                    f"'t={column}:iso'"))
+            found.append(value)
+        return found
+
+
+def _date(text: str) -> Decimal:
+    """Return the nanoseconds of a date."""
+    return Decimal(int(np.datetime64(text.removesuffix('Z'), 'ns').astype(int)))
 
 
 def read_table(path: Path, said: str | None) -> Recorded:
@@ -214,11 +208,8 @@ def _text(path: Path) -> Table:
             path.read_text('utf-8-sig').splitlines(), 1) if line.strip()]
     except UnicodeDecodeError as error:
         raise ValueError(f'no UTF-8 text: {error.reason} at byte {error.start}') from error
-    where, bare = [], []
-    for name, line in lines:
-        if not line.startswith('#'):
-            where.append(name)
-            bare.append(line)
+    where = [name for name, line in lines if not line.startswith('#')]
+    bare = [line for _, line in lines if not line.startswith('#')]
     if not bare:
         raise ValueError('the file has no rows')
     mark = next((mark for mark in ',;\t' if mark in bare[0]), ' ')
@@ -307,16 +298,17 @@ def _add(recorded: Recorded, table: Table, said: Chosen) -> None:
                            column
                            for name in names.split() for column, unit in chosen[name])
         if kind == 't':
-            stamps: Any = sum(units[unit] * np.array([*table.times(column, unit)], object)
-                              for column, unit in chosen['t'])
+            stamps: Any = sum(units[unit] * np.array(
+                table.cells(column, _date if unit == 'iso' else Decimal), object)
+                for column, unit in chosen['t'])
             first = min(stamps, default=Decimal(0))
             times = (stamps - first).astype(float)
             if not recorded.parts:
                 recorded.first_s = float(first)
                 recorded.notes.append(f'times of {source}: the first is {first:.12g} s')
         else:
-            recorded.add(kind, source, times, np.stack([units[unit] * np.fromiter(
-                table.numbers(column), float) for name in names.split()
+            recorded.add(kind, source, times, np.stack([units[unit] * np.array(
+                table.cells(column, float)) for name in names.split()
                 for column, unit in chosen[name]], axis=1), table.rows)
     if unused:
         recorded.notes.append(f'not used: {unused}')

@@ -30,7 +30,7 @@ def lag_of(comparison: Comparison) -> tuple[int, float, float, bool]:
         len(one.rates) for one in comparison.motions)]
     part, rows, bases = slice(-lags[0], -lags[-1] or None), [], []
     for motion in comparison.motions:
-        effects = comparison.effects(motion)
+        effects = comparison.columns(motion)
         design = np.hstack([effect for name, effect in effects.items() if name.split()[0] in ANY
                             or (name == 'total' and comparison.angles)]
                            + [np.ones((len(motion.rates), 1))])
@@ -45,10 +45,11 @@ def lag_of(comparison: Comparison) -> tuple[int, float, float, bool]:
                           for basis, one in zip(bases, read, strict=True))
     best = min(misfit, key=misfit.__getitem__)
     count, size = 3 * sum(map(len, rows)), rms(comparison.sizes)
-    compared, width = comparison.compare(0), comparison.motions[0].width
+    width = comparison.motions[0].width
+    comparison.compare(0)
     # Of smoothed samples fewer are independent: they must be more than the columns.
     few = count < ENOUGH * 3 * width * design.shape[1]
-    weak = rms(compared.effects['total']) < CLEARLY * compared.noise['total']
+    weak = rms(comparison.effects['total']) < CLEARLY * comparison.noise['total']
     still = misfit[0] < count * (ROUNDING * size) ** 2
     if few or weak or still or best in (lags[0], lags[-1]):
         return unknown                          # every lag explains it
@@ -61,7 +62,7 @@ def lag_of(comparison: Comparison) -> tuple[int, float, float, bool]:
     less = 0.125 * (sooner - later) ** 2 / curvature
     rest = max(least - less, 0.0)
     variance = rest / count * 2.0 * width       # of correlated noise
-    most = 1.5 * count * (compared.floor * size) ** 2
+    most = 1.5 * count * (comparison.floor * size) ** 2
     gained = now - least + less                 # which is that of a parabola, about
     clear = bool(rest < 0.25 * now or (rest < most and gained > max(
         (2.0 * SURE) ** 2 * variance, 0.05 * curvature * late ** 2)))

@@ -8,6 +8,7 @@ coefficients of columns and their uncertainty.
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -123,9 +124,8 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
         tried = [fit_of([*chosen, cause]) for cause in others]
         # A cause with a judge that names no fault explains nothing.
-        after = [np.inf if verdict(cause, found, len(found) - len(cause.effects), len(always)
-                                   ) is None else beyond(left, floor)
-                 for cause, (found, left) in zip(others, tried, strict=True)]
+        after = [np.inf if verdicts([*chosen, cause], found, len(always))[-1] is None else
+                 beyond(left, floor) for cause, (found, left) in zip(others, tried, strict=True)]
         good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * before, floor or np.inf))
         # Of equally good causes the one with the fewest columns wins, for more columns always fit
         # better, then the one that is named first.
@@ -138,22 +138,20 @@ def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause]
     return chosen
 
 
-def verdict(cause: Cause, found: Reals, first: int, always: int = 0) -> Verdict | None:
+def parts(causes: Sequence[Cause], first: int = 0) -> list[tuple[Cause, slice]]:
+    """Return causes with the places of their coefficients, from the first one on."""
+    ends = np.cumsum([first, *(len(cause.effects) for cause in causes)]).tolist()
+    return [(cause, slice(*pair)) for cause, pair in zip(causes, pairwise(ends), strict=True)]
+
+
+def verdicts(causes: Sequence[Cause], found: Reals, always: int = 0) -> list[Verdict | None]:
     """
-    Return what the coefficients of a cause mean; None: it is not this.
+    Return what the coefficients of causes mean, each; None: it is not this.
 
     found : coefficients, of `always` effects of unknown size and then of causes
-    first : where those of the cause begin
     """
-    return Verdict('', 'no fault') if cause.judge is None else cause.judge(np.append(
-        found[:always], found[first:first + len(cause.effects)]))
-
-
-def verdicts(causes: Sequence[Cause], found: Reals, always: int = 0) -> list[Verdict]:
-    """Return what the coefficients of all causes mean, as of `verdict`."""
-    first = always + np.cumsum([0, *(len(cause.effects) for cause in causes)])
-    return [told for cause, at in zip(causes, first.tolist(), strict=False)
-            if (told := verdict(cause, found, at, always))]
+    return [cause.judge(np.append(found[:always], found[of])) if cause.judge else
+            Verdict('', 'no fault') for cause, of in parts(causes, always)]
 
 
 def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:
