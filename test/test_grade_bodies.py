@@ -99,6 +99,16 @@ def test_gravity_elsewhere_and_gaps_and_rates_of_each_sensor_are_no_faults():
     assert report.passed and any('in gaps' in note for note in report.notes), report
 
 
+def test_without_positions_the_acceleration_of_the_origin_is_no_fault():
+    for seed in (1, 3):
+        parts = told(body(seed, noisy=False, seconds=4.0, kind='forced', rate=200.0))
+        assert parts.pop('positions')[1].any()
+        report = grade_readings(parts)
+        assert report.passed and any('without positions' in note for note in report.notes), report
+        t, f = parts['accelerations']
+        assert grade_readings({**parts, 'accelerations': (t, f[:, [1, 0, 2]])}).passed
+
+
 def test_a_magnetometer_needs_no_field_and_its_unit_is_told():
     moving = body(2, noisy=False, seconds=5.0, kind='forced', rate=200.0)
     field = moving.rotation.inv().apply((0.0, 20e-6, -43e-6))

@@ -239,7 +239,7 @@ START = State(theta=0.5235987755982988, l3=1.6, lz=1.3)         # config/looping
 
 
 @pytest.mark.parametrize(('change', 'code', 'says'), [
-    (lambda q: q, 0, 'total_error_deg: the motion'),
+    (lambda q: q, 0, 'total_error_deg'),
     (lambda q: q[100:], 0, 'another start than the one that is given'),
     (lambda q: (Rotation.from_quat(q) * Rotation.from_rotvec(np.random.default_rng(2).normal(
         0.0, 2e-3, (len(q), 3)))).as_quat(), 0, 'passed'),

@@ -35,19 +35,21 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     imu : Imu, optional
         What is known of it; default: nothing, along axes of the body.
     gravity, exact_gravity : float, bool
-        Where the body is [m/s^2]; whether that of another place on Earth is a fault.
+        Where the body is [m/s^2]; whether its place is known: then gravity of another one is a
+        fault, and without positions the origin is at rest.
     covariance : mapping, optional
         Covariances (3, 3) that are declared, by name.
     subject : str
         Name of what is graded.
     """
     imu, parts, faults = imu or Imu(), dict(parts), list[Finding]()
-    for name in [name for name in READINGS if name in parts]:
-        times, values = parts[name]
+    for name, (times, values) in parts.items():
         new = np.append(True, np.any(values[1:] != values[:-1], axis=1))
         if count := held(np.diff(np.flatnonzero(new))):
-            faults.append(Finding('held', f'{name}: each reading is told {count:.3g} times: '
-                                  'the sensor, or the log, is slower than its stamps', count))
+            faults.append(Finding('held', f'{name}: each row is told {count:.3g} times: the '
+                                  'sensor, or the log, is slower than its stamps', count))
+            if name not in READINGS:
+                return Report(subject, faults, {}, ['beside held poses readings are not graded'])
             parts[name] = times[new], values[new]
     bodies, left_out = stretches(parts)
     bodies = [replace(body, covariance=covariance or {}) for body in bodies]
@@ -60,7 +62,8 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
                               'undone'))
         bodies = [undone(body, convention) for body in bodies]
     return Report(subject, faults, {}, notes).plus(*(
-        judge(name, bodies, imu, gravity, exact_gravity=exact_gravity) for name in READINGS))
+        judge(name, bodies, imu, gravity, exact_gravity=exact_gravity,
+              placed=exact_gravity or 'positions' in parts) for name in READINGS))
 
 
 def held(runs: Reals) -> float:

@@ -64,11 +64,12 @@ TELLS = 0.5                 # uncertainty of a share of a term up to which its f
 
 
 def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
-          exact_gravity: bool = True, slack: float = 0.0) -> Report:
+          exact_gravity: bool = True, placed: bool = True, slack: float = 0.0) -> Report:
     """
     Return what is wrong with the readings of a kind.
 
     exact_gravity : whether that of another place on Earth is a fault
+    placed : whether it is known where the origin of the body is
     slack : share by which readings may differ, since the motion is known no better
     """
     comparison = Comparison(kind, stretches, imu, gravity)
@@ -84,13 +85,18 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
             f'{"before" if late > 0.0 else "after"}', late))
     for last in (False, False, True):
         comparison.compare(lag)
-        found, residual = Causes(comparison, exact_gravity, slack).find()
+        found, residual, rest = Causes(
+            comparison, exact_gravity, placed, slack).find()
         undo = [one.undo for one in found if one.name and one.undo is not None]
         if last or not undo:
             break
         faults.extend(one for one in found if one.name and one.undo is not None)
         comparison.undo(undo[0])
     faults.extend(found)
+    if kind == 'accelerations' and not placed and rest > max(STRANGE, 2.0 * comparison.floor):
+        return Report(kind, notes=[f'{kind}: {100.0 * rest:.3g} % of the reading may be the '
+                                   'acceleration of the origin: without positions they are not '
+                                   'graded'])
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)),
              **_marks(comparison, lag)}
     if comparison.density:
@@ -116,24 +122,25 @@ def listed(values: Iterable[float]) -> str:
 class Causes:
     """What may be wrong with readings; `find` finds what is."""
 
-    def __init__(self, comparison: Comparison, exact_gravity: bool, slack: float) -> None:
-        self.comparison, self.kind = comparison, comparison.kind
+    def __init__(self, comparison: Comparison, exact_gravity: bool, placed: bool,
+                 slack: float) -> None:
+        self.comparison, self.kind, self.placed = comparison, comparison.kind, placed
         self.exact_gravity, self.noisy = exact_gravity, comparison.noisy
         self.arm_known = not comparison.always
         self.least = (OF_STEPS if self.kind == 'rates' else STRANGE) + slack
         self.strange = max(self.least, REAL * self.noisy)
 
-    def find(self) -> tuple[list[Verdict], Reals]:
-        """Return the faults, and what they leave of the discrepancy."""
+    def find(self) -> tuple[list[Verdict], Reals, float]:
+        """Return the faults, what they leave of the discrepancy, and its size beyond noise."""
         compared, always = self.comparison, self.comparison.always
         residual = compared.fit(always).residual
         doubt = FOUR_SIGMA * SPREAD / math.sqrt(residual.size)
         most = compared.floor * math.sqrt(SAME_POWER + 2.0 * doubt)
         before = beyond(residual, most)
         if unit := [*self._field_unit()]:
-            return unit, residual
+            return unit, residual, before
         if before <= self.least:
-            return [], residual
+            return [], residual, before
         chosen = explain(*compressed(compared.target, compared.effects), [*self._causes()],
                          math.hypot(compared.floor, 0.5 * self.least), always)
         while True:
@@ -148,10 +155,10 @@ class Causes:
         if rest > max(UNEXPLAINED * before, self.strange, 2.0 * compared.floor,
                       (ROUGH + 2.0 * compared.floor) * self.noisy):
             if self.noisy and not self._clear('free'):      # weightless: noise is seen
-                return [], residual
+                return [], residual, rest
             return [Verdict('inaccurate', f'{100.0 * rest:.3g} % of the reading is not that of '
-                            'the motion', rest)], residual
-        return [*filter(None, verdicts(chosen, found, len(always)))], residual
+                            'the motion', rest)], residual, rest
+        return [*filter(None, verdicts(chosen, found, len(always)))], residual, rest
 
     def _causes(self) -> Iterator[Cause]:
         if self.kind == 'accelerations':
@@ -167,7 +174,8 @@ class Causes:
                 name, f'the readings are in axes of {text}'))
         arms = [name for name in self.comparison.always if name.startswith('arm')]
         entries = [f'matrix {i}{j} {of}' for of in (*arms, 'free') for i, j in ENTRIES]
-        yield Cause(entries, lambda found: self._matrix(AXES + found[-9:].reshape(3, 3)))
+        if self.placed or not arms:     # so many columns fit what the origin does, too
+            yield Cause(entries, lambda found: self._matrix(AXES + found[-9:].reshape(3, 3)))
 
     def _causes_of_forces(self) -> Iterator[Cause]:
         for name in TERMS:

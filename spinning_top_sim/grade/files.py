@@ -305,7 +305,7 @@ def _add(recorded: Recorded, table: Table, said: Chosen) -> None:
             times = (stamps - first).astype(float)
             if not recorded.parts:
                 recorded.first_s = float(first)
-                recorded.notes.append(f'times of {source}: the first is {first:.12g} s')
+                recorded.notes.append(f'times of {source}: the first is {float(first):.12g} s')
         else:
             recorded.add(kind, source, times, np.stack([units[unit] * np.array(
                 table.cells(column, float)) for name in names.split()
