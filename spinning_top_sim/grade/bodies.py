@@ -12,12 +12,13 @@ from spinning_top_sim.grade.causes import OFFSETS, judge
 from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, Comparison, Imu
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Convention
-from spinning_top_sim.tools.identify import rms
+from spinning_top_sim.tools.identify import beyond
 from spinning_top_sim.tools.kinematics import Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
 EXCERPT = 3000                  # samples by which a convention is found
-WRONG, RIGHT = 0.2, 0.3         # share of a reading left in ours, of that in another convention
+# Share of a reading left in ours, of that in another convention, and of the reading there.
+WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
 HELD_RUNS, HELD_SHARE = 20, 0.9     # runs of equal readings that are a hold, and as long as usual
 
 
@@ -85,10 +86,10 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     """
     Return how attitudes are told: ours, unless another explains readings that ours does not.
 
-    Axes of the sensor are left to the readings.
+    Axes of the sensor are left to the readings, and a z that is down to the sign of gravity.
     """
     ours, *others = [one for one in conventions.group() if not any(
-        part.startswith('sensor') for part in one.parts)]
+        part.startswith('sensor') or part.endswith('down') for part in one.parts)]
     body = max(bodies, key=lambda one: len(one.t))
     angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
     first = int(np.argmax(angles[EXCERPT:] - angles[:-EXCERPT])) if len(angles) > EXCERPT else 0
@@ -107,7 +108,7 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     worst = np.where(np.any(after > 1.5 * before + 1e-3, axis=1), np.inf, np.max(after, axis=1))
     # Of equally good ones the first has the fewest parts.
     best = int(np.argmax(worst <= 1.5 * np.min(worst) + 1e-6))
-    return others[best] if worst[best] < RIGHT * np.max(before) else ours
+    return others[best] if worst[best] < min(RIGHT * np.max(before), SMALL) else ours
 
 
 def _left(comparison: Comparison) -> float:
@@ -117,4 +118,4 @@ def _left(comparison: Comparison) -> float:
     comparison.compare(0)
     found, _, residual = comparison.fit(['total', *comparison.always, *OFFSETS])
     right = any(abs((1.0 + found[0]) * size - 1.0) < 0.1 for size in comparison.units.values())
-    return rms(residual) if right else 1.0
+    return beyond(residual, comparison.floor) if right else 1.0

@@ -51,9 +51,11 @@ LATE = 0.75                 # lag from which on it is a fault [samples of the se
 # Share of a reading from which on a discrepancy is strange: rates that are told may be those of
 # the middle of a step; a real device, where poses have noise, has errors that no simulator needs.
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
-UNEXPLAINED, ROUGH = 0.5, 0.3   # shares of a discrepancy, with noise of a reading, left at most
+UNEXPLAINED, ROUGH = 0.25, 0.3   # shares of a discrepancy, with noise of a reading, left at most
 MISSING = 0.05              # share of a whole reading that is none
-OF_UNIT, OF_AXES = 0.02, 0.1    # by which a size differs from that of a unit, entries from axes
+# By which a size differs from that of a unit, entries from axes, and from a turn, as a share.
+OF_UNIT, OF_AXES, OF_TURN = 0.02, 0.1, 0.3
+SANE = 0.5                  # by which the matrix of a sensor may differ from the identity
 GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
 EARTH_FIELD = 15e-6, 90e-6  # [T]
 SAME_POWER = 1.05           # of noise, by which it may be larger besides
@@ -163,6 +165,7 @@ class Causes:
     def _causes(self) -> Iterator[Cause]:
         if self.kind == 'accelerations':
             yield from self._causes_of_forces()
+        arms = [name for name in self.comparison.always if name.startswith('arm')]
         yield Cause(['total'], lambda found: self._matrix((1.0 + found[-1]) * AXES))
         yield Cause(['step'])
         yield Cause(OFFSETS, self._bias)
@@ -170,11 +173,13 @@ class Causes:
                 ('world', 'rates_in_world' if self.comparison.angles else 'reading_in_world',
                  'the world, not of the IMU'),
                 ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
-            yield Cause(['total', effect], instead(
+            yield Cause([*(f'world {arm}' for arm in arms), 'free', effect], instead(
                 name, f'the readings are in axes of {text}'))
-        arms = [name for name in self.comparison.always if name.startswith('arm')]
         entries = [f'matrix {i}{j} {of}' for of in (*arms, 'free') for i, j in ENTRIES]
-        if self.placed or not arms:     # so many columns fit what the origin does, too
+        if self.kind == 'magnetometer' and self.comparison.always:
+            yield Cause([f'matrix {i}{j} field {k}' for i, j in ENTRIES for k in range(3)],
+                        self._matrix_of_field)
+        elif self.placed or not arms:     # so many columns fit what the origin does, too
             yield Cause(entries, lambda found: self._matrix(AXES + found[-9:].reshape(3, 3)))
 
     def _causes_of_forces(self) -> Iterator[Cause]:
@@ -210,15 +215,25 @@ class Causes:
                            size, times * axes)
         left, _, right = np.linalg.svd(shape)
         turn = left @ right
-        if np.linalg.det(turn) > 0.0 and np.max(np.abs(shape - turn)) < max(0.02, 0.1 * change):
+        if np.linalg.det(turn) > 0.0 and np.max(np.abs(shape - turn)) < max(
+                0.02, OF_TURN * change):
             vector = Rotation.from_matrix(turn).inv().as_rotvec()
             angle = float(np.linalg.norm(vector))
             return Verdict('mounting' * (angle > self.strange), 'the readings are in axes that '
                            f'are turned by ({listed(vector)}) rad from those of the IMU{unit}',
                            angle, times * turn)
+        if change > SANE and self.comparison.always:    # beside an arm it fits what it is not
+            return None
         rows = '; '.join(map(listed, matrix))
         return Verdict('matrix' * (change > self.strange), f'the readings are the matrix [{rows}] '
                        'times what they should be', change)
+
+    def _matrix_of_field(self, found: Reals) -> Verdict | None:
+        """Judge the products (9, 3) of entries of a matrix and of a field that is not known."""
+        products = np.outer(AXES, self.comparison.field + found[:3]) + found[3:].reshape(9, 3)
+        matrix = np.linalg.svd(products)[0][:, 0].reshape(3, 3)     # but for its size
+        size = abs(float(np.linalg.det(matrix))) ** (1.0 / 3.0)
+        return self._matrix(math.copysign(1.0 / max(size, MISSING), np.trace(matrix)) * matrix)
 
     def _unit_of(self, size: float) -> tuple[str, float]:
         """Return the unit of readings that are so many times too large, in words, and a size."""

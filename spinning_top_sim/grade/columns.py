@@ -210,14 +210,18 @@ class Comparison:
         else:
             effects = self._of_forces(motion)
         total = effects['total']
-        world = self.mounting.apply(along(motion.turn, total))
         arms = self.always if self.kind == 'accelerations' else []
+        effects['free'] = total - effects['lever'] if arms else total   # of an unknown arm
+
+        def turned(reading: Reals) -> Reals:
+            return self.mounting.apply(along(motion.turn, reading))
+
         effects |= {
-            'step': _per_step(total), 'world': world,
-            'reversed': self.mounting.apply(along(motion.turn, world)),
-            'free': total - effects['lever'] if arms else total,    # of an arm that is not known
+            'step': _per_step(total), 'world': turned(effects['free']),
+            'reversed': turned(turned(effects['free'])),
+            **{f'world {arm}': turned(effects[arm]) for arm in arms},
             **{f'offset {k}': 0.0 * total + axis for k, axis in enumerate(AXES)}}
-        for of in ('free', *arms):
+        for of in ('free', *self.always):
             effects |= {f'matrix {i}{j} {of}': np.outer(effects[of][:, j], AXES[i])
                         for i, j in ENTRIES}
         return effects

@@ -65,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     path, log = arguments.file, arguments.file.suffix == '.mcap'
     if path.is_dir():
+        path = path / 'mav0' if (path / 'mav0').is_dir() else path
         log = not (path / 'imu0').is_dir()
     if (arguments.columns if log else arguments.topic):
         raise ValueError('--columns is for tables' if log else '--topic is for logs')
@@ -128,7 +129,7 @@ def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) ->
             math.degrees(worst), math.degrees(tolerance))})
     top = Body(**vars(parameters.top_of(values)))
     start, notes, told = Start.of(top, parameters.start_state(values)), [], body.rotation.as_quat()
-    begin = recorded.first_s if 0.0 <= recorded.first_s < 1.0 else 0.0
+    begin = float(recorded.first_s) if 0 <= recorded.first_s < 1 else 0.0
     truth = solve(top, start, body.t[:EARLY] + begin).quaternion
     if conventions.best(told[:EARLY], truth).after > START:
         smoothed = Smoothed(body, 1)

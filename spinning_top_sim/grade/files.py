@@ -59,7 +59,7 @@ class Recorded:
 
     parts: dict[str, tuple[Reals, Reals]] = field(default_factory=dict)
     covariance: dict[str, Reals] = field(default_factory=dict)
-    first_s: float = 0.0
+    first_s: Decimal = Decimal(0)
     origin_ns: int = 0
     run: Any = None
     notes: list[str] = field(default_factory=list)
@@ -301,11 +301,11 @@ def _add(recorded: Recorded, table: Table, said: Chosen) -> None:
             stamps: Any = sum(units[unit] * np.array(
                 table.cells(column, _date if unit == 'iso' else Decimal), object)
                 for column, unit in chosen['t'])
-            first = min(stamps, default=Decimal(0))
-            times = (stamps - first).astype(float)
             if not recorded.parts:
-                recorded.first_s = float(first)
-                recorded.notes.append(f'times of {source}: the first is {float(first):.12g} s')
+                recorded.first_s = min(stamps, default=Decimal(0))
+                recorded.notes.append(f'times of {source}: the first is '
+                                      f'{float(recorded.first_s):.12g} s')
+            times = (stamps - recorded.first_s).astype(float)
         else:
             recorded.add(kind, source, times, np.stack([units[unit] * np.array(
                 table.cells(column, float)) for name in names.split()
