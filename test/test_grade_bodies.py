@@ -115,4 +115,21 @@ def test_a_magnetometer_needs_no_field_and_its_unit_is_told():
     parts = {**told(moving), 'magnetometer': (moving.t, field)}
     report = grade_readings(parts)
     assert report.passed and abs(report.marks['field_y'].value - 20e-6) < 1e-9, report
-    assert grade_readings({**parts, 'magnetometer': (moving.t, 1e6 * field)}).faults == ['units']
+    for told_field, fault in ((1e6 * field, 'units'), (field @ SWAPPED, 'axes'),
+                              (field + np.array((1e-5, 0.0, 2e-5)), 'bias')):
+        assert grade_readings({**parts, 'magnetometer': (moving.t, told_field)}).faults == [fault]
+
+
+def test_a_wrong_sign_of_gravity_and_accelerations_in_the_world_are_no_conventions():
+    moving = body(5, noisy=False, seconds=4.0, kind='forced', rate=200.0)
+    parts = told(moving)
+    for force, fault in ((moving.force(gravity=-1.0), 'gravity_sign'), (
+            moving.rotation.apply(moving.force()), 'reading_in_world')):
+        assert grade_readings({**parts, 'accelerations': (moving.t, force)}).faults == [fault]
+
+
+def test_held_poses_are_told_and_nothing_is_graded_beside_them():
+    parts = told(body(1, noisy=False, seconds=4.0, kind='forced', rate=200.0))
+    t, q = parts['attitudes']
+    held = q[np.floor(np.arange(len(q)) / 6.667).astype(int) * 20 // 3]
+    assert grade_readings({**parts, 'attitudes': (t, held)}).faults == ['held']

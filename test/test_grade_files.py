@@ -92,6 +92,10 @@ def test_what_tum_and_euroc_define_is_read(tmp_path):
         f'{name}_RS_S_{axis} [{unit}]': IMU[f'{ours}{axis}'] for name, unit, ours in (
             ('w', 'rad s^-1', 'g'), ('a', 'm s^-2', 'a')) for axis in 'xyz'}})
     same(read_table(tmp_path / 'mav0', None))
+    assert main([str(tmp_path)]) == 0
+    path.write_text(path.read_text().replace('17000', '17036'))
+    with pytest.raises(ValueError, match='stamps must be of one clock'):
+        read_table(tmp_path / 'mav0', None)
 
 
 ROWS = {'t': T, **VALUES}

@@ -159,10 +159,10 @@ def read_table(path: Path, said: str | None) -> Recorded:
         if path.is_dir():
             for part in ('state_groundtruth_estimate0', 'imu0'):
                 _add(recorded, _text(path / part / 'data.csv'), {})
-        elif path.suffix not in READERS:
+        elif path.suffix.lower() not in READERS:
             raise ValueError(f'the name must end in .mcap, {", ".join(READERS)}')
         else:
-            _add(recorded, READERS[path.suffix](path), columns_said(said) if said else {})
+            _add(recorded, READERS[path.suffix.lower()](path), columns_said(said) if said else {})
         recorded.check()
     except (ValueError, EOFError) as error:
         raise ValueError(f'{path}: {one_line(error)}') from error

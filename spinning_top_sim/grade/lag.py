@@ -14,7 +14,8 @@ ROUNDING = 1e-5             # share of a reading from which on a lag is looked f
 SURE = 5.0                  # standard deviations from which on a number is not chance
 CLEARLY = 10.0              # by which a term must exceed its noise to be missed
 # Effects that any reading may have, along any axes.
-ANY = 'gravity', 'linear', 'world', 'arm', 'turned', 'field'
+ANY = ('gravity', 'linear', 'world', *(
+    f'{name} {k}' for name in ('arm', 'turned arm', 'field') for k in range(3)))
 
 
 def lag_of(comparison: Comparison) -> tuple[int, float, float, bool]:
@@ -31,9 +32,8 @@ def lag_of(comparison: Comparison) -> tuple[int, float, float, bool]:
     part, rows, bases = slice(-lags[0], -lags[-1] or None), [], []
     for motion in comparison.motions:
         effects = comparison.columns(motion)
-        design = np.hstack([effect for name, effect in effects.items() if name.split()[0] in ANY
-                            or (name == 'total' and comparison.angles)]
-                           + [np.ones((len(motion.rates), 1))])
+        design = np.hstack([effect for name, effect in effects.items() if name in ANY or (
+            name == 'total' and comparison.angles)] + [np.ones((len(motion.rates), 1))])
         rows.append(np.flatnonzero(motion.smooth[part]) + part.start)
         left, sizes, _ = np.linalg.svd(design[rows[-1]] / np.maximum(
             np.linalg.norm(design, axis=0), 1e-300), full_matrices=False)
