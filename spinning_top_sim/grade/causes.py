@@ -284,9 +284,9 @@ class Causes:
         if self.noisy and not self._clear(term):
             return None                         # a term of noise seems to be missing
         text = f'the term of {what} has {share:.3g} times its size'
+        if term != 'linear' and abs(share * STANDARD_GRAVITY - 1.0) < OF_UNIT:
+            return None                         # in g, as the whole reading is
         if term == 'gravity':
-            if not self.arm_known and abs(share * STANDARD_GRAVITY - 1.0) < 0.01:
-                return None                     # in g: the arm is as much smaller
             if abs(share - 1.0) < GRAVITY_BAND and not self.exact_gravity:
                 return Verdict('', text)
             if share > NEAR:
