@@ -100,7 +100,7 @@ def test_gravity_elsewhere_and_gaps_and_rates_of_each_sensor_are_no_faults():
 
 
 def test_without_positions_the_acceleration_of_the_origin_is_no_fault():
-    for seed in (1, 3):
+    for seed in (0, 4):
         parts = told(body(seed, noisy=False, seconds=4.0, kind='forced', rate=200.0))
         assert parts.pop('positions')[1].any()
         report = grade_readings(parts)
