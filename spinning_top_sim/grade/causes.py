@@ -153,14 +153,16 @@ class Causes:
             if not chance:
                 break
             chosen.remove(chance[-1])
-        rest = beyond(residual, most)
+        told = verdicts(chosen, found, len(always))
+        # A cause that is not what it seemed to be explains nothing.
+        rest = before if None in told else beyond(residual, most)
         if rest > max(UNEXPLAINED * before, self.strange, 2.0 * compared.floor,
                       (ROUGH + 2.0 * compared.floor) * self.noisy):
             if self.noisy and not self._clear('free'):      # weightless: noise is seen
                 return [], residual, rest
             return [Verdict('inaccurate', f'{100.0 * rest:.3g} % of the reading is not that of '
                             'the motion', rest)], residual, rest
-        return [*filter(None, verdicts(chosen, found, len(always)))], residual, rest
+        return [*filter(None, told)], residual, rest
 
     def _causes(self) -> Iterator[Cause]:
         if self.kind == 'accelerations':
