@@ -89,26 +89,28 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     Axes of the sensor are left to the readings, and a z that is down to the sign of gravity.
     """
     ours, *others = [one for one in conventions.group() if not any(
-        part.startswith('sensor') or part.endswith('down') for part in one.parts)]
+        part.startswith('sensor') for part in one.parts)]
     body = max(bodies, key=lambda one: len(one.t))
     angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
     first = int(np.argmax(angles[EXCERPT:] - angles[:-EXCERPT])) if len(angles) > EXCERPT else 0
     body = body.part(slice(first, first + EXCERPT))     # in which it turns the most
 
-    def left(convention: Convention) -> Reals:
+    def left(convention: Convention, sign: float = 1.0) -> Reals:
         told = undone(body, convention)
-        return np.array([_left(Comparison(name, [told], imu, gravity)) for name in present])
+        return np.array([_left(Comparison(name, [told], imu, sign * gravity))
+                         for name in present])
 
     present = [name for name in ('gyroscope', 'accelerations') if name in body.readings]
     before = left(ours)
-    if not present or np.max(before) < WRONG:
+    enough = min(RIGHT * float(np.max(before, initial=0.0)), SMALL)
+    if np.max(before, initial=0.0) < WRONG or np.max(left(ours, -1.0)) < enough:
         return ours
     after = np.array([left(one) for one in others])
     # No reading may agree less.
     worst = np.where(np.any(after > 1.5 * before + 1e-3, axis=1), np.inf, np.max(after, axis=1))
     # Of equally good ones the first has the fewest parts.
     best = int(np.argmax(worst <= 1.5 * np.min(worst) + 1e-6))
-    return others[best] if worst[best] < min(RIGHT * np.max(before), SMALL) else ours
+    return others[best] if worst[best] < enough else ours
 
 
 def _left(comparison: Comparison) -> float:
