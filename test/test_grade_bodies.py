@@ -99,10 +99,37 @@ def test_gravity_elsewhere_and_gaps_and_rates_of_each_sensor_are_no_faults():
     assert report.passed and any('in gaps' in note for note in report.notes), report
 
 
+def test_without_positions_the_acceleration_of_the_origin_is_no_fault():
+    for seed in (0, 4):
+        parts = told(body(seed, noisy=False, seconds=4.0, kind='forced', rate=200.0))
+        assert parts.pop('positions')[1].any()
+        report = grade_readings(parts)
+        assert report.passed and any('without positions' in note for note in report.notes), report
+        t, f = parts['accelerations']
+        assert grade_readings({**parts, 'accelerations': (t, f[:, [1, 0, 2]])}).passed
+
+
 def test_a_magnetometer_needs_no_field_and_its_unit_is_told():
     moving = body(2, noisy=False, seconds=5.0, kind='forced', rate=200.0)
     field = moving.rotation.inv().apply((0.0, 20e-6, -43e-6))
     parts = {**told(moving), 'magnetometer': (moving.t, field)}
     report = grade_readings(parts)
     assert report.passed and abs(report.marks['field_y'].value - 20e-6) < 1e-9, report
-    assert grade_readings({**parts, 'magnetometer': (moving.t, 1e6 * field)}).faults == ['units']
+    for told_field, fault in ((1e6 * field, 'units'), (field @ SWAPPED, 'axes'),
+                              (field + np.array((1e-5, 0.0, 2e-5)), 'bias')):
+        assert grade_readings({**parts, 'magnetometer': (moving.t, told_field)}).faults == [fault]
+
+
+def test_a_wrong_sign_of_gravity_and_accelerations_in_the_world_are_no_conventions():
+    moving = body(5, noisy=False, seconds=4.0, kind='forced', rate=200.0)
+    parts = told(moving)
+    for force, fault in ((moving.force(gravity=-1.0), 'gravity_sign'), (
+            moving.rotation.apply(moving.force()), 'reading_in_world')):
+        assert grade_readings({**parts, 'accelerations': (moving.t, force)}).faults == [fault]
+
+
+def test_held_poses_are_told_and_nothing_is_graded_beside_them():
+    parts = told(body(1, noisy=False, seconds=4.0, kind='forced', rate=200.0))
+    t, q = parts['attitudes']
+    held = q[np.floor(np.arange(len(q)) / 6.667).astype(int) * 20 // 3]
+    assert grade_readings({**parts, 'attitudes': (t, held)}).faults == ['held']

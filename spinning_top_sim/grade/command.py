@@ -27,11 +27,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
-from spinning_top_sim.grade import files, grade_readings, grade_trajectory
-from spinning_top_sim.grade.effects import STANDARD_GRAVITY, Imu
-from spinning_top_sim.grade.grader import EARLY, TOLERANCE
+from spinning_top_sim.grade import files, grade_readings
+from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, Imu
 from spinning_top_sim.grade.logs import own_attitudes, read_log
 from spinning_top_sim.grade.scenes import Body, Start
+from spinning_top_sim.grade.simulators import EARLY, TOLERANCE, Judgement
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, conventions, scene_file
 from spinning_top_sim.tools.kinematics import Smoothed, stretches
@@ -65,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     path, log = arguments.file, arguments.file.suffix == '.mcap'
     if path.is_dir():
+        path = path / 'mav0' if (path / 'mav0').is_dir() else path
         log = not (path / 'imu0').is_dir()
     if (arguments.columns if log else arguments.topic):
         raise ValueError('--columns is for tables' if log else '--topic is for logs')
@@ -74,40 +75,40 @@ def _run(arguments: argparse.Namespace) -> int:
     known = None if arguments.scene or arguments.params else recorded.run
     values = parameters.checked({**(known.values_in_effect if known else {}), **given})
     of_top = bool(known) or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
-    if not of_top and recorded.parts.keys() <= {'positions', 'attitudes'}:
+    if not of_top and READINGS.keys().isdisjoint(recorded.parts):
+        unused = [f"; {note}: name readings by --columns 'gx=COLUMN:UNIT, ...'"
+                  for note in recorded.notes if note.startswith('not used') and not log]
         raise ValueError(f'{path}: there are no readings, and no top is known (--scene): '
-                         'nothing to grade' + ''.join(f'; {note}' for note in recorded.notes
-                                                      if '--columns' in note))
-    imu, gravity = _imu(arguments, given, values, of_top)
-    report = grade_readings(recorded.parts, imu, subject=path.name, exact_gravity=of_top,
-                            gravity=gravity, covariance=recorded.covariance)
+                         f'nothing to grade{"".join(unused)}')
+    report = Report(path.name, [], {}, recorded.notes).plus(grade_readings(
+        recorded.parts, _imu(arguments, given, values, of_top), exact_gravity=of_top,
+        gravity=values['top.gravity'] if of_top else STANDARD_GRAVITY,
+        covariance=recorded.covariance))
     if known:
         report = _without_declared(report, known.values_in_effect)
     if of_top:
-        report = _with_motion(report, recorded, values, known)
-    report = replace(report, notes=[*recorded.notes, *report.notes])
+        report = report.plus(_of_motion(recorded, values, known))
     return printed(report, arguments.json)
 
 
 def _imu(arguments: argparse.Namespace, given: Mapping[str, Any], values: Mapping[str, Any],
-         of_top: bool) -> tuple[Imu, float]:
-    """Return what is known of the IMU, and gravity."""
-    arm = arguments.lever_arm or (
-        values['imu.lever_arm'] if of_top or 'imu.lever_arm' in given else None)
-    field = values['mag.field'] if of_top or 'mag.field' in given else None
+         of_top: bool) -> Imu:
+    """Return what is known of the IMU."""
+    arm, field = (values[name] if of_top or name in given else None
+                  for name in ('imu.lever_arm', 'mag.field'))
+    arm = arguments.lever_arm or arm
     return Imu(
         lever_arm=arm and tuple(arm), field=field and tuple(field),
         mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
-        **{name: given.get(f'imu.{name}') for name in (
-            'gyroscope_noise_density', 'accelerometer_noise_density')}), (
-                values['top.gravity'] if of_top else STANDARD_GRAVITY)
+        **{kind.density: given.get(f'imu.{kind.density}') for kind in READINGS.values()
+           if kind.density})
 
 
 def _without_declared(report: Report, values: Mapping[str, Any]) -> Report:
     """Return a report without the errors that the parameters of a log give its device."""
     defaults = parameters.checked({})
-    ours = {name for name, value in values.items()
-            if name.startswith(('imu.', 'mag.')) and value != defaults[name]}
+    ours = [name for name, value in values.items()
+            if name.startswith(('imu.', 'mag.')) and value != defaults[name]]
     known = set().union(*(faults for part, faults in DECLARED.items()
                           if any(part in name for name in ours)))
     return replace(report, found=[one for one in report.found if one.name not in known], notes=[
@@ -115,40 +116,37 @@ def _without_declared(report: Report, values: Mapping[str, Any]) -> Report:
                          for one in report.found if one.name in known)])
 
 
-def _with_motion(report: Report, recorded: files.Recorded, values: Mapping[str, Any],
-                 run: Any) -> Report:
-    """Return a report with the motion of a top beside the exact one."""
+def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) -> Report:
+    """Return a report on the motion of a top beside the exact one."""
     bodies, _ = stretches({'attitudes': recorded.parts['attitudes']})
     body = max(bodies, key=lambda one: len(one.t))
     noise = body.sigma['attitudes']
+    tolerance = TOLERANCE + NOISES * noise
     if run is not None:
         truth = own_attitudes(run, 1e9 * body.t + recorded.origin_ns - run.epoch_ns)
         worst = float(np.max((Rotation.from_quat(truth).inv() * body.rotation).magnitude()))
-        return replace(report, found=[*report.found, *_inaccurate(worst, noise)], marks={
-            **report.marks, 'total_error_deg': Mark(math.degrees(worst),
-                                                    math.degrees(TOLERANCE))})
-    top, start = Body.of(parameters.top_of(values)), parameters.start_state(values)
-    first, notes, told = Start.of(top, start), list(report.notes), body.rotation.as_quat()
-    begin = recorded.first_s if 0.0 <= recorded.first_s < 1.0 else 0.0
-    truth = solve(top, first, body.t[:EARLY] + begin).quaternion
+        return Report('', _inaccurate(worst, tolerance), {'total_error_deg': Mark(
+            math.degrees(worst), math.degrees(tolerance))})
+    top = Body(**vars(parameters.top_of(values)))
+    start, notes, told = Start.of(top, parameters.start_state(values)), [], body.rotation.as_quat()
+    begin = float(recorded.first_s) if 0 <= recorded.first_s < 1 else 0.0
+    truth = solve(top, start, body.t[:EARLY] + begin).quaternion
     if conventions.best(told[:EARLY], truth).after > START:
         smoothed = Smoothed(body, 1)
         at = smoothed.inner.start
-        first, begin = Start.at(top, told[at], smoothed.rates[0]), -float(body.t[at])
+        start, begin = Start.at(top, told[at], smoothed.rates[0]), -float(body.t[at])
         notes.append('another start than the one that is given: it is read off the first samples')
-    found = grade_trajectory({'attitudes': told}, top, first, times=body.t + begin,
-                             tolerance=TOLERANCE + NOISES * noise, subject='the motion')
-    faults = found.found if noise < EXACT else [*_inaccurate(math.radians(
-        found.measures['total_error_deg: the motion']), noise)]
-    names = {one.name for one in report.found}
-    return replace(report, notes=notes, marks={**found.marks, **report.marks}, found=[
-        *report.found, *(one for one in faults if one.name != 'convention' or one.name not in
-                         names)])
+    judgement = Judgement(top, body.step, tolerance)
+    motion = judgement.beside_truth('the motion', start, replace(body, t=body.t + begin))
+    judgement.motions.append(motion)
+    found = Report('', judgement.faults, {}, notes).plus(*judgement.reports())
+    return found if noise < EXACT else replace(
+        found, found=[*judgement.faults, *_inaccurate(motion.worst, tolerance)])
 
 
-def _inaccurate(worst: float, noise: float) -> list[Finding]:
+def _inaccurate(worst: float, tolerance: float) -> list[Finding]:
     return [Finding('inaccurate', f'the attitude is up to {math.degrees(worst):.3g} deg off',
-                    math.degrees(worst))] if worst > TOLERANCE + NOISES * noise else []
+                    math.degrees(worst))] if worst > tolerance else []
 
 
 main = partial(cli.run, 'grade', __doc__, add_arguments, _run)

@@ -9,8 +9,7 @@ What is not understood is refused in one line, with what to type.
 import csv
 import math
 import re
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -19,36 +18,20 @@ from zipfile import is_zipfile
 
 import numpy as np
 
+from spinning_top_sim.grade.columns import LENGTHS, READINGS
 from spinning_top_sim.installation import needed
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.kinematics import Reals
 
-
-class Kind(NamedTuple):
-    """Columns of a part of a motion, factors of their units by name, and words that hint at it."""
-
-    columns: Sequence[str]
-    units: Mapping[str, Any]
-    words: str
-
-
-KINDS = {
-    't': Kind('t', {'s': Decimal(1), 'ms': Decimal('1e-3'), 'us': Decimal('1e-6'),
-                    'ns': Decimal('1e-9'), 'iso': Decimal('1e-9')}, 'time|stamp|sec|date|clock'),
-    'attitudes': Kind(('qx', 'qy', 'qz', 'qw'), {'1': 1.0},
-                      'quaternion|quat|qpos|rotation|rot|orientation|attitude|q'),
-    'positions': Kind(('px', 'py', 'pz'), {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3},
-                      'position|pos|translation|p|t'),
-    'gyroscope': Kind(('gx', 'gy', 'gz'), {
-        'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': math.pi / 180.0, 'dps': math.pi / 180.0,
-        'rpm': math.pi / 30.0}, 'gyroscope|gyro|gyr|omega|velocity|rates|rate|g|w'),
-    'accelerations': Kind(('ax', 'ay', 'az'), {
-        'm/s^2': 1.0, 'm/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3},
-        'accelerometer|acceleration|accel|acc|a'),
-    'magnetometer': Kind(('mx', 'my', 'mz'), {
-        'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7},
-        'magnetometer|magnetic|mag|field|m')}
-UNITS = {name: kind.units for kind in KINDS.values() for name in kind.columns}
+TIMES = {'s': Decimal(1), 'ms': Decimal('1e-3'), 'us': Decimal('1e-6'), 'ns': Decimal('1e-9'),
+         'iso': Decimal('1e-9')}
+# Columns of each part of a motion, and factors of their units by name, the first by default.
+PARTS: dict[str, tuple[str, Mapping[str, Any]]] = {
+    't': ('t', TIMES), 'attitudes': ('qx qy qz qw', {'1': 1.0}),
+    'positions': ('px py pz', LENGTHS),
+    **{name: (' '.join(f'{letter}{axis}' for axis in 'xyz'), READINGS[name].units)
+       for name, letter in zip(READINGS, 'gam', strict=True)}}
+UNITS = {name: units for names, units in PARTS.values() for name in names.split()}
 TUM = ['t', 'px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw']
 # Columns of EuRoC's state_groundtruth_estimate0 and imu0, by their names without the unit.
 EUROC = {'timestamp': 't', **{f'{a}_{axis}': f'{b}{axis}' for a, b in (
@@ -66,7 +49,7 @@ class Recorded:
     """
     What is in a file.
 
-    parts : times (n,), ascending [s], and values (n, k) by names of KINDS, SI; attitudes are
+    parts : times (n,), ascending [s], and values (n, k) by names of PARTS, SI; attitudes are
         q(world <- body) as x, y, z, w
     covariance : (3, 3) that the first message of an IMU tells, by name
     first_s, origin_ns : the first stamp, of a table [s] and of a log [ns]
@@ -76,33 +59,30 @@ class Recorded:
 
     parts: dict[str, tuple[Reals, Reals]] = field(default_factory=dict)
     covariance: dict[str, Reals] = field(default_factory=dict)
-    first_s: float = 0.0
+    first_s: Decimal = Decimal(0)
     origin_ns: int = 0
     run: Any = None
     notes: list[str] = field(default_factory=list)
 
     def add(self, kind: str, source: str, times: Reals, values: Reals,
-            where: str | Sequence[int]) -> None:
+            rows: Sequence[str]) -> None:
         """
         Add a part whose times are in seconds from the first stamp of the file.
 
-        where : what a row is called, or the lines of the rows
+        rows : what each row is called
 
         Raises ValueError.
         """
-        def row(at: int) -> str:
-            return _place(where, whole[at])
-
         whole = np.flatnonzero(np.all(np.isfinite(values), axis=1) & np.isfinite(times))
         times, values = times[whole], values[whole]
         steps = np.diff(times)
         for at in np.flatnonzero(steps < 0.0)[:1]:
-            raise ValueError(f'{row(at + 1)}: the time goes back from {times[at]:.9g} to '
+            raise ValueError(f'{rows[whole[at + 1]]}: the time goes back from {times[at]:.9g} to '
                              f'{times[at + 1]:.9g} s: one motion at a time, in a file of its own')
         same = steps == 0.0
         for at in np.flatnonzero(same & np.any(values[1:] != values[:-1], axis=1))[:1]:
-            raise ValueError(f'{row(at + 1)}: another row of {kind} at the time {times[at]:.9g} '
-                             's: write times with more digits')
+            raise ValueError(f'{rows[whole[at + 1]]}: another row of {kind} at the time '
+                             f'{times[at]:.9g} s: write times with more digits')
         if np.any(same):
             self.notes.append(f'{kind}: {np.sum(same)} rows are there twice: used once')
             times, values = times[np.append(True, ~same)], values[np.append(True, ~same)]
@@ -116,8 +96,8 @@ class Recorded:
         if kind == 'attitudes':
             norms = np.linalg.norm(values, axis=1, keepdims=True)
             for at in np.flatnonzero(~(np.abs(norms - 1.0) < NORM))[:1]:
-                raise ValueError(f'{row(at)}: |q| = {float(norms[at, 0]):.4g}: must be 1: these '
-                                 'are no unit quaternions')
+                raise ValueError(f'{rows[whole[at]]}: |q| = {float(norms[at, 0]):.4g}: must be 1: '
+                                 'these are no unit quaternions')
             values = values / norms
         self.parts[kind] = times, values
         self.notes.append(f'{kind} of {source}: {len(times)} rows, {1.0 / usual:.4g} Hz, from '
@@ -133,15 +113,37 @@ class Recorded:
                 raise ValueError(f'{kind} from {at[0]:.6g} to {at[-1]:.6g} s, attitudes from '
                                  f'{times[0]:.6g} to {times[-1]:.6g} s: stamps must be of one '
                                  'clock')
-        if not {'gyroscope', 'accelerations', 'magnetometer'} & self.parts.keys():
+        if not READINGS.keys() & self.parts.keys():
             self.notes.append('no readings: the IMU is not graded')
 
 
 class Table(NamedTuple):
-    """Columns of a file by name, and the lines of its rows, or what a row is called."""
+    """Columns of a file by name, and what its rows are called."""
 
     columns: Mapping[str, Sequence[Any]]
-    where: str | Sequence[int]
+    rows: Sequence[str]
+
+    def cells(self, column: str, parse: Callable[[str], Any]) -> list[Any]:
+        """Return the parsed cells of a column, NaN of an empty one.  Raises ValueError."""
+        found: list[Any] = []
+        for row, cell in zip(self.rows, self.columns[column], strict=True):
+            text = '' if cell is None else str(cell).strip()
+            try:
+                value = parse(text) if text and '_' not in text else math.nan
+            except (InvalidOperation, ValueError):
+                value = math.inf
+            if math.isinf(value) or '_' in text or (math.isnan(value) and parse is not float):
+                raise ValueError(f'{row}: {column} = {text[:40]!r} is no ' + (
+                    'number: correct it, leave it empty, or cut the line off' if parse is float
+                    else 'time: correct it, or cut the line off; of a date say --columns '
+                    f"'t={column}:iso'"))
+            found.append(value)
+        return found
+
+
+def _date(text: str) -> Decimal:
+    """Return the nanoseconds of a date."""
+    return Decimal(int(np.datetime64(text.removesuffix('Z'), 'ns').astype(int)))
 
 
 def read_table(path: Path, said: str | None) -> Recorded:
@@ -157,10 +159,10 @@ def read_table(path: Path, said: str | None) -> Recorded:
         if path.is_dir():
             for part in ('state_groundtruth_estimate0', 'imu0'):
                 _add(recorded, _text(path / part / 'data.csv'), {})
-        elif path.suffix not in READERS:
+        elif path.suffix.lower() not in READERS:
             raise ValueError(f'the name must end in .mcap, {", ".join(READERS)}')
         else:
-            _add(recorded, READERS[path.suffix](path), columns_said(said) if said else {})
+            _add(recorded, READERS[path.suffix.lower()](path), columns_said(said) if said else {})
         recorded.check()
     except (ValueError, EOFError) as error:
         raise ValueError(f'{path}: {one_line(error)}') from error
@@ -184,51 +186,55 @@ def columns_said(text: str) -> Chosen:
         said[name] = []
         for one in filter(None, what.split('+') if name == 't' else [what]):
             column, colon, unit = one.rpartition(':')
-            unit = unit.strip().translate(_SIGNS)
-            if colon and unit not in UNITS[name]:
-                raise ValueError(f'--columns {item.strip()}: the unit must be '
-                                 f'{", ".join(UNITS[name])}')
-            said[name].append((column.strip(), unit) if colon else (
-                one.strip(), next(iter(UNITS[name]))))
+            said[name].append((column.strip(), _unit(name, unit.strip(), item.strip()))
+                              if colon else (one.strip(), next(iter(UNITS[name]))))
     return said
+
+
+def _unit(name: str, unit: str, where: str) -> str:
+    """Return a unit by its name.  Raises ValueError."""
+    unit = unit.translate(_SIGNS)
+    if unit not in UNITS[name]:
+        raise ValueError(f"{where}: the unit must be {', '.join(UNITS[name])}: say "
+                         f"--columns '{name}=COLUMN:UNIT'")
+    return unit
 
 
 # ------------------------------------------------------------------------------------- readers
 
 def _text(path: Path) -> Table:
     try:
-        lines = [(number, line) for number, line in enumerate(
+        lines = [(f'line {number}', line.strip()) for number, line in enumerate(
             path.read_text('utf-8-sig').splitlines(), 1) if line.strip()]
     except UnicodeDecodeError as error:
         raise ValueError(f'no UTF-8 text: {error.reason} at byte {error.start}') from error
-    bare = [(number, line.strip()) for number, line in lines if not line.lstrip().startswith('#')]
+    where = [name for name, line in lines if not line.startswith('#')]
+    bare = [line for _, line in lines if not line.startswith('#')]
     if not bare:
         raise ValueError('the file has no rows')
-    mark = next((mark for mark in ',;\t' if mark in bare[0][1]), ' ')
-    comments = [line.lstrip('# \t') for _, line in lines if line.lstrip().startswith('#')]
+    mark = next((mark for mark in ',;\t' if mark in bare[0]), ' ')
+    comments = [line.lstrip('# \t') for _, line in lines if line.startswith('#')]
     heads, rows = ([[cell.strip() for cell in row] for row in csv.reader(
-        part, delimiter=mark, skipinitialspace=True)]
-        for part in (comments, [line for _, line in bare]))
-    numbers = [number for number, _ in bare]
-    names, *rest = rows
-    if _are_numbers(names):             # no names: those of a comment, or of TUM
-        rest, heads = rows, [head for head in heads if len(head) == len(names)]
-        names = heads[0] if heads else TUM if mark == ' ' and len(names) == len(TUM) else []
+        part, delimiter=mark, skipinitialspace=True)] for part in (comments, bare))
+    if _are_numbers(rows[0]):           # no names: those of a comment, or of TUM
+        count = len(rows[0])
+        names = next((head for head in heads if len(head) == count),
+                     TUM if mark == ' ' and count == len(TUM) else [])
         if not names:
-            raise ValueError(f'line {numbers[0]}: {len(rows[0])} numbers without names: write a '
-                             'line of names such as t,qw,qx,qy,qz above them')
+            raise ValueError(f'{where[0]}: {count} numbers without names: write a line of names '
+                             'such as t,qw,qx,qy,qz above them')
     else:
-        numbers = numbers[1:]
+        names, where, rows = rows[0], where[1:], rows[1:]
     if mark == ' ' and names == ['timestamp', 'tx', 'ty', 'tz', *TUM[4:]]:
         names = TUM
-    for name, count in Counter(filter(None, names)).items():
-        if count > 1:
-            raise ValueError(f'{count} columns are called {name}: each needs a name of its own')
-    for number, row in zip(numbers, rest, strict=True):
+    if twice := [name for name in names if name and names.count(name) > 1]:
+        raise ValueError(f'{len(twice)} columns are called {twice[0]}: each needs a name of its '
+                         'own')
+    for line, row in zip(where, rows, strict=True):
         if len(row) != len(names):
-            raise ValueError(f'line {number} has {len(row)} values, the head {len(names)} names: '
-                             'correct it, or cut it off')
-    return Table(dict(zip(names, zip(*rest, strict=True), strict=True)), numbers)
+            raise ValueError(f'{line} has {len(row)} values, the head {len(names)} names: correct '
+                             'it, or cut it off')
+    return Table(dict(zip(names, zip(*rows, strict=True), strict=True)), where)
 
 
 def _are_numbers(cells: Sequence[str]) -> bool:
@@ -238,11 +244,19 @@ def _are_numbers(cells: Sequence[str]) -> bool:
         return False
 
 
+def _arrays(columns: Mapping[str, Sequence[Any]]) -> Table:
+    lengths = {len(column) for column in columns.values()}
+    if len(lengths) != 1:
+        raise ValueError(f'columns have {", ".join(map(str, sorted(lengths))) or "no"} rows: must '
+                         'have as many')
+    return Table(columns, [f'row {k}' for k in range(*lengths)])
+
+
 def _parquet(path: Path) -> Table:
     with needed('a Parquet file', 'parquet'):
         from pyarrow import parquet  # noqa: PLC0415
     table = parquet.read_table(path)
-    return Table({name: table[name].to_numpy() for name in table.column_names}, 'row')
+    return _arrays({name: table[name].to_numpy() for name in table.column_names})
 
 
 def _npz(path: Path) -> Table:
@@ -254,7 +268,7 @@ def _npz(path: Path) -> Table:
             columns.update({name: values} if values.ndim == 1 else {
                 f'{name}[{k}]': column for k, column in enumerate(values.T)
             } if values.ndim == 2 else {})
-    return Table(columns, 'row')
+    return _arrays(columns)
 
 
 READERS = {'.csv': _text, '.txt': _text, '.tum': _text, '.tsv': _text, '.parquet': _parquet,
@@ -269,106 +283,52 @@ def _add(recorded: Recorded, table: Table, said: Chosen) -> None:
     used = {column for columns in chosen.values() for column, _ in columns}
     if missing := sorted(used - table.columns.keys()):
         raise ValueError(f'--columns {missing[0]}: the file has {", ".join(table.columns)}')
-    unused = [name for name in table.columns if name not in used]
-    for kind, (names, units, _) in KINDS.items():
-        there = [name for name in names if chosen.get(name)]
+    unused = ', '.join(name for name in table.columns if name not in used)
+    for kind, (names, units) in PARTS.items():
+        there = [name for name in names.split() if chosen.get(name)]
         if not there and (kind not in ('t', 'attitudes') or kind in recorded.parts):
-            if kind not in recorded.parts and (hint := _hint(kind, names, unused)):
-                recorded.notes.append(f'{kind}: none; {hint}')
             continue
-        if missing := [name for name in names if name not in there]:
-            raise ValueError(f'no column {", ".join(missing)}; ' + (
-                _hint(kind, missing, unused) or f'the file has {", ".join(unused) or "no other"}'
-                + ', and Euler angles are not read' * (kind == 'attitudes')))
-        source = ', '.join(column if f'[{unit}]' in column else f'{column} [{unit}]'
-                           for name in names for column, unit in chosen[name])
+        if missing := [name for name in names.split() if name not in there]:
+            what = ', '.join(f'{name}=COLUMN' + ':UNIT' * (len(units) > 1) for name in missing)
+            raise ValueError(f'no column {", ".join(missing)}: name {unused or "them"}, by '
+                             f"--columns '{what}'" + (
+                                 f' with a UNIT of {", ".join(units)}' if len(units) > 1 else
+                                 '; Euler angles are not read'))
+        source = ', '.join(f'{column} [{unit}]' if unit != '1' and f'[{unit}]' not in column else
+                           column
+                           for name in names.split() for column, unit in chosen[name])
         if kind == 't':
-            stamps: Any = sum(units[unit] * np.array([*_decimals(column, unit, table)], object)
-                              for column, unit in chosen['t'])
-            first = min(stamps, default=Decimal(0))
-            times = (stamps - first).astype(float)
+            stamps: Any = sum(units[unit] * np.array(
+                table.cells(column, _date if unit == 'iso' else Decimal), object)
+                for column, unit in chosen['t'])
             if not recorded.parts:
-                recorded.first_s = float(first)
-                recorded.notes.append(f'times of {source}: the first is {first:.12g} s')
+                recorded.first_s = min(stamps, default=Decimal(0))
+                recorded.notes.append(f'times of {source}: the first is '
+                                      f'{float(recorded.first_s):.12g} s')
+            times = (stamps - recorded.first_s).astype(float)
         else:
-            recorded.add(kind, source, times, np.stack([units[unit] * np.fromiter(
-                _numbers(column, table), float) for ((column, unit),) in map(
-                    chosen.__getitem__, names)], axis=1), table.where)
+            recorded.add(kind, source, times, np.stack([units[unit] * np.array(
+                table.cells(column, float)) for name in names.split()
+                for column, unit in chosen[name]], axis=1), table.rows)
     if unused:
-        recorded.notes.append(f'not used: {", ".join(unused)}')
+        recorded.notes.append(f'not used: {unused}')
 
 
 def _ours(columns: Mapping[str, Sequence[Any]]) -> Chosen:
     """Return the columns that have our names, with or without a unit in brackets, or EuRoC's."""
-    euroc = {column: EUROC.get(re.sub(r'\s*\[.*', '', column.lstrip('#').strip()))
-             for column in columns}
-    if {'t', 'qw'} <= {*euroc.values()} or {'t', 'gx', 'ax'} <= {*euroc.values()}:
-        return {name: [(column, 'ns' if name == 't' else next(iter(UNITS[name])))]
-                for column, name in euroc.items() if name}
+    bare = {column: re.sub(r'\s*\[.*', '', column.lstrip('#').strip()) for column in columns}
+    if {'timestamp', 'q_RS_w'} <= {*bare.values()} or {'timestamp', 'w_RS_S_x'} <= {
+            *bare.values()}:
+        return {EUROC[name]: [(column, 'ns' if name == 'timestamp' else next(iter(
+            UNITS[EUROC[name]])))] for column, name in bare.items() if name in EUROC}
     found: Chosen = {}
-    for column in columns:
-        matched = re.fullmatch(r'(\w+)(?: ?\[([^\]]*)\])?', column)
-        name, unit = matched.groups() if matched else ('', None)
+    for column, name in bare.items():
         if name not in UNITS:
             continue
-        unit = next(iter(UNITS[name])) if unit is None else unit.translate(_SIGNS)
-        if unit not in UNITS[name] or name in found:
-            raise ValueError(f"{column}: say which column is {name}, in {', '.join(UNITS[name])}: "
-                             f"--columns '{name}={column}:UNIT'")
-        found[name] = [(column, unit)]
+        if name in found:
+            raise ValueError(f"{column}: say which column is {name}: --columns "
+                             f"'{name}={column}:UNIT'")
+        unit = re.search(r'\[(.*)\]', column)
+        found[name] = [(column, _unit(name, unit[1], column) if unit and unit[1] else next(iter(
+            UNITS[name])))]
     return found
-
-
-def _hint(kind: str, names: Sequence[str], unused: Sequence[str]) -> str:
-    """Return what to type where columns may be meant by others, '' if none may be."""
-    found: dict[str, list[str]] = {name: [] for name in names}
-    for column in unused:
-        flat = re.sub('[^a-z0-9]+', '_', column.lower())
-        matched = re.search(f'({KINDS[kind].words}|^t$)' if kind == 't' else
-                            f'(?:^|_)(?:{KINDS[kind].words})_?([wxyz0-9])(?:_|$)', flat)
-        for name in names:
-            if matched and (kind == 't' or matched[1] in (name[-1], *'0123456789')):
-                found[name].append(column)
-    if not all(found.values()):
-        return ''
-    unit = '1' if kind == 'attitudes' else 'UNIT'
-    meant = ', '.join(f'{name}={columns[0] if len(columns) == 1 else "COLUMN"}:{unit}'
-                      for name, columns in found.items())
-    of = dict.fromkeys(column for columns in found.values() for column in columns)
-    return f"if it is {', '.join(of)}: --columns '{meant}'" + (
-        f' with a UNIT of {", ".join(KINDS[kind].units)}' if unit == 'UNIT' else '')
-
-
-def _place(where: str | Sequence[int], row: int) -> str:
-    return f'{where} {row}' if isinstance(where, str) else f'line {where[row]}'
-
-
-def _decimals(column: str, unit: str, table: Table) -> Iterator[Decimal]:
-    """Yield times, as nanoseconds of a date.  Raises ValueError."""
-    for row, cell in enumerate(table.columns[column]):
-        text = str(cell).strip()
-        try:
-            time = Decimal(int(np.datetime64(text.removesuffix('Z'), 'ns').astype(int))) if (
-                unit == 'iso') else Decimal(text)
-        except (InvalidOperation, ValueError):
-            time = Decimal('NaN')
-        if not time.is_finite():
-            raise ValueError(f'{_place(table.where, row)}: {column} = {text[:40]!r} is no time' + (
-                ': write decimal points' if re.fullmatch(r'-?\d+,\d+', text) else
-                f": cut a row of units off, and say --columns 't={column}:{text}'"
-                if text in UNITS['t'] else f"; of a date say --columns 't={column}:iso'"))
-        yield time
-
-
-def _numbers(column: str, table: Table) -> Iterator[float]:
-    """Yield numbers, NaN of an empty cell.  Raises ValueError."""
-    for row, cell in enumerate(table.columns[column]):
-        text = '' if cell is None else str(cell).strip()
-        try:
-            value = math.nan if text in ('', 'nan', 'NaN') else float(text)
-        except ValueError:
-            value = math.inf
-        if math.isinf(value) or '_' in text:
-            raise ValueError(f'{_place(table.where, row)}: {column} = {text[:40]!r} is no number: '
-                             'correct it, leave it empty, or cut the line off')
-        yield value

@@ -80,7 +80,8 @@ def _choose(recorded: Recorded, found: Mapping[str, Mapping[str, list[Sample]]],
             recorded.covariance[kind] = covariance.reshape(3, 3)
         recorded.add(kind, rows[0].source, np.array([
             1e-9 * ((row.stamp_ns or row.log_ns) - origin) for row in rows]),
-            np.array([row.values for row in rows]), 'message')
+            np.array([row.values for row in rows]),
+                     [f'message {k}' for k in range(len(rows))])
     if unused := sorted(sources - {rows[0].source for rows in chosen.values()}):
         recorded.notes.append(f'not used: {", ".join(unused)}')
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from spinning_top_sim.grade.grader import grade
+from spinning_top_sim.grade.simulators import grade
 from spinning_top_sim.tools.report import Report, passing
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
-from spinning_top_sim.grade.effects import Imu
+from spinning_top_sim.grade.columns import Imu
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.tools.kinematics import Reals
@@ -34,17 +34,8 @@ class Body(Imu, Top):
             if value.shape != (length,) or not np.all(np.isfinite(value)):
                 raise ValueError(f'{name} = {getattr(self, name)!r}: must be {length} finite '
                                  'numbers')
-            object.__setattr__(self, name, tuple(value.tolist()))
         if abs(math.hypot(*self.mounting) - 1.0) > 1e-6:
             raise ValueError(f'mounting = {self.mounting!r}: its norm must be 1')
-        for name in ('gyroscope_noise_density', 'accelerometer_noise_density'):
-            if not 0.0 <= (getattr(self, name) or 0.0) < math.inf:
-                raise ValueError(f'{name} = {getattr(self, name)!r}: must be >= 0, or None')
-
-    @classmethod
-    def of(cls, top: Top, **imu: object) -> Self:
-        """Return the body of a top; `imu` are the parameters of `Imu`, by default those above."""
-        return top if isinstance(top, cls) and not imu else cls(**{**vars(top), **imu})
 
     @property
     def inertia(self) -> tuple[float, float, float]:

@@ -8,12 +8,11 @@ coefficients of columns and their uncertainty.
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from spinning_top_sim.tools.report import Finding
 
 Reals = NDArray[np.float64]
 
@@ -32,7 +31,23 @@ NEAR = 0.25             # distance of a coefficient from the value that it has f
 # most AS_GOOD_SHARE of what there was, but no more than the noise.
 AS_GOOD, AS_GOOD_SHARE = 2.0, 0.02
 
-Judge = Callable[[Reals], Finding | None]   # of the coefficients of a cause; None: no fault
+
+class Verdict(NamedTuple):
+    """
+    What the coefficients of a cause mean.
+
+    name : of the fault; '': none, it explains as a known property does
+    evidence, number : as of a `Finding`
+    undo : the matrix (3, 3) by which a reading was multiplied, if it can be undone
+    """
+
+    name: str
+    evidence: str
+    number: float = math.nan
+    undo: Reals | None = None
+
+
+Judge = Callable[[Reals], Verdict | None]   # of the coefficients of a cause; None: it is not this
 
 
 class Cause(NamedTuple):
@@ -78,8 +93,8 @@ def autocorrelation_time(values: Reals) -> float:
 
 def instead(name: str, evidence: str) -> Judge:
     """Return a judge of the last two columns: the second effect is there instead of the first."""
-    def judge(found: Reals) -> Finding | None:
-        return Finding(name, evidence) if np.allclose(found[-2:], (-1.0, 1.0), atol=NEAR) else None
+    def judge(found: Reals) -> Verdict | None:
+        return Verdict(name, evidence) if np.allclose(found[-2:], (-1.0, 1.0), atol=NEAR) else None
     return judge
 
 
@@ -91,53 +106,52 @@ def pooled(parts: Iterable[tuple[Reals, Mapping[str, Reals]]]) -> tuple[Reals, d
 
 
 def explain(target: Reals, effects: Mapping[str, Reals], causes: Sequence[Cause],
-            floor: float = 0.0, always: Sequence[str] = (),
-            ) -> tuple[list[tuple[Cause, Finding]], Reals]:
+            floor: float = 0.0, always: Sequence[str] = ()) -> list[Cause]:
     """
-    Explain a discrepancy (N, 3) by causes, the best one first.
+    Return the causes that explain a discrepancy (N, 3), the best one first.
 
     effects : by name, change of what is compared by an effect of size 1 (N, 3)
     floor : rms of the noise in the target, 0 if it is not known
-    always : names of effects of a size that is not known; their coefficients come before those of
-        the cause in what a judge gets
-
-    Returns the causes with their faults, and what is left.  A fault without a name is none: it
-    explains, as a known property does.
+    always : names of effects of a size that is not known
     """
-    chosen: list[Cause] = []
-    found, residual = fitted(target, [effects[name] for name in always]) if always else (
-        np.empty(0), target)
-    first, others = len(always), [*causes]
+    def fit_of(causes: Sequence[Cause]) -> tuple[Reals, Reals]:
+        names = [*always, *(name for cause in causes for name in cause.effects)]
+        return fitted(target, [effects[name] for name in names]) if names else (
+            np.empty(0), target)
+
+    chosen, others, residual = list[Cause](), [*causes], fit_of([])[1]
     enough = max(ENOUGH * beyond(residual, floor), ENOUGH_OF_NOISE * floor)
-
-    def judged(cause: Cause, part: Reals) -> Finding | None:
-        assert cause.judge is not None
-        return cause.judge(np.append(part[:first], part[-len(cause.effects):]))
-
     while len(chosen) < MOST_CAUSES and (before := beyond(residual, floor)) > enough:
-        tried = [fitted(target, [effects[name] for name in (*always, *(
-            name for known in (*chosen, cause) for name in known.effects))]) for cause in others]
+        tried = [fit_of([*chosen, cause]) for cause in others]
         # A cause with a judge that names no fault explains nothing.
-        after = [np.inf if cause.judge and judged(cause, part) is None else beyond(left, floor)
-                 for cause, (part, left) in zip(others, tried, strict=True)]
+        after = [np.inf if verdicts([*chosen, cause], found, len(always))[-1] is None else
+                 beyond(left, floor) for cause, (found, left) in zip(others, tried, strict=True)]
         good = max(AS_GOOD * min(after), min(AS_GOOD_SHARE * before, floor or np.inf))
         # Of equally good causes the one with the fewest columns wins, for more columns always fit
         # better, then the one that is named first.
         _, _, best = min((len(cause.effects), max(left, good / AS_GOOD), k) for k, (
             cause, left) in enumerate(zip(others, after, strict=True)) if left <= good)
-        left = after[best]
-        if left > WORTHWHILE * before:
+        if after[best] > WORTHWHILE * before:
             break
-        found, residual = tried[best]
         chosen.append(others.pop(best))
-    pairs = []
-    for cause in chosen:
-        width = len(cause.effects)
-        fault = cause.judge(np.append(found[:len(always)], found[first:first + width])) \
-            if cause.judge else None
-        pairs.append((cause, fault or Finding('', 'no fault')))
-        first += width
-    return pairs, residual
+        residual = tried[best][1]
+    return chosen
+
+
+def parts(causes: Sequence[Cause], first: int = 0) -> list[tuple[Cause, slice]]:
+    """Return causes with the places of their coefficients, from the first one on."""
+    ends = np.cumsum([first, *(len(cause.effects) for cause in causes)]).tolist()
+    return [(cause, slice(*pair)) for cause, pair in zip(causes, pairwise(ends), strict=True)]
+
+
+def verdicts(causes: Sequence[Cause], found: Reals, always: int = 0) -> list[Verdict | None]:
+    """
+    Return what the coefficients of causes mean, each; None: it is not this.
+
+    found : coefficients, of `always` effects of unknown size and then of causes
+    """
+    return [cause.judge(np.append(found[:always], found[of])) if cause.judge else
+            Verdict('', 'no fault') for cause, of in parts(causes, always)]
 
 
 def fitted(target: Reals, columns: Sequence[Reals]) -> tuple[Reals, Reals]:

@@ -10,7 +10,7 @@ own bias.  The noise of what comes out follows from the white noise of the poses
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import pairwise
 
@@ -26,14 +26,20 @@ Parts = Mapping[str, tuple[Reals, Reals]]       # times (n,) [s] and values (n, 
 _FIRST = np.array([0.0, 5.0 / 6, -5.0 / 21, 5.0 / 84, -5.0 / 504, 1.0 / 1260])
 _SECOND = np.array([-5269.0 / 1800, 5.0 / 3, -5.0 / 21, 5.0 / 126, -5.0 / 1008, 1.0 / 3150])
 FIRST, SECOND = np.append(-_FIRST[:0:-1], _FIRST), np.append(_SECOND[:0:-1], _SECOND)
+TENTH = _SECOND[-1] * np.array([(-1) ** k * math.comb(10, k) for k in range(11)])
 SIDE = 5                        # samples that a derivative needs on each side
 WIDTHS = 1, 3, 5, 9, 15, 25, 41, 65     # of kernels [samples]
 ORDER = 10                      # of the differences in which motions vanish and noise does not
+# The relative standard deviation of white noise by n of them, times sqrt(n).
+SPREAD = math.sqrt(0.5 * math.comb(4 * ORDER, 2 * ORDER)) / math.comb(2 * ORDER, ORDER)
 MEDIAN = 0.6745                 # of the absolute values of normal noise, in standard deviations
 GAP = 2.5                       # intervals that are a gap
 EVEN = 1e-4                     # share of the interval by which stamps may be uneven
 DEGREE = 5                      # of the splines between samples
 LEAST = 60                      # samples of a stretch
+# Errors of samples that are left out, over the median, and over the second derivative; the largest
+# share of such samples.
+OUTLIER, ROUGH, FEW = 20.0, 1e-3, 0.1
 
 
 @cache
@@ -91,6 +97,7 @@ class Stretch:
     sigma : white noise of the attitudes about each axis [rad], of positions [m], of readings
     intervals : between the samples of each, as they were read [s]
     rates : (n, 3) in the body, where they are known better than by the attitudes [rad/s]
+    covariance : (3, 3) that is declared, by name of the reading
     """
 
     t: Reals
@@ -100,24 +107,24 @@ class Stretch:
     sigma: Mapping[str, float] = field(default_factory=dict)
     intervals: Mapping[str, float] = field(default_factory=dict)
     rates: Reals | None = None
+    covariance: Mapping[str, Reals] = field(default_factory=dict)
 
     @property
     def step(self) -> float:
         """Interval between samples [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
+    def part(self, chosen: slice) -> 'Stretch':
+        """Return some of the samples."""
+        return replace(self, t=self.t[chosen], rotation=self.rotation[chosen],
+                       positions=self.positions[chosen], readings={
+                           name: values[chosen] for name, values in self.readings.items()})
+
     @cached_property
     def matrices(self) -> Reals:
         """The rotations (n, 3, 3)."""
         matrices: Reals = self.rotation.as_matrix()
         return matrices
-
-    def noise(self, width: int) -> tuple[float, float, float, float]:
-        """Return the noise of turns, of rates, of R^T R'' and of accelerations of the origin."""
-        turns, places = self.sigma.get('attitudes', 0.0), self.sigma.get('positions', 0.0)
-        first, second = (gain(width, weights) / self.step ** k
-                         for k, weights in ((1, FIRST), (2, SECOND)))
-        return turns * gain(width), turns * first, turns * second, places * second
 
 
 class Smoothed:
@@ -129,6 +136,8 @@ class Smoothed:
     second : R^T R'' (m, 3, 3): its antisymmetric part is that of the angular acceleration, its
         symmetric part that of w x (w x ..) [1/s^2]
     acceleration : of the origin, along axes of the body (m, 3) [m/s^2]
+    noise : of turns, of rates, of R^T R'' and of accelerations of the origin
+    smooth : samples (m,) where no force sets in, so that a derivative of samples holds
     """
 
     def __init__(self, body: Stretch, width: int) -> None:
@@ -144,8 +153,20 @@ class Smoothed:
             change = correlate1d(body.rates, FIRST, axis=0)[self.inner] / body.step
             self.rates, turning = body.rates[self.inner], _hat(body.rates[self.inner])
             self.second = _hat(change) + turning @ turning
-        places = correlate1d(self._convolved(body.positions), SECOND, axis=0)[self.inner]
-        self.acceleration = along(self.back, places / body.step ** 2)
+        places = self._convolved(body.positions)
+        self.acceleration = along(self.back, correlate1d(places, SECOND, axis=0)[self.inner]
+                                  / body.step ** 2)
+        one, two = (gain(width, weights) / body.step ** k
+                    for k, weights in ((1, FIRST), (2, SECOND)))
+        turns, moves = body.sigma.get('attitudes', 0.0), body.sigma.get('positions', 0.0)
+        self.noise = turns * gain(width), turns * one, turns * two, moves * two
+        self.smooth = np.ones(len(self.rates), bool)
+        for values in (smooth, places):
+            error, size = (np.linalg.norm(correlate1d(values, weights, axis=0)[self.inner], axis=1)
+                           for weights in (TENTH, SECOND))
+            self.smooth &= error <= np.maximum(OUTLIER * np.median(error), ROUGH * np.median(size))
+        if np.mean(self.smooth) < 1.0 - FEW:
+            self.smooth[:] = True
 
     def _convolved(self, values: Reals) -> Reals:
         if self.width == 1:

@@ -4,7 +4,7 @@
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from spinning_top_sim.tools import cli
@@ -88,6 +88,13 @@ class Report:
         """Values of the marks by name; NaN: could not be measured."""
         return {name: mark.value for name, mark in self.marks.items()}
 
+    def plus(self, *others: 'Report') -> 'Report':
+        """Return this report with what others have found, measured and noted."""
+        every = self, *others
+        return replace(self, found=[one for report in every for one in report.found],
+                       marks={name: one for report in every for name, one in report.marks.items()},
+                       notes=[one for report in every for one in report.notes])
+
     def __str__(self) -> str:
         lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.faults)}',
                  *(f'  {finding.name}: {finding.evidence}' for finding in self.found),
@@ -95,15 +102,27 @@ class Report:
         return '\n'.join([*lines, *(f'  {line}' for line in self.mark_lines())])
 
     def mark_lines(self) -> list[str]:
-        """Return the marks as a table, without those that could not be measured."""
+        """
+        Return the marks as a table, without those that could not be measured.
+
+        Those that are called 'MARK: SCENE' are a table of their own, scene by mark.
+        """
         known = {name: mark for name, mark in self.marks.items() if not math.isnan(mark.value)}
-        rows = [('measure', 'value', 'limit', ''),
-                *((name, f'{mark.value:.4g}',
-                   '' if math.isnan(mark.limit) else f'{mark.limit:.4g}', mark.meaning)
-                  for name, mark in known.items())]
-        width = max(len(row[0]) for row in rows)
-        return [f'{name:<{width}}{value:>12}{limit:>9}  {meaning}'.rstrip()
-                for name, value, limit, meaning in rows] if known else []
+        scenes: dict[str, dict[str, Mark]] = {}
+        for name, mark in known.items():
+            if ': ' in name:
+                what, _, scene = name.partition(': ')
+                scenes.setdefault(scene, {})[what] = mark
+        columns = list(dict.fromkeys(what for marks in scenes.values() for what in marks))
+        limits = {what: mark.limit for marks in scenes.values() for what, mark in marks.items()}
+        by_scene = [('scene', *columns), *((scene, *(
+            f'{marks[what].value:.4g}' if what in marks else '' for what in columns))
+            for scene, marks in scenes.items()), ('limit', *map(_limit, limits.values()))]
+        others = [('measure', 'value', 'limit', ''), *(
+            (name, f'{mark.value:.4g}', _limit(mark.limit), f'  {mark.meaning}')
+            for name, mark in known.items() if ': ' not in name)]
+        return [*(_aligned(by_scene) if scenes else ()),
+                *(_aligned(others) if len(others) > 1 else ())]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON can hold it; None: NaN or infinity."""
@@ -117,6 +136,18 @@ class Report:
     def as_json(self) -> str:
         """Return `as_dict` as JSON."""
         return json.dumps(self.as_dict(), indent=2)
+
+
+def _limit(value: float) -> str:
+    return '' if math.isnan(value) else f'{value:.4g}'
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows as lines: names to the left, numbers to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [''.join(cell if cell.startswith(' ') else f'{cell:<{width}}' if k == 0 else
+                    f'  {cell:>{max(width, 9)}}' for k, (cell, width) in enumerate(
+                        zip(row, widths, strict=True))).rstrip() for row in rows]
 
 
 def number(value: float) -> float | None:

@@ -8,18 +8,17 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade import sensors
-from spinning_top_sim.grade.effects import STANDARD_GRAVITY, Comparison, Imu
+from spinning_top_sim.grade.causes import OFFSETS, judge
+from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, Comparison, Imu
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import Convention
-from spinning_top_sim.tools.identify import rms
+from spinning_top_sim.tools.identify import beyond
 from spinning_top_sim.tools.kinematics import Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
-READINGS = 'gyroscope', 'accelerations', 'magnetometer'
-WORLDS = 'east-up-south', 'north-up-east'       # with y up; a z that is down is a sign of gravity
 EXCERPT = 3000                  # samples by which a convention is found
-WRONG, RIGHT = 0.2, 0.3         # share of a reading left in ours, of that in another convention
+# Share of a reading left in ours, of that in another convention, and of the reading there.
+WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
 HELD_RUNS, HELD_SHARE = 20, 0.9     # runs of equal readings that are a hold, and as long as usual
 
 
@@ -37,7 +36,8 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     imu : Imu, optional
         What is known of it; default: nothing, along axes of the body.
     gravity, exact_gravity : float, bool
-        Where the body is [m/s^2]; whether that of another place on Earth is a fault.
+        Where the body is [m/s^2]; whether its place is known: then gravity of another one is a
+        fault, and without positions the origin is at rest.
     covariance : mapping, optional
         Covariances (3, 3) that are declared, by name.
     subject : str
@@ -46,11 +46,14 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     imu, parts, faults = imu or Imu(), dict(parts), list[Finding]()
     for name, (times, values) in parts.items():
         new = np.append(True, np.any(values[1:] != values[:-1], axis=1))
-        if name in READINGS and (count := held(np.diff(np.flatnonzero(new)))):
-            faults.append(Finding('held', f'{name}: each reading is told {count:.3g} times: '
-                                  'the sensor, or the log, is slower than its stamps', count))
+        if count := held(np.diff(np.flatnonzero(new))):
+            faults.append(Finding('held', f'{name}: each row is told {count:.3g} times: the '
+                                  'sensor, or the log, is slower than its stamps', count))
+            if name not in READINGS:
+                return Report(subject, faults, {}, ['beside held poses readings are not graded'])
             parts[name] = times[new], values[new]
     bodies, left_out = stretches(parts)
+    bodies = [replace(body, covariance=covariance or {}) for body in bodies]
     notes = [f'{left_out:.3g} s in gaps, or between them, are not graded'] if left_out else []
     if not bodies:
         return Report(subject, faults, {}, [*notes, 'no part without a gap is long enough'])
@@ -58,12 +61,10 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
     if convention.parts:
         faults.append(Finding('convention', f'attitudes are told as {convention.name}; this is '
                               'undone'))
-        bodies = [undone(one, convention) for one in bodies]
-    judged = [sensors.judge(name, bodies, imu, gravity, exact_gravity=exact_gravity,
-                            covariance=(covariance or {}).get(name)) for name in READINGS]
-    return Report(subject, [*faults, *(fault for one in judged for fault in one.faults)],
-                  {name: mark for one in judged for name, mark in one.marks.items()},
-                  [*notes, *(note for one in judged for note in one.notes)])
+        bodies = [undone(body, convention) for body in bodies]
+    return Report(subject, faults, {}, notes).plus(*(
+        judge(name, bodies, imu, gravity, exact_gravity=exact_gravity,
+              placed=exact_gravity or 'positions' in parts) for name in READINGS))
 
 
 def held(runs: Reals) -> float:
@@ -85,41 +86,38 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     """
     Return how attitudes are told: ours, unless another explains readings that ours does not.
 
-    Axes of the sensor are left to the readings.
+    Axes of the sensor are left to the readings, and a z that is down to the sign of gravity.
     """
     ours, *others = [one for one in conventions.group() if not any(
         part.startswith('sensor') for part in one.parts)]
-    body = excerpt(max(bodies, key=lambda one: len(one.t)))
-    present = [name for name in READINGS[:2] if name in body.readings]
-    before = np.array([_left(name, body, imu, gravity) for name in present])
-    if not present or np.max(before) < WRONG:
+    body = max(bodies, key=lambda one: len(one.t))
+    angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
+    first = int(np.argmax(angles[EXCERPT:] - angles[:-EXCERPT])) if len(angles) > EXCERPT else 0
+    body = body.part(slice(first, first + EXCERPT))     # in which it turns the most
+
+    def left(convention: Convention, sign: float = 1.0) -> Reals:
+        told = undone(body, convention)
+        return np.array([_left(Comparison(name, [told], imu, sign * gravity))
+                         for name in present])
+
+    present = [name for name in ('gyroscope', 'accelerations') if name in body.readings]
+    before = left(ours)
+    enough = min(RIGHT * float(np.max(before, initial=0.0)), SMALL)
+    if np.max(before, initial=0.0) < WRONG or np.max(left(ours, -1.0)) < enough:
         return ours
-    after = np.array([[_left(name, undone(body, one), imu, gravity) for name in present]
-                      for one in others])
+    after = np.array([left(one) for one in others])
     # No reading may agree less.
     worst = np.where(np.any(after > 1.5 * before + 1e-3, axis=1), np.inf, np.max(after, axis=1))
     # Of equally good ones the first has the fewest parts.
     best = int(np.argmax(worst <= 1.5 * np.min(worst) + 1e-6))
-    return others[best] if worst[best] < RIGHT * np.max(before) else ours
+    return others[best] if worst[best] < enough else ours
 
 
-def excerpt(body: Stretch) -> Stretch:
-    """Return the part of a motion, of EXCERPT samples at most, in which it turns the most."""
-    angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
-    first = int(np.argmax(angles[EXCERPT:] - angles[:-EXCERPT])) if len(angles) > EXCERPT else 0
-    part = slice(first, first + EXCERPT)
-    return replace(body, t=body.t[part], rotation=body.rotation[part],
-                   positions=body.positions[part],
-                   readings={name: values[part] for name, values in body.readings.items()})
-
-
-def _left(name: str, body: Stretch, imu: Imu, gravity: float) -> float:
+def _left(comparison: Comparison) -> float:
     """Return the share of a reading that is not the right one, in any unit."""
-    comparison = Comparison(name, [body], imu, gravity)
-    if not comparison.smoothed:
+    if not comparison.motions:
         return 0.0
-    compared = comparison.compare(0)
-    found, _, residual = compared.fit(['total', *compared.always, *sensors.OFFSETS])
-    right = any(abs((1.0 + found[0]) / size - 1.0) < 0.1
-                for size in (1.0, *sensors.UNITS[name].values()))
-    return rms(residual) if right else 1.0
+    comparison.compare(0)
+    found, _, residual = comparison.fit(['total', *comparison.always, *OFFSETS])
+    right = any(abs((1.0 + found[0]) * size - 1.0) < 0.1 for size in comparison.units.values())
+    return beyond(residual, comparison.floor) if right else 1.0

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs a simulator through the scenes, and grades what it returns beside the exact motions."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spinning_top_sim.grade import dynamics
+from spinning_top_sim.grade.causes import judge
+from spinning_top_sim.grade.columns import KINDS, READINGS
+from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
+from spinning_top_sim.physics.states import relative_drift
+from spinning_top_sim.physics.top import State
+from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.tools import conventions
+from spinning_top_sim.tools.cli import one_line, progress
+from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, white
+from spinning_top_sim.tools.report import Finding, Mark, Report
+
+Simulate = Callable[[Body, Start, Reals, float], Any]
+# The largest error of an attitude that is no fault [rad].
+TOLERANCE = math.radians(0.1)
+EARLY = 24              # samples at the start by which a convention is known
+WRONG, RIGHT = math.radians(10.0), 0.2      # of their error, in ours, and as a share in another
+MOST = 0.7              # that the top turns in a step [rad]: in longer ones rates are not known
+NORM = 1e-2             # by which the norm of a quaternion may differ from 1
+
+
+class InvalidTrajectoryError(ValueError):
+    """A simulator has returned no motion; the text names what and why."""
+
+
+def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
+          scenes: Sequence[Scene] = SCENES, seed: int = 0, tolerance: float = TOLERANCE,
+          subject: str | None = None) -> Report:
+    """
+    Grade a simulator.
+
+    Parameters
+    ----------
+    run : callable
+        ``run(top, start, times, dt)`` simulates a `Body` from a `Start` with steps of dt [s] and
+        returns the motion at the times (n,) [s]: attitudes q(world <- body) as x, y, z, w (n, 4),
+        or a mapping or an object with `attitudes` and any of `rates`, angular velocities of the
+        state in the body (n, 3) [rad/s], `gyroscope`, `accelerations`, `magnetometer`, readings
+        in the frame of the IMU (n, 3), SI, and `covariance` of the first two, (3, 3) by name or
+        one for both.  The first time is 0, and all are multiples of dt.
+    dt : float
+        The step [s].  Samples are dt apart, also where the order of convergence is measured with
+        smaller steps.  A scene in which the top turns by more than 0.7 rad in a step is left out.
+    body : Body
+        The top and the IMU on it.
+    scenes : sequence of Scene
+        Motions to run.
+    seed : int
+        Determines how the top is turned at the start.
+    tolerance : float
+        Largest error of an attitude that is no fault [rad].
+    subject : str, optional
+        Name of the simulator; default: that of `run`.
+
+    Raises
+    ------
+    TypeError
+        If `run` cannot be called.
+    ValueError
+        Naming the argument, its value and what is allowed.
+    """
+    if not callable(run):
+        raise TypeError(f'run = {run!r}: must be run(top, start, times, dt)')
+    if not 0.0 < dt <= 1.0:
+        raise ValueError(f'dt = {dt!r} s: must be in (0, 1]')
+    if not scenes:
+        raise ValueError(f'scenes = {scenes!r}: must have one at least')
+    judgement, notes = Judgement(body, dt, tolerance), list[str]()
+    with progress('graded', len(scenes), 'scenes') as show:
+        for number, scene in enumerate(scenes):
+            show(number)
+            start = scene.start_of(body, seed)
+            if dt * max(*map(abs, start.rates), abs(start.l3) / body.lambda1) > MOST:
+                notes.append(f'{scene.name}: the top turns by more than {MOST:g} rad in a step: '
+                             'not graded')
+                continue
+            try:
+                judgement.run(run, scene, start)
+            except InvalidTrajectoryError as error:
+                judgement.faults.append(Finding('invalid_output', f'{scene.name}: {error}'))
+    if len(notes) == len(scenes):
+        raise ValueError(f'dt = {dt!r} s: the top turns by more than {MOST:g} rad in a step')
+    subject = one_line(subject or getattr(run, '__name__', type(run).__name__))
+    return Report(subject, judgement.faults, {}, notes).plus(*judgement.reports())
+
+
+def told_motion(said: Any, times: Reals) -> Stretch:
+    """Return the motion that a run has said.  Raises InvalidTrajectoryError."""
+    names = 'attitudes', *KINDS, 'covariance'
+    if not isinstance(said, Mapping):
+        said = {name: getattr(said, name, None) for name in names} if (
+            hasattr(said, 'attitudes')) else {'attitudes': said}
+    said = {str(name): part for name, part in said.items() if part is not None}
+    if 'attitudes' not in said:
+        raise InvalidTrajectoryError(f'what is returned has {sorted(said) or "nothing"}: must '
+                                     'have attitudes')
+    attitudes = _numbers('attitudes', said['attitudes'], (len(times), 4))
+    norms = np.linalg.norm(attitudes, axis=1)
+    for at in np.flatnonzero(np.abs(norms - 1.0) > NORM)[:1]:
+        raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
+                                     'must be 1')
+    told, noisy = said.get('covariance', {}), [name for name in KINDS if KINDS[name].density]
+    if not isinstance(told, Mapping):
+        told = dict.fromkeys(noisy, told)
+    if others := [*map(str, told.keys() - {*noisy})]:
+        raise InvalidTrajectoryError(f'covariance of {", ".join(others)}: must be of '
+                                     f'{" or ".join(noisy)}')
+    readings = {name: _numbers(name, said[name], (len(times), 3)) for name in KINDS
+                if name in said}
+    return Stretch(
+        times, Rotation.from_quat(attitudes), np.zeros((len(times), 3)), readings,
+        {name: white(values, jumps=False) for name, values in readings.items()},
+        covariance={name: _numbers(f'covariance of {name}', matrix, (3, 3))
+                    for name, matrix in told.items()})
+
+
+def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
+    """Return an array of this shape.  Raises InvalidTrajectoryError."""
+    try:
+        numbers = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InvalidTrajectoryError(f'{name}: {error}') from error
+    if numbers.shape != shape:
+        raise InvalidTrajectoryError(f'{name} has shape {numbers.shape}: must be {shape}')
+    for at in np.argwhere(~np.isfinite(numbers))[:1]:
+        raise InvalidTrajectoryError(f'{name}{at.tolist()} = {numbers[tuple(at)]}: must be finite')
+    return numbers
+
+
+@dataclass
+class Motion:
+    """What is told of a motion from a start, and its angles to the exact attitudes (n,) [rad]."""
+
+    name: str
+    start: State
+    told: Stretch
+    errors: Reals
+
+    @property
+    def worst(self) -> float:
+        """The largest error [rad]."""
+        return float(np.max(self.errors))
+
+
+class Judgement:
+    """Motions of a body beside the exact ones; `reports` judges them."""
+
+    def __init__(self, body: Body, dt: float, tolerance: float) -> None:
+        self.body, self.dt, self.tolerance = body, dt, tolerance
+        self.motions: list[Motion] = []
+        self.faults: list[Finding] = []
+        self.orders: dict[str, float] = {}
+
+    def run(self, run: Simulate, scene: Scene, start: Start) -> None:
+        """Add the motion of a scene.  Raises InvalidTrajectoryError."""
+        times: Reals = np.arange(math.floor(scene.duration / self.dt + 1e-9) + 1.0) * self.dt
+
+        def motion_of(step: float) -> Stretch:
+            try:
+                said = run(self.body, start, times.copy(), step)
+            except (Exception, SystemExit) as error:
+                raise InvalidTrajectoryError(f'run raises {type(error).__name__}: '
+                                             f'{one_line(error)}') from error
+            return told_motion(said, times)
+
+        told = [motion_of(self.dt / divided) for divided in scene.divided]
+        if not self.motions and not np.array_equal(told[0].matrices, motion_of(self.dt).matrices):
+            self.faults.append(Finding('not_deterministic', f'{scene.name}: the attitudes of the '
+                                       'same run twice differ'))
+        same = [self.beside_truth(scene.name, start, one) for one in told]
+        self.motions.append(same[0])
+        errors = [one.worst for one in same]
+        if len(same) > 1 and min(errors) > 1e-9:        # beyond rounding: errors ~ dt^p
+            self.orders[scene.name] = -float(np.polyfit(
+                np.log(scene.divided), np.log(errors), 1)[0])
+
+    def beside_truth(self, name: str, start: State, told: Stretch) -> Motion:
+        """Return a motion; a convention of its attitudes, or a step, is told and undone."""
+        solution, early = ExactSolution(self.body, start), slice(0, EARLY)
+
+        def motion_of(late: int) -> Motion:
+            truth = Rotation.from_quat(solution.states_at_seconds(
+                told.t - late * self.dt).quaternion)
+            return Motion(name, start, told, (truth.inv() * told.rotation).magnitude())
+
+        motion = motion_of(0)
+        error = float(np.max(motion.errors[early]))
+        for late in (-1, 1) if error > min(WRONG, 2.0 * self.tolerance) else ():
+            other = motion_of(late)
+            if np.max(other.errors[early]) < RIGHT * error and (
+                    np.median(other.errors) < RIGHT * np.median(motion.errors)):
+                self._tell('late' if late > 0 else 'early', f'{name}: the attitudes are those of '
+                           f'one step {"before" if late > 0 else "after"}', float(late))
+                return other
+        if error > WRONG:
+            q = told.rotation.as_quat()
+            found = conventions.best(q[early], solution.states_at_seconds(
+                told.t[early]).quaternion)
+            if found.convention.parts and found.after < RIGHT * found.before:
+                self._tell('convention', f'{name}: attitudes are told as {found.convention.name}; '
+                           'this is undone', found.before)
+                told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
+                return motion_of(0)
+        return motion
+
+    def _tell(self, name: str, evidence: str, number: float) -> None:
+        if name not in [fault.name for fault in self.faults]:
+            self.faults.append(Finding(name, evidence, number))
+
+    def reports(self) -> Iterator[Report]:
+        """Yield what is wrong with the motions and with each reading."""
+        if not self.motions:
+            return
+        of_rates = self._readings('rates').found
+        first = of_rates[0].name if of_rates else ''
+        if first in ('', 'rates_scale', 'rates_in_world'):      # rates that are told are known
+            for motion in self.motions:
+                rates = motion.told.readings.get('rates')
+                if rates is not None and first == 'rates_in_world':
+                    rates = motion.told.rotation.inv().apply(rates)
+                motion.told = replace(motion.told, rates=rates)
+        yield Report('rates', of_rates)
+        found = [fault for fault in self._of_motions() if not (
+            first == 'rates_scale' and fault.name == 'inaccurate')]
+        yield Report('motions', found, {
+            name: mark for motion in self.motions for name, mark in self._marks(motion)}, [
+                'no readings: the IMU is not graded'] * READINGS.keys().isdisjoint(
+                    self.motions[0].told.readings))
+        yield from map(self._readings, READINGS)
+
+    def _readings(self, kind: str) -> Report:
+        told = [motion.told for motion in self.motions]
+        # Where no rates are told, half a step may be between readings and attitudes.
+        slack = 0.0 if told[0].rates is not None or kind == 'rates' else max(
+            float(0.5 * (one.rotation[0].inv() * one.rotation[1]).magnitude()) for one in told)
+        return judge(kind, told, self.body, self.body.gravity, slack=slack ** 2)
+
+    def _marks(self, motion: Motion) -> Iterator[tuple[str, Mark]]:
+        """Yield the largest error, and relative changes of the constants of the motion."""
+        yield f'total_error_deg: {motion.name}', Mark(math.degrees(motion.worst),
+                                                      math.degrees(self.tolerance))
+        smoothed = Smoothed(motion.told, 1)
+        w, up = smoothed.rates, smoothed.turn[:, 2]
+        momenta = w * self.body.inertia
+        first = ExactSolution(self.body, motion.start).states_at_seconds(np.zeros(1))
+        for name, values in (
+                ('energy', 0.5 * np.sum(momenta * w, axis=1)
+                 + self.body.gravity_torque * up[:, 2]),
+                ('l3', momenta[:, 2]), ('lz', np.sum(momenta * up, axis=1))):
+            yield f'{name}_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
+                values, float(getattr(first, name)[0]))))))
+        if motion.name in self.orders:
+            yield f'order: {motion.name}', Mark(self.orders[motion.name])
+
+    def _of_motions(self) -> Iterator[Finding]:
+        worst = max(self.motions, key=lambda motion: motion.worst)
+        if worst.worst <= self.tolerance:
+            return
+        text = f'{worst.name}: the attitude is up to {math.degrees(worst.worst):.3g} deg off'
+        first = [(scene, order) for scene, order in self.orders.items() if 0.5 < order < 1.5][:1]
+        for scene, order in first:
+            yield Finding('first_order', f'{text}; {scene}: the error falls as dt^{order:.2f}',
+                          order)
+        causes = [fault for fault in dynamics.faults_of(
+            self.body, [motion.told for motion in self.motions], self.dt)
+            if not (first and fault.name == 'first_order')]
+        yield from (Finding(fault.name, f'{text}; {fault.evidence}', fault.number)
+                    for fault in causes)
+        if not (first or causes):
+            yield Finding('inaccurate', text, math.degrees(worst.worst))
