@@ -139,9 +139,9 @@ def way_of_tilt(exam: Exam) -> Measured:
     limit = max(STRAY, trembles / answers.SMALL)
     tilt = _worst(exam, 'tilt')
     errors = _errors(exam.outcomes('attitudes')[0], exam.attitudes)
-    # A filter that never settles has errors at rest for other reasons.
-    if off < limit and max(map(_size, errors)) > (
-            CLEAN_DEG + math.degrees(trembles)) and exam.settles:
+    # What a rest takes away is right, whatever its way; a filter that never settles has errors at
+    # rest for other reasons.
+    if off < limit and _size(errors[1]) > CLEAN_DEG + math.degrees(trembles) and exam.settles:
         right = answers.pull([one[:, :2] for one in errors], bias.STEADY)
         off, limit, text = 1.0 - right, FAR, 'at rest'
     return Measured(off, f'{text} the way leads to the vertical by {1.0 - off:.2f} (1: straight, '
