@@ -144,7 +144,7 @@ def file_of(kind: str, name: str) -> Path:
     files = parameter_files(kind)
     if name not in files and '/' not in name and not name.endswith('.yaml'):
         raise ValueError(f'--{kind} {name}: must be the path of a file, or one of '
-                         f'{", ".join(files)}')
+                         f'{", ".join(files)}{likely_name(name, files)}')
     return files.get(name, Path(name))
 
 
@@ -250,9 +250,11 @@ def is_of_ros(name: str) -> bool:
 
 
 def likely_name(name: str, known: Iterable[str] = parameters.BY_NAME, prefix: str = '') -> str:
-    """Return a hint at the known name, behind the prefix, that is most like an unknown one."""
-    near = difflib.get_close_matches(name.removeprefix(prefix), list(known), 1)
-    return f'; did you mean {prefix}{near[0]}?' if near else ''
+    """Return a hint at the known names, behind the prefix, that are most like an unknown one."""
+    names, asked = list(known), name.removeprefix(prefix)
+    near = difflib.get_close_matches(asked, names, 1) or [
+        one for one in names if all(word in one for word in re.split('[._]', asked))][:3]
+    return f'; did you mean {" or ".join(prefix + one for one in near)}?' if near else ''
 
 
 def _known(name: str, value: object, source: str) -> object:
