@@ -8,7 +8,6 @@ import warnings
 import numpy as np
 import pytest
 from helpers.examples import examples
-from helpers.extremes import DOUBLES
 from helpers.simulations import SECOND, play, simulate
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,8 +18,9 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.times import LAST_STAMP_NS
-from spinning_top_sim.tools.simulate import main
 
+DOUBLES = (0.0, -0.0, 5e-324, 1e-310, 1e-300, 1e-170, 1e-150, 1e-100, 1e-46, 1e-30, 1e-20, 1e-9,
+           1e-3, 0.5, 1.0, math.pi, 14.0, 1e3, 1e9, 1e16, 1e30, 1e100, 1e150, 1e200, 1e300)
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.8}
 START = {'theta': 0.6, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
 METHODS = ({'method': 'exact'}, {'method': 'rk45', 'rtol': 1e-6},
@@ -28,7 +28,7 @@ METHODS = ({'method': 'exact'}, {'method': 'rk45', 'rtol': 1e-6},
 # What may be said instead of an answer; a ValueError names the field or says "too far apart".
 REASONS = (r'(theta|theta_dot|l3|lz|lambda1|lambda3|mass|com_distance|gravity|t) = '
            r'|too far apart|closer to the separatrix|at most|at least')
-SIZES = st.sampled_from((*DOUBLES[:-1], 1e-160, 1e-150, 1e-30, 1e150)) | st.floats(0.0, 1e300)
+SIZES = st.sampled_from(DOUBLES) | st.floats(0.0, 1e300)
 FIELDS = st.sampled_from([*TOP, *START])
 
 
@@ -78,25 +78,15 @@ def test_any_sizes_of_all_numbers_give_the_start_exactly_or_a_reason(changed, lz
 
 
 HUGE, TINY = 1e300, 1e-300
-OUT_OF_RANGE = [
-    ('status_period', TINY), ('pose.rate', 1e5), ('imu.gyroscope_M', (*8 * (0.0,), HUGE)),
-    ('imu.clock_drift', -HUGE), ('imu.bias_instability_band', (0.0, 1.0)), ('top.mass', HUGE),
-    ('step.count', 0), ('record.min_free_bytes', 2 ** 63), ('seed', 10 ** 400),
-    ('imu.vibration.rate_psd', (20.0, 0.1, 30.0)), ('pivot.waypoints', (1.0, 1.0, 0.0, 2.0)),
-    ('pivot.waypoints', (1.0, math.nan, 0.0)), ('imu.bandwidth_order', 3)]
-
-
-@pytest.mark.parametrize(('name', 'value'), OUT_OF_RANGE)
-def test_what_no_arithmetic_holds_is_refused_by_the_table(name, value):
-    with pytest.raises(ValueError, match='must be') as refusal:
-        parameters.checked({name: value})
-    assert str(refusal.value).startswith(f'{name} = {value!r}: must be ')
-
-
 SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.repeat': True}
 
 
 @pytest.mark.parametrize(('values', 'words'), [
+    *(({name: value}, rf'^{re.escape(name)} = .*: must be ') for name, value in (
+        ('status_period', TINY), ('pose.rate', 1e5), ('imu.gyroscope_M', (*8 * (0.0,), HUGE)),
+        ('imu.bias_instability_band', (0.0, 1.0)), ('step.count', 0), ('seed', 10 ** 400),
+        ('record.min_free_bytes', 2 ** 63), ('pivot.waypoints', (1.0, math.nan, 0.0)),
+        ('imu.bandwidth_order', 3))),
     ({'imu.bandwidth': 0.5}, 'imu.bandwidth.*must be a number 0 or >= 1 and <= 100000'),
     ({'imu.vibration.force_psd': (20.0, 0.1)}, 'force_psd.*two or more ascending'),
     ({'imu.vibration.rate_psd': (20.0, 0.1, 20.0, 0.1)}, 'rate_psd.*two or more ascending'),
@@ -122,24 +112,6 @@ def test_what_makes_no_sense_is_refused_in_words(values, words):
     with pytest.raises(ValueError, match=words):
         parameters.checked(values)
     parameters.checked({'imu.rate': 0.5})
-
-
-@pytest.mark.parametrize(('given', 'named'), [
-    ({'spin.l3': HUGE}, '1e+300'), ({'initial.theta_dot': 1e12}, '1000000000000.0'),
-    ({'top.lambda3': 5e-324}, 'lambda3=5e-324')])
-@pytest.mark.parametrize('method', ['exact', 'rk45'])
-def test_what_turns_too_fast_is_refused_at_the_start_and_by_simulate(
-        given, named, method, tmp_path, capsys):
-    values = parameters.checked({**given, 'solver.method': method})
-    with pytest.raises(ValueError, match='no motion from') as refusal:
-        LiveSimulation(values)
-    assert named in str(refusal.value)
-    log = tmp_path / 'run.mcap'
-    arguments = [part for name, value in values.items() if name in (*given, 'solver.method')
-                 for part in ('-p', f'{name}:={value}')]
-    assert main(['-o', str(log), '--duration', '1', '--quiet', *arguments]) == 2
-    assert 'no motion from' in capsys.readouterr().err
-    assert not log.exists()
 
 
 def test_a_run_offline_whose_stamps_would_end_is_refused_before():

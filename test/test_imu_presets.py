@@ -13,7 +13,8 @@ FOLDER = ROOT / 'config/imu'
 ERRORS = {name for name in parameters.BY_NAME if name.endswith((
     '_noise_density', '_random_walk', '_turn_on_bias', '_bias_instability', '_range',
     '_resolution'))}
-MAG = {f'mag.{name}' for name in ('noise_density', 'random_walk', 'range', 'resolution')}
+MAG = {f'mag.{name}' for name in ('noise_density', 'random_walk', 'range', 'resolution', 'enabled',
+                                  'rate')}
 # What else is an error; the others of `imu` and `mag` say where it sits, how often it is read, and
 # what the flat of a bias instability of 0 would be.
 ALL_ERRORS = {name for name in parameters.BY_NAME if name.startswith(('imu.', 'mag.')) and not (
@@ -48,18 +49,13 @@ FIGURES = ('noise_density', 'bias_instability', 'turn_on_bias', 'range', 'resolu
 def test_a_preset_sets_all_errors_of_the_imu_and_nothing_else(name):
     """So any preset replaces any other, and a scene keeps its motion and its mounting."""
     given = read_scene(FOLDER / f'{name}.yaml')
-    if name == 'perfect':
-        assert set(given) == ALL_ERRORS
-        defaults = parameters.checked({})
-        assert all(parameters.BY_NAME[key].check(value) == defaults[key]
-                   for key, value in given.items())
-    elif name == 'icm_20948':
-        assert set(given) == ERRORS | MAG | {'mag.enabled', 'mag.rate'}
-        assert given['mag.enabled'] is True
-        assert (given['mag.range'], given['mag.resolution']) == (4912e-6, 0.15e-6)
-    else:
-        assert set(given) == ERRORS | {'mag.enabled'} and given['mag.enabled'] is False
-    assert not any(value for key, value in given.items() if key.endswith('_random_walk'))
+    assert set(given) == {'perfect': ALL_ERRORS, 'icm_20948': ERRORS | MAG}.get(
+        name, ERRORS | {'mag.enabled'})
+    assert given.get('mag.enabled', False) is (name == 'icm_20948')
+    defaults = parameters.checked({})
+    assert name != 'perfect' or all(defaults[key] == value or [*defaults[key]] == value
+                                    for key, value in given.items())
+    assert given.get('mag.range', 0.0) == (name == 'icm_20948') * 4912e-6
     values = parameters.checked({**scene_parameters('wavy'), **given})
     for kind, figures in zip(('gyroscope', 'accelerometer'), DATA_SHEETS[name], strict=True):
         found = [values[f'imu.{kind}_{one}'] for one in FIGURES]

@@ -65,25 +65,6 @@ def test_the_trace_is_the_path_of_the_tip(values, count):
         assert np.abs(trace[:-1] - tip * axis_of(exact.quaternion)).max() < 1e-12 * abs(tip)
 
 
-def test_a_coarse_solver_leaves_the_trace():
-    """What is traced is the truth, and the body is where the solver has it."""
-    *_, there = drawn({'solver.rtol': 1e-2, 'solver.atol': 1e-2}, 3 * SECOND)
-    steps = np.linalg.norm(np.diff(there[3 * SECOND][2], axis=0), axis=1)
-    assert steps[-1] > 1.5 * steps[-10:-1].max()
-
-
-def test_the_trace_goes_on_through_commands():
-    simulation, found, there = drawn({'pose.rate': 40.0}, 3 * SECOND, 'pose', events=[
-        (t_ns, 'command', {'l3': l3, 'lz': lz}) for t_ns, l3, lz in (
-            (700_000_000, 2.0, 1.5), (725_000_000, 1.9, 1.4), (1_234_567_890, 0.5, -0.3),
-            (1_240_000_000, 1.6, 1.0))])
-    tips = Shape(simulation.trajectory.top).tip * axis_of(found['pose'][3])     # each 25 ms
-    for t_ns in (750_000_000, 1_250_000_000, 1_500_000_000, 2_200_000_000):
-        newest = (t_ns - 1) // 25_000_000
-        expected = tips[np.maximum(np.arange(newest - 39, newest + 1), 0)]
-        assert there[t_ns][2][:-1] == pytest.approx(expected, abs=1e-8)
-
-
 @pytest.mark.parametrize('frame', ['x' * 7, 'θ'])
 def test_bodies_and_lines_are_drawn_to_the_scale_of_the_top(frame):
     """The axis is 2 % of the distance to the tip wide, the trace half of that."""

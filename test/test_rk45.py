@@ -21,10 +21,8 @@ from helpers.reference import CASES, angle, quaternion_of, scene_parameters, sta
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import ERROR, STAGES, IntegrationError
-from spinning_top_sim.solvers.euler import EulerMotion
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.solve import motion_of
-from spinning_top_sim.solvers.transport import TransportMotion
 from spinning_top_sim.streams import parameters
 
 NODES = tuple(map(Fraction, ['0', '1/5', '3/10', '4/5', '8/9', '1', '1']))
@@ -132,15 +130,10 @@ LITERAL_FAILURES = {
 
 
 @pytest.mark.parametrize('name', LITERAL_FAILURES)
-@pytest.mark.parametrize('rtol', [1e-3, 1e-9])
-def test_the_literal_equations_stop_with_advice_where_they_fail(name, rtol):
+def test_the_literal_equations_stop_with_advice_where_they_fail(name):
     fields, t = LITERAL_FAILURES[name]
-    start = State(**fields)
     with pytest.raises(IntegrationError, match=r'euler equations.*pole.*transport'):
-        solve(ONE_TOP, start, [t], method='rk45', equations='euler', rtol=rtol)
-    exact = solve(ONE_TOP, start, [t], method='exact')
-    regular = solve(ONE_TOP, start, [t], method='rk45', rtol=1e-12)
-    assert angle(regular.quaternion[0], exact.quaternion[0]) < 1e-7
+        solve(ONE_TOP, State(**fields), [t], method='rk45', equations='euler', rtol=1e-9)
 
 
 def test_the_literal_equations_refuse_a_disc_that_loses_their_digits():
@@ -174,44 +167,6 @@ def test_bad_settings_and_times_are_refused_by_name_and_value(arguments, message
     top, start, _ = cusp_scene()
     with pytest.raises(ValueError, match=message):
         solve(top, start, **{'t': [1.0], 'method': 'rk45', **arguments})
-
-
-@pytest.mark.parametrize(('theta', 'theta_dot', 'l3', 'lz'), [
-    (0.1, 0.3, 1.6, 1.59), (3.05, 0.2, 1.0, -0.99)])
-def test_close_to_a_pole_the_invariants_hold(theta, theta_dot, l3, lz):
-    """At tilts of 0.05 to 0.25 rad from the vertical, where rounding is magnified."""
-    top = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
-    start = State(theta=theta, theta_dot=theta_dot, phi=0.3, psi=-0.7, l3=l3, lz=lz)
-    t = np.linspace(0.0, 20.0, 4001)
-    motion, truth = (solve(top, start, t, method=method) for method in ('rk45', 'exact'))
-    tilts = np.minimum(truth.theta_folded, math.pi - truth.theta_folded)
-    assert tilts.min() > 0.05 and tilts.max() < 0.25
-    assert np.abs(motion.l3 - l3).max() <= 5e-15 * l3
-    assert np.abs(motion.energy - motion.energy[0]).max() <= 1e-12
-    x, y, z, w = motion.quaternion.T
-    omega1, omega2, omega3 = motion.angular_velocity.T
-    vertical = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
-    of_motion = (top.lambda1 * (omega1 * vertical[0] + omega2 * vertical[1])
-                 + top.lambda3 * omega3 * vertical[2])
-    assert np.abs(of_motion - lz).max() <= 5e-15 * abs(lz)
-    assert np.abs(motion.quaternion - truth.quaternion).max() <= 4e-10
-
-
-@pytest.mark.parametrize('theta_dot', [2.5, -2.5])
-def test_a_free_planar_rotation_counts_its_turns(theta_dot):
-    """Without torque and momentum theta = theta0 + theta' t, either way round."""
-    top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=0.5, gravity=0.0)
-    start = State(theta=0.7, theta_dot=theta_dot, phi=0.3, psi=-0.4, l3=0.0, lz=0.0)
-    t = np.linspace(0.0, 50.0, 1001)
-    motion = solve(top, start, t)
-    assert motion.theta == pytest.approx(0.7 + theta_dot * t, abs=5e-14)
-    assert np.all(motion.theta_dot == pytest.approx(theta_dot, abs=1e-14))
-    assert motion.phi == pytest.approx(np.full(1001, 0.3), abs=1e-14)
-    assert motion.psi == pytest.approx(np.full(1001, -0.4), abs=1e-14)
-    half = 0.5 * motion.theta
-    expected = np.array([-np.sin(half) * math.sin(0.35), np.sin(half) * math.cos(0.35),
-                         np.cos(half) * math.sin(-0.05), np.cos(half) * math.cos(-0.05)]).T
-    assert np.abs(motion.quaternion - expected).max() <= 5e-14
 
 
 WITHOUT_GMPY2 = """
@@ -274,48 +229,11 @@ def test_so_many_steps_are_kept_at_most(monkeypatch):
         motion.states(range(1))
 
 
-@pytest.mark.parametrize(('rtol', 'bound'), [(1e-3, 0.5), (1e-9, 1e-4)])
-@pytest.mark.parametrize(('l3', 'lz'), [
-    (1.5, 1.5 - 1e-9), (1.5, -1.5), (1.5, -1.5 + 1e-4), (0.0, 0.0)])
-def test_phases_are_followed_past_the_poles(l3, lz, rtol, bound):
-    """
-    Every phase is the exact one, however fast it turns.
-
-    Close by a pole it turns by half a turn within a step, and with long steps by more.
-    """
-    start = State(theta=1.0 if l3 * lz > 0.0 else 2.0, theta_dot=-4.0, phi=0.4, psi=-0.7, l3=l3,
-                  lz=lz)
-    t = np.linspace(0.0, 20.0, 2001)
-    stepped, exact = (solve(ONE_TOP, start, t, rtol=rtol, atol=0.0, method=method)
-                      for method in ('rk45', 'exact'))
-    # During a pass, steps that come a little early or late have another phase.
-    away = np.sin(exact.theta_folded) > 100.0 * rtol
-    assert np.mean(away) > 0.9
-    for column in (lambda states: 0.5 * (states.phi + states.psi),
-                   lambda states: 0.5 * (states.phi - states.psi),
-                   lambda states: 0.5 * states.theta):
-        assert column(stepped)[away] == pytest.approx(column(exact)[away], abs=bound)
-
-
-@pytest.mark.parametrize('motion_type', [TransportMotion, EulerMotion])
-def test_an_error_that_is_no_number_is_no_small_error(motion_type, monkeypatch):
-    motion = motion_type(top_of(LOOPING), start_of(LOOPING), 1e-9, 1e-10)
-    y = motion._kept[0].y0
-    for place in range(len(y)):
-        difference = [0.0 * unknown for unknown in y]
-        difference[place] = math.nan + 0.0 * y[place]
-        monkeypatch.setattr(dormand_prince, 'unrolled_step', lambda size, is_complex, rest=tuple(
-            difference): lambda f, h, y, k1: (y, k1, rest))
-        with pytest.raises(IntegrationError, match='collapsed'):
-            motion._take_step()
-
-
 @pytest.mark.parametrize('equations', ['transport', 'euler'])
-@pytest.mark.parametrize('t', [[1.0], np.linspace(0.0, 1.0, 100_001)])
-def test_a_time_that_takes_too_many_steps_is_refused_at_once(equations, t):
+def test_a_time_that_takes_too_many_steps_is_refused_at_once(equations):
     top = Top(lambda1=1e-8, lambda3=1e-8, mass=1.0, com_distance=0.1, gravity=9.81)
     with pytest.raises(IntegrationError, match=r'steps of .* s away: use|leapt over a pole'):
-        solve(top, State(theta=0.7, l3=40.0, lz=-11.0), t, method='rk45', equations=equations,
+        solve(top, State(theta=0.7, l3=40.0, lz=-11.0), [1.0], method='rk45', equations=equations,
               rtol=1e-6)
 
 

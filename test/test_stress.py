@@ -1,36 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Random tops, symmetries, edge inputs and continued branches: what must hold for every motion.
-
-STRESS_TOPS=100000 in the environment takes as many random tops; `python test/stress tops` does the
-same on all processors.
-"""
+"""Continued branches after commands, and seeds of the parts of `make stress`."""
 
 import importlib
 import math
-import os
 
 import numpy as np
 import pytest
 from helpers.reference import scene_parameters
 from helpers.simulations import MILLISECOND, simulate
 from helpers.wrong_filters import TABLE
-from stress.tops import blocks, check_block
 
 from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.solvers.exact import ExactSolution
-
-TOPS = int(os.environ.get('STRESS_TOPS', '30'))
-
-
-@pytest.mark.parametrize('seeds', blocks(0, TOPS), ids=lambda seeds: f'{seeds[0]}-{seeds[-1]}')
-def test_random_tops(seeds):
-    found = check_block(seeds)
-    assert not found.failures, '\n'.join(found.failures)
-    # The judges must have judged: most tops all the way.
-    assert found.counts['integrated'] > 0.85 * len(seeds)
-    assert found.counts['rk45: q'] > 0.8 * len(seeds)
 
 
 def momenta(random, scale, theta):
