@@ -2,16 +2,13 @@
 """Exports, read as their formats are documented, beside what the log has."""
 
 import csv
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 
-from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.tools import inspect, simulate
-from spinning_top_sim.tools.recorded_run import read_run_description
 
 NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-5,
          'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 0.02,
@@ -153,21 +150,3 @@ def test_what_cannot_be_exported_is_told_before_anything_is_computed(
     assert not log.exists()
     assert not (tmp_path / 'a').exists()
     assert (tmp_path / 'there').read_text() == 'precious'
-
-
-def test_parameters_that_wait_for_a_reset_are_not_in_effect(folder):
-    with LogReader(folder / 'run.mcap') as log:
-        run = read_run_description(log)
-    later = replace(run, values_at_recording={
-        **run.values_at_recording, 'imu.gyroscope_noise_density': 0.5, 'imu.rpy': (0.0, 0.0, 0.0),
-        'imu.rate': 50.0})
-    assert later.values_in_effect == {**run.values_at_start, 'imu.rate': 50.0}
-    assert run.values_in_effect == run.values_at_recording
-
-
-@pytest.mark.parametrize('text', ['tum:', 'kitti:a'])
-def test_a_wrong_kind_is_told_with_the_right_ones(tmp_path, capsys, text):
-    with pytest.raises(SystemExit):
-        simulate.main(['--export', text, '-o', str(tmp_path / 'run.mcap')])
-    assert f'{text}: must be KIND:FILE with one of tum, euroc, euroc_imu, kalibr' in (
-        capsys.readouterr().err)

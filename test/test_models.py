@@ -104,14 +104,3 @@ def test_the_command_writes_a_scene_and_overwrites_nothing(tmp_path, capsys):
     assert path.read_text(encoding='utf-8') == model(values, 'sdf', 'cusp')
     assert main(words) == 1
     assert 'exists' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(('words', 'named'), [
-    (['--model', 'mjcf'], '-o/--output'), (['-o', 'x'], '--model'),
-    (['--model', 'step', '-o', 'x'], "'step'")])
-def test_wrong_options_are_named_and_make_no_file(tmp_path, monkeypatch, capsys, words, named):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match='2'):
-        main(['export', *words])
-    assert named in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []

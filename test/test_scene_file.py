@@ -122,16 +122,6 @@ def test_the_last_section_of_the_node_decides(tmp_path, sections):
         assert read_scene(path) == {'world_frame': node.get_parameter('world_frame').value}
 
 
-@pytest.mark.parametrize('section', ['use_sim_time: false', '{}', '{qos_overrides: {/a: 1}}'])
-def test_a_file_may_have_parameters_of_ros_only(tmp_path, section):
-    path = tmp_path / 'p.yaml'
-    path.write_text(f'/**:\n  ros__parameters:\n    {section}\n')
-    with ros_node(path):
-        assert read_scene(path) == {}
-    assert main(['-o', str(tmp_path / 'run.mcap'), '--params', str(path), '--duration', '0.01',
-                 '-p', 'use_sim_time:=true', '-p', 'qos_overrides./a.b:=1', '--quiet']) == 0
-
-
 def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):
     path = scene(tmp_path / 'p.yaml', **{'spin.l33': 1.0})
     output = tmp_path / 'run.mcap'

@@ -7,27 +7,20 @@ deviations of the estimate.  `python test/stress sensor` does the same for many 
 """
 
 import math
-from itertools import combinations
 from statistics import NormalDist
 
 import numpy as np
 import pytest
-from helpers.simulations import MILLISECOND, SECOND, read, run
+from helpers.simulations import MILLISECOND, SECOND, read
 from scipy.special import chdtri
 from stress import sensor as statistics
 
 from spinning_top_sim.streams import noise
 
-ALL_BIASES = {f'imu.{kind}_{name}': value for kind in ('gyroscope', 'accelerometer')
-              for name, value in (('random_walk', 1e-2), ('bias_stddev', 0.1),
-                                  ('turn_on_bias', 0.2), ('bias_instability', 0.05))}
 
-
-def test_matrices_g_sensitivity_bias_and_iron_are_found_by_least_squares():
-    """All 45 numbers from one run, each within 3 of its standard deviations."""
-    found, deviations, expected = statistics.calibration(0)
-    assert np.abs((found - expected) / deviations).max() < 3.0
-    assert deviations[:33].max() < 3e-3 and deviations[33:].max() < 0.05
+def test_what_a_seed_reads_is_as_commanded():
+    """Matrices, g-sensitivity, biases, iron, correlation time, flat of the Allan deviation."""
+    statistics.check(0, None)
 
 
 def test_the_chain_by_hand():
@@ -61,26 +54,7 @@ def test_the_bias_begins_with_the_turn_on_bias_and_walks_with_its_density():
     assert np.abs(np.diff(biases, axis=0)[seams] / deviations).max() < 5.0
 
 
-def test_turn_on_bias_white_noise_and_walks_have_no_number_in_common():
-    """Each of deviation 1."""
-    period_ns = noise.DRAWN_TOGETHER * noise.STEP_NS
-    times, root = range(0, 100 * period_ns, period_ns), math.sqrt(1e-9 * period_ns)
-    turn_on, white, walk = (read({f'imu.{kind}_{name}': value for kind in (
-        'gyroscope', 'accelerometer')}, times)[0] for name, value in (
-            ('turn_on_bias', 1.0), ('noise_density', root), ('random_walk', 1.0 / root)))
-    assert np.ptp(turn_on[0]) > 0.1
-    for one, two in combinations(map(np.ravel, (turn_on[0], white, np.diff(walk, axis=0))), 2):
-        assert np.abs(one[:, np.newaxis] - two).min() > 1e-8
-
-
-def test_a_gauss_markov_bias_has_its_variance_and_its_correlation_time():
-    """Within 2 %, of which the estimates take some 0.5 %."""
-    for found in statistics.gauss_markov(0):
-        assert found == pytest.approx(1.0, rel=0.02)
-
-
-@pytest.mark.parametrize('time', [0.01, 3.0, 1e6])
-def test_a_gauss_markov_bias_is_stationary_at_any_time(time):
+def test_a_gauss_markov_bias_is_stationary(time=3.0):
     """At the start, at a second and after three years it has one variance: 2400 numbers each."""
     times_ns = np.array([0, SECOND, 94_608_000 * SECOND])
     rows = np.concatenate([noise.RandomPath(
@@ -89,12 +63,6 @@ def test_a_gauss_markov_bias_is_stationary_at_any_time(time):
     assert np.std(rows, axis=0) == pytest.approx(2.0, rel=4.0 / math.sqrt(2.0 * len(rows)))
     correlation = np.mean(rows[:, 0] * rows[:, 1]) / 4.0
     assert correlation == pytest.approx(math.exp(-1.0 / time), abs=4.0 / math.sqrt(len(rows)))
-
-
-def test_the_allan_deviation_of_a_flicker_bias_is_flat_over_its_band():
-    """Within 10 % of the parameter."""
-    _, found = statistics.flicker(0)
-    assert found == pytest.approx(1.0, rel=0.10)
 
 
 @pytest.mark.parametrize('lowest', [0.01, 1.0])
@@ -108,49 +76,16 @@ def test_the_law_of_a_flicker_bias_is_flat_for_every_band(lowest):
         assert np.sqrt(variance) == pytest.approx(1.0, rel=0.06)
 
 
-def test_a_jump_of_three_years_draws_few_numbers(monkeypatch):
-    """By way of some log2 of the blocks before, for each of six paths."""
-    draws, philox = [], np.random.Philox
-    monkeypatch.setattr(np.random, 'Philox',
-                        lambda **keys: (draws.append(keys), philox(**keys))[1])
-    begin, values = 94_608_000 * SECOND, {**ALL_BIASES, 'seed': 77}
-    there, _ = read(values, range(begin, begin + SECOND, MILLISECOND))
-    assert 6 * 20 < len(draws) < 6 * 100
-    assert np.isfinite(there).all() and np.std(there, axis=0).min() > 0.0
-    draws.clear()
-    later, _ = read(values, range(begin + SECOND, begin + 2 * SECOND, MILLISECOND))
-    assert len(draws) < 6 * 20
-    assert np.std(there - later, axis=0).min() > 0.0
-
-
-def test_a_change_of_the_rate_leaves_the_bias_on_its_path():
-    values = {**ALL_BIASES, 'solver.method': 'exact', 'imu.rate': 200.0}
-    _, found = run(values, 2 * SECOND, 'ground_truth/imu_bias', events=[
-        (number * SECOND // 2 + 7, 'parameters', {'imu.rate': hertz})
-        for number, hertz in enumerate((1000.0, 90.0, 400.0), 1)])
-    times_ns, _, rates, force = found['ground_truth/imu_bias']
-    _, steady = read(values, range(0, 2 * SECOND + 1, MILLISECOND))
-    assert len(times_ns) > 700
-    assert np.array_equal(np.hstack((rates, force)), steady[times_ns // MILLISECOND])
-
-
-@pytest.mark.parametrize('number', range(3), ids=('orientation', 'imu/data', 'imu/data_raw'))
-def test_errors_are_distributed_as_published(squares, number):
-    """NEES: chi-square of each axis, and in the share of its own band in 100 parts of a run."""
-    found = squares[number]
-    low, high = chdtri(len(found), (1.0 - 1e-5, 1e-5))
-    assert (low < found.sum(axis=0)).all() and (found.sum(axis=0) < high).all()
-    low, high = chdtri(found.size, (0.975, 0.025))
-    assert low < found.sum() < high
-    parts = found[:10_000].reshape(100, -1)
-    low, high = chdtri(parts.shape[1], (0.975, 0.025))
-    # Binomial of 100 and 0.95: from 89 to 99 with 99 %.
-    assert 89 <= np.count_nonzero((low < parts.sum(axis=1)) & (parts.sum(axis=1) < high)) <= 99
-
-
-@pytest.fixture(scope='module')
-def squares():
-    return statistics.nees(0, 50 * SECOND)
+def test_errors_are_distributed_as_published():
+    """NEES of orientation and readings: chi-square of an axis, and in 100 parts of a run."""
+    for found in statistics.nees(0, 50 * SECOND):
+        low, high = chdtri(len(found), (1.0 - 1e-5, 1e-5))
+        assert (low < found.sum(axis=0)).all() and (found.sum(axis=0) < high).all()
+        parts = found[:10_000].reshape(100, -1)
+        low, high = chdtri(parts.shape[1], (0.975, 0.025))
+        # Binomial of 100 and 0.95: from 89 to 99 with 99 %.
+        assert 89 <= np.count_nonzero(
+            (low < parts.sum(axis=1)) & (parts.sum(axis=1) < high)) <= 99
 
 
 def test_axes_sensors_samples_and_seeds_are_uncorrelated():

@@ -185,7 +185,7 @@ def check_symmetries(found, case, motion, times):
 
 
 def growth_of(case, times):
-    """Return how far exact solutions from neighbouring starts part, over how far apart they were."""
+    """Return how far exact solutions part, over how far apart they begin."""
     top, start, size = case.top, case.start, 1e-8
     unit, around = natural_rate(top, start), rate_around(top, start)
     middle, most = solve(top, start, times).quaternion, 1.0
