@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.tools import conventions, identify
+from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
 TRUTH = Rotation.random(12, random_state=3)
@@ -29,11 +29,6 @@ def test_a_constant_heading_is_no_error_where_it_need_only_be_steady():
     for heading, error in (('absolute', 0.7), ('steady', 0.0), ('any', 0.0)):
         assert conventions.error_of(turned, TRUTH.as_quat(), heading) == pytest.approx(
             error, abs=1e-9)
-
-
-def test_a_matrix_is_told_by_its_columns():
-    assert 'y turns the attitude about x by' in identify.in_words(np.array(
-        ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))))
 
 
 def test_a_report_is_a_table_and_json():

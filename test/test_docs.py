@@ -1,17 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The documents say what the code does."""
+"""
+The documents say what the code does: their code blocks are run, page by page.
 
+The blocks of a page run in order, in one empty folder and one Python namespace.
+
+- `python` blocks are executed, unless their first line is a comment with the name of a file, such
+  as `# my_filter.py`: then they are written to that file.  So are `yaml` blocks.
+- `bash` blocks are run by bash, but for plain commands of `spinning-top`, which are called here.
+  `<!-- background -->` in the line before keeps one running until the page ends; `<!-- exit code 1
+  -->` expects another than 0; `<!-- not run: REASON -->` leaves one out, and fails where REASON is
+  not known.
+- A `text` block right behind a block that ran is its output.  Integers are equal, other numbers
+  agree within 2 %, and a line `...` stands for any lines.
+"""
+
+import contextlib
 import importlib
+import io
+import math
 import os
 import re
 import runpy
+import shlex
+import signal
+import subprocess
+import sys
 from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
-from helpers import doc_blocks
-from helpers.reference import ROOT, SCENES
+from helpers.reference import ROOT
 
-FOLDERS = 'config', 'docs', 'examples', 'launch', 'rviz', 'scripts', 'test', 'urdf', 'benchmark'
+from spinning_top_sim.__main__ import main
 
 # Pages that programs write or Sphinx copies have no blocks of their own.
 PAGES = {str(path.relative_to(ROOT)): path.read_text(encoding='utf-8')
@@ -30,81 +51,153 @@ NOT_RUN = {
 }
 
 
+FENCE = re.compile(r'^(?:<!-- (?P<mark>[^\n]*?) -->\n)?'
+                   r'^```(?P<language>[^\n]*)\n(?P<text>.*?)^```$', re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r'(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?(?![\w])')
+FILE = re.compile(r'# ([\w/]+\.(?:py|yaml))\n')
+TIMEOUT = 600        # of a block [s], also under load
+
+
+class Block(NamedTuple):
+    """A fenced block: its language, text, first line in the page, mark, and what is before it."""
+
+    language: str
+    text: str
+    line: int
+    mark: str
+    follows: bool       # directly behind the block before
+
+
+def blocks(page):
+    """Return the blocks of a page, those of Sphinx (`{...}`) left out."""
+    found, end = [], 0
+    for match in FENCE.finditer(page):
+        language = match['language'] or 'text'
+        if not language.startswith('{'):
+            found.append(Block(language, match['text'], page[:match.start()].count('\n') + 1,
+                               match['mark'] or '', not page[end:match.start()].strip()))
+        end = match.end()
+    return found
+
+
+def left_out(block):
+    """Return why a block is not run, or None."""
+    return block.mark.removeprefix('not run: ') if block.mark.startswith('not run: ') else None
+
+
+def same(expected, actual):
+    """Return whether two lines are the same but for the last digits of numbers."""
+    if NUMBER.sub('#', ' '.join(expected.split())) != NUMBER.sub('#', ' '.join(actual.split())):
+        return False
+    return all(one == other or (not one.isdecimal() and math.isclose(
+        float(one), float(other), rel_tol=0.02)) for one, other in
+        zip(NUMBER.findall(expected), NUMBER.findall(actual), strict=True))
+
+
+def agrees(expected, actual):
+    """Return whether lines of output are those of a page, where `...` stands for any lines."""
+    if not expected or not actual:
+        return all(line.strip() == '...' for line in expected) and not actual
+    if expected[0].strip() == '...':
+        return any(agrees(expected[1:], actual[skipped:]) for skipped in range(len(actual) + 1))
+    return same(expected[0], actual[0]) and agrees(expected[1:], actual[1:])
+
+
+class Runner:
+    """Runs the blocks of a page in a folder, which is the working directory."""
+
+    def __init__(self, name):
+        self._name, self._namespace, self._background = name, {'__name__': '__main__'}, []
+        for folder in ('config', 'examples', 'urdf'):
+            Path(folder).symlink_to(ROOT / folder)
+        # Executables, and the package where it is not installed.
+        paths = (str(Path(sys.executable).parent), str(ROOT / 'scripts'), os.environ['PATH'])
+        self._environment = {**os.environ, 'PATH': os.pathsep.join(paths),
+                             'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1',
+                             'PYTHONPATH': os.pathsep.join(filter(None, (
+                                 os.environ.get('PYTHONPATH'), str(ROOT))))}
+
+    def run(self, block):
+        """Run a block; return what it printed, None if it is no code."""
+        named = FILE.match(block.text)
+        if block.language in ('python', 'yaml') and named:
+            path = Path(named[1])
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(block.text, encoding='utf-8')
+            return None
+        if block.language == 'python':
+            said = io.StringIO()
+            with contextlib.redirect_stdout(said):
+                exec(compile('\n' * block.line + block.text, self._name, 'exec'), self._namespace)
+            return said.getvalue()
+        if block.language == 'bash':
+            return self._shell(block)
+        return None
+
+    def _shell(self, block):
+        commands = [shlex.split(line) for line in block.text.replace('\\\n', '').splitlines()]
+        if not block.mark and all(words[:1] == ['spinning-top'] and not {'|', '||', '>'} & {*words}
+                                  for words in commands):
+            # The command itself, without a start of Python.
+            with contextlib.redirect_stdout(io.StringIO()) as out:
+                assert [main(words[1:]) for words in commands] == [0] * len(commands), block
+            return out.getvalue()
+        process = subprocess.Popen(
+            ['bash', '-euo', 'pipefail', '-c', block.text], stdin=subprocess.DEVNULL, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+            env=self._environment)
+        if block.mark == 'background':
+            self._background.append(process)
+            return None
+        try:
+            said, _ = process.communicate(timeout=TIMEOUT)
+        except BaseException:
+            os.killpg(process.pid, signal.SIGKILL)
+            raise
+        expected = block.mark.removeprefix('exit code ') or '0'
+        assert str(process.returncode) == expected, f'{self._name}:{block.line}: {said}'
+        return said
+
+    def end(self):
+        """End what runs in the background, as Ctrl-C does."""
+        for process in self._background:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGINT)
+            try:
+                process.communicate(timeout=TIMEOUT)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                raise
+
+
 @pytest.mark.parametrize('name', [name for name, page in PAGES.items()
                                   if any(block.language in ('python', 'bash')
-                                         for block in doc_blocks.blocks(page))])
+                                         for block in blocks(page))])
 def test_the_code_of_a_page_runs_and_prints_what_it_says(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv('COLUMNS', '118')
-    runner, said, last = doc_blocks.Runner(name), None, None
+    runner, said, last = Runner(name), None, None
     try:
-        for block in doc_blocks.blocks(PAGES[name]):
+        for block in blocks(PAGES[name]):
             if block.language == 'text' and block.follows and said is not None:
-                if not doc_blocks.agrees(block.text.splitlines(), said.splitlines()):
+                if not agrees(block.text.splitlines(), said.splitlines()):
                     pytest.fail(f'{name}:{last.line} prints\n{said}', pytrace=False)
             else:
-                said = None if doc_blocks.left_out(block) else runner.run(block)
+                said = None if left_out(block) else runner.run(block)
                 last = block
     finally:
         runner.end()
 
 
 def test_what_is_not_run_is_counted():
-    reasons = Counter(doc_blocks.left_out(block) for page in PAGES.values()
-                      for block in doc_blocks.blocks(page) if doc_blocks.left_out(block))
+    reasons = Counter(left_out(block) for page in PAGES.values()
+                      for block in blocks(page) if left_out(block))
     assert reasons == NOT_RUN
-
-
-def test_output_that_differs_is_found():
-    assert doc_blocks.agrees(['a 1.00 b', '...', 'end'], ['a  1.01 b', 'x', 'y', 'end'])
-    assert not doc_blocks.agrees(['a 1.00 b'], ['a 1.10 b'])
-    assert not doc_blocks.agrees(['all 1000'], ['all 1001'])
-    assert not doc_blocks.agrees(['a 1.00 b'], ['a 1.00 c'])
-    assert not doc_blocks.agrees(['a'], ['a', 'b'])
 
 
 def test_the_interface_page_is_written_from_the_present_code():
     page = runpy.run_path(str(ROOT / 'docs/interface.py'))['page']()
     assert (ROOT / 'docs/interface.md').read_text() == page
-
-
-def test_the_cost_check_fails_above_the_factor_that_contributing_names(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / 'benchmark')
-    check = importlib.import_module('regression')
-    text = (ROOT / 'CONTRIBUTING.md').read_text()
-    limit = float(*re.findall(r'costs more than (\d\.\d+) times', text))
-    right, unknown = [1.0, 1.0, 1.0], [float('nan')] * 3
-    for now, parent, release, good in (
-            (0.99 * limit, right, right, True), (1.01 * limit, right, unknown, False),
-            (1.01 * limit, [2.0] * 3, right, False), (1.01 * limit, right, [2.0] * 3, False)):
-        row, found = check.cells('start-up', {
-            check.NOW: [now, now, 9.0], check.PARENT: parent, check.RELEASE: release})
-        assert found is good and (row[-1] == 'ok') is good, row
-
-
-def test_architecture_has_every_folder_of_the_package_and_no_name_that_does_not_exist():
-    text = (ROOT / 'docs/architecture.md').read_text()
-    package = ROOT / 'spinning_top_sim'
-    folders = {path.parent.name for path in package.glob('*/__init__.py')}
-    heads = re.findall(r'^\| ((?:`\w+/`(?:, )?)+) \|', text, re.MULTILINE)
-    assert set(re.findall(r'\w+', ' '.join(heads))) == folders
-    text = re.sub(r'^```$.*?^```$', '', text, flags=re.MULTILINE | re.DOTALL)
-    named = {word for code in re.findall(r'`([^`]+)`', text)
-             for word in re.findall(r'\w+\b(?!\*)', code)}
-    paths = [path for folder in (package, *map(ROOT.joinpath, FOLDERS))
-             for path in folder.rglob('*') if path.suffix in ('.py', '.md', '')]
-    known = {word for path in (*paths, *ROOT.glob('*.py'))
-             for word in re.findall(r'\w+', str(path.relative_to(ROOT)))}
-    known |= {word for path in package.rglob('*.py')
-              for word in re.findall(r'\w+', path.read_text())}
-    assert named - known == set()
-
-
-def test_the_readme_begins_with_the_two_commands_and_a_page_lists_every_scene():
-    commands = re.findall(r'^\s*(make \w+)', (ROOT / 'README.md').read_text(), re.MULTILINE)
-    assert commands[:2] == ['make run', 'make test']
-    text = (ROOT / 'docs/sensor.md').read_text()
-    assert all(f'`{scene}`' in text for scene in SCENES)
 
 
 def test_every_name_that_is_public_can_be_imported():

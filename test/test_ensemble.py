@@ -163,34 +163,43 @@ def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
     assert manifest['complete'] and manifest['failed'] == {}
     assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(manifest['versions'])
     assert ensemble_spec.parse(manifest['specification'], 'test') == ensemble_spec.read(path)
-    assert sorted(entry.name for entry in folder.iterdir()) == ['data', 'manifest.json']
+    # It is complete: nothing is computed again, and no other ensemble goes there.
+    assert ensemble(path, '-o', folder) == 0
+    other = written(tmp_path, runs=1)
+    assert ensemble(other, '-o', folder) == 2
+    assert contents(folder / 'data') == contents(data)
+    (folder / 'notes').write_text('mine')
+    assert ensemble(other, '-o', folder, '--overwrite') == 0
+    assert (folder / 'notes').read_text() == 'mine'
+    assert len([*(folder / 'data').iterdir()]) == 1
+    assert ensemble(other, '-o', tmp_path, '--overwrite') == 2      # it has no manifest.json
 
 
+@pytest.mark.parametrize('is_lost', [False, True])
 def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_scheduler(
-        whole, tmp_path, ensemble, cluster, monkeypatch, capsys):
+        whole, tmp_path, ensemble, cluster, monkeypatch, capsys, is_lost):
     """A part that is there is not computed again; a torn one is."""
     from distributed import Future, comm
 
-    (data, path), folder, ordinary = whole, tmp_path / 'other', Future.result
-    for error, code, said in ((comm.CommClosedError('gone'), 1, 'the scheduler is lost'),
-                              (KeyboardInterrupt(), 130, 'interrupted')):
-        results = []
+    (data, path), folder, ordinary, results = whole, tmp_path / 'other', Future.result, []
+    error, code, said = KeyboardInterrupt(), 130, 'interrupted'
+    if is_lost:
+        error, code, said = comm.CommClosedError('gone'), 1, 'the scheduler is lost'
 
-        def result(future, error=error, results=results):
-            results.append(future)
-            if len(results) > 3:
-                raise error
-            return ordinary(future)
+    def result(future):
+        results.append(future)
+        if len(results) > 3:
+            raise error
+        return ordinary(future)
 
-        with monkeypatch.context() as patch:
-            patch.setattr(Future, 'result', result)
-            assert ensemble(path, '-o', folder) == code
-        assert capsys.readouterr().err == f'spinning-top ensemble: {said}\n'
+    with monkeypatch.context() as patch:
+        patch.setattr(Future, 'result', result)
+        assert ensemble(path, '-o', folder) == code
+    assert capsys.readouterr().err == f'spinning-top ensemble: {said}\n'
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
     cluster.gather([cluster.submit(os.getpid, workers=[one], pure=False)    # after running tasks
                     for one in cluster.scheduler_info()['workers']])
     torn, *kept = sorted((folder / 'data').iterdir())
-    assert len(kept) >= 2
     then = [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept]
     torn.write_bytes(torn.read_bytes()[:-1])
     assert ensemble(path, '-o', folder) == 0
@@ -198,31 +207,22 @@ def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_sched
     assert [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept] == then
 
 
-def test_failed_runs_are_told_with_their_reason(tmp_path, capsys, ensemble):
+@pytest.mark.parametrize(('momenta', 'failed', 'code'), [
+    ([1.42, 1e30], ['1'], 0), ([1e30, -1e30], ['0', '1'], 1)])
+def test_failed_runs_are_told_with_their_reason(
+        tmp_path, capsys, ensemble, momenta, failed, code):
     """Also by a part that is there already, and is not computed again."""
-    path = written(tmp_path, runs=6, duration=0.05, runs_per_part=3, streams=[], sample={
-        'initial.theta': {'values': [0.5, 0.5, 3.0]}, 'spin.lz': {'values': [1.42, 1e30]}})
+    path = written(tmp_path, runs=2, duration=0.05, streams=[], sample={
+        'spin.lz': {'values': momenta}})
     folder = tmp_path / 'other'
     for _ in range(2):
-        assert ensemble(path, '-o', folder) == 0
+        assert ensemble(path, '-o', folder) == code
         said = capsys.readouterr().err
-        assert said.startswith('spinning-top ensemble: '
-                               '3 of 6 runs failed, see manifest.json; run 3: ValueErr')
+        assert said.startswith(f'spinning-top ensemble: {len(failed)} of 2 runs failed, see ')
         assert said.count('\n') == 1
-        failed = json.loads((folder / 'manifest.json').read_text())['failed']
-        assert list(failed) == ['3', '4', '5']
-        assert all('ValueError: no motion from theta = ' in why
-                   and 'initial.theta = ' in why and why.endswith(', spin.lz = 1e+30')
-                   for why in failed.values())
-    part, = (folder / 'data').iterdir()
-    assert set(parquet.read_table(part)['run'].to_pylist()) == {0, 1, 2}
-
-
-def test_an_ensemble_all_of_whose_runs_fail_is_a_failure(tmp_path, capsys, ensemble):
-    path = written(tmp_path, runs=2, duration=0.05, streams=[], sample={
-        'spin.lz': {'values': [1e30, -1e30]}})
-    assert ensemble(path, '-o', tmp_path / 'other') == 1
-    assert '2 of 2 runs failed' in capsys.readouterr().err
+        why = json.loads((folder / 'manifest.json').read_text())['failed']
+        assert list(why) == failed
+        assert 'ValueError: no motion from theta = ' in why['1'] and 'spin.lz = ' in why['1']
 
 
 def test_a_receiver_without_reception_is_no_failure_and_has_no_fix():
@@ -266,11 +266,6 @@ def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(
     assert abs(np.corrcoef(columns['spin.l3'], columns['spin.lz'])[0, 1]) < 5.0 / np.sqrt(2000)
 
 
-def test_a_part_has_at_most_50_000_rows_and_an_ensemble_at_least_50_parts_by_default():
-    assert [ensemble_spec.parse({'runs': runs, 'duration': duration}, 'test').runs_per_part
-            for runs, duration in ((10 ** 6, 10.0), (1000, 10.0), (10 ** 6, 1e5))] == [25, 20, 1]
-
-
 @pytest.mark.parametrize(('content', 'counts'), [
     # A magnetometer in one of two IMUs; a value that is unset in some runs.
     ({'runs': 4, 'sample': {'params': {'values': [
@@ -309,42 +304,13 @@ def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(
     ({'streams': ['imu', 'markers']}, "streams: 'markers': must be some of pose"),
     ({'runs': 1.5}, 'runs = 1.5: must be an integer >= 1'),
     ({'duration': 0.0}, 'duration = 0.0: must be a number >= 1e-09'),
-    ({'run': 3}, "'run'")])
+    ({'run': 3}, "'run'"), ({'--workers': '0'}, '--workers 0: must be')])
 def test_a_bad_specification_is_refused_and_makes_nothing(tmp_path, capsys, changes, said):
-    path = written(tmp_path, **changes)
-    code = main([str(path), '-o', str(tmp_path / 'out')])
+    workers = changes.get('--workers', '1')
+    path = written(tmp_path, **{name: value for name, value in changes.items() if '-' not in name})
+    code = main([str(path), '-o', str(tmp_path / 'out'), '--workers', workers])
     error = capsys.readouterr().err
     assert said in error
     assert error.startswith('spinning-top ensemble: ') and error.count('\n') == 1
     assert code == (1 if 'No such file' in said else 2)
     assert not (tmp_path / 'out').exists()
-
-
-def test_a_folder_of_something_else_is_refused(whole, tmp_path, capsys, ensemble):
-    _, path = whole
-    folder = tmp_path / 'runs'
-    one = written(tmp_path, runs=1, duration=0.05, sample={
-        'initial.theta': {'values': [0.3, 0.6]}, 'spin.l3': {'values': [1.5, 1.7]}})
-    assert ensemble(one, '-o', folder) == 0
-    before = contents(folder)
-    assert ensemble(one, '-o', folder) == 0             # it is complete
-    assert contents(folder) == before
-    assert ensemble(path, '-o', folder) == 2
-    error = capsys.readouterr().err
-    assert f'{folder} has another ensemble' in error
-    assert error.endswith(': choose a new folder, or --overwrite\n')
-    (folder / 'notes').write_text('mine')
-    other = written(tmp_path, runs=1, duration=0.05, sample={'spin.l3': {'values': [1.5, 1.7]}})
-    assert ensemble(other, '-o', folder, '--overwrite') == 0
-    after = contents(folder)
-    assert after.pop('notes') == b'mine'
-    assert after.keys() == before.keys() and not after.items() & before.items()
-    assert ensemble(path, '-o', tmp_path, '--overwrite') == 2
-    assert capsys.readouterr().err.endswith(
-        f'{tmp_path} exists and has no manifest.json: choose a new folder\n')
-
-
-def test_bad_arguments_are_refused(tmp_path, capsys):
-    assert main([str(written(tmp_path)), '-o', str(tmp_path / 'out'), '--workers', '0']) == 2
-    assert '--workers 0: must be' in capsys.readouterr().err
-    assert [entry.name for entry in tmp_path.iterdir()] == ['spec.yaml']

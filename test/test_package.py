@@ -7,7 +7,6 @@ import runpy
 import subprocess
 import sys
 import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,6 @@ from spinning_top_sim.installation import remedy
 
 NAME = 'spinning_top_sim'
 SCRIPTS = sorted(path for path in (ROOT / 'scripts').iterdir() if path.is_file())
-SCENES = sorted((ROOT / 'config').glob('*.yaml'))
 NO_KEY = {'gmpy2', 'mcap', 'rosbags'}        # of rosdep, or one of PyPI only
 SOURCES = ('.ci', 'benchmark', 'docs', 'examples', 'launch', 'scripts', NAME, 'test')
 
@@ -42,15 +40,9 @@ def prefix():
     pytest.skip(f'{NAME} is not installed here, only importable')
 
 
-def test_the_manifest_is_valid():
-    warnings: list[str] = []
-    package = parse_package(str(ROOT / 'package.xml'), warnings=warnings)
-    package.validate(warnings=warnings)
-    assert not warnings
-    assert package.name == NAME
-    assert package.get_build_type() == 'ament_python'
-    assert package.licenses == ['Apache-2.0']
-    assert (ROOT / package.licenses[0].file).is_file()
+def test_every_command_has_a_script(project):
+    assert project['scripts'] == {'spinning-top': f'{NAME}.__main__:main'}
+    assert len(SCRIPTS) == len(COMMANDS)
 
 
 def test_the_manifest_names_every_ros_package_that_is_imported():
@@ -67,29 +59,14 @@ def test_the_manifest_names_every_ros_package_that_is_imported():
     assert {'launch', 'launch_ros', 'xacro'} <= ros
 
 
-def test_versions_agree(project):
-    package = parse_package(str(ROOT / 'package.xml'))
+def test_the_manifest_is_valid_and_versions_agree(project):
+    warnings: list[str] = []
+    package = parse_package(str(ROOT / 'package.xml'), warnings=warnings)
+    package.validate(warnings=warnings)
+    assert not warnings and package.get_build_type() == 'ament_python'
     newest = next(get_changelog_from_path(str(ROOT), NAME).foreach_version(reverse=True))[0]
     citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
     assert package.version == newest == project['version'] == citation['version']
-
-
-def test_no_private_name_of_rclpy_is_used():
-    """What ends with a release of rclpy: `rclpy.impl`, and attributes like `node._parameters`."""
-    private = re.compile(r'rclpy\.impl|rclpy_implementation|_rclpy\b|publish_raw'
-                         r'|(?<!\bself)(?<!\bcls)(?<!\bos)\._[a-z]')
-    found = [f'{path.name}:{number}: {line.strip()}'
-             for path in (*(ROOT / NAME / 'nodes').glob('*.py'), *(ROOT / 'launch').glob('*.py'))
-             for number, line in enumerate(path.read_text(encoding='utf-8').splitlines(), 1)
-             if private.search(line)]
-    assert found == []
-    assert private.search('node._parameter_overrides') and private.search('publisher.publish_raw')
-
-
-def test_one_command_is_on_path_and_every_script_is_a_part_of_it(project):
-    assert project['scripts'] == {'spinning-top': f'{NAME}.__main__:main'}
-    called = [re.search(r"main\(\['(\w+)', \*sys", path.read_text())[1] for path in SCRIPTS]
-    assert sorted(called) == sorted(COMMANDS)
 
 
 def test_ctrl_c_during_the_imports_of_a_tool_is_quiet():
@@ -143,26 +120,6 @@ def test_the_manifest_requires_what_ubuntu_has_of_what_pip_installs(project):
     assert declared == set(keys.values()) == required - NO_KEY
 
 
-def make(*arguments):
-    """Run make without what the `make` that runs the tests was given."""
-    environment = {name: value for name, value in os.environ.items()
-                   if name not in ('MAKEFLAGS', 'MFLAGS', 'MAKELEVEL', 'PYTHON', 'ROS', 'VENV')}
-    return subprocess.run(['make', *arguments], cwd=ROOT, check=False, capture_output=True,
-                          text=True, timeout=60, env=environment)
-
-
-def test_make_refuses_a_second_ros_in_an_environment(tmp_path):
-    (tmp_path / '.deps-ros-jazzy').touch()
-    made = make('dependencies', 'ROS=kilted', f'VENV={tmp_path}')
-    assert made.returncode == 2 and 'the wheels of ROS 2 jazzy, not of kilted' in made.stderr
-
-
-def test_make_help_fits_into_80_columns_and_names_every_scene():
-    told = make('help').stdout
-    assert max(map(len, told.splitlines())) <= 80
-    assert {path.stem for path in SCENES} <= set(told.split())
-
-
 def test_every_source_says_its_license():
     paths = [path for folder in SOURCES for path in (ROOT / folder).rglob('*') if path.is_file()
              and (path.suffix in ('.py', '.sh') or path.read_bytes().startswith(b'#!'))]
@@ -171,34 +128,6 @@ def test_every_source_says_its_license():
     silent = [path for path in paths if '# SPDX-License-Identifier: Apache-2.0'
               not in path.read_text(encoding='utf-8').splitlines()[:2]]
     assert silent == []
-
-
-@pytest.mark.parametrize('name, arguments', [
-    ('simulate', ['--help']), ('inspect', ['--help']),
-    ('examine', ['run.mcap', '--topic', 'imu/data'])])
-def test_a_command_whose_library_is_missing_names_it_and_the_remedy(
-        name, arguments, monkeypatch, capsys):
-    for module in [one for one in sys.modules if one.startswith('spinning_top_sim')]:
-        monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, 'mcap.exceptions', None)
-    monkeypatch.setitem(sys.modules, 'mcap.records', None)
-    monkeypatch.setitem(sys.modules, 'mcap.opcode', None)
-    assert import_module('spinning_top_sim.__main__').main([name, *arguments]) == 1
-    assert re.fullmatch(f'spinning-top {name}: it needs mcap, which is not installed: '
-                        rf"\S+ -m pip install 'mcap[^']*'\n", capsys.readouterr().err)
-
-
-@pytest.mark.parametrize('name', ['node', 'simulate'])
-def test_output_that_has_no_encoding_is_escaped_and_a_pager_may_end(name):
-    command = [sys.executable, '-m', NAME, name, '--scene', 'help']
-    run = subprocess.run(command, cwd=ROOT, text=True, capture_output=True, timeout=60,
-                         check=False, env={**os.environ, 'PYTHONIOENCODING': 'ascii'})
-    assert (run.returncode, run.stderr) == (0, '')
-    assert r'Br\xfcls' in run.stdout
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                          text=True) as running:
-        running.stdout.close()
-        assert (running.wait(60), running.stderr.read()) == (0, '')
 
 
 def test_a_remedy_names_the_distribution_or_the_package_of_ubuntu(monkeypatch):

@@ -125,10 +125,6 @@ def test_every_scene_is_valid_and_is_the_motion_it_says():
         assert regime_of(top, parameters.start_state(values)) == name
 
 
-def test_the_default_parameters_are_the_cusp_scene():
-    assert parameters.checked(scene_parameters('cusp')) == parameters.checked({})
-
-
 @pytest.mark.parametrize(('l3', 'name'), [
     (math.nextafter(2.0, 3.0), 'sleeping'), (2.0, 'sleeping, unstable'),
     (-2.0, 'sleeping, unstable'), (math.nextafter(2.0, 0.0), 'sleeping, unstable')])

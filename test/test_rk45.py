@@ -19,7 +19,6 @@ import pytest
 from helpers.reference import CASES, angle, quaternion_of, scene_parameters, start_of, top_of
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import ERROR, STAGES, IntegrationError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.solve import motion_of
@@ -215,18 +214,6 @@ def test_steps_are_read_until_they_are_forgotten():
         motion.states(range(SECOND, 2 * SECOND, SECOND))
     motion.forget(100 * SECOND)                 # the newest step stays: the next begins there
     assert len(motion.states(range(59 * SECOND, 90 * SECOND, SECOND))) == 31
-
-
-def test_so_many_steps_are_kept_at_most(monkeypatch):
-    """Whatever is asked: a fast top between two samples of a slow IMU must not fill the memory."""
-    monkeypatch.setattr(dormand_prince, 'MOST_KEPT', 50)
-    motion = looping_motion()
-    expected = looping_motion().states(range(60 * SECOND, 60 * SECOND + 1)).phi
-    for second in (40, 60, 60):
-        found = motion.states(range(second * SECOND, second * SECOND + 1)).phi
-    assert found == expected
-    with pytest.raises(IntegrationError, match='oldest'):
-        motion.states(range(1))
 
 
 @pytest.mark.parametrize('equations', ['transport', 'euler'])

@@ -153,15 +153,3 @@ def test_what_is_missing_is_told_with_its_remedy(empty, answers):
         assert f'{empty}/bin/python -m {remedy}' in err
         words = err.split()
         assert len(set(words)) == len(words)
-
-
-def test_the_shell_completes_commands_and_options(empty):
-    def completed(line):
-        _, out, _ = run('sh', '-c', f'"{sys.executable}" -m spinning_top_sim 8>&1 9>/dev/null',
-                        _ARGCOMPLETE='1', _ARGCOMPLETE_IFS='\n', COMP_LINE=line,
-                        COMP_POINT=str(len(line)))
-        return out.split()
-
-    pytest.importorskip('argcomplete')
-    assert completed('spinning-top in') == ['inspect']
-    assert '--verify' in completed('spinning-top inspect --ve')
