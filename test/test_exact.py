@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from gmpy2 import get_context
 from helpers.reference import CASES, ROOT, start_of, top_of
-from stress.tops import blocks, check_block
+from helpers.tops import blocks, check_block
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.physics.states import TIMES_TOGETHER
@@ -127,10 +127,10 @@ REGIMES = {
     'nothing moves': (replace(TOP, gravity=0.0), start(0.5, l3=0.0, lz=0.0))}
 
 
-@pytest.mark.parametrize('seeds', blocks(0, int(os.environ.get('STRESS_TOPS', '42'))),
+@pytest.mark.parametrize('seeds', blocks(0, int(os.environ.get('TOPS', '42'))),
                          ids=lambda seeds: f'{seeds[0]}-{seeds[-1]}')
 def test_random_tops(seeds):
-    """STRESS_TOPS=100000 in the environment takes as many; three of each kind by default."""
+    """TOPS=100000 in the environment takes as many; three of each kind by default."""
     found = check_block(seeds)
     assert not found.failures, '\n'.join(found.failures)
     # Of most tops the error of rk45 could be told.

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from helpers.examples import examples
 from helpers.simulations import SECOND, play, simulate
+from helpers.tops import COLUMNS, UNIT, time_limit
 from hypothesis import given
 from hypothesis import strategies as st
-from stress.tops import COLUMNS, UNIT, time_limit
 
 from spinning_top_sim import State, Top, solve
 from spinning_top_sim.solvers.dormand_prince import IntegrationError

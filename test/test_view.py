@@ -193,21 +193,6 @@ def test_the_effective_potential_meets_the_energy_at_the_turning_points(shown):
     assert np.interp(turning.x, line.x, line.y) == pytest.approx(energy, abs=1e-3)
 
 
-def test_a_plot_is_svg_with_title_units_and_its_points():
-    x = np.array([0.0, 1.0, 2.0])
-    svg = ElementTree.fromstring(plots.draw(plots.Plot('Tilt', 't [s]', 'θ [deg]', [
-        plots.Line('θ', '#123456', x, 10.0 * x)], 1.0)))
-    texts = [text for text in svg.itertext() if text]
-    assert {'Tilt', 't [s]', 'θ [deg]', '0.0', '2.0', '10', '20'} <= set(texts)
-    (line,) = svg.iter('polyline')
-    (first, middle, last) = ([float(number) for number in point.split(',')]
-                             for point in line.get('points').split())
-    assert first[0] < middle[0] < last[0] and first[1] > middle[1] > last[1]
-    (mark,) = (group for group in svg.iter('g') if group.get('class') == 'now')
-    assert mark.get('transform') == f'translate({middle[0]} 0)'
-    assert plots.draw(plots.Plot('', '', '', [], 0.0)) == ''
-
-
 @pytest.mark.parametrize('scene', parameter_files('scene'))
 def test_every_scene_has_words_and_plots(scene):
     """And samples of it tell the motion that the solution has."""

@@ -2,7 +2,6 @@
 """
 Stress tests: random inputs and faults, for so long or so many.
 
-    python test/stress tops --count 100000      both solvers on random tops
     python test/stress world --count 100000     loop, recorder and log in a simulated world
     python test/stress logs --seconds 600       damaged logs, and what reads them
     python test/stress nodes --seconds 600      extreme parameters and commands at a real node
@@ -19,14 +18,14 @@ from pathlib import Path
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
 sys.path.remove(str(Path(__file__).parent))     # its modules are those of a package
 
-from stress import runner, tops, world  # noqa: E402
+from stress import runner, world  # noqa: E402
 
 
 def main():
     parser = argparse.ArgumentParser(
         prog='python test/stress', description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('part', choices=('tops', *runner.PARTS))
+    parser.add_argument('part', choices=runner.PARTS)
     parser.add_argument('--first', type=int, default=0, help='the first seed')
     parser.add_argument('--count', type=int, help='how many seeds')
     parser.add_argument('--seconds', type=float, help='how long')
@@ -35,8 +34,6 @@ def main():
     options = parser.parse_args()
     if options.only:
         return world.repeat(options.first, options.only)
-    if options.part == 'tops':
-        return tops.stress(options.first, options.count or 100_000, options.processes)
     if options.count is None and options.seconds is None:
         options.seconds = 60.0
     return stress(options)

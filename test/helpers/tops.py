@@ -1,22 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Both solvers on random tops: what must hold for every one of them, with each bound and its reason.
-
-    python test/stress tops --count 100000 [--first SEED] [--processes N]
-
-prints its progress and what failed; its exit code says whether.
-"""
+"""Both solvers on random tops: what must hold for every one, with each bound and its reason."""
 
 import collections
 import math
-import multiprocessing
 import signal
 from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
-from helpers.random_tops import random_case
 
+from helpers.random_tops import random_case
 from spinning_top_sim import Top, solve
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.solve import motion_of
@@ -268,18 +261,3 @@ def check_case(found, case):
 
 def blocks(first, count):
     return [range(at, min(at + BLOCK, first + count)) for at in range(first, first + count, BLOCK)]
-
-
-def stress(first, count, processes=None):
-    """Check so many tops; return the exit code."""
-    failures, counts = 0, collections.Counter()
-    with multiprocessing.Pool(processes) as pool:
-        for done, part in enumerate(pool.imap_unordered(check_block, blocks(first, count)), 1):
-            failures += len(part.failures)
-            counts += part.counts
-            for failure in part.failures:
-                print(f'\r{failure}', flush=True)
-            print(f'\r{min(done * BLOCK, count)} of {count} tops, {failures} failures ', end='',
-                  flush=True)
-    print(*(f'{name}: {number}' for name, number in counts.items()), sep='\n')
-    return 1 if failures else 0
