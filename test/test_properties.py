@@ -51,8 +51,8 @@ def test_any_value_of_a_parameter_is_taken_or_refused_by_its_name(name, value):
 
 YAML = st.text(st.sampled_from(string.ascii_letters + string.digits + ' \n\t:-[]{},&*!|>#\'"%@`~.'
                                '\x00\x85\u2028\ud800\U0001f300'), max_size=60) | st.recursive(
-    SHORT, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(
-        NAMES | KEYS, inner, max_size=3), max_leaves=8).map(lambda content: yaml.dump(
+    SHORT, lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(
+        NAMES | KEYS, inner, max_size=3)), max_leaves=8).map(lambda content: yaml.dump(
             {'/**': {'ros__parameters': content}}, allow_unicode=True)) | st.tuples(
                 NAMES, st.integers(15_000, 20_000)).map(lambda pair: (
                     f'/**: {{ros__parameters: {{{pair[0]}: [1.0, {1 << pair[1]:#x}]}}}}'))

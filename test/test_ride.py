@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gmpy2 import mpfr
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from spinning_top_sim import State, Top
@@ -169,6 +170,15 @@ def test_pieces_are_joined():
     assert moved == pytest.approx(velocity, abs=1e-6)
 
 
+@pytest.mark.parametrize(('theta', 'lz'), [(1e-6, 5e-26), (1e-20, 1e-50)])
+def test_a_pole_that_is_missed_by_little_is_not_passed_exactly(theta, lz):
+    """The motion about a line of effective gravity is the one about the vertical."""
+    times, start = np.arange(0, 20 * S, S // 3), State(theta=theta, l3=0.0, lz=lz)
+    one, other = (Piece(TOP, start, 0, *pivot_moves, method='exact').states(times).quaternion
+                  for pivot_moves in ((), (ride(NOWHERE),)))
+    assert np.minimum(abs(one - other).max(1), abs(one + other).max(1)).max() <= BOUND
+
+
 def test_next_to_the_line_of_effective_gravity_an_axis_stays_what_it_is():
     """Within 1e-30 rad it is taken for the line, as the documentation says."""
     for theta, falls in ((1e-29, True), (1e-31, False)):
@@ -200,9 +210,10 @@ def test_a_repeated_path_closes_exactly(waypoints):
     PivotPath([(S, (1.0, 0.0, 0.0)), (3 * S, (-1.0 / 3.0, 0.0, 0.0))], repeat=True)     # rounded
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.lists(st.tuples(st.integers(1, 10 ** 11), st.tuples(*3 * [st.floats(-50, 50)])),
                 min_size=1, max_size=6), st.booleans())
+@example([(S, (1.0, -2.0, 0.0)), (S // 7, (0.0, 3.0, 1.0))], True)
 def test_position_and_velocity_are_those_of_exact_arithmetic(pieces, there_and_back):
     if there_and_back := there_and_back and min(pieces)[0] >= 10 ** 6:
         pieces = [*pieces, *((length, tuple(-x for x in a)) for length, a in pieces)]
