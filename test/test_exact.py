@@ -109,17 +109,6 @@ def start(theta, theta_dot=0.0, *, l3, lz, phi=0.3, psi=-0.7):
     return State(theta=theta, theta_dot=theta_dot, phi=phi, psi=psi, l3=l3, lz=lz)
 
 
-def steady_rate(top, theta, l3):
-    """Slow steady precession: lambda1 cos(theta) Omega^2 - L3 Omega + P = 0."""
-    a, P = top.lambda1 * math.cos(theta), top.gravity_torque
-    return 2 * P / (l3 + math.sqrt(l3 * l3 - 4 * a * P))
-
-
-def steady_start(top, theta, l3):
-    return start(theta, l3=l3, lz=top.lambda1 * steady_rate(top, theta, l3)
-                 * math.sin(theta) ** 2 + l3 * math.cos(theta))
-
-
 REGIMES = {
     'looping': (UNIT, start(0.6, l3=6.0, lz=4.5)),
     'cusp': (TOP, start(0.5, l3=0.2, lz=0.2 * math.cos(0.5))),
@@ -135,16 +124,6 @@ def test_random_tops(seeds):
     assert not found.failures, '\n'.join(found.failures)
     # Of most tops the error of rk45 could be told.
     assert found.counts['rk45: q'] > 0.8 * len(seeds)
-
-
-def test_rates_of_equilibria():
-    sleeping = ExactSolution(TOP, start(0.0, l3=0.2, lz=0.2))
-    assert sleeping.mean_precession_rate == 0.2 / (2 * TOP.lambda1)
-    assert sleeping.mean_spin_rate == 0.2 / TOP.lambda3 - 0.2 / (2 * TOP.lambda1)
-    steady = ExactSolution(TOP, steady_start(TOP, 0.5, 0.2))
-    assert steady.mean_precession_rate == pytest.approx(steady_rate(TOP, 0.5, 0.2), rel=1e-14)
-    assert ExactSolution(replace(TOP, gravity=0.0), start(0.5, l3=0.0, lz=0.0)
-                         ).nutation_period is None
 
 
 def test_a_tiny_oscillation_has_its_rate_and_is_refused_below_what_doubles_hold():

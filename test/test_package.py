@@ -100,17 +100,6 @@ def test_an_installed_executable_tells_its_version_where_ros2_run_looks(
             timeout=60) == said.out
 
 
-def test_the_share_folder_is_complete(prefix):
-    share = prefix / 'share' / NAME
-    assert (share / 'package.xml').read_bytes() == (ROOT / 'package.xml').read_bytes()
-    for folder, pattern in (('config', '*.yaml'), ('config/imu', '*.yaml'),
-                            ('launch', '*.launch.*'), ('urdf', '*'), ('rviz', '*.rviz'),
-                            ('foxglove', '*.json')):
-        there = {path.name for path in (share / folder).glob('*') if path.is_file()}
-        assert there, folder
-        assert there == {path.name for path in (ROOT / folder).glob(pattern)}, folder
-
-
 def test_the_manifest_requires_what_ubuntu_has_of_what_pip_installs(project):
     keys = {'python3-numpy': 'numpy', 'python3-scipy': 'scipy', 'python3-tqdm': 'tqdm',
             'python3-yaml': 'PyYAML'}

@@ -18,9 +18,11 @@ import pytest
 from helpers.reference import CASES, angle, quaternion_of, scene_parameters, start_of, top_of
 
 from spinning_top_sim import State, Top, solve
+from spinning_top_sim.solvers import dormand_prince
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.solve import motion_of
+from spinning_top_sim.solvers.transport import TransportMotion
 from spinning_top_sim.streams import parameters
 
 SECOND = 1_000_000_000
@@ -192,6 +194,26 @@ def test_steps_are_read_until_they_are_forgotten():
         motion.states(range(SECOND, 2 * SECOND, SECOND))
     motion.forget(100 * SECOND)                 # the newest step stays: the next begins there
     assert len(motion.states(range(59 * SECOND, 90 * SECOND, SECOND))) == 31
+
+
+def test_so_many_steps_are_kept_at_most(monkeypatch):
+    """Whatever is asked: a fast top between two samples of a slow IMU must not fill the memory."""
+    monkeypatch.setattr(dormand_prince, 'MOST_KEPT', 50)
+    motion = looping_motion()
+    found = motion.states(range(60 * SECOND, 60 * SECOND + 1)).phi
+    with pytest.raises(IntegrationError, match='oldest'):
+        motion.states(range(1))
+    monkeypatch.undo()
+    assert found == looping_motion().states(range(60 * SECOND, 60 * SECOND + 1)).phi
+
+
+def test_an_error_that_is_no_number_is_no_small_error():
+    class Blind(TransportMotion):
+        def errors(self, y, y_new, difference):
+            return 0.5, math.nan, 0.25
+
+    with pytest.raises(IntegrationError, match='collapsed'):
+        Blind(top_of(LOOPING), start_of(LOOPING), 1e-9, 1e-10).states(range(SECOND, SECOND + 1))
 
 
 @pytest.mark.parametrize('equations', ['transport', 'euler'])
