@@ -100,6 +100,15 @@ def test_an_installed_executable_tells_its_version_where_ros2_run_looks(
             timeout=60) == said.out
 
 
+def test_the_share_folder_is_complete(prefix):
+    share = prefix / 'share' / NAME
+    for pattern in ('package.xml', 'config/*.yaml', 'config/imu/*.yaml', 'launch/*.launch.*',
+                    'urdf/*', 'rviz/*.rviz', 'foxglove/*.json'):
+        there, ours = ({path.relative_to(folder) for path in folder.glob(pattern)}
+                       for folder in (share, ROOT))
+        assert there == ours != set(), pattern
+
+
 def test_the_manifest_requires_what_ubuntu_has_of_what_pip_installs(project):
     keys = {'python3-numpy': 'numpy', 'python3-scipy': 'scipy', 'python3-tqdm': 'tqdm',
             'python3-yaml': 'PyYAML'}

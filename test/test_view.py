@@ -121,17 +121,32 @@ def test_motions_of_a_log_begin_with_its_commands(source, shown):
     assert shown.motion_at(change_ns + NANOSECONDS) is second
 
 
-def test_arrows_are_the_vectors_in_the_world(shown):
-    t_ns = 1_230_000_000
-    exact, top = truth(shown, t_ns), shown.top
+@pytest.mark.parametrize('distance', [0.15, -0.15])
+def test_arrows_are_the_vectors_in_the_world(distance):
+    track = simulation.SimulatedTrack(values_of('cusp', **{'top.com_distance': distance}), '')
+    t_ns, top = 1_230_000_000, track.top
+    exact = truth(track, t_ns)
     omega, turn = exact.angular_velocity[0], Rotation.from_quat(exact.quaternion[0])
     up = turn.inv().apply([0.0, 0.0, 1.0])
-    far = abs(drawn.axis_length(shown))
-    momentum, torque = (drawn.arrow(shown, name, t_ns) / far for name in drawn.ARROWS)
+    far = abs(drawn.axis_length(track))
+    momentum, torque = (drawn.arrow(track, name, t_ns) / far for name in drawn.ARROWS)
     assert momentum * exact.l3[0] == pytest.approx(         # L3 is the usual length
         turn.apply(omega * [top.lambda1, top.lambda1, top.lambda3]), abs=1e-8)
-    assert torque * top.gravity_torque == pytest.approx(turn.apply(
+    assert torque * abs(top.gravity_torque) == pytest.approx(turn.apply(
         np.cross([0.0, 0.0, top.com_distance], -top.mass * top.gravity * up)), abs=1e-8)
+
+
+def test_a_plot_is_svg_with_its_points():
+    x = np.array([0.0, 1.0, 2.0])
+    svg = ElementTree.fromstring(plots.draw(plots.Plot('Tilt', 't [s]', 'θ [deg]', [
+        plots.Line('θ', '#123456', x, 10.0 * x)], 1.0)))
+    assert {'Tilt', 't [s]', 'θ [deg]', '0.0', '2.0', '10', '20'} <= {*svg.itertext()}
+    (line,) = svg.iter('polyline')
+    across, down = zip(*(map(float, point.split(',')) for point in line.get('points').split()),
+                       strict=True)
+    assert (*across,) == (*sorted(across),) and (*down,) == (*sorted(down, reverse=True),)
+    (mark,) = (group for group in svg.iter('g') if group.get('class') == 'now')
+    assert mark.get('transform') == f'translate({across[1]} 0)'
 
 
 def lines_of(track, t_ns):
@@ -311,6 +326,16 @@ def test_sliders_and_scenes_begin_the_motions_of_their_numbers():
     assert own.update(0.25) == 250_000_000
     assert own.track_at(0).motion_at(0).description.name == 'sleeping'
     assert own.track_at(0).about.startswith('Scene sleeping; ')
+
+
+def test_a_reset_goes_back_to_what_was_forgotten():
+    desk = Desk()
+    own = simulation.OwnSimulation(desk, 'wavy', values_of('wavy', **{'solver.method': 'rk45'}))
+    start = own.track_at(0).state(0).quaternion
+    assert own.update(50.0) == 50 * NANOSECONDS
+    desk.press('time', 'Reset')
+    assert own.update(0.0) == 0
+    assert np.array_equal(own.track_at(0).state(0).quaternion, start)
 
 
 def test_equations_that_end_stop_the_page_there():
