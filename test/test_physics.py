@@ -55,6 +55,9 @@ def test_an_energy_that_doubles_hold_is_finite_where_the_square_of_the_rate_is_n
     top = Top(**{**TOP, 'lambda1': 1e-200, 'lambda3': 1e-200, 'mass': 0.0})
     energy = solve(top, State(theta=1.0, theta_dot=1e160, l3=0.0, lz=0.0), [0.0]).energy
     assert energy[0] == pytest.approx(5e119, rel=1e-14)
+    top = Top(**{**TOP, 'lambda1': 1e200, 'lambda3': 1e200, 'mass': 0.0})
+    energy = solve(top, State(theta=0.0, l3=1e160, lz=1e160), [0.0]).energy
+    assert energy[0] == pytest.approx(5e119, rel=1e-14)
 
 
 @pytest.mark.parametrize(('theta', 'lz', 'allowed'), [(0.0, 1.5, 1.6), (math.pi, 1.6, -1.6)])
