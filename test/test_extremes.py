@@ -10,7 +10,7 @@ import pytest
 from helpers.examples import examples
 from helpers.simulations import SECOND, play, simulate
 from helpers.tops import COLUMNS, UNIT, time_limit
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from spinning_top_sim import State, Top, solve
@@ -63,6 +63,7 @@ def test_any_size_of_any_number_gives_an_answer_or_a_reason(method, name, size, 
 @examples(80)
 @given(st.dictionaries(FIELDS, st.tuples(SIZES, st.sampled_from((1.0, -1.0))), min_size=2),
        st.sampled_from((None, 1.0, -1.0)))
+@example({'lambda3': (5e-324, 1.0)}, None)
 def test_any_sizes_of_all_numbers_give_the_start_exactly_or_a_reason(changed, lz_of_l3):
     values = {**TOP, **START, **{
         name: size * (side if name not in ('theta', 'lambda1', 'lambda3', 'mass') else 1.0)

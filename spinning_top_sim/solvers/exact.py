@@ -105,6 +105,9 @@ class ExactSolution:
     def _check_start(self) -> None:
         """Refuse constants so large, or so far apart, that doubles lose the start among them."""
         start, arrays = self.start, self.arrays
+        if not self.time_limit > 0.0:
+            raise ValueError(f'lambda3 = {self.top.lambda3!r} kg m^2 with l3 = {start.l3!r}: '
+                             'l3/lambda3 must be a double')
         with np.errstate(all='ignore'):
             first = ThetaValues(arrays, Times(1, np.zeros(1)))
             alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
