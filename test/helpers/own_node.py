@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import rclpy
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -45,19 +46,22 @@ class OwnNode(InThisProcess):
         self.node = Simulator({})
         self.loop, self.simulation = self.node.loop, self.node.simulation
         self.heard, self._diagnosed = {}, []
-        self.node._diagnostics = SimpleNamespace(publish=self._diagnosed.append)
+        self.publisher('diagnostics').publish = self._diagnosed.append
+
+    def publisher(self, topic):
+        """Return the publisher of this topic; `topic` is the end of its name."""
+        (found,) = (one for one in self.node.publishers if one.topic_name.endswith(f'/{topic}'))
+        return found
 
     def listen(self, *topics):
-        """Let these streams, and no others, have a subscriber."""
-        self.heard |= {topic: [] for topic in topics}
-        self.loop._update_subscribers = self._connect
+        """Let these topics have a subscriber, which needs no DDS."""
+        for topic in topics:
+            self.heard[topic] = []
+            publisher = self.publisher(topic)
+            publisher.publish = lambda data, topic=topic: self.heard[topic].append(data)
+            publisher.get_subscription_count = lambda: 1
+            publisher.wait_for_all_acked = lambda timeout: None
         return self
-
-    def _connect(self):
-        for one in self.simulation.outputs:
-            if one.channel.topic in self.heard and one.publish is None:
-                one.publish = self.heard[one.channel.topic].append
-                self.simulation.refresh()
 
     def set(self, **values):
         """Set parameters all or none; return the result."""
@@ -68,7 +72,9 @@ class OwnNode(InThisProcess):
         return [self.node.get_parameter(name).value for name in names]
 
     def command(self, *data):
-        self.node._on_command(Float64MultiArray(data=[float(one) for one in data]))
+        (commands,) = (one for one in self.node.subscriptions
+                       if one.topic_name.endswith('/commands'))
+        commands.callback(Float64MultiArray(data=[float(one) for one in data]))
 
     def switch(self, name, on):
         return self._serve(SetBool, name, data=on)
@@ -77,16 +83,17 @@ class OwnNode(InThisProcess):
         return self._serve(Trigger, name)
 
     def _serve(self, kind, name, **request):
-        if name == 'record':
-            future = self.ask_to_record(**request)
-            self.spin_until('an answer', future.done)
-            return future.result()
-        return self.node._serve(getattr(self.node, f'_{name}'), kind.Request(**request),
-                                kind.Response())
+        (service,) = (one for one in self.node.services if one.srv_name.endswith(f'/{name}'))
+        answer = service.callback(kind.Request(**request), kind.Response())
+        if isinstance(answer, Future):
+            self.spin_until('an answer', answer.done)
+            return answer.result()
+        return answer
 
-    def ask_to_record(self, data):
+    def ask_to_record(self, on):
         """Return the Future of the answer."""
-        return self.node._record(SetBool.Request(data=data), SetBool.Response())
+        (service,) = (one for one in self.node.services if one.srv_name.endswith('/record'))
+        return service.callback(SetBool.Request(data=on), SetBool.Response())
 
     def spin_until(self, what, condition):
         wait_for(what, lambda: condition() or rclpy.spin_once(self.node, timeout_sec=0.1))
@@ -99,7 +106,8 @@ class OwnNode(InThisProcess):
 
     def diagnostics(self):
         """Return level, message and values of a new report."""
-        self.node._publish_diagnostics()
+        (timer,) = (one for one in self.node.timers if one.timer_period_ns == 10 ** 9)
+        timer.callback()
         (status,) = self._diagnosed[-1].status
         return status.level[0], status.message, numbers(status)
 
