@@ -94,31 +94,6 @@ def test_a_node_waits_for_a_clock_follows_its_steps_and_names_its_jumps(
     assert [event['event'] for event in events_in(log_of(path)[0])] == ['start', 'epoch', 'epoch']
 
 
-def test_of_two_clocks_the_latest_counts_and_that_is_said_once(peer, tmp_path):
-    clock = DrivenClock(peer, '/two_clock', 2000 * SECOND)
-    with follower(tmp_path, 'two') as node:
-        pose = peer.listen(node.topic('pose'), PoseStamped)
-        clock.drive('the motion', lambda: len(pose.raw) > 20)
-        other = DrivenClock(peer, '/two_clock', 0)
-        for lag_ns in (5_000_000, 30_000_000, 990 * SECOND):
-            count = len(pose.raw)
-
-            def both(lag_ns=lag_ns, count=count):
-                assert stamp_of(pose.raw[-1]) <= clock.now_ns, 'not ahead of the newest'
-                other.set(clock.now_ns - lag_ns)
-                return len(pose.raw) > count + 50
-
-            clock.drive('samples', both)
-        # The clock rests now: what is under way arrives.
-        wait_for('the newest', lambda: clock.now_ns - stamp_of(pose.raw[-1]) < SECOND // 2)
-        pose.muted = True
-        assert_clean_end(node, node.end())
-    clock.stop()
-    other.stop()
-    assert node.err.count('several nodes publish on /clock') == 1
-    assert 'stepped back' not in node.err and 'jumped' not in node.err
-
-
 def test_a_node_that_publishes_the_clock_does_not_wait_for_itself(peer, tmp_path):
     with SimNode(tmp_path, {'clock.enabled': True, 'use_sim_time': True}) as node:
         clock = peer.listen('/clock', Clock).wait(3)

@@ -7,7 +7,6 @@ import signal
 import sys
 import time
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
@@ -15,7 +14,6 @@ pytest.importorskip('rclpy')
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.node_logs import (
-    SECOND,
     TRACEBACK,
     assert_clean_end,
     assert_received_from,
@@ -45,8 +43,6 @@ sys.exit(main())
 """
 INT, TERM = signal.SIGINT, signal.SIGTERM
 ENDINGS = [     # executor, signals, other parameters, state of the recorder and of the motion then
-    ('events', (INT, INT), {}, 'recording', 'running'),
-    ('single', (INT, INT), {}, 'recording', 'running'),
     ('events', (signal.SIGHUP, signal.SIGQUIT), {}, 'recording', 'running'),
     ('single', (TERM, TERM), {'start_paused': True}, 'recording', 'paused'),
     ('events', (INT, INT), {}, 'opening', 'running'),
@@ -109,40 +105,6 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(monkeypa
             executable.tell(line)
 
 
-READER = """
-import rclpy, sys
-from geometry_msgs.msg import PoseStamped
-from rclpy.qos import HistoryPolicy, QoSProfile
-rclpy.init()
-node = rclpy.create_node('reader')
-node.create_subscription(PoseStamped, sys.argv[1], lambda _: print('.', end='', flush=True),
-                         QoSProfile(history=HistoryPolicy.KEEP_ALL))
-rclpy.spin(node)
-"""
-
-
-def test_readers_that_stall_are_counted_and_motion_and_recording_go_on(
-        peer, diagnostics, tmp_path):
-    values = {'record.enabled': True, 'pose.rate': 5000.0,
-              'qos_overrides./keep/pose.publisher.history': 'keep_all'}
-    with (SimNode(tmp_path, values, namespace='/keep') as node,
-          SimNode(tmp_path, namespace='/reader', program=('-c', READER, '/keep/pose')) as reader):
-        wait_for('messages', lambda: len(reader.out) > 100)
-        os.kill(reader.process.pid, signal.SIGSTOP)
-        wait_for('failures', lambda: diagnostics.number(node, 'failed messages') > 1000)
-        said = diagnostics.next(node)
-        later = diagnostics.next(node)
-        assert float(later['simulated time [s]']) > float(said['simulated time [s]'])
-        assert (later['state'], later['recorder']) == ('running', 'recording')
-        count = len(reader.out)
-        os.kill(reader.process.pid, signal.SIGCONT)
-        wait_for('more messages', lambda: len(reader.out) > count + 6000)
-        assert_clean_end(node, node.end())
-    path = the_log(node.folder)
-    assert verified(path)['identical']
-    assert set(np.diff([stamp for stamp, _ in log_of(path)[0]['/keep/pose']])) == {SECOND // 5000}
-
-
 def test_overload_skips_what_is_live_records_everything_and_stays_reachable(tmp_path, capfd):
     streams = ('pose', 'joint_states', 'ground_truth_odom')
     rates = {f'{name}__rate': 10000.0 for name in streams}
@@ -158,41 +120,28 @@ def test_overload_skips_what_is_live_records_everything_and_stays_reachable(tmp_
         assert int(said['skipped samples']) > 0
         assert node.switch('set_pause', True).success
     assert capfd.readouterr().err.count('live topics skip samples') == 1
-    log, metadata = log_of(tmp_path / 'run.mcap')
-    epoch = int(metadata['spinning_top_sim']['epoch_ns'])
-    for name in ('pose', 'joint_states', 'ground_truth/odom'):
-        times = np.array([time for time, _ in log[f'/{name}']])
-        assert times[0] == epoch
-        assert set(np.diff(times)) == {100_000}, name
-    assert len(node.heard['pose']) < len(log['/pose'])
+    assert verified(tmp_path / 'run.mcap')['identical']
 
 
-# In a tick, in reports, in a parameter's change.
-BREAKABLE = {'loop.tick': None, '_report.diagnostics': None,
-             'loop.set_pace': lambda node: node.set(pose__rate=50.0)}
-
-
-@pytest.mark.parametrize('path', BREAKABLE)
+@pytest.mark.parametrize('name', ['tick', 'set_pace'])
 def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
-        monkeypatch, tmp_path, capfd, path):
+        monkeypatch, tmp_path, capfd, name):
     def broken(*_, **__):
         raise ZeroDivisionError('nobody expected this')
 
     reason = 'unexpected ZeroDivisionError: nobody expected this'
     with OwnNode(tmp_path, record__enabled=True).listen('pose') as node:
         node.spin_until('samples', lambda: len(node.heard['pose']) > 5)
-        owner, name = path.split('.')
         with monkeypatch.context() as patch:
-            patch.setattr(getattr(node.node, owner), name, broken)
-            if BREAKABLE[path]:
-                assert 'nobody expected this' in BREAKABLE[path](node).reason
+            patch.setattr(node.loop, name, broken)
+            if name == 'set_pace':
+                assert 'nobody expected this' in node.set(pose__rate=50.0).reason
             node.spin_until('an error', lambda: node.loop.failure)
-        node.spin_until('the end of the recording', lambda: node.node._recording.error)
-        assert node.diagnostics()[:2] == (2, f'recording: {reason}')
+        node.spin_until('the end of the recording', lambda: (
+            node.diagnostics()[:2] == (2, f'recording: {reason}')))
         assert node.loop.failure == reason
         said = capfd.readouterr().err
         assert 'until ~/reset' in said and TRACEBACK in said
-        assert ' FAILED |' in node.node._report.status_line()
         answer = node.switch('set_pause', False)
         assert not answer.success and f'stands still: {reason}' in answer.message
         heard = list(node.heard['pose'])
