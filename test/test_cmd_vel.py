@@ -61,13 +61,6 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops(method):
     assert goes_to(simulation, 11 * S + S // 2)[1][1] == 0.8
 
 
-def test_a_velocity_of_zero_brakes_a_pivot_that_moves():
-    simulation = simulate({'pivot.cmd_timeout': 0.0})
-    for t_ns, velocity, found in ((S, 0.8, 0.0), (2 * S, 0.0, 0.8), (3 * S, 0.0, 0.0)):
-        assert goes_to(simulation, t_ns)[1][1] == pytest.approx(found)
-        drive(simulation, 0.0, velocity, 0.0)
-
-
 def test_a_storm_of_velocities_costs_the_same_from_first_to_last(monkeypatch):
     """Also with a filter, which remembers some of them."""
     simulation, counts = simulate({'solver.method': 'exact', 'imu.bandwidth': 20.0}), []

@@ -74,15 +74,6 @@ def separatrix_distance(values):
     return (greatest - high) / (greatest - low)
 
 
-def test_a_slow_topic_says_that_it_does_not_resolve_the_nutation(tmp_path):
-    found = surveyed(log_of(
-        tmp_path / 'run.mcap', '--params', ROOT / 'config/fast_gyroscope.yaml', '--duration', 2,
-        '-p', 'record.streams:=["joint_states"]', '-p', 'solver.method:=exact'))
-    measured = found.motions[0].measured
-    assert measured.nutation_period is measured.mean_precession_rate is None
-    assert measured.missing == ('1.3 samples in a nutation are too few',)
-
-
 @pytest.mark.parametrize('topic', ['pose', 'ground_truth_imu', 'imu_data'])
 def test_any_topic_with_an_attitude_measures_a_motion(tmp_path, topic):
     found = surveyed(log_of(
@@ -202,8 +193,7 @@ def test_a_reader_that_leaves_is_no_error(short, monkeypatch, capsys):
 @pytest.mark.parametrize(('key', 'text'), [
     ('parameters', '[' * 100_000), ('parameters', '{"top.lambda1": 1e-320}'),
     ('begun_ns', str(10 ** 18)), ('history', '[[5, 1.0, 1.0], [4, 1.0, 1.0]]'),
-    ('history', '[[1e300, 1.0, 1.0]]'), ('history', '[[0, 1, NaN]]'), ('epoch_ns', 'NaN'),
-    ('parameters', '{"spin.l3": []}'), ('parameters', '{"seed": "\\ud800"}')])
+    ('history', '[[0, 1, NaN]]'), ('epoch_ns', 'NaN')])
 def test_odd_metadata_end_in_words(short, tmp_path, capsys, key, text):
     path = rewritten(short, tmp_path / 'odd.mcap', metadata={key: text})
     code, out, _ = told(capsys, path, '--verify')
@@ -226,24 +216,6 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
         frames.seek(number)
         shown.append(np.asarray(frames.convert('RGB'), int))
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
-
-
-def test_a_page_draws_every_motion_of_the_log(tmp_path, capsys, monkeypatch):
-    figure = pytest.importorskip('matplotlib.figure')
-    drawn = []
-    monkeypatch.setattr(figure.Figure, 'savefig', lambda self, *_, **__: drawn.append(self))
-    log = log_of(tmp_path / 'run.mcap', '--duration', 3, '--command', '1:2.0:1.5',
-                 '--command', '2:1.6:1.7')
-    assert told(capsys, log, '--plot', tmp_path / 'page.png')[0] == 0
-    (page,) = drawn
-    assert page.get_suptitle() == 'run.mcap: cusps, waves, waves (3 of 3 motions, 3 s)'
-    panels = {axes.get_ylabel(): axes for axes in page.axes}
-    tilt = panels['tilt θ [deg]'].lines
-    assert tilt[0].get_xdata()[[0, -1]].tolist() == [0.0, 3.0]
-    assert len(tilt[0].get_xdata()) == 301
-    assert [line.get_xdata()[0] for line in tilt[-2:]] == pytest.approx([1.01, 2.01])
-    # Each motion has its own energy, from which it drifts.
-    assert np.abs(panels['relative drift [1]'].lines[0].get_ydata()).max() < 1e-9
 
 
 @pytest.mark.parametrize('option', ['--plot', '--animate'])
@@ -277,10 +249,3 @@ def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path
     run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                          timeout=60, check=True)
     assert run.stdout.strip().endswith('loaded: [] []')
-
-
-def test_a_folder_with_one_log_is_that_log(short, tmp_path, capsys):
-    (tmp_path / 'bag').mkdir()
-    (tmp_path / 'bag/bag_0.mcap').symlink_to(short)
-    assert inspect.main([str(tmp_path / 'bag')]) == 0
-    assert capsys.readouterr().out.startswith(f'{tmp_path}/bag/bag_0.mcap: whole')

@@ -22,7 +22,6 @@ from helpers.simulations import (
 
 from spinning_top_sim import solve
 from spinning_top_sim.solvers import dormand_prince
-from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams import live, parameters
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.live import LiveSimulation
@@ -134,36 +133,6 @@ def test_each_sample_is_computed_once_for_all_and_what_nobody_takes_is_not(monke
     assert max(count for _, count in encoded) <= live.MOST_SAMPLES
     assert counts['pose'] == counts['/clock'] <= 1001 + live.MOST_SAMPLES
     assert counts['joint_states'] <= 501 + live.MOST_SAMPLES
-
-
-def test_a_clock_alone_solves_nothing(monkeypatch):
-    """Nor does the path of the pivot: fixes need no attitude."""
-    pytest.importorskip('pymap3d')
-    simulation = simulate(gnss__enabled=True)
-    asked = calls_of(monkeypatch, Piece, 'states', lambda piece, t_ns: len(t_ns))
-    publish(simulation, '/clock', 'gnss/fix')
-    for tick in range(1, 20):
-        simulation.send(tick * 100 * MILLISECOND)
-    # One at most a call, which finds out how far the motion goes.
-    assert max(asked) == 1
-    assert output(simulation, '/clock').sent == 191
-
-
-@pytest.mark.parametrize('ahead', [False, True])
-def test_late_samples_are_recorded_and_counted_but_not_published(ahead, monkeypatch):
-    simulation = simulate()
-    published = publish(simulation, 'pose', 'joint_states')
-    recorded, encoded = record(simulation, 'pose'), samples_of(monkeypatch)
-    simulation.send(0)
-    for _ in range(10 * ahead):
-        simulation.look_ahead(SECOND, 1.0)
-    assert simulation.send(10 * SECOND, publish_from_ns=9 * SECOND)
-    assert times(recorded, 'pose') == list(range(0, 10 * SECOND + 1, PERIOD_NS))
-    for topic in ('pose', 'joint_states'):
-        one = output(simulation, topic)
-        assert [name for name, _ in published].count(topic) == 102
-        assert (one.sent, one.skipped, one.failed) == (102, 899, 0)
-    assert total(encoded)['pose'] == 1001
 
 
 @pytest.mark.parametrize(('before', 'after'), [(100.0, 33.0), (10000.0, 10.0)])

@@ -7,7 +7,6 @@ What a slow, full or failing disk does: test_world.py and test_failing_calls.py.
 
 import os
 import re
-import resource
 import subprocess
 import sys
 import textwrap
@@ -15,13 +14,12 @@ import time
 
 import pytest
 from helpers import recordings
-from helpers.recordings import METADATA, TOPICS, opened, rows_of, write
+from helpers.recordings import METADATA, TOPICS, opened, write
 from helpers.reference import ROOT
 from rosbags.rosbag2 import Reader
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder
-from spinning_top_sim.recording.writer import McapWriter, log_head
 
 
 def is_indexed(path):
@@ -100,22 +98,3 @@ def test_a_message_that_cannot_be_packed_is_no_exception_for_the_simulation(tmp_
     summary = recorder.close()
     assert recorder.state == 'failed' and 'stopped: IndexError:' in (summary.error or '')
     assert (is_indexed(summary.path), summary.lost) == (True, 1)
-
-
-def test_a_chunk_for_which_there_is_no_room_leaves_room_for_the_summary(tmp_path):
-    """The kernel sets the limit, as a quota does."""
-    file = McapWriter(tmp_path / 'run.mcap', log_head(TOPICS, METADATA), compression='none')
-    file.add(*rows_of(0, 10))
-    file.flush()
-    file.add(*rows_of(10, 1000))
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (file.size + 30_000, limits[1]))
-    try:
-        with pytest.raises(OSError, match=r'File too large: .*run\.mcap'):
-            file.flush()
-        file.finish()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    with LogReader(tmp_path / 'run.mcap') as reader:
-        assert reader.whole
-        assert [message.log_time for message in reader.messages()] == list(range(10))

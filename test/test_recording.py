@@ -21,10 +21,8 @@ from helpers.recordings import (
     METADATA,
     TOPICS,
     parsed_qos,
-    pose_cdr,
     some_messages,
     write,
-    write_rows,
 )
 from helpers.reference import ROOT
 from mcap.data_stream import ReadDataStream
@@ -155,21 +153,6 @@ def test_bag_metadata_agrees_with_the_messages(tmp_path, monkeypatch, count):
         assert told['type_description_hash'].startswith('RIHS01_')
         assert told['offered_qos_profiles'][0]['reliability'] == (
             'best_effort' if topic.qos else 'reliable')
-
-
-def test_chunks_with_falling_stamps_give_the_whole_span(tmp_path):
-    path = write_rows(tmp_path / 'run.mcap', TOPICS, [
-        (0, stamp, pose_cdr(stamp)) for stamp in (50, 40, 20, 30)], per_chunk=2)
-    with path.open('rb') as stream:
-        reader = make_reader(stream)
-        summary = reader.get_summary()
-        bag = yaml.safe_load(next(one.metadata['serialized_metadata'] for one in
-                                  reader.iter_metadata() if one.name == 'rosbag2'))
-    assert [(one.message_start_time, one.message_end_time) for one in (
-        *summary.chunk_indexes, summary.statistics)] == [(40, 50), (20, 30), (20, 50)]
-    for times in (bag, bag['files'][0]):
-        assert times['starting_time']['nanoseconds_since_epoch'] == 20
-        assert times['duration']['nanoseconds'] == 30
 
 
 def test_the_definitions_of_all_streams_are_those_that_rosbags_generates():

@@ -29,10 +29,8 @@ from helpers.logs import (
     seen_by_us,
     write_anew,
     write_bag,
-    write_log,
     write_stranger,
 )
-from helpers.mutations import mutate, repair
 from helpers.recordings import METADATA, write_rows
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
@@ -45,8 +43,6 @@ from rosbags.highlevel import AnyReader
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.writer import record_bytes
-
-CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8      # bytes before the records in an uncompressed chunk
 
 
 def check_with_all_readers(path, messages) -> None:
@@ -115,43 +111,6 @@ def test_a_damaged_chunk_is_left_out_and_zeros_end_the_log(tmp_path, log):
     code, out, _ = run(path, '-o', output)
     assert code == SOME_LOST and 'lost: 3000000 bytes\n' in out and out.count('found: ') == 2
     check_with_all_readers(output, log.messages[:MESSAGES_PER_CHUNK])
-
-
-def test_a_summary_that_does_not_describe_the_file_is_damage(tmp_path):
-    """Also where every checksum is right: a message became a record of some application."""
-    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
-    messages = write_log(path, compression='none')
-    content = bytearray(path.read_bytes())
-    number, (_, start, end) = next(
-        (k, one) for k, one in enumerate(records_of(content)) if one[0] == Opcode.CHUNK)
-    content[start + CHUNK_HEAD] = 0x80
-    struct.pack_into('<I', content, start + 33, zlib.crc32(content[start + CHUNK_HEAD:end]))
-    repair(content)
-    write_anew(path, content)
-    code, out, _ = run(path, '-o', output)
-    assert code == SOME_LOST and out.startswith('lost: 1 messages\nfound: 35 messages, where ')
-    assert sorted([*seen_by_mcap(output), messages[1]]) == sorted(messages)
-    # The chunk behind its index.
-    write_log(tmp_path / 'b.mcap')
-    content = bytearray((tmp_path / 'b.mcap').read_bytes())
-    (_, start, middle), (_, _, end) = records_of(content)[number:number + 2]
-    content[start:end] = content[middle:end] + content[start:middle]
-    repair(content)
-    with LogReader(write_anew(path, content)) as reader:
-        assert not reader.whole and sorted(seen_by_us(path)) == sorted(messages)
-
-
-def test_any_damage_ends_in_a_line_and_what_is_recovered_is_whole(tmp_path, log, no_sync):
-    path, output, again = (tmp_path / name for name in ('a.mcap', 'b.mcap', 'c.mcap'))
-    for seed in range(150):
-        write_anew(path, mutate(log.content, random.Random(seed)))
-        code, out, err = run(path, '-o', output)
-        assert (code, err.count('\n')) in ((FAILED, 1), (ALL_KEPT, 0), (SOME_LOST, 0)), (seed, err)
-        if code != FAILED:
-            assert sorted(seen_by_us(output)) == sorted(seen_by_mcap(output)), seed
-            assert run(output, '-o', again)[0] == ALL_KEPT, seed
-            output.unlink()
-            again.unlink()
 
 
 @pytest.mark.parametrize('torn', [False, True])
@@ -271,8 +230,7 @@ def test_a_strangers_file_is_read_and_recovered_and_what_stands_before_a_tear(
         assert kept == messages[:len(kept)] and len(kept) >= sum(end <= size for end in ends)
 
 
-@pytest.mark.parametrize('form', ['zstd', 'lz4'])
-@pytest.mark.parametrize('told_by', ['record', 'metadata.yaml'])
+@pytest.mark.parametrize(('form', 'told_by'), [('zstd', 'record'), ('lz4', 'metadata.yaml')])
 def test_messages_that_rosbag2_compressed_are_decompressed_and_recover_keeps_the_mode(
         tmp_path, form, told_by):
     compress = {'zstd': zstandard.compress, 'lz4': lz4.frame.compress}[form]
@@ -289,15 +247,9 @@ def test_messages_that_rosbag2_compressed_are_decompressed_and_recover_keeps_the
         (tmp_path / 'new' / 'metadata.yaml').write_text(f'rosbag2_bagfile_information:\n  {text}')
         with AnyReader([tmp_path / 'new']) as bag:
             assert [bytes(data) for _, _, data in bag.messages()] == messages
-
-
-@pytest.mark.parametrize(('form', 'compress', 'reason'), [
-    ('zstd', lambda data: data, 'cannot be decompressed'),
-    ('snappy', zstandard.compress, "compression 'snappy' is none of zstd, lz4")])
-def test_messages_that_cannot_be_decompressed_are_named(tmp_path, form, compress, reason):
-    write_bag(tmp_path / 'bag', 'MESSAGE', form, compress)
-    with LogReader(tmp_path / 'bag') as reader, pytest.raises(
-            LogError, match=rf'bag_0\.mcap: a message of /said: its? .*{reason}'):
+    write_bag(tmp_path / 'plain', 'MESSAGE', form, bytes)       # they are not what it says
+    with LogReader(tmp_path / 'plain') as reader, pytest.raises(
+            LogError, match=r'plain_0\.mcap: a message of /said: .*cannot be decompressed'):
         list(reader.messages())
 
 
@@ -330,13 +282,6 @@ def test_what_is_damaged_or_too_large_is_left_out_alone(tmp_path, bad):
     with LogReader(path, max_bytes=4000) as reader:
         assert [one.data for one in reader.messages()] == [b'a', b'c']
         assert reader.damage.lost_bytes == len(bad) and reader.damage.reasons[0]
-
-
-@pytest.mark.parametrize('compress', [zstandard.compress, lz4.frame.compress])
-def test_a_chunk_of_several_frames_is_read_to_its_end(tmp_path, compress):
-    form = 'zstd' if compress is zstandard.compress else 'lz4'
-    path = closed(tmp_path, chunk_of(FIRST + SECOND, 5, form, compress(FIRST) + compress(SECOND)))
-    assert data_in(path) == [b'first', b'second' * 50]
 
 
 @pytest.mark.parametrize('content', [

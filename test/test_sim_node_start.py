@@ -10,17 +10,15 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-import rclpy
 import yaml
 from helpers.node_harness import SimNode
 from helpers.node_logs import TRACEBACK, log_of, the_log
-from helpers.own_node import OwnNode, as_a_process, run_main
+from helpers.own_node import OwnNode, run_main
 from helpers.reference import ROOT
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger_level
 from test_scene_file import scene
 
-from spinning_top_sim.nodes import executable, replay_node, sim_node, simulation_handlers
+from spinning_top_sim.nodes import replay_node, sim_node, simulation_handlers
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import simulate
@@ -116,14 +114,9 @@ def test_a_short_run_warns_of_what_is_odd_and_ends_with_code_0(main):
 
 def test_a_run_tells_where_its_log_is(main, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)
-    kinds, ordinary = [], executable._executor
-    monkeypatch.setattr(executable, '_executor', lambda node: (
-        kinds.append(ordinary(node)) or kinds[0]))
     run = main('--ros-args', '-p', 'record.enabled:=true', '-p', 'duration:=1.0', '-p',
                'status_period:=0.1')
     assert run.code == 0
-    assert isinstance(kinds[0], SingleThreadedExecutor), 'there is no other one'
     path = the_log(tmp_path)
     assert len(log_of(path)[0]['/pose']) == 101
     assert f'recording to {path}' in run.err
@@ -138,20 +131,24 @@ def test_a_node_without_standard_streams_leaves_a_whole_log(tmp_path):
     assert len(log_of(the_log(tmp_path))[0]['/pose']) == 31
 
 
-def start_values(*arguments):
-    """Return the values that a node starts with in the namespace /last."""
-    argv = ['--ros-args', '-r', '__ns:=/last', *arguments]
-    with as_a_process():
-        argv, make_node = sim_node._prepare(argv)
-        rclpy.init(args=argv)
-        node = make_node()
-        values = node.values
-        node.stop()
-        node.destroy_node()
-    return values
+@pytest.fixture
+def start_values(main, tmp_path):
+    """Return, of a node with these arguments, the topic of its events and the first values."""
+    def started(*arguments):
+        path = tmp_path / 'start.mcap'
+        path.unlink(missing_ok=True)
+        ros = [] if '--ros-args' in arguments else ['--ros-args']
+        run = main(*arguments, *ros, '-p', 'duration:=0.01', '-p', 'record.enabled:=true', '-p',
+                   f'record.uri:={path}')
+        assert run.code == 0, run.err
+        with LogReader(path) as log:
+            (events,) = (topic.name for topic in log.topics if topic.name.endswith('/events'))
+            return events, read_run_description(log).values_at_start
+    return started
 
 
-def test_the_last_value_of_the_options_wins_as_in_simulate_and_ros_overrides_it(tmp_path):
+def test_the_last_value_of_the_options_wins_as_in_simulate_and_ros_overrides_it(
+        tmp_path, start_values):
     first, second = (scene(tmp_path / f'{name}.yaml', **values) for name, values in (
         ('a', {'spin.l3': 3, 'time_scale': 2, 'imu.rate': 250, 'imu.lever_arm': '[1, 2, 3]'}),
         ('b', {'imu.rate': 300.5, 'seed': 9})))
@@ -159,16 +156,16 @@ def test_the_last_value_of_the_options_wins_as_in_simulate_and_ros_overrides_it(
     options = ['--scene', 'wavy', '--params', str(first), '--params', str(second),
                *(word for rule in given for word in ('-p', rule))]
     assert simulate.main(['-o', str(tmp_path / 'ours.mcap'), '--quiet', '--duration', '0.1',
-                          '--namespace', '/last', *options]) == 0
+                          *options]) == 0
     with LogReader(tmp_path / 'ours.mcap') as log:
         ours = read_run_description(log).values_at_recording
     names = ('spin.l3', 'solver.rtol', 'imu.rate', 'top.mass', 'time_scale', 'imu.lever_arm',
              'seed', 'spin.lz')
-    found = start_values('--', *options)
+    _, found = start_values(*options)
     assert [found[name] for name in names] == [2.25, 1e-7, 300.5, 1.0, 2.0, (0.0, 0.0, 1.0), 9,
                                                1.42]
     assert [found[name] for name in names] == [ours[name] for name in names]
-    found = start_values('--params-file', str(first), '-p', 'seed:=7', '--', *options)
+    _, found = start_values(*options, '--ros-args', '--params-file', str(first), '-p', 'seed:=7')
     assert [found[name] for name in names] == [3.0, 1e-7, 250.0, 1.0, 2.0, (1.0, 2.0, 3.0), 7,
                                                1.42]
 
@@ -178,32 +175,25 @@ def test_the_last_value_of_the_options_wins_as_in_simulate_and_ros_overrides_it(
     (['--ros-args', '-r', '__ns:=/a/b', '--remap', '__node:=c', '-r', '__ns:=/d'], '/a/b/c'),
     (['--namespace', 'left', '--ros-args', '-r', 'spinning_top:__name:=c', '-r', '__ns:=/e'],
      '/e/c')])
-def test_a_file_is_read_for_the_name_that_the_node_gets(tmp_path, arguments, name):
+def test_a_file_is_read_for_the_name_that_the_node_gets(tmp_path, start_values, arguments, name):
     file = tmp_path / 'f.yaml'
     file.write_text(f'{name}:\n  ros__parameters: {{seed: 4}}\n'
                     '/another: {ros__parameters: {seed: 5}}\n')
-    with as_a_process():
-        argv, make_node = sim_node._prepare(['--scene', str(file), '-p', 'use_sim_time:=true',
-                                             *arguments])
-        rclpy.init(args=argv)
-        node = make_node()
-        assert (node.get_fully_qualified_name(), node.values['seed']) == (name, 4)
-        assert node.get_parameter('use_sim_time').value is True
-        node.stop()
-        node.destroy_node()
+    topic, values = start_values('--scene', str(file), *arguments)
+    assert (topic, values['seed']) == (f'{name}/events', 4)
 
 
 @pytest.mark.parametrize(('installed', 'wanted'), [(True, True), (False, True), (True, False)])
 def test_simulation_interfaces_is_offered_where_it_is_installed_and_not_switched_off(
-        monkeypatch, installed, wanted):
+        monkeypatch, start_values, installed, wanted):
     offered = []
     monkeypatch.setattr(sim_node, 'find_spec', lambda name: installed or None)
     monkeypatch.setattr(simulation_handlers, 'offer', offered.append)
-    start_values('-p', f'simulation_interfaces:={str(wanted).lower()}')
+    start_values('--ros-args', '-p', f'simulation_interfaces:={str(wanted).lower()}')
     assert len(offered) == (installed and wanted)
 
 
-def test_a_dump_of_the_parameters_gives_the_same_start(tmp_path):
+def test_a_dump_of_the_parameters_gives_the_same_start(tmp_path, start_values):
     """With lz unset, lists, integers, and what was changed meanwhile."""
     with OwnNode(tmp_path, seed=7, pose__rate=37.5, imu__lever_arm=[0.1, 0.0, 0.02],
                  imu__frame_id='sensor', ground_truth_odom__enabled=False, start_paused=True,
@@ -216,7 +206,9 @@ def test_a_dump_of_the_parameters_gives_the_same_start(tmp_path):
             dumped[name] = value.tolist()
     file = tmp_path / 'dump.yaml'
     file.write_text(yaml.dump({'/**': {'ros__parameters': dumped}}))
-    assert start_values('--params-file', str(file)) == expected
+    _, found = start_values('--ros-args', '--params-file', str(file))
+    assert {name: value for name, value in found.items() if value != expected[name]}.keys() == {
+        'duration', 'record.enabled', 'record.uri'}
 
 
 def test_remapping_and_qos_overrides_work(tmp_path):
@@ -224,7 +216,7 @@ def test_remapping_and_qos_overrides_work(tmp_path):
                  'qos_overrides./ns/attitude.publisher.reliability:=best_effort', '-p',
                  'qos_overrides./ns/imu/data_raw.publisher.depth:=3']
     with OwnNode(tmp_path, *arguments, record__enabled=True) as node:
-        pose, imu = (node.node._topics.by_topic[name] for name in ('pose', 'imu/data_raw'))
+        pose, imu = (node.publisher(name) for name in ('attitude', 'imu/data_raw'))
         assert (pose.topic_name, pose.qos_profile.reliability.name) == (
             '/ns/attitude', 'BEST_EFFORT')
         assert (imu.qos_profile.depth, imu.qos_profile.reliability.name) == (3, 'RELIABLE')

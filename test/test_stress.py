@@ -11,7 +11,6 @@ from helpers.simulations import MILLISECOND, simulate
 from helpers.wrong_filters import TABLE
 
 from spinning_top_sim.physics.top import ContinuedState
-from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.solvers.exact import ExactSolution
 
 
@@ -55,17 +54,6 @@ def test_commands_at_random_times_leave_the_attitude_as_it_is(scene, method):
                       - truth.states(later).quaternion).max() < 1e-7
         now += int(later[-1])
         assert simulation.send(now)
-
-
-@pytest.mark.parametrize('which', [0, 4])
-def test_whole_logs_are_replayed_whole(tmp_path, which):
-    logs = importlib.import_module('stress.logs')
-    pytest.importorskip('rclpy')
-    path = tmp_path / 'whole.mcap'
-    path.write_bytes(logs.original_logs()[which])
-    with LogReader(path) as reader:
-        count = sum(1 for _ in reader.messages())
-    assert count > 200 and logs.replayed(path) == f'replay 0, {count} messages'
 
 
 @pytest.mark.parametrize(('part', 'seed'), [('logs', 4), ('nodes', 0), *(

@@ -12,7 +12,6 @@ from helpers.inspected import as_json, log_of, rewritten, told
 from helpers.logs import flipped
 from helpers.reference import ROOT
 from helpers.simulations import SECOND
-from mcap.reader import make_reader
 
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.reader import LogReader
@@ -157,21 +156,6 @@ def test_what_a_sensor_delays_or_drops_is_no_gap_and_a_message_that_is_lost_is_o
             assert found['gaps_ns'] == lost * [[at_ns, at_ns]]
 
 
-def test_a_torn_file_is_told_and_what_is_left_verifies(columns, tmp_path, capsys):
-    torn = tmp_path / 'torn.mcap'
-    with open(columns, 'rb') as file:
-        last = make_reader(file).get_summary().chunk_indexes[-1]
-    torn.write_bytes(columns.read_bytes()[:last.chunk_start_offset + last.chunk_length // 2])
-    code, out, _ = told(capsys, torn, '--verify')
-    assert code == 1
-    assert 'torn.mcap: truncated' in out and 'lost: ' in out
-    assert re.search(r'verify: identical, all \d+ messages', out)
-    code, content = as_json(capsys, torn)
-    assert code == 1 and not content['whole'] and content['damage']['torn']
-    assert content['damage']['lost_bytes'] > 0
-    assert content['motions'][0]['measured']['nutations'] > 3
-
-
 @pytest.mark.parametrize('event', [
     {'event': 'command', 'l3': math.nan, 'lz': 1.0},
     {'event': 'command', 'sent_ns': 2 ** 63, 'l3': 1.0, 'lz': 1.0},
@@ -204,8 +188,3 @@ def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
         stamp=lambda topic, number, stamp_ns: (
             4 * 10 ** 18 if topic.endswith('/events') and number == 1 else stamp_ns))
     assert 'integration steps are too many' in told(capsys, path)[1]
-
-
-def test_topics_are_known_by_their_names_in_a_log_put_together_anew(short, tmp_path, capsys):
-    path = rewritten(short, tmp_path / 'anew.mcap', order=reversed)
-    assert verified(capsys, path)['identical']

@@ -134,9 +134,7 @@ STRANGERS = {
     'plain': {},
     'unchunked': {'use_chunking': False},
     'lz4': {'compression': CompressionType.LZ4},
-    'no index': {'index_types': IndexType.NONE},
     'no message index': {'index_types': IndexType.ALL & ~IndexType.MESSAGE},
-    'nothing repeated': {'repeat_channels': False, 'repeat_schemas': False},
     'nothing but messages': {
         'use_chunking': False, 'use_statistics': False, 'use_summary_offsets': False,
         'repeat_channels': False, 'repeat_schemas': False, 'index_types': IndexType.NONE,
