@@ -196,7 +196,7 @@ def test_simulation_interfaces_is_offered_where_it_is_installed_and_not_switched
 def test_a_dump_of_the_parameters_gives_the_same_start(tmp_path, start_values):
     """With lz unset, lists, integers, and what was changed meanwhile."""
     with OwnNode(tmp_path, seed=7, pose__rate=37.5, imu__lever_arm=[0.1, 0.0, 0.02],
-                 imu__frame_id='sensor', ground_truth_odom__enabled=False, start_paused=True,
+                 imu__frame_id='sensor', ground_truth_odom__enabled=False,
                  record__streams=['pose', 'imu'], initial__theta=0.7) as node:
         assert node.set(solver__rtol=1e-10, seed=8).successful
         dumped = {name: one.value for name, one in node.node.get_parameters_by_prefix('').items()}

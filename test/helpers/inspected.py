@@ -27,7 +27,7 @@ def as_json(capsys, *arguments):
 
 
 def rewritten(source, target, change=lambda topic, number, data: data, metadata=None,
-              stamp=lambda topic, number, stamp_ns: stamp_ns, order=iter):
+              stamp=lambda topic, number, stamp_ns: stamp_ns):
     """
     Copy a log with checksums that are right.
 
@@ -35,7 +35,6 @@ def rewritten(source, target, change=lambda topic, number, data: data, metadata=
         or a list of data
     metadata : what is another in the metadata of the run
     stamp : takes topic, number and log time [ns]; returns the log time
-    order : of the topics
     """
     numbers = {}
     with open(source, 'rb') as old, open(target, 'wb') as new:
@@ -49,7 +48,7 @@ def rewritten(source, target, change=lambda topic, number, data: data, metadata=
                    for number, schema in summary.schemas.items()}
         channels = {number: writer.register_channel(
             channel.topic, channel.message_encoding, schemas[channel.schema_id],
-            channel.metadata) for number, channel in order(summary.channels.items())}
+            channel.metadata) for number, channel in summary.channels.items()}
         for _, channel, message in reader.iter_messages():
             topic = channel.topic
             number = numbers[topic] = numbers.get(topic, -1) + 1

@@ -4,7 +4,6 @@
 import contextlib
 import io
 import json
-import time
 from pathlib import Path
 
 import numpy as np
@@ -77,15 +76,6 @@ def assert_clean_end(node, code):
     assert code == 0, node.err
     assert TRACEBACK not in node.err, node.err
     assert TRACEBACK not in node.out, node.out
-
-
-def settled(topic):
-    """Return how many have arrived when no more do: what was under way is there."""
-    count = -1
-    while count != len(topic.raw):
-        count = len(topic.raw)
-        time.sleep(0.3)
-    return count
 
 
 def decoded(path):
