@@ -56,8 +56,8 @@ def test_by_the_steady_clock_t_0_is_due_when_the_date_of_its_stamp_has_come(scal
     assert top.tick(80 * S + 10 * MS).due_ns >= 0, 'it takes 10 ms at most'
 
 
-@pytest.mark.parametrize('step_ns', [1 * S, 2 * S, 5 * S])
-def test_what_one_message_on_a_slow_clock_makes_due_is_on_time(step_ns):
+def test_what_one_message_on_a_slow_clock_makes_due_is_on_time():
+    step_ns = 2 * S
     top = Top(publishers=1).begin(100 * S + 4 * MS)
     assert top.epoch_ns == 100 * S
     assert top.tick(0, 100 * S + 4 * MS).both == (4 * MS, -1), 't = 0 is on time'

@@ -4,7 +4,6 @@
 import json
 import re
 
-import pytest
 from helpers.reference import ROOT
 
 from spinning_top_sim.nodes.publishers import message_class
@@ -38,25 +37,17 @@ def end_of(path):
     return topic, [PART.fullmatch(part).groups() for part in parts]
 
 
-@pytest.mark.parametrize('path', PATHS, ids=lambda path: path['value'])
-def test_a_path_is_a_field_of_a_topic(path):
-    topic, parts = end_of(path['value'])
-    if path['timestampMethod'] == 'headerStamp':
-        assert 'header' in message_class(TYPES[topic]).get_fields_and_field_types()
-    index = parts[-1][1]
-    if topic == f'/{topics.NODE_NAME}/invariants':
-        assert topics.INVARIANTS[int(index)].replace('_', ' ') == path['label']
-    if topic == '/joint_states':
-        assert topics.JOINTS[int(index)] == {'θ': 'nutation_joint', "φ'": 'precession_joint'}[
-            path['label']]
-
-
-def test_panels_and_topics_are_there():
-    def panels(part):
-        return [part] if isinstance(part, str) else panels(part['first']) + panels(part['second'])
-    assert sorted(panels(LAYOUT['layout'])) == sorted(PANELS)
-    assert {'userNodes', 'globalVariables', 'playbackConfig'} < set(LAYOUT)
+def test_each_path_and_topic_of_the_layout_is_there():
+    for path in PATHS:
+        topic, parts = end_of(path['value'])
+        if path['timestampMethod'] == 'headerStamp':
+            assert 'header' in message_class(TYPES[topic]).get_fields_and_field_types()
+        index = parts[-1][1]
+        if topic == f'/{topics.NODE_NAME}/invariants':
+            assert topics.INVARIANTS[int(index)].replace('_', ' ') == path['label']
+        if topic == '/joint_states':
+            assert topics.JOINTS[int(index)] == {
+                'θ': 'nutation_joint', "φ'": 'precession_joint'}[path['label']]
     scene = PANELS['3D!scene']
-    assert set(scene['topics']) <= set(TYPES)
-    assert scene['layers']['urdf']['topic'] in TYPES
+    assert {*scene['topics'], scene['layers']['urdf']['topic']} <= set(TYPES)
     assert scene['followTf'] == parameters.BY_NAME['world_frame'].default

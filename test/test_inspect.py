@@ -16,11 +16,10 @@ import sys
 import numpy as np
 import pytest
 from helpers.inspected import as_json, log_of, rewritten, told
-from helpers.reference import ROOT, SCENES, scene_parameters
+from helpers.reference import ROOT, SCENES
 from mcap.writer import Writer
 
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import inspect, recover, simulate
 from spinning_top_sim.tools.survey import survey
 
@@ -43,8 +42,6 @@ def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
         "record.streams:=['joint_states', 'ground_truth_imu']"))
     motion, = found.motions
     truth = motion.exact
-    assert truth.separatrix_distance == pytest.approx(
-        separatrix_distance(parameters.checked(scene_parameters(scene))), rel=1e-5, abs=1e-7)
     measured = motion.measured
     if scene in RESTING:
         assert measured.nutation_period is None and measured.nutations == 0
@@ -55,23 +52,6 @@ def test_every_scene_is_measured_from_its_data(tmp_path, scene, method):
         truth.mean_precession_rate, rel=1e-9, abs=1e-9 if scene == 'free_top' else 0.0)
     assert measured.mean_spin_rate == pytest.approx(truth.mean_spin_rate, rel=1e-9)
     assert not measured.missing
-
-
-def separatrix_distance(values):
-    """Return 1 - m by the cubic u'^2 = f(u), u = cos(theta), solved by numpy."""
-    top, start = parameters.top_of(values), parameters.start_state(values)
-    torque, lambda1, l3, lz = top.gravity_torque, top.lambda1, start.l3, start.lz
-    if torque == 0.0:
-        return 1.0
-    u0 = np.cos(start.theta)
-    kinetic = 0.5 * lambda1 * start.theta_dot ** 2
-    if np.sin(start.theta):
-        kinetic += 0.5 * (lz - l3 * u0) ** 2 / lambda1 / np.sin(start.theta) ** 2
-    line = np.polynomial.Polynomial([kinetic + torque * u0, -torque])
-    f = (2.0 / lambda1 * line * np.polynomial.Polynomial([1.0, 0.0, -1.0])
-         - np.polynomial.Polynomial([lz / lambda1, -l3 / lambda1]) ** 2)
-    low, high, greatest = np.sort(f.roots().real)
-    return (greatest - high) / (greatest - low)
 
 
 @pytest.mark.parametrize('topic', ['pose', 'ground_truth_imu', 'imu_data'])

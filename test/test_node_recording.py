@@ -2,65 +2,16 @@
 """What a node records: beside its ticks, whole, and the same as `simulate` computes."""
 
 import errno
-import threading
 
 import pytest
 
 pytest.importorskip('rclpy')
 
-from helpers.node_harness import PATIENCE_S
-from helpers.node_logs import events_in, log_of, verified
+from helpers.node_logs import log_of, verified
 from helpers.own_node import OwnNode
 
 from spinning_top_sim.recording import recorder
 from spinning_top_sim.recording.writer import McapWriter
-
-
-@pytest.fixture
-def gate(monkeypatch):
-    """Have files opened and closed only while `gate` is set."""
-    gate = threading.Event()
-
-    def waiting(ordinary):
-        def slow(*arguments, **options):
-            assert gate.wait(PATIENCE_S)
-            return ordinary(*arguments, **options)
-        return slow
-
-    for name in ('__init__', 'finish'):
-        monkeypatch.setattr(McapWriter, name, waiting(getattr(McapWriter, name)))
-    return gate
-
-
-def test_ticks_and_commands_go_on_while_a_log_is_being_opened_or_closed(tmp_path, gate):
-    def goes_on():
-        count = len(node.heard['pose'])
-        node.spin_until('samples', lambda: len(node.heard['pose']) > count + 20)
-        assert not answer.done()
-        gate.set()
-        node.spin_until('the answer', answer.done)
-        assert answer.result().success
-        return answer.result().message
-
-    path = tmp_path / 'run.mcap'
-    with OwnNode(tmp_path).listen('pose') as node:
-        node.spin_until('samples', lambda: node.heard['pose'])
-        answer = node.ask_to_record(True)
-        heard = len(node.heard['pose'])
-        node.command(2.0, 1.0)
-        assert node.diagnostics()[2]['recorder'] == 'opening'
-        assert goes_on() == f'recording to {path}'
-        assert node.switch('record', True).message == f'recording already to {path}'
-        gate.clear()
-        answer = node.ask_to_record(False)
-        expected = node.heard['pose'][heard:]
-        assert goes_on().startswith(f'{path}: ')
-        assert node.switch('record', False).message == 'not recording'
-        assert not any(one.log_index for one in node.simulation.outputs)
-    log, _ = log_of(path)
-    assert [event['event'] for event in events_in(log)] == ['start', 'command']
-    assert [data for _, data in log['/pose']] == expected
-    assert verified(path)['identical']
 
 
 def test_a_step_waits_for_a_recorder_that_has_no_room(tmp_path, monkeypatch):

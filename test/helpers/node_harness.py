@@ -293,30 +293,24 @@ class Diagnostics:
         from diagnostic_msgs.msg import DiagnosticArray
         self._topic = peer.listen('/diagnostics', DiagnosticArray)
 
-    def statuses(self, node):
-        """Return all statuses of a node."""
+    def _of(self, node):
         return [status for message in self._topic.messages() for status in message.status
                 if status.name == node.name.lstrip('/')]
 
     def wait_for(self, node, what, condition):
         """Wait for a status for which the condition holds; return it."""
-        def newest():
-            said = self.statuses(node)
-            return said[-1] if said and condition(said[-1]) else None
-        return wait_for(f'/diagnostics with {what}', newest)
+        return wait_for(f'/diagnostics with {what}', lambda: next(
+            (one for one in self._of(node)[-1:] if condition(one)), None))
 
     def next(self, node):
         """Return the numbers of the next status but one, which is measured entirely after now."""
-        count = len(self.statuses(node))
-        wait_for('two /diagnostics', lambda: len(self.statuses(node)) >= count + 2)
-        return numbers(self.statuses(node)[-1])
+        count = len(self._of(node))
+        wait_for('two /diagnostics', lambda: len(self._of(node)) >= count + 2)
+        return numbers(self._of(node)[-1])
 
     def text(self, node, key):
         """Return the newest value of this name."""
         return numbers(self.wait_for(node, key, lambda _: True))[key]
-
-    def number(self, node, key):
-        return float(self.text(node, key))
 
 
 class DrivenClock:

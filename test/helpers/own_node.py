@@ -90,11 +90,6 @@ class OwnNode(InThisProcess):
             return answer.result()
         return answer
 
-    def ask_to_record(self, on):
-        """Return the Future of the answer."""
-        (service,) = (one for one in self.node.services if one.srv_name.endswith('/record'))
-        return service.callback(SetBool.Request(data=on), SetBool.Response())
-
     def spin_until(self, what, condition):
         wait_for(what, lambda: condition() or rclpy.spin_once(self.node, timeout_sec=0.1))
 
