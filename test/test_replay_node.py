@@ -310,6 +310,15 @@ def test_who_comes_late_gets_what_all_latched_publishers_sent(peer, tmp_path):
                           'reliable and transient_local') == 1
 
 
+def test_a_publisher_serves_all_whom_the_recorded_ones_have_served(tmp_path):
+    path = write_log(tmp_path / 'run.mcap', texts(2), [
+        ('/all', STRING, {'reliability': 2, 'depth': 3}, {'history': 2, 'depth': 4}), TWO[1]])
+    with OwnReplay(path) as replay:
+        (found,) = (publisher.qos_profile for publisher in replay.node.publishers
+                    if publisher.topic_name == '/all')
+    assert (found.history.name, found.reliability.name) == ('KEEP_ALL', 'RELIABLE')
+
+
 def stamped_log(path):
     """Record 21 joint states and paths in 0.2 s, whose last poses have no stamps."""
     messages = []

@@ -3,17 +3,22 @@
 
 import importlib
 import math
+import random
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
+import rclpy
+from helpers.examples import TIMES
+from helpers.extremes import DOUBLES, parameter_set
 from helpers.node_harness import wait_for
 from helpers.node_logs import events_in, log_of, verified
 from helpers.own_node import OwnNode
 
 from spinning_top_sim.nodes import publishers
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameter import ANY, Effect
 from spinning_top_sim.streams.topics import INVARIANTS
@@ -169,3 +174,27 @@ def test_parameters_are_described(node):
             assert bounds[0] in parameter.range or parameter.range.is_open, parameter.name
             assert bounds[1] == parameter.range.highest, parameter.name
         assert descriptor.additional_constraints == parameter.allowed
+
+
+@pytest.mark.parametrize('seed', range(3 * TIMES))
+def test_extreme_parameters_are_taken_or_refused_in_a_line(tmp_path, seed):
+    """The node answers and lives on, and its log is whole."""
+    rng = random.Random(seed)
+    with OwnNode(tmp_path, record__enabled=True) as node:
+        for _ in range(12):
+            values = parameter_set(rng)
+            try:
+                answer = node.set(**values)
+            except (AssertionError, TypeError, ValueError, OverflowError, AttributeError):
+                continue            # rclpy itself has no such value
+            assert bool(answer.reason) != answer.successful, values
+            assert '\n' not in answer.reason, values
+            node.command(rng.choice(DOUBLES), rng.choice(DOUBLES))
+            for act in (lambda: node.trigger('reset'), lambda: node.switch('set_pause', False)):
+                answer = act()
+                assert '\n' not in answer.message and 'unexpected' not in answer.message, values
+            for _ in range(3):
+                rclpy.spin_once(node.node, timeout_sec=0.01)
+            assert 'unexpected' not in (node.loop.failure or ''), values
+    with LogReader(tmp_path / 'run.mcap') as log:
+        assert log.whole

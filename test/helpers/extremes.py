@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Extreme values that look legal: sets of parameters, commands, and what else is done to a node.
+Extreme values that look legal: numbers, and sets of parameters.
 
-All depend on the random numbers that they are given alone, and need no ROS.  Whatever they return,
-a node must live on with it, or refuse it in one clear line.
+They depend on the random numbers that they are given alone.  Whatever they are, a node must live
+on with them, or refuse them in one clear line.
 """
 
 from __future__ import annotations
@@ -50,26 +50,6 @@ def _number(random_: random.Random, row: Parameter) -> float | int:
         wanted = abs(wanted)
     chosen = 0.0 if row.range.has_zero and wanted < low else min(max(wanted, low), high)
     return int(chosen) if isinstance(default, int) else chosen
-
-
-def actions(random_: random.Random) -> list[tuple[str, object]]:
-    """
-    Return four to twelve things to do to a running node, one after the other.
-
-    ('set', parameters), ('command', [L3, Lz]), ('pause', bool), ('step', None), ('reset', None),
-    and ('wait', seconds)
-    """
-    found: list[tuple[str, object]] = []
-    for _ in range(random_.randint(4, 12)):
-        kind = random_.choice(('set', 'set', 'command', 'pause', 'step', 'reset', 'wait'))
-        found.append((kind, {
-            'set': lambda: parameter_set(random_),
-            'command': lambda: [_double(random_) for _ in range(
-                random_.choice((2, 2, 2, 2, 2, 2, 2, 0, 1, 3)))],
-            'pause': lambda: random_.random() < 0.5,
-            'wait': lambda: random_.randrange(100) / 1000.0,
-        }.get(kind, lambda: None)()))
-    return found
 
 
 def _allowed_value(random_: random.Random, row: Parameter) -> object:

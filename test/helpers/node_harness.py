@@ -134,13 +134,6 @@ class SimNode:
                 os.killpg(self.process.pid, number)
         return self.wait(10.0)
 
-    def memory(self):
-        """Return the resident set [bytes]."""
-        for line in Path(f'/proc/{self.process.pid}/status').read_text().splitlines():
-            if line.startswith('VmRSS:'):
-                return 1024 * int(line.split()[1])
-        raise AssertionError('no VmRSS')
-
     def topic(self, name):
         """Return the full name of a topic or service, `~` for the node's own."""
         if name.startswith('~'):

@@ -4,7 +4,6 @@ Stress tests: random inputs and faults, for so long or so many.
 
     python test/stress world --count 100000     loop, recorder and log in a simulated world
     python test/stress logs --seconds 600       damaged logs, and what reads them
-    python test/stress nodes --seconds 600      extreme parameters and commands at a real node
     python test/stress grade --count 100        simulators with a defect, and right ones
     python test/stress wrong --count 94         the exam of filters that are wrong, or right
 

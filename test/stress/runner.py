@@ -28,7 +28,7 @@ from pathlib import Path
 
 STARTING_S = 120.0          # patience for imports
 MOST_FAILURES = 20          # then enough is known
-PARTS = ('world', 'logs', 'nodes', 'grade', 'wrong')
+PARTS = ('world', 'logs', 'grade', 'wrong')
 
 
 @dataclass
