@@ -29,8 +29,10 @@ from helpers.logs import (
     seen_by_us,
     write_anew,
     write_bag,
+    write_log,
     write_stranger,
 )
+from helpers.mutations import repair
 from helpers.recordings import METADATA, write_rows
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
@@ -43,6 +45,8 @@ from rosbags.highlevel import AnyReader
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.writer import record_bytes
+
+CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8      # bytes before the records in an uncompressed chunk
 
 
 def check_with_all_readers(path, messages) -> None:
@@ -111,6 +115,30 @@ def test_a_damaged_chunk_is_left_out_and_zeros_end_the_log(tmp_path, log):
     code, out, _ = run(path, '-o', output)
     assert code == SOME_LOST and 'lost: 3000000 bytes\n' in out and out.count('found: ') == 2
     check_with_all_readers(output, log.messages[:MESSAGES_PER_CHUNK])
+
+
+def test_a_summary_that_does_not_describe_the_file_is_damage(tmp_path):
+    """Also where every checksum is right: a message became a record of some application."""
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
+    messages = write_log(path, compression='none')
+    content = bytearray(path.read_bytes())
+    number, (_, start, end) = next(
+        (k, one) for k, one in enumerate(records_of(content)) if one[0] == Opcode.CHUNK)
+    content[start + CHUNK_HEAD] = 0x80
+    struct.pack_into('<I', content, start + 33, zlib.crc32(content[start + CHUNK_HEAD:end]))
+    repair(content)
+    write_anew(path, content)
+    code, out, _ = run(path, '-o', output)
+    assert code == SOME_LOST and out.startswith('lost: 1 messages\nfound: 35 messages, where ')
+    assert sorted([*seen_by_mcap(output), messages[1]]) == sorted(messages)
+    # The chunk behind its index.
+    write_log(tmp_path / 'b.mcap')
+    content = bytearray((tmp_path / 'b.mcap').read_bytes())
+    (_, start, middle), (_, _, end) = records_of(content)[number:number + 2]
+    content[start:end] = content[middle:end] + content[start:middle]
+    repair(content)
+    with LogReader(write_anew(path, content)) as reader:
+        assert not reader.whole and sorted(seen_by_us(path)) == sorted(messages)
 
 
 @pytest.mark.parametrize('torn', [False, True])
