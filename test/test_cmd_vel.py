@@ -60,6 +60,13 @@ def test_a_driven_pivot_goes_to_the_velocity_and_stops(method):
     assert goes_to(simulation, 11 * S + S // 2)[1][1] == 0.8
 
 
+def test_a_velocity_of_zero_brakes_a_pivot_that_moves():
+    simulation = simulate({'pivot.cmd_timeout': 0.0})
+    for t_ns, velocity, found in ((S, 0.8, 0.0), (2 * S, 0.0, 0.8), (3 * S, 0.0, 0.0)):
+        assert goes_to(simulation, t_ns)[1][1] == pytest.approx(found)
+        drive(simulation, 0.0, velocity, 0.0)
+
+
 @pytest.mark.parametrize('velocity', [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 1e5)])
 def test_a_bad_velocity_is_refused_with_its_value(velocity):
     with pytest.raises(ValueError, match=r'linear = \[.*(nan|inf|100000).*within 10000 m/s'):

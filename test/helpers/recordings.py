@@ -5,8 +5,6 @@ import struct
 import time
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
 from mcap.records import Channel as ChannelRecord
 from rosbags.typesys import Stores, get_typestore
 
@@ -69,19 +67,6 @@ def some_messages(count: int) -> list[tuple[int, int, bytes]]:
     """Messages of the first two topics in turn, 1 ms apart."""
     makers = (pose_cdr, array_cdr)
     return [(n % 2, EPOCH_NS + n * 1_000_000, makers[n % 2](n)) for n in range(count)]
-
-
-def complete_messages(path):
-    """Return (topic, channel, message) of every complete chunk, in file order; torn files too."""
-    found = []
-    with open(path, 'rb') as file:
-        reader = NonSeekingReader(file)
-        try:
-            for _, channel, message in reader.iter_messages(log_time_order=False):
-                found.append((channel.topic, channel, message))
-        except McapError:
-            pass
-    return found
 
 
 def parsed_qos(text):
