@@ -222,6 +222,13 @@ def test_extra_fields_and_unknown_kinds_are_no_damage_and_the_order_is_kept(tmp_
     assert data_in(path) == data_in(tmp_path / 'b.mcap') == [b'1', b'2', b'3', b'4']
 
 
+def test_a_channel_whose_schema_is_gone_is_recovered_without(tmp_path):
+    channel = Channel(id=2, topic='/b', message_encoding='x', metadata={}, schema_id=9)
+    path = closed(tmp_path, record_bytes(channel), message(5, b'1', channel=2))
+    assert run(path, '-o', tmp_path / 'b.mcap')[0] == ALL_KEPT
+    assert seen_by_mcap(tmp_path / 'b.mcap') == [('/b', 5, b'1')]
+
+
 @pytest.mark.parametrize('kind', STRANGERS)
 def test_a_strangers_file_is_read_and_recovered_and_what_stands_before_a_tear(
         tmp_path, kind, no_sync):

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 import rclpy
+from geometry_msgs.msg import Twist, Vector3
 from helpers.examples import TIMES
 from helpers.extremes import DOUBLES, parameter_set
 from helpers.node_harness import wait_for
@@ -97,6 +98,9 @@ def test_refused_commands_and_parameters_change_nothing(node, capfd):
     for data, named in REFUSED_COMMANDS.items():
         node.command(*data)
         assert named in capfd.readouterr().err, data
+    node.receive('cmd_vel', Twist(angular=Vector3(z=0.5)))
+    assert 'angular = [0.0, 0.0, 0.5] rad/s: must be 0' in capfd.readouterr().err
+    rejected += 1
     assert node.loop.rejected_commands == rejected + len(REFUSED_COMMANDS)
     for given, named in REFUSED_PARAMETERS:
         result = node.set(**given)

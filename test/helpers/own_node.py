@@ -71,10 +71,13 @@ class OwnNode(InThisProcess):
     def get(self, *names):
         return [self.node.get_parameter(name).value for name in names]
 
+    def receive(self, topic, message):
+        (found,) = (one for one in self.node.subscriptions
+                    if one.topic_name.endswith(f'/{topic}'))
+        found.callback(message)
+
     def command(self, *data):
-        (commands,) = (one for one in self.node.subscriptions
-                       if one.topic_name.endswith('/commands'))
-        commands.callback(Float64MultiArray(data=[float(one) for one in data]))
+        self.receive('commands', Float64MultiArray(data=[float(one) for one in data]))
 
     def switch(self, name, on):
         return self._serve(SetBool, name, data=on)
