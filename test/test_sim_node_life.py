@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
@@ -14,6 +15,7 @@ pytest.importorskip('rclpy')
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.node_logs import (
+    SECOND,
     TRACEBACK,
     assert_clean_end,
     assert_received_from,
@@ -103,6 +105,40 @@ def test_a_reader_of_the_terminal_who_goes_away_does_not_end_the_motion(monkeypa
         monkeypatch.setattr(sys, 'stdout', out)
         for line in ('one', 'two'):
             executable.tell(line)
+
+
+READER = """
+import rclpy, sys
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import HistoryPolicy, QoSProfile
+rclpy.init()
+node = rclpy.create_node('reader')
+node.create_subscription(PoseStamped, sys.argv[1], lambda _: print('.', end='', flush=True),
+                         QoSProfile(history=HistoryPolicy.KEEP_ALL))
+rclpy.spin(node)
+"""
+
+
+def test_readers_that_stall_are_counted_and_motion_and_recording_go_on(
+        peer, diagnostics, tmp_path):
+    values = {'record.enabled': True, 'pose.rate': 5000.0,
+              'qos_overrides./keep/pose.publisher.history': 'keep_all'}
+    with (SimNode(tmp_path, values, namespace='/keep') as node,
+          SimNode(tmp_path, namespace='/reader', program=('-c', READER, '/keep/pose')) as reader):
+        wait_for('messages', lambda: len(reader.out) > 100)
+        os.kill(reader.process.pid, signal.SIGSTOP)
+        wait_for('failures', lambda: int(diagnostics.text(node, 'failed messages')) > 1000)
+        said = diagnostics.next(node)
+        later = diagnostics.next(node)
+        assert float(later['simulated time [s]']) > float(said['simulated time [s]'])
+        assert (later['state'], later['recorder']) == ('running', 'recording')
+        count = len(reader.out)
+        os.kill(reader.process.pid, signal.SIGCONT)
+        wait_for('more messages', lambda: len(reader.out) > count + 6000)
+        assert_clean_end(node, node.end())
+    path = the_log(node.folder)
+    assert verified(path)['identical']
+    assert set(np.diff([stamp for stamp, _ in log_of(path)[0]['/keep/pose']])) == {SECOND // 5000}
 
 
 def test_overload_skips_what_is_live_records_everything_and_stays_reachable(tmp_path, capfd):
