@@ -17,13 +17,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
-from spinning_top_sim.exam.measures import increments
+from spinning_top_sim.exam.measures import increments, up
 from spinning_top_sim.exam.motions import RATE, ROUNDING, Reals, Run
 from spinning_top_sim.tools.identify import in_words
 
 SMALL, LARGE = 0.02, 0.3        # kicks [rad], of first order; that a step of first order misses
 # Sample of a kick in a rest, from its end: there is time for late answers.
 EARLY = -40
+LONG = -200     # of a kick that gravity leads back: filters that smooth it do that late
 FIT = 0.2       # of an effect: what a matrix may leave of it, if the matrix is what is wrong
 
 
@@ -103,10 +104,10 @@ def kicked_steps(still: Outcome) -> Run:
     """Return a run of uneven steps with kicks about what the filter takes for the vertical."""
     run, lengths = still.run, still.run.dt.round(6)
     place = 4 * len(lengths) // 5                   # the filter is settled from its start
-    up = Rotation.from_quat(still.estimates[place]).inv().apply((0.0, 0.0, 1.0))
+    vertical = up(still.estimates[place])
     for length in np.unique(lengths):
         place += 20 + int(np.argmax(lengths[place + 20:] == length))
-        run = with_kick(run, place, SMALL * RATE * length * up)         # as fast for each length
+        run = with_kick(run, place, SMALL * RATE * length * vertical)     # as fast in each
     return run
 
 
@@ -117,12 +118,6 @@ def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
     answers = (increments(moved.estimates) - increments(still.estimates))[steps]
     gains = np.sum(answers * turns[steps], axis=1) / np.sum(turns[steps] ** 2, axis=1)
     return dict(sorted(zip(still.run.dt[steps].round(6).tolist(), gains.tolist(), strict=True)))
-
-
-def kicked(still: Sequence[Outcome], axis: Sequence[float], size: float = SMALL) -> Reals:
-    """Return kicks to and fro about an axis of the world, where filters take it to be (n, 3)."""
-    return np.array([size * (-1) ** k * Rotation.from_quat(one.estimates[EARLY - 1]).inv().apply(
-        axis) for k, one in enumerate(still)])
 
 
 def pull(errors: Sequence[Reals], least: float = ROUNDING) -> float:
@@ -140,8 +135,7 @@ def pull(errors: Sequence[Reals], least: float = ROUNDING) -> float:
     return float(-np.sum(first * way) / np.sum(size * length))
 
 
-def tilts(still: Sequence[Outcome], moved: Sequence[Outcome]) -> list[Reals]:
-    """Return the tilts by kicks at once, and those at the end, about axes of the world (n, 2)."""
-    return [np.array([(Rotation.from_quat(other.estimates[k]) * Rotation.from_quat(
-        one.estimates[k]).inv()).as_rotvec()[:2] for one, other in zip(still, moved, strict=True)])
-        for k in (EARLY, -1)]
+def led_back(still: Outcome, moved: Outcome) -> float:
+    """Return which share of the tilt by a kick is led back until the end."""
+    first, last = (np.cross(up(moved.estimates[k]), up(still.estimates[k])) for k in (LONG, -1))
+    return float(1.0 - first @ last / (first @ first))

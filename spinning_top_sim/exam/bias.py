@@ -40,7 +40,7 @@ class Course(NamedTuple):
     @property
     def left(self) -> float:
         """What is left of the largest error in the end; errors below STILL are none."""
-        return last(self.error) / float(np.max(self.error)) * (last(self.error) > STILL)
+        return last(self.error) / float(np.max(self.error)) if last(self.error) > STILL else 0.0
 
 
 class Effects(NamedTuple):

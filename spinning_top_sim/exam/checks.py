@@ -14,9 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, measures
-from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import degrees
-from spinning_top_sim.exam.motions import RATE, ROUNDING, Motion, Reals
+from spinning_top_sim.exam.motions import RATE, ROUNDING, STILL, Reals
 from spinning_top_sim.exam.runs import FIELD_TURN, Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import errors_of
@@ -28,9 +27,9 @@ CLEAN_DEG = 0.3
 GAIN_OFF = 0.02         # of turns: less than sensors differ in scale
 TURNS_OFF = 0.003       # of large turns; a step of first order is 0.0075 off
 DELAY = 0.25            # samples: half of what a mean of two steps is late
-# 1 - cosine of a way: 11 deg from the straight one; where errors are not small, twice that.
-STRAY = 0.02
-FAR = 2.0 * STRAY
+AT_REST = 0.1           # of an error: what moves by less in half of a rest does not
+UNEVEN = 0.8            # 1 - ratio of gains about two axes: those of right filters differ less
+STRAY = 0.04            # 1 - cosine of a way: 16 deg from the straight one
 FOLLOWS = 0.7           # half of the power: the filter is faster than the motion
 GROWS = 2.0 + 2.0 * bias.STEADY         # see bias.growth
 NOISY_DEG = 5.0         # a right filter that corrects first lags a step, on the top 2.3 deg
@@ -131,39 +130,35 @@ def large_turns(exam: Exam) -> Measured:
                     limit=max(TURNS_OFF, _trembles(exam) / answers.LARGE))
 
 
-def way_of_tilt(exam: Exam) -> Measured:
-    """Turn the gyroscope alone: gravity leads the tilt back, straight and in every attitude."""
-    still, moved = exam.rests('attitudes'), exam.outcomes('tilts')
-    off = 1.0 - answers.pull(answers.tilts(still[:len(moved)], moved))
-    trembles, text = _trembles(exam), 'after a kick of the gyroscope'
-    limit = max(STRAY, trembles / answers.SMALL)
-    tilt = _worst(exam, 'tilt')
-    errors = _errors(exam.outcomes('attitudes')[0], exam.attitudes)
-    # What a rest takes away is right, whatever its way; a filter that never settles has errors at
-    # rest for other reasons.
-    if off < limit and _size(errors[1]) > CLEAN_DEG + math.degrees(trembles) and exam.settles:
-        right = answers.pull([one[:, :2] for one in errors], bias.STEADY)
-        off, limit, text = 1.0 - right, FAR, 'at rest'
-    return Measured(off, f'{text} the way leads to the vertical by {1.0 - off:.2f} (1: straight, '
-                    f'0: not at all); at rest the tilt is up to {tilt:.3g} deg off', limit=limit,
-                    others={'rest_tilt_deg': Mark(tilt, CLEAN_DEG, 'without noise')})
+def tilt_at_rest(exam: Exam) -> Measured | None:
+    """Judge the tilt at which new filters come to rest: no estimate of a bias explains it."""
+    tilt, right = _at_rest(exam, 'starts', slice(2))
+    alone, _ = _at_rest(exam, 'starts, no field', slice(2))
+    name = 'magnetometer' if alone < 0.5 * tilt else 'accelerometer'
+    return Measured(tilt, f'where a new filter comes to rest, the tilt is up to {tilt:.3g} deg off'
+                    f', without the magnetometer {alone:.3g} deg', name,
+                    math.nan if right else CLEAN_DEG + math.degrees(_trembles(exam)))
 
 
-def errors_by_field(exam: Exam) -> Measured | None:
-    """Judge the heading at rest, and a tilt that the field causes."""
+def tilt_answer(exam: Exam) -> Measured | None:
+    """Turn the gyroscope alone about each axis, and across it: gravity leads the tilt back."""
+    back = np.array([[answers.led_back(still, moved) for moved in exam.outcomes('tilts')[k:k + 2]]
+                     for k, still in zip((0, 2, 4), exam.level, strict=False)])
+    if not len(back):
+        return None
+    least = float(np.min(back[:, 0] / np.maximum(back[:, 1], ROUNDING)))
+    return Measured(1.0 - least, 'gravity leads a tilt about x, y and z back by ' + ', '.join(
+        f'{one:.2g}' for one in back[:, 0]) + f' of it within {-answers.LONG / RATE:g} s, and by '
+        + ', '.join(f'{one:.2g}' for one in back[:, 1]) + ' across')
+
+
+def heading_at_rest(exam: Exam) -> Measured | None:
+    """Judge the heading at which new filters come to rest."""
     if not exam.heading:
         return None
-    tilt, heading = _worst(exam, 'tilt'), _worst(exam, 'heading')
-    if tilt > max(heading, CLEAN_DEG):
-        alone = _worst(exam, 'tilt', 'no field')
-        return Measured(tilt, f'at rest the tilt is up to {tilt:.3g} deg off, without the '
-                        f'magnetometer {alone:.3g} deg',
-                        '' if alone < 0.5 * tilt and exam.settles else 'accuracy')
-    errors = _errors(exam.outcomes('excitation')[0], exam.motion)
-    right = answers.pull([one[:, 2:] for one in errors], bias.STEADY)
-    return Measured(heading, f'at rest the heading is up to {heading:.3g} deg off, and its way '
-                    f'leads to north by {right:.2f} (1: straight, 0: not at all)',
-                    'accuracy' if right > 1.0 - FAR or not exam.settles else '')
+    heading, right = _at_rest(exam, 'starts', slice(2, 3))
+    return Measured(heading, 'where a new filter comes to rest, the heading is up to '
+                    f'{heading:.3g} deg off', limit=math.nan if right else None)
 
 
 def heading_answer(exam: Exam) -> Measured | None:
@@ -275,23 +270,21 @@ def _trembles(exam: Exam) -> float:
                      for one in exam.rests('attitudes')))
 
 
-def _worst(exam: Exam, which: str, name: str = '') -> float:
-    """Return the largest error at rest [deg], without or with a field."""
-    errors = exam.errors(name) if name else exam.clean
-    return math.degrees(np.max(np.abs(getattr(errors, which)[_rests(exam)])))
+def _at_rest(exam: Exam, name: str, axes: slice) -> tuple[float, bool]:
+    """
+    Return the largest error of those that come to rest [deg], and whether it still vanishes.
 
-
-def _errors(outcome: Outcome, motion: Motion) -> list[Reals]:
-    """Return the errors at begin and end of the rests, about axes of the world (n, 3) [rad]."""
-    error = (Rotation.from_quat(outcome.estimates)
-             * Rotation.from_quat(outcome.run.truth).inv()).as_rotvec()
-    return [error[[part.begin for part in motion.of('rest')[1:]]],
-            error[[part.end - 1 for part in motion.of('rest')[1:]]]]
-
-
-def _size(errors: Reals) -> float:
-    """Return the largest tilt [deg]."""
-    return math.degrees(np.max(np.linalg.norm(errors[:, :2], axis=1)))
+    axes : of the world, about which errors count
+    """
+    last = [one.part(slice(len(one.run.dt) // 2, None)) for one in exam.outcomes(name)]
+    errors = [measures.turns(one.run.truth, one.estimates)[:, axes] for one in last]
+    errors = [one for one in errors
+              if np.ptp(one, axis=0).max() < max(STILL, AT_REST * np.max(np.abs(one[-1])))]
+    if not errors:
+        return 0.0, True
+    largest = math.degrees(max(np.linalg.norm(error[-1]) for error in errors))
+    return largest, answers.pull([np.array([error[k] for error in errors]) for k in (0, -1)],
+                                 bias.STEADY) > 1.0 - STRAY
 
 
 FIRST = 'invalid_output', 'nondeterministic'
@@ -306,20 +299,21 @@ CHECKS = (
     Check('timing', 'steps_off', GAIN_OFF, 'turns in steps of 2.5 to 15 ms', steps, INPUTS),
     Check('integration', 'large_turn_off', TURNS_OFF, 'turns of 0.3 rad in a step', large_turns,
           INPUTS),
-    Check('accelerometer', 'tilt_way', STRAY, '1 - cosine of the way to the vertical',
-          way_of_tilt, INPUTS),
-    Check('magnetometer', 'rest_heading_deg', CLEAN_DEG, 'without noise', errors_by_field,
+    Check('accelerometer', 'rest_tilt_deg', CLEAN_DEG, 'of new filters', tilt_at_rest, INPUTS),
+    Check('accelerometer', 'tilt_answer', UNEVEN, '1: gravity does not lead a tilt back',
+          tilt_answer, (*INPUTS, 'accelerometer')),
+    Check('magnetometer', 'rest_heading_deg', CLEAN_DEG, 'of new filters', heading_at_rest,
           (*INPUTS, 'integration', 'accelerometer')),
     Check('magnetometer', 'heading_answer', 0.99, '1: the heading does not follow the field',
           heading_answer, (*ALL, 'integration')),
-    Check('accuracy', 'clean_deg', CLEAN_DEG, 'largest error without noise', clean,
-          (*ALL, 'integration')),
-    Check('lever_arm', 'lever_arm', FOLLOWS, 'share of the tilt of the specific force', lever_arm,
-          ALL),
     Check('bias', 'bias_left', bias.LEFT, 'of the largest effect of a bias, if it is learned',
           effect_of_bias, ALL),
     Check('bias', 'bias_report_off', bias.LEFT, 'of a bias, relative', reported_bias,
           (*ALL, 'integration')),
+    Check('accuracy', 'clean_deg', CLEAN_DEG, 'largest error without noise', clean,
+          (*ALL, 'integration')),
+    Check('lever_arm', 'lever_arm', FOLLOWS, 'share of the tilt of the specific force', lever_arm,
+          ALL),
     Check('accuracy', 'noisy_deg', NOISY_DEG, 'rms with noise', noisy, ALL),
     Check('covariance', 'nees_off', 1.0, 'squared error over its covariance', covariance,
           (*ALL, 'integration', 'lever_arm', 'bias')),

@@ -35,8 +35,25 @@ def rmse(estimates: Reals, truth: Reals) -> Rmse:
 
 def increments(quaternions: Reals) -> Reals:
     """Return the rotation vectors of the steps (n, 3) about axes of the sensor."""
-    turns = Rotation.from_quat(quaternions)
-    return np.concatenate((np.zeros((1, 3)), (turns[:-1].inv() * turns[1:]).as_rotvec()))
+    attitudes = Rotation.from_quat(quaternions)
+    return np.concatenate((np.zeros((1, 3)), (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()))
+
+
+def up(quaternions: Reals) -> Reals:
+    """Return where attitudes (..., 4) take the vertical to be, in axes of the sensor (..., 3)."""
+    vertical: Reals = Rotation.from_quat(quaternions).inv().apply((0.0, 0.0, 1.0))
+    return vertical
+
+
+def turns(one: Reals, other: Reals) -> Reals:
+    """Return the rotation vector from attitudes to others about axes of the world (..., 3)."""
+    vector: Reals = (Rotation.from_quat(other) * Rotation.from_quat(one).inv()).as_rotvec()
+    return vector
+
+
+def moved(quaternions: Reals) -> float:
+    """Return the largest turn from the first of the attitudes (n, 4) [rad]."""
+    return float(np.max(np.linalg.norm(turns(quaternions[:1], quaternions), axis=1)))
 
 
 def degrees(angle: float) -> str:

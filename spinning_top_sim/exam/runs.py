@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import answers, bias, motions
+from spinning_top_sim.exam import answers, bias, measures, motions
 from spinning_top_sim.exam.feeding import Feed, MakeFilter, Outcome
-from spinning_top_sim.exam.motions import NEAR, RATE, ROUNDING, STILL, Motion, Part, Reals, Run
+from spinning_top_sim.exam.motions import NEAR, RATE, ROUNDING, STILL, Motion, Run
 from spinning_top_sim.tools.conventions import Convention, Errors, errors_of
 
 # A filter is settled if it is STILL in the second half of a rest at the start; slow ones get
 # longer ones.
 LEADS_S = 10.0, 40.0, 160.0
 ARM = 0.1, 0.0, 0.0                         # of the IMU [m]
+STARTS = NEAR, (60.0, -35.0, 20.0), (-110.0, 15.0, -50.0)      # yaw, pitch, roll [deg]
 FIELD_TURN = math.radians(3.0)              # of the field about the vertical
 NOISE_LEAD_S, NOISE_S = 6.0, 20.0           # rest and motion of the noisy runs
 
@@ -49,6 +50,17 @@ class Exam:
         return [self.outcomes(name)[0].part(slice(part.begin, part.end))
                 for part in self.attitudes.of('rest')[1:]]
 
+    @cached_property
+    def level(self) -> list[Outcome]:
+        """The outcomes of 'attitudes' up to the rests in which x, y and z are most level."""
+        (whole,) = self.outcomes('attitudes')
+        ends = [part.end for part in self.attitudes.of('rest')[1:]]
+        kicked = np.array(ends) + answers.LONG - 1
+        ups, true = (measures.up(rows[kicked]) for rows in (whole.estimates, whole.run.truth))
+        # Gravity leads away a filter that is upside down.
+        least = np.where(np.sum(ups * true, axis=1) > 0.0, np.abs(ups).T, np.inf)
+        return [whole.part(slice(ends[np.argmin(row)])) for row in least if min(row) < np.inf]
+
     def fed(self, runs: Sequence[Run]) -> list[Outcome]:
         """Return the outcomes of other runs, in our convention."""
         told = self._feed(self._make_filter, runs)
@@ -74,8 +86,7 @@ class Exam:
 
     def _settles_in(self, seconds: float) -> bool:
         (outcome,) = self.fed([Motion(motions.euler(NEAR)).rest(seconds).run('rest')])
-        turns = Rotation.from_quat(outcome.estimates[len(outcome.estimates) // 2:])
-        return float(np.max((turns[0].inv() * turns).magnitude())) < STILL
+        return measures.moved(outcome.estimates[len(outcome.estimates) // 2:]) < STILL
 
     @cached_property
     def motion(self) -> Motion:
@@ -138,26 +149,25 @@ def _begin(exam: Exam) -> list[Run]:
     return [replace(exam.run, name='force of the begin', accelerometer=force, magnetometer=field)]
 
 
-def _kicks(exam: Exam, axis: tuple[float, float, float], size: float = answers.SMALL,
-           ) -> list[tuple[Part, Reals]]:
-    """Return the rests of 'attitudes', and kicks in them."""
-    return list(zip(exam.attitudes.of('rest')[1:], answers.kicked(
-        exam.rests('attitudes'), axis, size), strict=True))
-
-
 def _turns(exam: Exam, size: float) -> list[Run]:
     """Return the run with a kick about the vertical in each attitude: nothing leads it back."""
     run = exam.outcomes('attitudes')[0].run
-    for part, turn in _kicks(exam, (0.0, 0.0, 1.0), size):
+    for k, (part, still) in enumerate(zip(exam.attitudes.of('rest')[1:], exam.rests('attitudes'),
+                                          strict=True)):
+        turn = size * (-1) ** k * measures.up(still.estimates[answers.EARLY - 1])
         run = answers.with_kick(run, part.end + answers.EARLY, turn)
     return [run]
 
 
 def _tilts(exam: Exam) -> list[Run]:
-    """Return runs with one kick each: what leads it back goes on for long."""
-    run = exam.outcomes('attitudes')[0].run
-    return [answers.with_kick(run.part(slice(part.end)), answers.EARLY, turn)
-            for part, turn in _kicks(exam, (0.6, 0.8, 0.0))[:3]]
+    """Return runs with one kick each: about x, y and z as far as level, and across them."""
+    runs = []
+    for axis, still in zip(np.eye(3), exam.level, strict=False):
+        up = measures.up(still.estimates[answers.LONG - 1])
+        across = np.cross(up, axis) * answers.SMALL / np.linalg.norm(np.cross(up, axis))
+        runs += [answers.with_kick(still.run, answers.LONG, kick)
+                 for kick in (np.cross(across, up), across)]
+    return runs
 
 
 RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
@@ -165,12 +175,14 @@ RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     'excitation': lambda exam: [exam.run],
     'force of the begin': _begin,
     'field turned': _field_turned,
-    'no field': lambda exam: [exam.run.without_field()],
     'uneven': lambda exam: [motions.uneven(1000).without_field()],
     'uneven turns': lambda exam: [answers.kicked_steps(exam.outcomes('uneven')[0])],
     'attitudes': lambda exam: [exam.attitudes.run('attitudes').without_field()],
     'turns': lambda exam: _turns(exam, answers.SMALL),
     'large turns': lambda exam: _turns(exam, answers.LARGE),
+    'starts': lambda exam: [Motion(motions.euler(one)).rest(exam.lead_s).run('start')
+                            for one in STARTS],
+    'starts, no field': lambda exam: [one.run.without_field() for one in exam.outcomes('starts')],
     'tilts': _tilts,
     'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM)],
     'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
