@@ -249,7 +249,7 @@ def test_the_fixture_for_pytest_fails_a_test_of_a_filter_with_faults(
 
 
 @pytest.mark.parametrize(('options', 'says'), [
-    ({'level': 'slow'}, "level = 'slow': must be one of quick, full"),
+    ({'level': 'slow'}, "level = 'slow': must be one of quick, field"),
     ({'imu': {'imu.colour': 1.0}}, 'imu.colour = 1.0: there is no such parameter'),
     ({'imu': ROOT / 'config/cusp.yaml'}, 'cusp.yaml has '),
     ({'imu': {'imu.bandwidth': 9.0}}, 'imu has imu.bandwidth = 9.0: must be 0.0, because'),
@@ -324,11 +324,13 @@ def test_the_command_examines_a_class_in_a_file(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(('arguments', 'says'), [
-    ([], 'give one of a log'), (['x', '--topic', '/pose', '--filter', 'vqf'], 'give one of'),
-    (['--filter', 'vqf', '--seeds', '0'], 'seeds = 0'), (['--data', '.'], 'give one of'),
+    ([], 'nothing to examine: type --filter FILE.py:CLASS'),
+    (['x', '--topic', '/pose', '--filter', 'vqf'], 'log and filter are given: must be one of'),
+    (['--filter', 'vqf', '--seeds', '0'], 'seeds = 0'),
+    (['--data', '.'], '--data needs a filter: add --filter'),
     (['x', '--topic', '/pose', '--data', '.'], '--data cannot be given with log'),
     (['--node', 'x'], '--node needs --topic'),
-    (['--filter', 'vqf', '--data', '.', '--level', 'full'],
+    (['--filter', 'vqf', '--data', '.', '--level', 'field'],
      '--level cannot be given with --data'),
     (['x', '--topic', '/pose', '--level', 'quick'],
      '--level cannot be given with log: must be --topic, --truth, --heading')])

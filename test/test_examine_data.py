@@ -2,7 +2,6 @@
 """The exam with trials of BROAD; those here are simulated and written as BROAD's files are."""
 
 import re
-import sys
 from functools import partial
 
 import numpy as np
@@ -123,29 +122,16 @@ def test_a_trial_in_which_nothing_counts_is_refused(trial, tmp_path, change):
         examine_data(None, tmp_path)
 
 
-def test_what_cannot_be_read_is_told_in_one_line(tmp_path, capsys, monkeypatch):
+def test_what_cannot_be_read_is_told_in_one_line(tmp_path, capsys):
     (tmp_path / 'empty').mkdir()
-    junk, hdf5 = tmp_path / 'junk', tmp_path / 'hdf5'
-    for folder, name in ((junk, 'a.mat'), (hdf5, 'a.hdf5')):
-        folder.mkdir()
-        (folder / name).write_bytes(b'not a file of numbers' * 99)
-    monkeypatch.setitem(sys.modules, 'h5py', None)
+    junk = tmp_path / 'junk'
+    junk.mkdir()
+    (junk / 'a.mat').write_bytes(b'not a file of numbers' * 99)
     for folder, code, says in (
             (tmp_path / 'none', 2, 'none: must be a folder with trials of BROAD'),
             (ROOT / 'setup.py', 2, 'setup.py: must be a folder'),
-            (tmp_path / 'empty', 2, 'has no trial: must have files .mat, .hdf5'),
-            (junk, 2, 'a.mat is no trial of BROAD: '),
-            (hdf5, 1, 'an HDF5 file needs h5py, which is not installed')):
+            (tmp_path / 'empty', 2, 'has no trial: must have files .mat'),
+            (junk, 2, 'a.mat is no trial of BROAD: ')):
         assert main(['--filter', 'ekf', '--data', str(folder)]) == code
         said = capsys.readouterr().err
         assert says in said and said.count('\n') == 1, said
-
-
-def test_an_hdf5_file_is_read_too(run, trial, tmp_path):
-    h5py = pytest.importorskip('h5py')
-    with h5py.File(tmp_path / 'a.hdf5', 'w') as file:
-        for name in COLUMNS:
-            file[name] = trial[name]
-        file.attrs['sampling_rate'] = trial['sampling_rate']
-    report = examine_data(partial(Known, run, Rotation.identity()), tmp_path)
-    assert report.measures['data_rms_deg'] == pytest.approx(0.0, abs=1e-5)

@@ -99,11 +99,10 @@ def test_the_mark_is_the_mean_over_scenes_and_tells_filters_apart(monkeypatch):
     assert bad['field_tilt_rms_deg'] == pytest.approx(good['field_tilt_rms_deg'])
 
 
-def test_a_level_is_a_part_of_full_and_has_a_verdict(monkeypatch):
+def test_the_level_has_a_verdict(monkeypatch):
     monkeypatch.setattr(field, 'SCENES', [BY_NAME['slow_rotation']])
     asked = examine(Vqf, 'field', seeds=[7], imu={'mag.field': (0.0, 2e-5, 0.0)})
     assert asked.passed and 0.0 < asked.measures['field_rms_deg'] < 10.0
-    assert 'field_rms_deg' in examine(Vqf, 'full', seeds=1, isolated=False).measures
     still = examine(type('Still', (), {'update': lambda *_: (0.0, 0.0, 0.0, 1.0)}), 'field')
     assert still.faults == ['accuracy'] and 'the mean tilt error is' in str(still.found)
     # Without a field the heading is unknown.

@@ -59,23 +59,23 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
     # The node takes the first sample for the begin of its first step; so it is sent again.
     (direct,) = feeding.feed(partial(Vqf, magnetic=False), [run])
     with live.NodeExam(NODE, 'imu/data') as node:
-        for outcome in node.feed(node.start, [run, run]):
+        for outcome in feeding.feed(node.start, [run, run]):
             assert np.max(np.abs(outcome.estimates - direct.estimates)) < 1e-9
             assert np.isnan(outcome.covariances).all()
 
 
 def test_a_best_effort_node_is_examined_and_a_lost_message_is_no_fault(run, plain):
     with live.NodeExam(plain(), 'imu/data') as node:
-        (outcome,) = node.feed(node.start, [run])
+        (outcome,) = feeding.feed(node.start, [run])
         assert len(outcome.estimates) == len(run.dt)
 
 
-def test_a_run_that_loses_messages_begins_again_and_the_exam_ends_with_a_line(
+def test_the_exam_ends_with_a_line_if_a_message_is_lost(
         run, plain, monkeypatch):
     monkeypatch.setattr(live, 'ANSWER_S', 0.3)
     with (live.NodeExam(plain(left_out=(30,)), 'imu/data') as node,
-          pytest.raises(feeding.NodeError, match='are lost in 3 runs: make imu/data_raw')):
-        node.feed(node.start, [run])
+          pytest.raises(feeding.NodeError, match=r's is lost between exam and node: make imu/data_raw')):
+        feeding.feed(node.start, [run])
 
 
 def test_another_publisher_is_told_whenever_it_comes(run, monkeypatch):
@@ -128,11 +128,11 @@ def test_a_node_that_does_not_start_or_answer_is_told(run, plain, monkeypatch):
     monkeypatch.setattr(live, 'AGAIN_S', 0.05)
     with (live.NodeExam(plain(left_out=range(99)), 'imu/data') as node,
           pytest.raises(feeding.InvalidOutputError, match='answers none of 20 samples')):
-        node.feed(node.start, [run])
+        feeding.feed(node.start, [run])
     monkeypatch.setattr(live, 'PATIENCE_S', 0.5)
     with (live.NodeExam(f'{sys.executable} -c "import time; time.sleep(9)"', 'imu/data') as node,
           pytest.raises(feeding.InvalidOutputError, match='no node reads imu/data_raw and')):
-        node.feed(node.start, [run])
+        feeding.feed(node.start, [run])
 
 
 @pytest.mark.parametrize(('arguments', 'says'), [

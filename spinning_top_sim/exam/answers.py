@@ -14,11 +14,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import increments, up
-from spinning_top_sim.exam.motions import RATE, ROUNDING, Reals, Run
+from spinning_top_sim.exam.motions import ROUNDING, Reals, Run
 from spinning_top_sim.tools.identify import in_words
 
 SMALL, LARGE = 0.02, 0.3        # kicks [rad], of first order; that a step of first order misses
@@ -53,71 +54,64 @@ class Rates(NamedTuple):
         return f'a rate about {text}' + (', axes of the world' if self.in_world else '')
 
 
-def with_kick(run: Run, sample: int, turn: Reals) -> Run:
-    """Return the run with a kick, a turn of the gyroscope alone (3,) [rad]."""
+class Kicks(NamedTuple):
+    """Kicks at steps of a run (n,), turns (n, 3), and the answers until then (n, samples, 3)."""
+
+    steps: NDArray[np.intp]
+    turns: Reals
+    moves: Reals
+
+    @property
+    def off(self) -> float:
+        """The median of how far answers of the same step are off their turns, relative."""
+        return _left(self.moves[:, 0], self.turns, np.eye(3))
+
+    @property
+    def gains(self) -> Reals:
+        """How far the turns move the attitude in the same step, relative (n,)."""
+        gains: Reals = (np.sum(self.moves[:, 0] * self.turns, axis=1)
+                        / np.sum(self.turns ** 2, axis=1))
+        return gains
+
+
+def kicked(run: Run, steps: ArrayLike, turns: Reals) -> Run:
+    """Return the run with turns of the gyroscope alone (n, 3) [rad] in some steps (n,)."""
     gyroscope = run.gyroscope.copy()
-    gyroscope[sample] += turn / run.dt[sample]
+    gyroscope[steps] += turns / run.dt[steps, np.newaxis]
     return replace(run, name=f'{run.name}, kick', gyroscope=gyroscope)
 
 
-def rates(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Rates:
-    """Identify the use of the rates from rests without and with kicks about the vertical."""
-    apart = np.array([increments(other.estimates) - increments(one.estimates)
-                      for one, other in zip(still, moved, strict=True)])[:, EARLY:]
-    turns = _turns(still, moved)
-    moves = np.cumsum(apart, axis=1)                # (rests, samples, 3)
+def kicks(still: Outcome, moved: Outcome) -> Kicks:
+    """Return the kicks in which a run differs from another, and their answers."""
+    turns = (moved.run.gyroscope - still.run.gyroscope) * still.run.dt[:, np.newaxis]
+    steps = np.flatnonzero(np.any(turns, axis=1))
+    apart = increments(moved.estimates) - increments(still.estimates)
+    return Kicks(steps, turns[steps], np.cumsum(apart[steps[:, np.newaxis] + np.arange(-EARLY)],
+                                                axis=1))
+
+
+def rates(still: Outcome, moved: Outcome) -> Rates:
+    """Identify the use of the rates from runs without and with kicks about the vertical."""
+    steps, turns, moves = kicks(still, moved)
     size = np.median(np.linalg.norm(moves, axis=2), axis=0)
     delay = float(np.sum(1.0 - size / max(size[-1], 1e-300)))
     matrix, left = _fit(moves[:, -1], turns)
-    world = Rotation.from_quat([one.estimates[EARLY] for one in moved])
+    world = Rotation.from_quat(moved.estimates[steps])
     of_world, left_of_world = _fit(world.apply(moves[:, -1]), turns)
     if in_world := left_of_world < left and left > FIT:
         matrix, left = of_world, left_of_world
     return Rates(matrix, left, in_world, delay)
 
 
-def _turns(still: Sequence[Outcome], moved: Sequence[Outcome]) -> Reals:
-    """Return the kicks (n, 3) [rad]."""
-    return np.array([(other.run.gyroscope - one.run.gyroscope)[EARLY] * one.run.dt[EARLY]
-                     for one, other in zip(still, moved, strict=True)])
-
-
-def off_rotation(still: Sequence[Outcome], moved: Sequence[Outcome]) -> float:
-    """Return how far the answers to large kicks are off them, relative, the median."""
-    found = [(increments(other.estimates) - increments(one.estimates))[EARLY]
-             for one, other in zip(still, moved, strict=True)]
-    return float(np.median(_off(np.array(found), _turns(still, moved))))
-
-
-def _off(answers: Reals, turns: Reals) -> Reals:
-    off: Reals = np.linalg.norm(answers - turns, axis=1) / np.linalg.norm(turns, axis=1)
-    return off
-
-
 def _fit(answers: Reals, turns: Reals) -> tuple[Reals, float]:
     """Return the matrix from turns to answers, and the median deviation from it over a turn."""
     matrix = np.asarray(np.linalg.lstsq(turns, answers, rcond=None)[0].T, dtype=np.float64)
-    return matrix, float(np.median(_off(answers - turns @ matrix.T + turns, turns)))
+    return matrix, _left(answers, turns, matrix)
 
 
-def kicked_steps(still: Outcome) -> Run:
-    """Return a run of uneven steps with kicks about what the filter takes for the vertical."""
-    run, lengths = still.run, still.run.dt.round(6)
-    place = 4 * len(lengths) // 5                   # the filter is settled from its start
-    vertical = up(still.estimates[place])
-    for length in np.unique(lengths):
-        place += 20 + int(np.argmax(lengths[place + 20:] == length))
-        run = with_kick(run, place, SMALL * RATE * length * vertical)     # as fast in each
-    return run
-
-
-def gains_of_steps(still: Outcome, moved: Outcome) -> dict[float, float]:
-    """Return for each length of a step [s] how far a turn in it moves the attitude, relative."""
-    turns = (moved.run.gyroscope - still.run.gyroscope) * still.run.dt[:, np.newaxis]
-    steps = np.flatnonzero(np.any(turns, axis=1))
-    answers = (increments(moved.estimates) - increments(still.estimates))[steps]
-    gains = np.sum(answers * turns[steps], axis=1) / np.sum(turns[steps] ** 2, axis=1)
-    return dict(sorted(zip(still.run.dt[steps].round(6).tolist(), gains.tolist(), strict=True)))
+def _left(answers: Reals, turns: Reals, matrix: Reals) -> float:
+    return float(np.median(np.linalg.norm(answers - turns @ matrix.T, axis=1)
+                           / np.linalg.norm(turns, axis=1)))
 
 
 def pull(errors: Sequence[Reals], least: float = ROUNDING) -> float:

@@ -6,20 +6,17 @@ Examines filters with trials of BROAD: readings of a real IMU beside an optical 
 Estimation", Data 2021, 6, 72)
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spinning_top_sim.exam.feeding import TOLERANCE, Feed, MakeFilter, feed_apart
 from spinning_top_sim.exam.motions import Run
 from spinning_top_sim.exam.scored import ScoredRun, report_of
-from spinning_top_sim.installation import needed
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.report import Report
 
-SUFFIXES = '.mat', '.hdf5', '.h5'
 # Arrays of a trial with their columns; the field is in microtesla, quaternions are w, x, y, z.
 COLUMNS = {'imu_gyr': 3, 'imu_acc': 3, 'imu_mag': 3, 'opt_quat': 4, 'movement': 1}
 
@@ -28,24 +25,11 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
                  feed: Feed = feed_apart,
                  show: Callable[[float, float], object] = lambda done, total: None) -> Report:
     """
-    Examine a filter with the trials of BROAD in a folder: .mat, or .hdf5, which need h5py.
+    Examine a filter with the trials of BROAD in a folder: .mat.
 
     The filter gets each trial from its first sample on.  The measures are the root mean squares
-    of the errors in motion, of each trial and their means.
-
-    Parameters
-    ----------
-    make_filter : callable
-        As of `examine`.
-    folder : path
-        With the files.
-    subject, feed, show : optional
-        As of `examine`.
-
-    Raises
-    ------
-    ValueError
-        If there is no folder, no trial in it, or a file is none.
+    of the errors in motion, of each trial and their means.  The other arguments are those of
+    `examine`.  Raises ValueError if there is no folder, no trial in it, or a file is none.
     """
     paths = trials_in(folder)
     return report_of(make_filter, map(read_trial, paths), len(paths), 'data', one_line(
@@ -56,9 +40,9 @@ def trials_in(folder: str | Path) -> list[Path]:
     """Return the files of trials in a folder, by name.  Raises ValueError if there is none."""
     if not Path(folder).is_dir():
         raise ValueError(f'{folder}: must be a folder with trials of BROAD')
-    paths = sorted(path for path in Path(folder).iterdir() if path.suffix in SUFFIXES)
+    paths = sorted(path for path in Path(folder).iterdir() if path.suffix == '.mat')
     if not paths:
-        raise ValueError(f'{folder} has no trial: must have files {", ".join(SUFFIXES)}')
+        raise ValueError(f'{folder} has no trial: must have files .mat')
     return paths
 
 
@@ -67,12 +51,10 @@ def read_trial(path: Path) -> ScoredRun:
     from scipy.io import loadmat  # noqa: PLC0415 - slow
 
     try:
-        data = loadmat(path) if path.suffix == '.mat' else _hdf5(path)
+        data = loadmat(path)
         rate = float(np.squeeze(data['sampling_rate']))
         readings = [np.reshape(data[name], (len(data['imu_gyr']), count)).astype(float)
                     for name, count in COLUMNS.items()]
-    except ImportError:
-        raise
     except Exception as error:      # whatever a reader says of a damaged file
         what = f'it has no {error}' if isinstance(error, KeyError) else one_line(error)
         raise ValueError(f'{path} is no trial of BROAD: {what}') from error
@@ -86,10 +68,3 @@ def read_trial(path: Path) -> ScoredRun:
     step = np.full(len(truth), 1.0 / rate)
     return ScoredRun(Run(one_line(path.stem), step, truth[:, [1, 2, 3, 0]], gyroscope,
                          accelerometer, 1e-6 * magnetometer), counts)
-
-
-def _hdf5(path: Path) -> Mapping[str, Any]:
-    with needed('an HDF5 file'):
-        import h5py  # noqa: PLC0415
-    with h5py.File(path) as file:
-        return {**file.attrs, **{name: file[name][()] for name in COLUMNS}}

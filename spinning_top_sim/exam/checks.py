@@ -111,16 +111,17 @@ def delay(exam: Exam) -> Measured | None:
 
 def steps(exam: Exam) -> Measured:
     """Compare turns in steps of different lengths."""
-    gains = answers.gains_of_steps(*exam.outcomes('uneven'), *exam.outcomes('uneven turns'))
-    return Measured(max(abs(gain - 1.0) for gain in gains.values()),
-                    f'in steps of {", ".join(f"{1e3 * one:g}" for one in gains)} ms a turn moves '
-                    f'the attitude {", ".join(f"{one:.3g}" for one in gains.values())} times as '
-                    'far: the length of the step is misused')
+    ((still,), (moved,)) = exam.outcomes('uneven'), exam.outcomes('uneven turns')
+    kicks = answers.kicks(still, moved)
+    return Measured(float(np.max(np.abs(kicks.gains - 1.0))), 'in steps of '
+                    f'{", ".join(f"{1e3 * one:g}" for one in still.run.dt[kicks.steps])} ms a '
+                    f'turn moves the attitude {", ".join(f"{one:.3g}" for one in kicks.gains)} '
+                    'times as far: the length of the step is misused')
 
 
 def large_turns(exam: Exam) -> Measured:
     """Compare large turns in one step with the closed form of the rotation."""
-    off = answers.off_rotation(exam.rests('attitudes'), exam.rests('large turns'))
+    off = answers.kicks(*exam.outcomes('attitudes'), *exam.outcomes('large turns')).off
     turn = f'a turn of {answers.LARGE:g} rad in one step'
     if off > answers.FIT:
         return Measured(off, f'{turn}, {answers.LARGE * RATE:g} rad/s, moves the attitude '
@@ -257,7 +258,7 @@ def _rests(exam: Exam) -> list[int]:
 
 
 def _rates(exam: Exam) -> answers.Rates:
-    return answers.rates(exam.rests('attitudes'), exam.rests('turns'))
+    return answers.rates(*exam.outcomes('attitudes'), *exam.outcomes('turns'))
 
 
 def _in_degrees(rates: Reals) -> str:
@@ -266,8 +267,8 @@ def _in_degrees(rates: Reals) -> str:
 
 def _trembles(exam: Exam) -> float:
     """Return the largest turn of a step in rests [rad]: corrections may have a fixed size."""
-    return float(max(np.max(np.abs(measures.increments(one.estimates[answers.EARLY:])))
-                     for one in exam.rests('attitudes')))
+    turns = np.abs(measures.increments(exam.outcomes('attitudes')[0].estimates))
+    return float(max(np.max(turns[end + answers.EARLY + 1:end]) for end in exam.ends))
 
 
 def _at_rest(exam: Exam, name: str, axes: slice) -> tuple[float, bool]:

@@ -6,7 +6,7 @@ node, a published filter by name, or the attitudes in a log beside the truth.
   spinning-top examine --filter mine.py:MyFilter
   spinning-top examine --command "./my_filter"
   spinning-top examine --node "python examples/attitude_node.py" --topic imu/data
-  spinning-top examine --filter vqf --level full --page vqf.png
+  spinning-top examine --filter vqf --level field --page vqf.png
   spinning-top examine --filter vqf --data broad/data_mat    # with real readings
   spinning-top examine run.mcap --topic /imu/data
 
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--heading', choices=('true', 'magnetic'), help='the heading in the log must be right, '
         'from true or magnetic north; default: it must be steady')
     add('--data', type=Path, metavar='FOLDER', help='examine with the trials of BROAD in this '
-        'folder: readings of a real IMU beside an optical truth (.mat; .hdf5 needs h5py)')
+        'folder: readings of a real IMU beside an optical truth (.mat)')
     add('--level', choices=SEEDS, help='level of the exam; default: quick; field: scenes of a '
         'sensor in a hand')
     scene_file.add_arguments(parser, 'imu')
@@ -88,9 +88,14 @@ def _run(arguments: argparse.Namespace) -> int:
 def _options(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Return what is examined, a key of KINDS, and its options.  Raises ValueError."""
     kinds = [kind for kind in KINDS if getattr(arguments, kind) is not None]
-    if len(kinds) != 1:
-        raise ValueError('give one of a log, --filter, --command and --node, not '
-                         f'{" and ".join(kinds) or "none"}')
+    if not kinds and arguments.data is not None:
+        raise ValueError('--data needs a filter: add --filter FILE.py:CLASS or --command COMMAND')
+    if not kinds:
+        raise ValueError('nothing to examine: type --filter FILE.py:CLASS, --command COMMAND, '
+                         '--node COMMAND --topic TOPIC, or a log and --topic TOPIC')
+    if len(kinds) > 1:
+        raise ValueError(f'{" and ".join(kinds)} are given: must be one of a log, --filter, '
+                         '--command and --node')
     (kind,) = kinds
     options = {name: value for name in dict.fromkeys(sum(KINDS.values(), ()))
                if (value := getattr(arguments, name)) is not None}

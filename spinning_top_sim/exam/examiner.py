@@ -3,7 +3,6 @@
 
 import operator
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.report import Finding, Mark, Report
 from spinning_top_sim.tools.scene_file import read_scene
 
-SEEDS = {'quick': 3, 'full': 10, 'field': 1}        # of the noisy runs, or of the scenes
+SEEDS = {'quick': 3, 'field': 1}        # of the noisy runs, or of the scenes
 
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
@@ -41,13 +40,13 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     ----------
     make_filter : callable
         Returns a new filter for every run: its class, a function, or one of `adapters.FILTERS`.
-    level : {'quick', 'full', 'field'}
-        'full' has more seeds, and a seed of the scenes of 'field'.
+    level : {'quick', 'field'}
+        'field' are scenes of a sensor in a hand instead of the checks.
     imu : mapping or path, optional
         Parameters imu.* and mag.* that replace those of the noisy runs and of the scenes, or the
         path of a parameter file such as those in config/imu.
     seeds : int or iterable of int, optional
-        Seeds of the noisy runs, or their number; default: 3, of 'full' 10, of 'field' 1.
+        Seeds of the noisy runs, or their number; default: 3, of 'field' 1.
     subject : str, optional
         Name in the report; default: that of the filter's class.
     isolated : bool, optional
@@ -80,16 +79,8 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     subject = one_line(subject or getattr(make_filter, '__name__', 'filter'))
     if level == 'field':
         return examine_field(make_filter, subject, numbers, values, feed, show)
-    of_noise = {name: value for name, value in values.items()
-                if not name.startswith(motions.OF_SCENES)}
-    exam = Exam(make_filter, feed, {**motions.CALIBRATED, **of_noise}, numbers)
-    report = _sit(exam, subject, show)
-    if level == 'full' and report.outcomes:
-        scenes = examine_field(make_filter, subject, numbers[:1], values, feed, show)
-        report = replace(report, found=[*report.found, *scenes.found],
-                         marks={**report.marks, **scenes.marks},
-                         notes=[*report.notes, *scenes.notes])
-    return report
+    exam = Exam(make_filter, feed, {**motions.CALIBRATED, **values}, numbers)
+    return _sit(exam, subject, show)
 
 
 def checked_imu(imu: Mapping[str, Any] | str | Path | None, level: str) -> Mapping[str, Any]:
@@ -98,7 +89,7 @@ def checked_imu(imu: Mapping[str, Any] | str | Path | None, level: str) -> Mappi
         return {}
     given = imu if isinstance(imu, Mapping) else read_scene(imu)
     checked, source = parameters.checked(given), 'imu' if imu is given else imu
-    taken = motions.TAKEN + motions.OF_SCENES * (level != 'quick')
+    taken = motions.TAKEN + motions.OF_SCENES * (level == 'field')
     for name, value in given.items():
         if not name.startswith(('imu.', 'mag.')):
             raise ValueError(f'{source} has {name}: must have parameters imu.* and mag.* only')

@@ -7,7 +7,7 @@ import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,10 @@ from spinning_top_sim.exam.feeding import (
     ANSWER_S,
     INTERRUPTED,
     READ_EVERY,
-    MakeFilter,
     NodeError,
-    Outcome,
     feed,
 )
-from spinning_top_sim.exam.motions import Reals, Run
+from spinning_top_sim.exam.motions import Reals
 from spinning_top_sim.times import NANOSECONDS
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
@@ -46,13 +44,8 @@ IMU_TOPIC, FIELD_TOPIC = 'imu/data_raw', 'imu/mag'
 PATIENCE_S = 20.0               # for a node to start
 # The first sample is sent again so often, after this time each: endpoints match within seconds.
 AGAIN, AGAIN_S = 20, 0.3
-ATTEMPTS = 3                    # at a run in which messages are lost
 START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 NAME, FRAME = 'examine', 'imu_link'
-
-
-class LostError(NodeError):
-    """A message between exam and node has been lost."""
 
 
 def examine_node(command: str, topic: str, level: str = 'quick',
@@ -62,22 +55,12 @@ def examine_node(command: str, topic: str, level: str = 'quick',
     """
     Examine a ROS node that `command` starts for each run, without a shell.
 
-    Parameters
-    ----------
-    command : str
-        Starts the node.
-    topic : str
-        Of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
-    level, imu, seeds, show : optional
-        As of `examine`.
-
-    Raises
-    ------
-    NodeError
-        If other nodes publish on its topics, or messages are lost.
+    `topic` is that of its attitudes, sensor_msgs/Imu, each with the stamp of its sample; the other
+    arguments are those of `examine`.  Raises NodeError if other nodes publish on its topics, or
+    messages are lost.
     """
     with NodeExam(command, topic) as node:
-        return examine(node.start, level, imu, seeds, subject=command, feed=node.feed, show=show)
+        return examine(node.start, level, imu, seeds, subject=command, feed=feed, show=show)
 
 
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
@@ -101,17 +84,6 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         self._process: subprocess.Popen[bytes] | None = None
         self._answers: dict[int, Any] = {}          # by stamp [ns]
         self.covariance: Reals | None = None
-
-    def feed(self, make_filter: MakeFilter, runs: Sequence[Run]) -> list[Outcome]:
-        """Do as `feeding.feed`; begin a run again in which a message is lost."""
-        return [self._feed(make_filter, run) for run in runs]
-
-    def _feed(self, make_filter: MakeFilter, run: Run) -> Outcome:
-        for _ in range(ATTEMPTS):
-            with contextlib.suppress(LostError):
-                return feed(make_filter, [run])[0]
-        raise NodeError(f'messages between exam and node are lost in {ATTEMPTS} runs: make '
-                        f'{IMU_TOPIC} and {self._topic} reliable in the node')
 
     def __exit__(self, *exception: object) -> None:
         self._end_process()
@@ -153,9 +125,8 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         best_effort = ReliabilityPolicy.BEST_EFFORT
         self._reliable = best_effort not in (*offered, *asked)
         self._subscription = self._subscription or self._node.create_subscription(
-            Imu, self._topic, self._take, QoSProfile(
-                depth=100, reliability=best_effort if best_effort in offered
-                else ReliabilityPolicy.RELIABLE))
+            Imu, self._topic, self._take,
+            QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_AVAILABLE))
 
     def _check_alone(self) -> None:
         """Raise NodeError if another node publishes on a topic of the exam."""
@@ -182,7 +153,8 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             if not self._answered:
                 raise RuntimeError(f'it answers none of {AGAIN} samples')
             if not self._reliable:
-                raise LostError
+                raise NodeError(f'the message of {self._now_ns * 1e-9:.9f} s is lost between exam '
+                                f'and node: make {IMU_TOPIC} and {self._topic} reliable there')
             raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
                                f'sample within {ANSWER_S:g} s')
         message = self._answers.pop(self._now_ns)

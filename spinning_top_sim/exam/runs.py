@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, measures, motions
@@ -45,21 +46,20 @@ class Exam:
             self.done[name] = self.fed(RUNS[name](self))
         return self.done[name]
 
-    def rests(self, name: str) -> list[Outcome]:
-        """Return the outcomes in the rests of 'attitudes', or of the same with kicks."""
-        return [self.outcomes(name)[0].part(slice(part.begin, part.end))
-                for part in self.attitudes.of('rest')[1:]]
+    @cached_property
+    def ends(self) -> NDArray[np.intp]:
+        """The ends of the rests in many attitudes."""
+        return np.array([part.end for part in self.attitudes.of('rest')[1:]])
 
     @cached_property
     def level(self) -> list[Outcome]:
         """The outcomes of 'attitudes' up to the rests in which x, y and z are most level."""
         (whole,) = self.outcomes('attitudes')
-        ends = [part.end for part in self.attitudes.of('rest')[1:]]
-        kicked = np.array(ends) + answers.LONG - 1
-        ups, true = (measures.up(rows[kicked]) for rows in (whole.estimates, whole.run.truth))
+        ups, true = (measures.up(rows[self.ends + answers.LONG - 1])
+                     for rows in (whole.estimates, whole.run.truth))
         # Gravity leads away a filter that is upside down.
         least = np.where(np.sum(ups * true, axis=1) > 0.0, np.abs(ups).T, np.inf)
-        return [whole.part(slice(ends[np.argmin(row)])) for row in least if min(row) < np.inf]
+        return [whole.part(slice(self.ends[np.argmin(row)])) for row in least if min(row) < np.inf]
 
     def fed(self, runs: Sequence[Run]) -> list[Outcome]:
         """Return the outcomes of other runs, in our convention."""
@@ -149,14 +149,22 @@ def _begin(exam: Exam) -> list[Run]:
     return [replace(exam.run, name='force of the begin', accelerometer=force, magnetometer=field)]
 
 
+def _uneven_turns(exam: Exam) -> list[Run]:
+    """Return the run of uneven steps with a kick in a step of each length."""
+    (still,) = exam.outcomes('uneven')
+    settled = 4 * len(still.run.dt) // 5
+    lengths, first = np.unique(still.run.dt[settled:].round(6), return_index=True)
+    # In the third period after the one before; as fast in each length.
+    steps = settled + first + 3 * len(motions.STEPS) * np.arange(len(first))
+    return [answers.kicked(still.run, steps, answers.SMALL * RATE * lengths[:, np.newaxis]
+                           * measures.up(still.estimates[steps - 1]))]
+
+
 def _turns(exam: Exam, size: float) -> list[Run]:
     """Return the run with a kick about the vertical in each attitude: nothing leads it back."""
-    run = exam.outcomes('attitudes')[0].run
-    for k, (part, still) in enumerate(zip(exam.attitudes.of('rest')[1:], exam.rests('attitudes'),
-                                          strict=True)):
-        turn = size * (-1) ** k * measures.up(still.estimates[answers.EARLY - 1])
-        run = answers.with_kick(run, part.end + answers.EARLY, turn)
-    return [run]
+    ((still,), steps) = exam.outcomes('attitudes'), exam.ends + answers.EARLY
+    sizes = np.resize((size, -size), (len(steps), 1))
+    return [answers.kicked(still.run, steps, sizes * measures.up(still.estimates[steps - 1]))]
 
 
 def _tilts(exam: Exam) -> list[Run]:
@@ -165,7 +173,7 @@ def _tilts(exam: Exam) -> list[Run]:
     for axis, still in zip(np.eye(3), exam.level, strict=False):
         up = measures.up(still.estimates[answers.LONG - 1])
         across = np.cross(up, axis) * answers.SMALL / np.linalg.norm(np.cross(up, axis))
-        runs += [answers.with_kick(still.run, answers.LONG, kick)
+        runs += [answers.kicked(still.run, [answers.LONG], kick)
                  for kick in (np.cross(across, up), across)]
     return runs
 
@@ -176,7 +184,7 @@ RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     'force of the begin': _begin,
     'field turned': _field_turned,
     'uneven': lambda exam: [motions.uneven(1000).without_field()],
-    'uneven turns': lambda exam: [answers.kicked_steps(exam.outcomes('uneven')[0])],
+    'uneven turns': _uneven_turns,
     'attitudes': lambda exam: [exam.attitudes.run('attitudes').without_field()],
     'turns': lambda exam: _turns(exam, answers.SMALL),
     'large turns': lambda exam: _turns(exam, answers.LARGE),
