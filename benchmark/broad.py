@@ -25,7 +25,7 @@ from spinning_top_sim.exam import broad
 from spinning_top_sim.exam import scenes as field
 from spinning_top_sim.exam.adapters import Ahrs, Imufusion, Vqf
 from spinning_top_sim.exam.feeding import InvalidOutputError, feed
-from spinning_top_sim.exam.measures import Rmse, rmse
+from spinning_top_sim.exam.measures import rmse
 from spinning_top_sim.exam.scored import ScoredRun
 from spinning_top_sim.tools.cli import progress
 
@@ -46,7 +46,7 @@ FILTERS = {
     'imufusion': Imufusion,
     'imufusion rejection=10': partial(Imufusion, acceleration_rejection=10.0,
                                       magnetic_rejection=10.0, rejection_timeout=5.0)}
-WORST = Rmse(180.0, 180.0, 180.0)       # of a filter that fails
+WORST = np.full(3, 180.0)       # of a filter that fails
 DRAWS = 2000
 
 
@@ -58,7 +58,7 @@ def trial_of(what: Path | tuple[int, int]) -> ScoredRun:
     return field.record(field.SCENES[what[0]], what[1], {})
 
 
-def error_of(job: tuple[str, Path | tuple[int, int]]) -> Rmse:
+def error_of(job: tuple[str, Path | tuple[int, int]]) -> np.ndarray:
     name, what = job
     try:
         run, counts = trial_of(what)

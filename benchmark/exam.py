@@ -66,8 +66,8 @@ def main() -> None:
         for (name, _), faults in zip(jobs, pool.map(faults_of, jobs), strict=True):
             found.setdefault(name, []).append(faults)
     rows = [(name, f'`{fault}`' if fault else 'none', str(len(said)), str(
-        sum(one == ([fault] if fault else []) for one in said)), ', '.join(sorted(
-            {other for one in said for other in one} - {fault})) or '–')
+        sum(', '.join(one) == fault for one in said)), ', '.join(sorted(
+            {other for one in said for other in one} - {*fault.split(', ')})) or '–')
         for name, said in found.items() for fault in [TABLE[name][1]]]
     report.write('exam_marks.md', '\n'.join((
         report.preamble('Results of published filters', PACKAGES),

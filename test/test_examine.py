@@ -50,13 +50,14 @@ def short():
 
 def test_the_names_of_faults_are_twelve_and_the_tables_have_them():
     assert {check.fault for check in CHECKS} | {'invalid_output'} == NAMES
-    assert {areas for _, areas in WRONG.values()} == NAMES - {'nondeterministic'}
+    assert {area for _, areas in WRONG.values() for area in areas.split(', ')} == (
+        NAMES - {'nondeterministic'})
 
 
 @pytest.mark.parametrize('name', FAST)
 def test_a_wrong_filter_is_named_by_its_area_and_nothing_else(report, name):
     found = report(name)
-    assert found.faults == [WRONG[name][1]], found
+    assert ', '.join(found.faults) == WRONG[name][1], found
     assert found.found[0].evidence in str(found)
 
 
@@ -70,7 +71,7 @@ def test_a_right_filter_passes(report, name):
 
 @pytest.mark.parametrize('name', ['first order', 'no bias', 'no field', 'slow turns dropped'])
 def test_a_mistake_inside_is_named(report, name):
-    assert report(name).faults == [WRONG[name][1]], report(name)
+    assert ', '.join(report(name).faults) == WRONG[name][1], report(name)
 
 
 @pytest.mark.parametrize('reports', [True, False])

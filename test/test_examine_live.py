@@ -74,7 +74,8 @@ def test_the_exam_ends_with_a_line_if_a_message_is_lost(
         run, plain, monkeypatch):
     monkeypatch.setattr(live, 'ANSWER_S', 0.3)
     with (live.NodeExam(plain(left_out=(30,)), 'imu/data') as node,
-          pytest.raises(feeding.NodeError, match=r's is lost between exam and node: make imu/data_raw')):
+          pytest.raises(feeding.NodeError,
+                        match=r's is lost between exam and node: make imu/data_raw')):
         feeding.feed(node.start, [run])
 
 

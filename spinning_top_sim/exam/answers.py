@@ -14,12 +14,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import increments, up
-from spinning_top_sim.exam.motions import ROUNDING, Reals, Run
+from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.tools.identify import in_words
 
 SMALL, LARGE = 0.02, 0.3        # kicks [rad], of first order; that a step of first order misses
@@ -74,10 +74,10 @@ class Kicks(NamedTuple):
         return gains
 
 
-def kicked(run: Run, steps: ArrayLike, turns: Reals) -> Run:
+def kicked(run: Run, steps: Sequence[int] | NDArray[np.intp], turns: Reals) -> Run:
     """Return the run with turns of the gyroscope alone (n, 3) [rad] in some steps (n,)."""
     gyroscope = run.gyroscope.copy()
-    gyroscope[steps] += turns / run.dt[steps, np.newaxis]
+    gyroscope[steps] += turns / run.dt[steps][:, np.newaxis]
     return replace(run, name=f'{run.name}, kick', gyroscope=gyroscope)
 
 
@@ -112,21 +112,6 @@ def _fit(answers: Reals, turns: Reals) -> tuple[Reals, float]:
 def _left(answers: Reals, turns: Reals, matrix: Reals) -> float:
     return float(np.median(np.linalg.norm(answers - turns @ matrix.T, axis=1)
                            / np.linalg.norm(turns, axis=1)))
-
-
-def pull(errors: Sequence[Reals], least: float = ROUNDING) -> float:
-    """
-    Return whether errors go straight to zero: the cosine of the angle between the ways, weighted.
-
-    errors : before and after (n, axes)
-    least : share by which they must fall, else 0 is returned
-    """
-    first, last = errors
-    way = last - first
-    size, length = np.linalg.norm(first, axis=1), np.linalg.norm(way, axis=1)
-    if np.sum(np.linalg.norm(last, axis=1)) >= (1.0 - least) * np.sum(size):
-        return 0.0
-    return float(-np.sum(first * way) / np.sum(size * length))
 
 
 def led_back(still: Outcome, moved: Outcome) -> float:

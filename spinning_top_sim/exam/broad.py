@@ -7,6 +7,7 @@ Estimation", Data 2021, 6, 72)
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +32,8 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     of the errors in motion, of each trial and their means.  The other arguments are those of
     `examine`.  Raises ValueError if there is no folder, no trial in it, or a file is none.
     """
-    paths = trials_in(folder)
-    return report_of(make_filter, map(read_trial, paths), len(paths), 'data', one_line(
+    runs = [partial(read_trial, path) for path in trials_in(folder)]
+    return report_of(make_filter, runs, 'data', one_line(
         subject or getattr(make_filter, '__name__', 'filter')), feed, show)
 
 

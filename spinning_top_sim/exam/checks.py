@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, measures
 from spinning_top_sim.exam.measures import degrees
-from spinning_top_sim.exam.motions import RATE, ROUNDING, STILL, Reals
+from spinning_top_sim.exam.motions import RATE, ROUNDING, Reals
 from spinning_top_sim.exam.runs import FIELD_TURN, Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import errors_of
@@ -27,9 +27,7 @@ CLEAN_DEG = 0.3
 GAIN_OFF = 0.02         # of turns: less than sensors differ in scale
 TURNS_OFF = 0.003       # of large turns; a step of first order is 0.0075 off
 DELAY = 0.25            # samples: half of what a mean of two steps is late
-AT_REST = 0.1           # of an error: what moves by less in half of a rest does not
 UNEVEN = 0.8            # 1 - ratio of gains about two axes: those of right filters differ less
-STRAY = 0.04            # 1 - cosine of a way: 16 deg from the straight one
 FOLLOWS = 0.7           # half of the power: the filter is faster than the motion
 GROWS = 2.0 + 2.0 * bias.STEADY         # see bias.growth
 NOISY_DEG = 5.0         # a right filter that corrects first lags a step, on the top 2.3 deg
@@ -131,14 +129,13 @@ def large_turns(exam: Exam) -> Measured:
                     limit=max(TURNS_OFF, _trembles(exam) / answers.LARGE))
 
 
-def tilt_at_rest(exam: Exam) -> Measured | None:
+def tilt_at_rest(exam: Exam) -> Measured:
     """Judge the tilt at which new filters come to rest: no estimate of a bias explains it."""
-    tilt, right = _at_rest(exam, 'starts', slice(2))
-    alone, _ = _at_rest(exam, 'starts, no field', slice(2))
-    name = 'magnetometer' if alone < 0.5 * tilt else 'accelerometer'
+    tilt, alone = (_at_rest(exam, name, slice(2)) for name in ('starts', 'starts, no field'))
     return Measured(tilt, f'where a new filter comes to rest, the tilt is up to {tilt:.3g} deg off'
-                    f', without the magnetometer {alone:.3g} deg', name,
-                    math.nan if right else CLEAN_DEG + math.degrees(_trembles(exam)))
+                    f', without the magnetometer {alone:.3g} deg',
+                    'magnetometer' if alone < 0.5 * tilt else 'accelerometer',
+                    CLEAN_DEG + math.degrees(_trembles(exam)))
 
 
 def tilt_answer(exam: Exam) -> Measured | None:
@@ -150,16 +147,17 @@ def tilt_answer(exam: Exam) -> Measured | None:
     least = float(np.min(back[:, 0] / np.maximum(back[:, 1], ROUNDING)))
     return Measured(1.0 - least, 'gravity leads a tilt about x, y and z back by ' + ', '.join(
         f'{one:.2g}' for one in back[:, 0]) + f' of it within {-answers.LONG / RATE:g} s, and by '
-        + ', '.join(f'{one:.2g}' for one in back[:, 1]) + ' across')
+        + ', '.join(f'{one:.2g}' for one in back[:, 1]) + ' across',
+                    limit=UNEVEN + _trembles(exam) / answers.SMALL)
 
 
 def heading_at_rest(exam: Exam) -> Measured | None:
     """Judge the heading at which new filters come to rest."""
     if not exam.heading:
         return None
-    heading, right = _at_rest(exam, 'starts', slice(2, 3))
+    heading = _at_rest(exam, 'starts', slice(2, 3))
     return Measured(heading, 'where a new filter comes to rest, the heading is up to '
-                    f'{heading:.3g} deg off', limit=math.nan if right else None)
+                    f'{heading:.3g} deg off')
 
 
 def heading_answer(exam: Exam) -> Measured | None:
@@ -271,21 +269,12 @@ def _trembles(exam: Exam) -> float:
     return float(max(np.max(turns[end + answers.EARLY + 1:end]) for end in exam.ends))
 
 
-def _at_rest(exam: Exam, name: str, axes: slice) -> tuple[float, bool]:
-    """
-    Return the largest error of those that come to rest [deg], and whether it still vanishes.
-
-    axes : of the world, about which errors count
-    """
-    last = [one.part(slice(len(one.run.dt) // 2, None)) for one in exam.outcomes(name)]
-    errors = [measures.turns(one.run.truth, one.estimates)[:, axes] for one in last]
-    errors = [one for one in errors
-              if np.ptp(one, axis=0).max() < max(STILL, AT_REST * np.max(np.abs(one[-1])))]
-    if not errors:
-        return 0.0, True
-    largest = math.degrees(max(np.linalg.norm(error[-1]) for error in errors))
-    return largest, answers.pull([np.array([error[k] for error in errors]) for k in (0, -1)],
-                                 bias.STEADY) > 1.0 - STRAY
+def _at_rest(exam: Exam, name: str, axes: slice) -> float:
+    """Return the largest error about axes of the world that has settled in these runs [deg]."""
+    # A filter that never settles has errors at rest for other reasons.
+    sizes = [np.linalg.norm(measures.turns(one.run.truth, one.estimates)[:, axes], axis=1)
+             for one in exam.outcomes(name) if exam.settles]
+    return math.degrees(max((size[-1] for size in sizes if bias.settled(size)), default=0.0))
 
 
 FIRST = 'invalid_output', 'nondeterministic'

@@ -3,15 +3,16 @@
 
 import operator
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from spinning_top_sim.exam import motions
+from spinning_top_sim.exam import motions, scenes
 from spinning_top_sim.exam.checks import CHECKS
 from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter, feed_apart
 from spinning_top_sim.exam.feeding import feed as feed_here
 from spinning_top_sim.exam.runs import Exam
-from spinning_top_sim.exam.scenes import examine_field
+from spinning_top_sim.exam.scored import report_of
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.report import Finding, Mark, Report
@@ -78,7 +79,9 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     show = show or (lambda done, total: None)
     subject = one_line(subject or getattr(make_filter, '__name__', 'filter'))
     if level == 'field':
-        return examine_field(make_filter, subject, numbers, values, feed, show)
+        runs = [partial(scenes.record, scene, seed, values)
+                for seed in numbers for scene in scenes.SCENES]
+        return report_of(make_filter, runs, 'field', subject, feed, show)
     exam = Exam(make_filter, feed, {**motions.CALIBRATED, **values}, numbers)
     return _sit(exam, subject, show)
 

@@ -18,19 +18,15 @@ from spinning_top_sim.tools.identify import autocorrelation_time, rms
 SIGMAS, SMALL, LARGE = 4.0, 2.0, 10.0
 
 
-class Rmse(NamedTuple):
-    """Root mean squares of the whole attitude error, of heading and of tilt [deg]."""
+def rmse(estimates: Reals, truth: Reals) -> Reals:
+    """
+    Return the root mean squares of the whole error of attitudes (n, 4), of heading and tilt [deg].
 
-    total: float
-    heading: float
-    tilt: float
-
-
-def rmse(estimates: Reals, truth: Reals) -> Rmse:
-    """Return what BROAD's evaluation says of attitudes (n, 4); the heading is absolute."""
-    total = (Rotation.from_quat(estimates) * Rotation.from_quat(truth).inv()).magnitude()
+    They are those of BROAD's evaluation; the heading is absolute.
+    """
     errors = errors_of(estimates, truth)
-    return Rmse(*(math.degrees(rms(one)) for one in (total, errors.heading, errors.tilt)))
+    whole = np.linalg.norm(turns(truth, estimates), axis=1)
+    return np.degrees([rms(one) for one in (whole, errors.heading, errors.tilt)])
 
 
 def increments(quaternions: Reals) -> Reals:

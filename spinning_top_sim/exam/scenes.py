@@ -8,20 +8,18 @@ moves.  Rates, accelerations, their frequencies and lever arms are those of the 
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam.feeding import Feed, MakeFilter
 from spinning_top_sim.exam.motions import GRAVITY, Reals, Run
-from spinning_top_sim.exam.scored import ScoredRun, report_of
+from spinning_top_sim.exam.scored import ScoredRun
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.felt import Vibration
 from spinning_top_sim.streams.imu import Imu, Magnetometer
-from spinning_top_sim.tools.report import Report
 
 # The motion is computed every half step.
 PERIOD_NS, HALF_NS = 7_000_000, 3_500_000
@@ -75,15 +73,6 @@ SCENES = (
     Scene('magnet_near', (3.5, 1.8, 4.6), 0.75, (3.5, 3.5, 3.5), 1.5, 0.25, 0.65, magnet=3e-6),
     Scene('magnet_on_it', (1.6, 0.8, 1.8), 0.5, (1.2, 1.2, 1.2), 0.6, 0.35, values={
         'mag.disturbance.body': (0.0, 1e3, -2e-6, 5e-7, 9e-6)}))
-
-
-def examine_field(make_filter: MakeFilter, subject: str, seeds: Sequence[int],
-                  imu: Mapping[str, Any], feed: Feed,
-                  show: Callable[[float, float], object]) -> Report:
-    """Examine a filter with the scenes; the arguments are those of `record` and `report_of`."""
-    return report_of(make_filter, (record(scene, seed, imu) for seed in seeds
-                                   for scene in SCENES), len(seeds) * len(SCENES), 'field',
-                     subject, feed, show)
 
 
 def record(scene: Scene, seed: int, imu: Mapping[str, Any]) -> ScoredRun:

@@ -2,7 +2,7 @@
 """Runs whose errors count in motion only, and the report on a filter in several of them."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter
-from spinning_top_sim.exam.measures import Rmse, rmse
+from spinning_top_sim.exam.measures import rmse
 from spinning_top_sim.exam.motions import ROUNDING, Run
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
@@ -24,16 +24,17 @@ class ScoredRun(NamedTuple):
     counts: NDArray[np.intp]
 
 
-def report_of(make_filter: MakeFilter, runs: Iterable[ScoredRun], total: int, kind: str,
+def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], ScoredRun]], kind: str,
               subject: str, feed: Feed, show: Callable[[float, float], object]) -> Report:
     """
-    Return the report on a filter in `total` runs; the names of its marks begin with `kind`.
+    Return the report on a filter in runs, made one by one; names of marks begin with `kind`.
 
     The whole error is judged, of a filter that does not use the field the tilt.
     """
     outcomes, failed, whole = [], [], True
-    for done, (run, counts) in enumerate(runs):
-        show(done, total)
+    for done, make_run in enumerate(runs):
+        show(done, len(runs))
+        run, counts = make_run()
         try:
             if not done:
                 part = run.part(slice(1000))        # shows whether it uses the field
@@ -43,22 +44,22 @@ def report_of(make_filter: MakeFilter, runs: Iterable[ScoredRun], total: int, ki
             outcomes.append(feed(make_filter, [run])[0].part(counts))
         except InvalidOutputError as error:
             failed.append(str(error))
-    show(total, total)
+    show(len(runs), len(runs))
     faults = [Finding('invalid_output', '; '.join(failed))] if failed else []
     if not outcomes:
         return Report(subject, faults)
     errors = [rmse(one.estimates, one.run.truth) for one in outcomes]
-    mean = Rmse(*np.mean(errors, axis=0).tolist())
-    judged, name = (mean.total, 'error') if whole else (mean.tilt, 'tilt error')
+    total, heading, tilt = np.mean(errors, axis=0).tolist()
+    judged, name = (total, 'error') if whole else (tilt, 'tilt error')
     if judged > USELESS_DEG:
         faults.append(Finding('accuracy', f'the mean {name} is {judged:.3g} deg', judged))
     limits = (USELESS_DEG, math.nan) if whole else (math.nan, USELESS_DEG)
-    marks = {f'{kind}_rms_deg': Mark(mean.total, limits[0], 'in motion, mean over the runs'),
-             f'{kind}_heading_rms_deg': Mark(mean.heading, meaning='heading alone'),
-             f'{kind}_tilt_rms_deg': Mark(mean.tilt, limits[1], 'tilt alone')}
+    marks = {f'{kind}_rms_deg': Mark(total, limits[0], 'in motion, mean over the runs'),
+             f'{kind}_heading_rms_deg': Mark(heading, meaning='heading alone'),
+             f'{kind}_tilt_rms_deg': Mark(tilt, limits[1], 'tilt alone')}
     names = [one.run.name for one in outcomes]
     for name in dict.fromkeys(names):
-        of_run = [error.total for error, other in zip(errors, names, strict=True) if other == name]
+        of_run = [error[0] for error, other in zip(errors, names, strict=True) if other == name]
         marks[f'{kind}_rms_{name}_deg'] = Mark(float(np.mean(of_run)))
     return Report(subject, faults, marks, [] if whole else [
         'the magnetometer changes nothing: the filter is judged by its tilt'], outcomes)
