@@ -107,8 +107,10 @@ def delay(exam: Exam) -> Measured | None:
                     f'samples {"late" if found.delay > 0.0 else "ahead"}')
 
 
-def steps(exam: Exam) -> Measured:
-    """Compare turns in steps of different lengths."""
+def steps(exam: Exam) -> Measured | None:
+    """Compare turns in steps of different lengths, if they are right in equal ones."""
+    if _rates(exam).off_identity > GAIN_OFF:
+        return None
     ((still,), (moved,)) = exam.outcomes('uneven'), exam.outcomes('uneven turns')
     kicks = answers.kicks(still, moved)
     return Measured(float(np.max(np.abs(kicks.gains - 1.0))), 'in steps of '
