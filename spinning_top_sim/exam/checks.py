@@ -119,8 +119,10 @@ def steps(exam: Exam) -> Measured | None:
                     'times as far: the length of the step is misused')
 
 
-def large_turns(exam: Exam) -> Measured:
-    """Compare large turns in one step with the closed form of the rotation."""
+def large_turns(exam: Exam) -> Measured | None:
+    """Compare large turns in one step with the closed form, if small ones are right."""
+    if _rates(exam).off_identity > GAIN_OFF:
+        return None
     off = answers.kicks(*exam.outcomes('attitudes'), *exam.outcomes('large turns')).off
     turn = f'a turn of {answers.LARGE:g} rad in one step'
     if off > answers.FIT:
@@ -136,6 +138,7 @@ def tilt_at_rest(exam: Exam) -> Measured:
     tilt, alone = (_at_rest(exam, name, slice(2)) for name in ('starts', 'starts, no field'))
     return Measured(tilt, f'where a new filter comes to rest, the tilt is up to {tilt:.3g} deg off'
                     f', without the magnetometer {alone:.3g} deg',
+                    'accuracy' if _rates(exam).off_identity > answers.FIT else
                     'magnetometer' if alone < 0.5 * tilt else 'accelerometer',
                     CLEAN_DEG + math.degrees(_trembles(exam)))
 
@@ -144,7 +147,7 @@ def tilt_answer(exam: Exam) -> Measured | None:
     """Turn the gyroscope alone about each axis, and across it: gravity leads the tilt back."""
     back = np.array([[answers.led_back(still, moved) for moved in exam.outcomes('tilts')[k:k + 2]]
                      for k, still in zip((0, 2, 4), exam.level, strict=False)])
-    if not len(back):
+    if not len(back) or _rates(exam).off_identity > answers.FIT:
         return None
     least = float(np.min(back[:, 0] / np.maximum(back[:, 1], ROUNDING)))
     return Measured(1.0 - least, 'gravity leads a tilt about x, y and z back by ' + ', '.join(
