@@ -106,6 +106,15 @@ class Mahony:
         return self._q.copy()
 
 
+class UpsideDown(Mahony):
+    """Starts upside down if there is no field; its estimate of the bias has to come back."""
+
+    def update(self, w, a, m, dt):
+        if self._q is None and m is None:
+            self._q = world(from_two_vectors(a, None), np.array((math.pi, 0.0, 0.0)))
+        return super().update(w, a, m, dt)
+
+
 def axes(*rows):
     """Return what reads other axes: numbers from 1 on, negative where the sign is changed."""
     chosen, signs = np.abs(rows) - 1, np.sign(rows)
@@ -135,6 +144,7 @@ RIGHT = {
     'mahony, float32': partial(Mahony, number=np.float32),
     'mahony, from the identity': partial(Mahony, triad=False),
     'mahony, slow from the identity': partial(Mahony, 0.1, 0.1, 0.01, triad=False),
+    'mahony, upside down': partial(UpsideDown, 0.5, 0.5, 0.05),
     'mahony, corrects first': partial(Mahony, 1.0, 0.5, 0.1, first=True)}
 # Each with the faults that may be named.
 WRONG = {
