@@ -13,9 +13,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
+from spinning_top_sim.exam.measures import up
 from spinning_top_sim.exam.motions import NEAR, STILL, X_UP, Motion, Reals, Run, euler
 
 # Of the gyroscope [rad/s], 0.7 deg/s in all: so large are those of consumer devices at power-on.
@@ -56,10 +56,8 @@ def effects(feed: Callable[[Sequence[Run]], list[Outcome]]) -> Effects:
         motion = Motion(euler(NEAR)).rest(seconds).turn(euler(X_UP)).rest(seconds)
         run = motion.run('no bias')
         without, outcome = feed([run, replace(run, name='bias', gyroscope=run.gyroscope + BIAS)])
-        # Where they take the vertical to be, about axes of the sensor; the heading may drift.
-        ups = [Rotation.from_quat(one.estimates).inv().apply((0.0, 0.0, 1.0))
-               for one in (without, outcome)]
-        tilt = np.abs(np.cross(*ups))
+        # About axes of the sensor, because the heading may drift.
+        tilt = np.abs(np.cross(up(without.estimates), up(outcome.estimates)))
         courses = []
         for part, axes in zip(motion.of('rest'), ((0, 1), (1, 2)), strict=True):
             told = outcome.biases[part.begin:part.end]

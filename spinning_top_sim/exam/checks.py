@@ -62,8 +62,8 @@ class Check(NamedTuple):
 
 def repeat(exam: Exam) -> Measured:
     """Feed two filters of one process with the same readings."""
-    one, other = (Rotation.from_quat(outcome.estimates) for outcome in exam.outcomes('twice'))
-    apart = float(np.max((one.inv() * other).magnitude()))
+    one, other = (outcome.estimates for outcome in exam.outcomes('twice'))
+    apart = float(np.max(np.linalg.norm(measures.turns(one, other), axis=1)))
     return Measured(apart, 'two new filters of one process that get the same readings are '
                     f'{degrees(apart)} apart: they are random, or share state')
 
