@@ -78,7 +78,8 @@ class Simulator(Node):
         self._report = NodeStatus(simulation, self.loop, self._recording)
         self._alarms: dict[str, Timer] = {}
         self._topics.check(values)
-        self._take_over(values)
+        self._topics.open(values)
+        self._show_status(values)
         self._diagnostics = create_publisher(self, DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         self.create_subscription(Twist, '~/cmd_vel', self._on_velocity, 10)
@@ -232,15 +233,20 @@ class Simulator(Node):
         values = parameters.checked({**self.values, **{
             name: value for name, value in changes.items() if name not in command}})
         self._check_context(values)
-        if command:
-            self.check_started()
-            motion = self.simulation.trajectory     # it goes on with what is not commanded
-            self.loop.change('command', lambda: {
-                'l3': command.get('spin.l3', motion.l3), 'lz': command.get('spin.lz', motion.lz)})
-        if rest := sorted(changes.keys() - SPIN):
+        rest = sorted(changes.keys() - SPIN)
+        try:                # what may be refused comes first
+            if rest:
+                self._topics.open(values)
+            if command:
+                self._command(command)
+        except Exception:
+            self._topics.open(self.values)
+            raise
+        if rest:
             self._recording.write(self.simulation.apply(
                 'parameters', **{name: values[name] for name in rest}))
-            self._take_over(values)
+            self.loop.set_pace(values)
+            self._show_status(values)
             self._align_ticks()
         for effect in (Effect.RESET, Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
@@ -248,6 +254,12 @@ class Simulator(Node):
             if names:
                 self._log.info(f'{", ".join(names)}: {effect.value}')
         self.values = values
+
+    def _command(self, command: Mapping[str, float]) -> None:
+        self.check_started()
+        motion = self.simulation.trajectory     # it goes on with what is not commanded
+        self.loop.change('command', lambda: {
+            'l3': command.get('spin.l3', motion.l3), 'lz': command.get('spin.lz', motion.lz)})
 
     def _check_context(self, values: Mapping[str, Any]) -> None:
         if self._follows and parameters.is_enabled('clock', values):
@@ -259,10 +271,7 @@ class Simulator(Node):
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
                              'means or increments are taken, published or recorded')
 
-    def _take_over(self, values: Mapping[str, Any]) -> None:
-        """Do what parameters of the node ask for that act at once."""
-        self._topics.open(values)
-        self.loop.set_pace(values)
+    def _show_status(self, values: Mapping[str, Any]) -> None:
         self._every('status', values['status_period'],
                     lambda: tell(self._report.status_line()))
 
