@@ -243,9 +243,7 @@ class Simulator(Node):
             self._topics.open(self.values)
             raise
         if rest:
-            self._recording.write(self.simulation.apply(
-                'parameters', **{name: values[name] for name in rest}))
-            self.loop.set_pace(values)
+            self.loop.set_parameters(values, {name: values[name] for name in rest})
             self._show_status(values)
             self._align_ticks()
         for effect in (Effect.RESET, Effect.RECORDING):

@@ -196,8 +196,7 @@ class World:
         lowest = self.simulation.lowest_imu_rate
         if values['imu.rate'] < lowest:
             raise ValueError
-        self.recording.write(self.simulation.apply('parameters', **changes))
-        self.loop.set_pace(values)
+        self.loop.set_parameters(values, changes)
         self.values = values
 
     def start_recording(self):
