@@ -301,9 +301,13 @@ class Simulator(Node):
         if request.data:
             self.loop.pause()
         else:
-            self.loop.resume()
-            self._align_ticks()
+            self.resume()
         return f'{self.loop.state.value} {self.loop.time_text}'
+
+    def resume(self) -> None:
+        """Let simulated time run on.  Raises RuntimeError if the motion has failed."""
+        self.loop.resume()
+        self._align_ticks()
 
     @property
     def step_ns(self) -> int:
