@@ -10,20 +10,17 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType, ROSClock
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
 from rclpy.task import Future
-from rclpy.time import Time
 from rclpy.timer import Timer
-from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -96,17 +93,9 @@ class Simulator(Node):
     def _make_clock(self) -> SimulatedClock:
         if not self._follows:
             return SimulatedClock(time.time_ns, self._log.warning)
-        for subscription in [*self.subscriptions]:
-            if subscription.msg_type is ClockMessage:   # it raises an error for times before 0
-                self.destroy_subscription(subscription)
-        topic = self.create_subscription(ClockMessage, '/clock', self._on_clock, QoSProfile(
-            depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)).topic_name
+        topic = self.resolve_topic_name('/clock')
         return SimulatedClock(lambda: int(self.get_clock().now().nanoseconds), self._log.warning,
                               lambda: int(self.count_publishers(topic)))
-
-    def _on_clock(self, message: ClockMessage) -> None:
-        if message.clock.sec >= 0:
-            cast(ROSClock, self.get_clock()).set_ros_time_override(Time.from_msg(message.clock))
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
