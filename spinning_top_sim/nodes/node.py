@@ -244,9 +244,10 @@ class Simulator(Node):
 
     def _command(self, command: Mapping[str, float]) -> None:
         self.check_started()
-        motion = self.simulation.trajectory     # it goes on with what is not commanded
+        # The motion goes on with what is not commanded.
         self.loop.change('command', lambda: {
-            'l3': command.get('spin.l3', motion.l3), 'lz': command.get('spin.lz', motion.lz)})
+            name.removeprefix('spin.'): command.get(name, present)
+            for name, present in self._spin().items()})
 
     def _check_context(self, values: Mapping[str, Any]) -> None:
         if self._follows and parameters.is_enabled('clock', values):
@@ -324,13 +325,16 @@ class Simulator(Node):
         self._align_ticks()
         self.show_spin()
 
+    def _spin(self) -> dict[str, float]:
+        """Return the present spin, by the names of its parameters."""
+        return dict(zip(SPIN, self.simulation.trajectory.momenta(self.loop.now_ns), strict=True))
+
     def show_spin(self) -> None:
         """Let the parameters show the present spin."""
-        motion = self.simulation.trajectory
         self.remove_on_set_parameters_callback(self._on_set_parameters)
         try:
-            self.set_parameters([Parameter(name, value=value) for name, value in zip(
-                SPIN, (motion.l3, motion.lz), strict=True)])
+            self.set_parameters([
+                Parameter(name, value=value) for name, value in self._spin().items()])
         finally:
             self.add_on_set_parameters_callback(self._on_set_parameters)
 
