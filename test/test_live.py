@@ -172,6 +172,8 @@ def test_motions_are_forgotten_when_nothing_reaches_back_to_them(method):
     kept = simulation.trajectory.starts(0, 11 * SECOND)
     assert 10 * SECOND - trace_ns - SECOND // 2 <= kept[0] <= 10 * SECOND - trace_ns
     assert kept == list(range(kept[0], 10 * SECOND + 1, SECOND // 10))
+    with pytest.raises(LookupError, match=r't = 0 ns: the motion before .* is forgotten'):
+        simulation.trajectory.evaluate(np.array([0]))
 
 
 @pytest.mark.parametrize(('kind', 'details', 'words'), [

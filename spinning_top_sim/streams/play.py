@@ -64,7 +64,8 @@ class Simulation:
         self.history: list[Event] = []
         self.now_ns = -1
         # The trace of the markers, intervals of the IMU and late fixes reach back across events.
-        self._keep_ns = max(round(values['markers.trace_length'] * NANOSECONDS), LONGEST_NS)
+        self._keep_ns = max(LONGEST_NS, *(round(values[name] * NANOSECONDS) for name in (
+            'markers.trace_length', 'gnss.latency')))
 
     def apply(self, kind: str, **details: Any) -> Event:
         """

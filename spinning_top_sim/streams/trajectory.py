@@ -74,7 +74,14 @@ class Trajectory:
         return joined([piece.states(times) for piece, times in self.pieces(t_ns)])
 
     def pieces(self, t_ns: Times) -> list[tuple[Piece, Times]]:
-        """Return the pieces in which times lie, with the times in each; one piece without any."""
+        """
+        Return the pieces in which times lie, with the times in each; one piece without any.
+
+        Raises LookupError for times in a piece that is forgotten.
+        """
+        if len(t_ns) and t_ns[0] < self._pieces[0].start_ns:
+            raise LookupError(f't = {t_ns[0]} ns: the motion before '
+                              f'{self._pieces[0].start_ns} ns is forgotten')
         self._go_on(int(t_ns[-1]) if len(t_ns) else 0)
         if len(self._pieces) == 1:
             return [(self._pieces[0], t_ns)]
