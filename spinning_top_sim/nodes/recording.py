@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.streams.channel import Channel
@@ -56,8 +57,8 @@ class Recording:
         channels = recorded(simulation.channels, values)
         recorder = self._recorder = Recorder(
             values['record.uri'], [RecordedTopic(*topic) for topic in self._topics(channels)],
-            run_metadata(simulation.values, simulation.epoch_ns, simulation.now_ns,
-                         [event.as_mapping() for event in simulation.history], values),
+            partial(run_metadata, simulation.values, simulation.epoch_ns, simulation.now_ns,
+                    (event.as_mapping() for event in tuple(simulation.history)), values),
             max_loss=values['record.max_loss'], compression=values['record.compression'],
             min_free_bytes=values['record.min_free_bytes'], **self._options)
         self.error, self._events_index = None, len(channels)
