@@ -50,7 +50,8 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
 - `ground_truth/imu`, `ground_truth/odom`: noise-free. The twist of the odometry is in the body frame.
 - What is exact has the variance 1e-18 in SI units: in sensor_msgs a covariance of zeros means unknown.
 - `~/invariants`: one labelled dimension, {invariants}. Drifts are relative to the value at the start of
-  the motion; the orientation error [rad] is the angle to the exact solution.
+  the motion. `lz_drift` is 0 by construction, and so is `l3_drift` but with `rk45` and `transport`: solvers
+  take them as constants. The orientation error [rad] is the angle to the exact solution.
 - `markers`: in `world_frame`, so that no TF is needed. A cylinder with the mass and the moments of inertia
   of the top, lines on it that show the spin, and the trace of the tip over the last
   `markers.trace_length`. Every message has the whole trace. The trace is that of the exact solution; its

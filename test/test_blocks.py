@@ -53,7 +53,7 @@ RUNS = {
 STATE = dataclasses.asdict(State(theta=1.0, theta_dot=0.3, l3=1.5, lz=1.1))
 # What may happen in a run; refused ones change nothing.
 ACTS = {
-    'command': lambda one: one.apply('command', l3=1.2 * one.trajectory.l3 + 0.1, lz=1.1),
+    'command': lambda one: one.apply('command', l3=1.2 * float(one.state().l3[0]) + 0.1, lz=1.1),
     'state': lambda one: one.apply('state', **STATE),
     'drive': lambda one: drive(one, 0.5, 0.0, 0.1),
     'repeat': lambda one: drive(one, 0.5, 0.0, 0.1),

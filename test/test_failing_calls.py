@@ -49,7 +49,7 @@ def test_of_a_recording(tmp_path):
 
         def live():
             nonlocal recorder
-            recorder = Recorder(str(path), TOPICS, METADATA, max_loss=0.1, min_free_bytes=0,
+            recorder = Recorder(str(path), TOPICS, METADATA.copy, max_loss=0.1, min_free_bytes=0,
                                 threads=machine, clock=machine.clock)
             for number in range(20):
                 recorder.write([rows_of(5 * number, 5 * number + 5)])

@@ -152,6 +152,14 @@ def test_after_a_change_of_the_rates_every_topic_goes_on_on_the_new_grid(before,
             *(t for t in range(0, until_ns + 1, new) if t > changed_at)], one.topic
 
 
+def test_the_channels_are_made_of_every_parameter_that_acts_at_once(monkeypatch):
+    simulation, given = simulate(), []
+    monkeypatch.setattr('spinning_top_sim.streams.play.all_channels', lambda values, _: (
+        given.append(dict(values)) or simulation.channels))
+    simulation.apply('parameters', **{'step.dt': 2.0, 'top.mass': 7.0})
+    assert (given[-1]['step.dt'], given[-1]['top.mass']) == (2.0, simulation.values['top.mass'])
+
+
 @pytest.mark.parametrize('method', ['exact', 'rk45'])
 def test_motions_are_forgotten_when_nothing_reaches_back_to_them(method):
     """The trace of the markers has 4 s by default."""
@@ -164,6 +172,8 @@ def test_motions_are_forgotten_when_nothing_reaches_back_to_them(method):
     kept = simulation.trajectory.starts(0, 11 * SECOND)
     assert 10 * SECOND - trace_ns - SECOND // 2 <= kept[0] <= 10 * SECOND - trace_ns
     assert kept == list(range(kept[0], 10 * SECOND + 1, SECOND // 10))
+    with pytest.raises(LookupError, match=r't = 0 ns: the motion before .* is forgotten'):
+        simulation.trajectory.evaluate(np.array([0]))
 
 
 @pytest.mark.parametrize(('kind', 'details', 'words'), [

@@ -18,11 +18,12 @@ class Run:
     """
     A loop that has started, on a steady clock that goes on by `step_ns` whenever it is read.
 
+    follows: a /clock, which shows the same time
     times: of the poses recorded since the start or the last reset
     told: warnings, errors and events
     """
 
-    def __init__(self, **values):
+    def __init__(self, follows=False, **values):
         self.now_ns, self.step_ns, self.room, self.told = 77, 0, True, []
         self.counted = 0            # how often subscribers were
         self.simulation = simulate(**values)
@@ -31,7 +32,8 @@ class Run:
                                     write=self.told.append)
         self.loop = Loop(
             self.simulation, self.values, recording, SimulatedClock(
-                lambda: DATE_NS + self.now_ns - 77, self.told.append, steady=self.read),
+                lambda: DATE_NS + self.now_ns - 77, self.told.append,
+                (lambda: 1) if follows else None, self.read),
             update_subscribers=self.count, warn=self.told.append, error=self.told.append)
         self.simulation.log_to(lambda entries: self._taken.extend(
             stamp_ns for _, stamps_ns, _ in entries for stamp_ns in stamps_ns.tolist()),
@@ -129,6 +131,14 @@ def test_a_step_is_exact_while_clocks_go_on_or_says_what_is_left(monkeypatch):
     run.loop.resume()
     run.ticks(3)
     assert run.times == grid(run.loop.now_ns)
+
+
+def test_a_change_of_parameters_does_not_hide_a_jump_of_the_clock():
+    run = Run(follows=True).ticks(4)
+    run.now_ns += 3600 * SECOND
+    run.loop.set_parameters(run.values, {'status_period': 0.5})
+    run.ticks(2)
+    assert run.kinds == ['epoch', 'parameters'] and run.loop.now_ns == 6 * TICK_NS
 
 
 def test_the_duration_ends_with_its_last_sample_and_nothing_leads_on():

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import DrivenClock, SimNode, wait_for
 from helpers.node_logs import (
@@ -23,6 +24,8 @@ from helpers.node_logs import (
 )
 from helpers.own_node import OwnNode
 from rosgraph_msgs.msg import Clock
+
+from spinning_top_sim.nodes import executable
 
 GRID_NS = 10_000_000        # of the stamps, and of pose
 
@@ -100,6 +103,17 @@ def test_a_node_that_publishes_the_clock_does_not_wait_for_itself(peer, tmp_path
         assert clock.last().clock.sec > 1_000_000_000
         clock.muted = True
         assert_clean_end(node, node.end())
+
+
+@pytest.mark.parametrize('publishes', [True, False])
+def test_what_is_no_time_on_a_clock_is_left_out_with_one_line(tmp_path, capfd, publishes):
+    with OwnNode(tmp_path, use_sim_time=True, clock__enabled=publishes) as node:
+        executable.guard_clock(node.node)
+        (clock,) = [one for one in node.node.subscriptions if one.msg_type is Clock]
+        for sec, nanosec in ((7, 0), (-1, 0), (2 ** 31 - 1, 4_000_000_000)):
+            clock.callback(Clock(clock=Time(sec=sec, nanosec=nanosec)))
+        assert node.node.get_clock().now().nanoseconds == 7 * SECOND
+    assert capfd.readouterr().err.count('/clock is left out: the stamp -1 s: must be >= 0') == 1
 
 
 def test_a_stamp_is_a_date_that_has_come_at_the_start_and_after_resets(tmp_path):

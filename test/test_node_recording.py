@@ -9,9 +9,20 @@ pytest.importorskip('rclpy')
 
 from helpers.node_logs import log_of, verified
 from helpers.own_node import OwnNode
+from std_srvs.srv import SetBool
 
 from spinning_top_sim.recording import recorder
 from spinning_top_sim.recording.writer import McapWriter
+
+
+def test_who_asks_twice_for_a_recording_hears_twice_where_it_goes(tmp_path):
+    with OwnNode(tmp_path, start_paused=True) as node:
+        (service,) = (one for one in node.node.services if one.srv_name.endswith('/record'))
+        asked = [service.callback(SetBool.Request(data=True), SetBool.Response())
+                 for _ in range(2)]
+        node.spin_until('the answers', lambda: all(one.done() for one in asked))
+    assert [one.result().message for one in asked] == [
+        f'recording {text} {tmp_path}/run.mcap' for text in ('to', 'already to')]
 
 
 def test_a_step_waits_for_a_recorder_that_has_no_room(tmp_path, monkeypatch):

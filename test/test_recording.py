@@ -42,7 +42,7 @@ COMPRESSIONS = ('zstd', 'lz4', 'none')
 
 def record(path, messages, **options):
     with closing(Recorder(
-            str(path), TOPICS, METADATA, **{'min_free_bytes': 0} | options)) as recorder:
+            str(path), TOPICS, METADATA.copy, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
             write(recorder, *message)
         return recorder.close()

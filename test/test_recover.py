@@ -109,7 +109,9 @@ def test_a_damaged_chunk_is_left_out_and_zeros_end_the_log(tmp_path, log):
     assert code == SOME_LOST and f'lost: {end - start} bytes\n' in out
     assert seen_by_us(path) == seen_by_mcap(output) == seen_by_rosbags(output) == kept
     with LogReader(path) as reader:
-        assert reader.whole and len([*reader.messages()]) == len(kept) and reader.left_out == 1
+        for _ in range(2):
+            assert len([*reader.messages()]) == len(kept)
+        assert reader.whole and reader.left_out == 1
     output.unlink()
     write_anew(path, log.content[:start] + bytes(3_000_000))
     code, out, _ = run(path, '-o', output)

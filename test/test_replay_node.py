@@ -200,6 +200,12 @@ def test_one_odd_channel_does_not_stop_the_others(tmp_path, capfd):
     assert '\x1b[31' not in err
 
 
+def test_of_two_channels_with_a_topic_the_one_that_can_be_played_is(tmp_path):
+    path = write_log(tmp_path / 'run.mcap', texts(10), [
+        TWO[0], (TWO[0][0], 'nowhere_msgs/msg/Thing')])
+    assert play_all(path) == ([of_each(texts(10))[0]], 0)
+
+
 def test_a_torn_log_is_refused_with_a_hint_and_played_in_part(tmp_path, capfd):
     messages = texts(400, step_ns=100_000, padding=20_000)
     path = write_log(tmp_path / 'torn.mcap', messages, chunk_size=100_000)
@@ -349,6 +355,19 @@ def test_without_a_clock_the_stamps_of_later_rounds_go_on(tmp_path, capfd):
     assert {later - before for before, later in pairwise(stamps)} == {SECOND // 100}
     assert [ns_of(one.poses[0].header.stamp) for one in paths][:60] == stamps[:60]
     assert all(one.poses[1].header.stamp.sec == 0 for one in paths), '0 is no time'
+
+
+def test_stamps_of_later_rounds_are_later_by_what_was_chosen(tmp_path):
+    joints = [(0, EPOCH_NS + n, serialize_message(JointState(
+        header=Header(stamp=Time(nanoseconds=EPOCH_NS + n).to_msg())))) for n in range(2)]
+    path = write_log(tmp_path / 'run.mcap', [*joints, (1, EPOCH_NS + 99 * SECOND, text(7))], [
+        ('/joint_states', 'sensor_msgs/msg/JointState'), TWO[0]])
+    with OwnReplay(path, '--loop', '--topics', '/joint_states') as replay:
+        replay.spin_until('three rounds', lambda: len(replay.raw[0]) >= 6)
+    stamps = [ns_of((deserialize_message(one, JointState) if isinstance(one, bytes) else one)
+                    .header.stamp) - EPOCH_NS for one in replay.of('/joint_states')]
+    gap = replayer.ROUND_GAP_NS + 1
+    assert stamps[:6] == [0, 1, gap, gap + 1, 2 * gap, 2 * gap + 1]
 
 
 def test_with_a_clock_each_round_begins_with_the_clock_of_its_begin(tmp_path):

@@ -159,7 +159,7 @@ def test_overload_skips_what_is_live_records_everything_and_stays_reachable(tmp_
     assert verified(tmp_path / 'run.mcap')['identical']
 
 
-@pytest.mark.parametrize('name', ['tick', 'set_pace'])
+@pytest.mark.parametrize('name', ['tick', 'set_parameters'])
 def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
         monkeypatch, tmp_path, capfd, name):
     def broken(*_, **__):
@@ -170,7 +170,7 @@ def test_an_error_that_nobody_expects_stops_the_motion_loudly_until_a_reset(
         node.spin_until('samples', lambda: len(node.heard['pose']) > 5)
         with monkeypatch.context() as patch:
             patch.setattr(node.loop, name, broken)
-            if name == 'set_pace':
+            if name == 'set_parameters':
                 assert 'nobody expected this' in node.set(pose__rate=50.0).reason
             node.spin_until('an error', lambda: node.loop.failure)
         node.spin_until('the end of the recording', lambda: (

@@ -134,6 +134,18 @@ def test_a_stream_whose_messages_cannot_be_used_is_refused_before_anything_chang
     assert node.loop.failure is None
 
 
+def test_a_publisher_that_cannot_be_made_is_refused_before_anything_changes(tmp_path):
+    with OwnNode(tmp_path, '-p', 'qos_overrides./imu/mag.publisher.reliability:=foo',
+                 start_paused=True) as node:
+        topics, rates = ({one.topic_name for one in node.node.publishers},
+                         [one.period_ns for one in node.simulation.channels])
+        result = node.set(imu_data__enabled=True, mag__enabled=True, pose__rate=20.0)
+        assert not result.successful and 'foo' in result.reason
+        assert [one.period_ns for one in node.simulation.channels] == rates
+        assert {one.topic_name for one in node.node.publishers} == topics
+        assert not node.simulation.history
+
+
 def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
     """YAML 1.1 takes 1e-9 for a text, and so do `ros2 param set` and `ros2 param load`."""
     assert node.set(solver__rtol='1e-9', imu__gyroscope_noise_density='5e-5', duration=0,

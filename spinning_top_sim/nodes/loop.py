@@ -56,7 +56,7 @@ class Loop:
         # Asked for the pivot, and not yet applied
         self._velocity: Sequence[float] | None = None
         self._drive_from_ns = 0                 # simulated time of the next velocity
-        self.set_pace(values)
+        self._set_pace(values)
 
     @property
     def state(self) -> LoopState:
@@ -78,7 +78,7 @@ class Loop:
         """The simulated time for the user, with all its digits."""
         return f'at t = {stamp_text(self.now_ns)} s'
 
-    def set_pace(self, values: Mapping[str, Any]) -> None:
+    def _set_pace(self, values: Mapping[str, Any]) -> None:
         """Take over tick_rate, time_scale and duration."""
         self._duration_ns = round(values['duration'] * NANOSECONDS) or NEVER_NS
         # With fewer ticks, some of what is due would be too late to be published.
@@ -191,6 +191,12 @@ class Loop:
         self._check_failure()
         self._recording.write(self._simulation.apply(kind, **details()))
         self.commands += 1
+
+    def set_parameters(self, values: Mapping[str, Any], changes: Mapping[str, Any]) -> None:
+        """Send what is due, then take over changes, of which all `values` are the result."""
+        self._advance()     # by the old pace, and over a jump of /clock
+        self._recording.write(self._simulation.apply('parameters', **changes))
+        self._set_pace(values)
 
     def drive(self, velocity: Sequence[float]) -> None:
         """Let the pivot go to a velocity [m/s] from the end of a tick on, or raise ValueError."""

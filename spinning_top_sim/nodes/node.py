@@ -10,20 +10,17 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType, ROSClock
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
 from rclpy.task import Future
-from rclpy.time import Time
 from rclpy.timer import Timer
-from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -78,7 +75,8 @@ class Simulator(Node):
         self._report = NodeStatus(simulation, self.loop, self._recording)
         self._alarms: dict[str, Timer] = {}
         self._topics.check(values)
-        self._take_over(values)
+        self._topics.open(values)
+        self._show_status(values)
         self._diagnostics = create_publisher(self, DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         self.create_subscription(Twist, '~/cmd_vel', self._on_velocity, 10)
@@ -95,17 +93,9 @@ class Simulator(Node):
     def _make_clock(self) -> SimulatedClock:
         if not self._follows:
             return SimulatedClock(time.time_ns, self._log.warning)
-        for subscription in [*self.subscriptions]:
-            if subscription.msg_type is ClockMessage:   # it raises an error for times before 0
-                self.destroy_subscription(subscription)
-        topic = self.create_subscription(ClockMessage, '/clock', self._on_clock, QoSProfile(
-            depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)).topic_name
+        topic = self.resolve_topic_name('/clock')
         return SimulatedClock(lambda: int(self.get_clock().now().nanoseconds), self._log.warning,
                               lambda: int(self.count_publishers(topic)))
-
-    def _on_clock(self, message: ClockMessage) -> None:
-        if message.clock.sec >= 0:
-            cast(ROSClock, self.get_clock()).set_ros_time_override(Time.from_msg(message.clock))
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
@@ -232,15 +222,18 @@ class Simulator(Node):
         values = parameters.checked({**self.values, **{
             name: value for name, value in changes.items() if name not in command}})
         self._check_context(values)
-        if command:
-            self.check_started()
-            motion = self.simulation.trajectory     # it goes on with what is not commanded
-            self.loop.change('command', lambda: {
-                'l3': command.get('spin.l3', motion.l3), 'lz': command.get('spin.lz', motion.lz)})
-        if rest := sorted(changes.keys() - SPIN):
-            self._recording.write(self.simulation.apply(
-                'parameters', **{name: values[name] for name in rest}))
-            self._take_over(values)
+        rest = sorted(changes.keys() - SPIN)
+        try:                # what may be refused comes first
+            if rest:
+                self._topics.open(values)
+            if command:
+                self._command(command)
+        except Exception:
+            self._topics.open(self.values)
+            raise
+        if rest:
+            self.loop.set_parameters(values, {name: values[name] for name in rest})
+            self._show_status(values)
             self._align_ticks()
         for effect in (Effect.RESET, Effect.RECORDING):
             names = [name for name in rest if parameters.BY_NAME[name].effect is effect
@@ -248,6 +241,13 @@ class Simulator(Node):
             if names:
                 self._log.info(f'{", ".join(names)}: {effect.value}')
         self.values = values
+
+    def _command(self, command: Mapping[str, float]) -> None:
+        self.check_started()
+        # The motion goes on with what is not commanded.
+        self.loop.change('command', lambda: {
+            name.removeprefix('spin.'): command.get(name, present)
+            for name, present in self._spin().items()})
 
     def _check_context(self, values: Mapping[str, Any]) -> None:
         if self._follows and parameters.is_enabled('clock', values):
@@ -259,10 +259,7 @@ class Simulator(Node):
             raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
                              'means or increments are taken, published or recorded')
 
-    def _take_over(self, values: Mapping[str, Any]) -> None:
-        """Do what parameters of the node ask for that act at once."""
-        self._topics.open(values)
-        self.loop.set_pace(values)
+    def _show_status(self, values: Mapping[str, Any]) -> None:
         self._every('status', values['status_period'],
                     lambda: tell(self._report.status_line()))
 
@@ -294,9 +291,13 @@ class Simulator(Node):
         if request.data:
             self.loop.pause()
         else:
-            self.loop.resume()
-            self._align_ticks()
+            self.resume()
         return f'{self.loop.state.value} {self.loop.time_text}'
+
+    def resume(self) -> None:
+        """Let simulated time run on.  Raises RuntimeError if the motion has failed."""
+        self.loop.resume()
+        self._align_ticks()
 
     @property
     def step_ns(self) -> int:
@@ -324,13 +325,16 @@ class Simulator(Node):
         self._align_ticks()
         self.show_spin()
 
+    def _spin(self) -> dict[str, float]:
+        """Return the present spin, by the names of its parameters."""
+        return dict(zip(SPIN, self.simulation.trajectory.momenta(self.loop.now_ns), strict=True))
+
     def show_spin(self) -> None:
         """Let the parameters show the present spin."""
-        motion = self.simulation.trajectory
         self.remove_on_set_parameters_callback(self._on_set_parameters)
         try:
-            self.set_parameters([Parameter(name, value=value) for name, value in zip(
-                SPIN, (motion.l3, motion.lz), strict=True)])
+            self.set_parameters([
+                Parameter(name, value=value) for name, value in self._spin().items()])
         finally:
             self.add_on_set_parameters_callback(self._on_set_parameters)
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.streams.channel import Channel
@@ -41,9 +42,14 @@ class Recording:
 
     def start(self, values: Mapping[str, Any], answer: Answer = lambda *_: None) -> None:
         """Record from now on; `check` answers once the file is open."""
-        if self._recorder is not None:
-            answer(True, f'recording already to {self._recorder.path}')
-            return
+        if (recorder := self._recorder) is None:
+            recorder, text = self._begin(values), 'recording to'
+        else:
+            text = 'recording already to'
+        self._requests.append((recorder, ('opening',), lambda: answer(
+            recorder.error is None, recorder.error or f'{text} {recorder.path}')))
+
+    def _begin(self, values: Mapping[str, Any]) -> Recorder:
         from spinning_top_sim.recording.provenance import run_metadata  # noqa: PLC0415
         from spinning_top_sim.recording.recorder import Recorder  # noqa: PLC0415
         from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
@@ -51,15 +57,14 @@ class Recording:
         channels = recorded(simulation.channels, values)
         recorder = self._recorder = Recorder(
             values['record.uri'], [RecordedTopic(*topic) for topic in self._topics(channels)],
-            run_metadata(simulation.values, simulation.epoch_ns, simulation.now_ns,
-                         [event.as_mapping() for event in simulation.history], values),
+            partial(run_metadata, simulation.values, simulation.epoch_ns, simulation.now_ns,
+                    (event.as_mapping() for event in tuple(simulation.history)), values),
             max_loss=values['record.max_loss'], compression=values['record.compression'],
             min_free_bytes=values['record.min_free_bytes'], **self._options)
         self.error, self._events_index = None, len(channels)
         simulation.log_to(recorder.write, channels)
         self.write(Event('start', max(simulation.now_ns, 0), simulation.now_ns))
-        self._requests.append((recorder, ('opening',), lambda: answer(
-            recorder.error is None, recorder.error or f'recording to {recorder.path}')))
+        return recorder
 
     def end(self, answer: Answer = lambda *_: None, error: str | None = None) -> None:
         """Record no more; `check` answers once the file is closed."""
@@ -75,18 +80,18 @@ class Recording:
 
     def check(self) -> str | None:
         """Answer the requests that are done; return why a recording has stopped by itself."""
-        recorder, told = self._recorder, None
+        recorder, told = self._recorder, []
         has_failed = recorder is not None and recorder.state == 'failed'
         for request in list(self._requests):
             asked, states, tell = request
             if asked.state not in states:
                 self._requests.remove(request)
-                told = asked
+                told.append(asked)
                 tell()
         if recorder is None or not has_failed:
             return None
         self.end(error=recorder.error)
-        return None if recorder is told else recorder.error
+        return None if recorder in told else recorder.error
 
     def close(self) -> str | None:
         """Wait until all logs are closed; return a text for the user about the last one."""

@@ -59,8 +59,8 @@ class Replayer(Node):
         self.sent = self.late = self.failed = 0
         self._log, self._options = log, options
         first = next(log.messages(start=1), None)       # a time of 0 says: no clock yet
-        log_begin_ns, self._end_ns = first.log_time if first else 0, log.span[1]
-        self._length_s = (self._end_ns - log_begin_ns) / NANOSECONDS
+        log_begin_ns = first.log_time if first else 0
+        self._length_s = (log.span[1] - log_begin_ns) / NANOSECONDS
         for name, value, allowed in (('start', options.start, Range(0.0, self._length_s)),
                                      ('rate', options.rate, Range(1e-6, 1e9)),
                                      ('clock', options.clock or 1.0, Range(1e-6, 1e4))):
@@ -71,6 +71,7 @@ class Replayer(Node):
         for warning in ros_parameters.disobeyed_overrides(self, overrides):
             self.get_logger().warning(warning)
         self._paused, self._round = options.start_paused, 0
+        self._later_ns = 0              # what the rounds before have played
         self._set_log_time(self._begin_ns)
         self._steps = self._play()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -179,6 +180,7 @@ class Replayer(Node):
             yield ROUND_GAP_NS
             yield from self._play_round()
             yield ROUND_GAP_NS          # the last messages arrive before the clock goes back
+            self._later_ns += self._next_ns - self._begin_ns + ROUND_GAP_NS
         yield LAST_ANSWERS_NS
         wait_for_all_acked(self.outputs.values(), PATIENCE_S)
         tell(f'played {self._counts()}')
@@ -205,15 +207,16 @@ class Replayer(Node):
 
     def _messages(self) -> Iterator[tuple[int, Publisher, Any]]:
         """Yield log time [ns], publisher and message of the messages of a round."""
-        names = {topic.name for topic in self._log.topics if topic.channel_id in self.outputs}
+        outputs, names = self.outputs, {
+            topic.name for topic in self._log.topics if topic.channel_id in self.outputs}
         # Without a /clock that goes back, too, nobody takes stamps that go back.
         goes_back = self._clock_output is not None or '/clock' in names
-        later_ns = 0 if goes_back else self._round * (
-            self._end_ns - self._begin_ns + ROUND_GAP_NS)
+        later_ns = 0 if goes_back else self._later_ns
         for message in self._log.messages(names, self._begin_ns if self._options.start else 0):
-            publisher, data = self.outputs[message.channel_id], message.data
-            yield (max(message.log_time, self._begin_ns), publisher,
-                   stamped_later(data, publisher, later_ns) if later_ns else data)
+            if publisher := outputs.get(message.channel_id):    # of several with a topic
+                data = message.data
+                yield (max(message.log_time, self._begin_ns), publisher,
+                       stamped_later(data, publisher, later_ns) if later_ns else data)
 
     def _publish_clock(self) -> None:
         if self._clock_output is not None:

@@ -134,7 +134,7 @@ class SimulationHandlers:
     def _set_simulation_state(self, request: Message, response: Message) -> None:
         number, present = request.state.state, self._state
         changes: Mapping[str, Callable[[], None]] = {
-            'STOPPED': partial(self._node.start_again, paused=True), 'PLAYING': self._loop.resume,
+            'STOPPED': partial(self._node.start_again, paused=True), 'PLAYING': self._node.resume,
             'PAUSED': self._pause, 'QUITTING': self._quit}
         names = {getattr(request.state, f'STATE_{name}'): name for name in changes}
         if number not in names:

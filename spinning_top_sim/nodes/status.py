@@ -96,7 +96,7 @@ class NodeStatus:
         """Return the line for the terminal, with the angle in degrees."""
         simulation, loop = self._simulation, self._loop
         motion = simulation.trajectory
-        regime = motion.after(loop.now_ns).describe()
+        regime, (l3, lz) = motion.after(loop.now_ns).describe(), motion.momenta(loop.now_ns)
         theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
         flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
                 else ' paused' if loop.paused else '')
@@ -107,5 +107,5 @@ class NodeStatus:
             f'theta {theta:6.2f} deg',
             f'x{self._speed:.2f}' if is_running else '',
             f'{sent} messages' if sent else 'no subscribers yet',
-            f'L3 {motion.l3:.4g} Lz {motion.lz:.4g}',
+            f'L3 {l3:.4g} Lz {lz:.4g}',
             f'energy drift {self._energy_drift():+.0e}')))

@@ -37,7 +37,8 @@ def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: in
         'seed': str(values_at_start['seed']),
         'epoch_ns': str(epoch_ns),
         'begun_ns': str(begun_ns),
-        'history': json.dumps(list(history), default=list),
+        # One by one, so that other threads get their turn.
+        'history': f'[{", ".join(json.dumps(event, default=list) for event in history)}]',
     }
 
 

@@ -108,7 +108,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
-        self.path, self._max_bytes, self.left_out = _file_of(Path(path)), max_bytes, 0
+        self.path, self._max_bytes = _file_of(Path(path)), max_bytes
+        self._left_out: set[int] = set()        # offsets of chunks
         self.metadata: dict[str, dict[str, str]] = {}
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -156,6 +157,10 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             rosbag2.qos_profiles(channel), number)
             for number, channel in sorted(self.channels.items())
             for schema in [self.schemas.get(channel.schema_id)])
+
+    @property
+    def left_out(self) -> int:
+        return len(self._left_out)
 
     @cached_property
     def compression(self) -> tuple[str, str]:
@@ -217,7 +222,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             try:
                 messages, _ = self._records(self._at(offset, its_end))
             except UNREADABLE:
-                self.left_out += 1
+                self._left_out.add(offset)
                 continue
             chosen = iter(sorted((one for one in messages if one.channel_id in wanted
                                   and one.log_time in times), key=attrgetter('log_time')))

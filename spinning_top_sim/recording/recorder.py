@@ -56,17 +56,18 @@ class Recorder:
     uri : the file, which must not exist; or a folder, in which a name with the date is taken, and
         which is made if it ends with '/'; '' is the working directory
     topics : a message refers to one by its index
-    metadata : of the run; see `provenance.run_metadata`; the `environment` is added
+    metadata : returns those of the run, in the recorder's thread; see `provenance.run_metadata`;
+        the `environment` is added
     max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
     compression : 'zstd', 'lz4' or 'none'
     min_free_bytes : the recording stops if the disk has less left than this
     threads, clock : make threads and events as `threading` does, and return steady time [s]
     """
 
-    def __init__(self, uri: str, topics: Sequence[RecordedTopic], metadata: Mapping[str, str], *,
-                 max_loss: float = 0.5, compression: str = 'zstd',
-                 min_free_bytes: int = 100_000_000, threads: Any = threading,
-                 clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, uri: str, topics: Sequence[RecordedTopic],
+                 metadata: Callable[[], Mapping[str, str]], *, max_loss: float = 0.5,
+                 compression: str = 'zstd', min_free_bytes: int = 100_000_000,
+                 threads: Any = threading, clock: Callable[[], float] = time.monotonic) -> None:
         self.state: Literal['opening', 'recording', 'closed', 'failed'] = 'opening'
         self.error: str | None = None
         self.path: Path | None = None       # known once the file is open
@@ -192,9 +193,14 @@ class Recorder:
     def _open(self) -> McapWriter:
         """Return the file that `uri` names; in a folder, under the first free name."""
         with needed('a recording', 'mcap'):
+            from spinning_top_sim.recording.reader import MAX_BYTES  # noqa: PLC0415
             from spinning_top_sim.recording.writer import McapWriter, log_head  # noqa: PLC0415
 
-        head = log_head(self._topics, {**self._metadata, **environment()})
+        metadata = {**self._metadata(), **environment()}
+        if sum(map(len, metadata.values())) > MAX_BYTES // 2:   # it has keys and lengths, too
+            raise RecordingError('too many events before the recording: a log could not be read; '
+                                 '~/reset begins a run without any')
+        head = log_head(self._topics, metadata)
         folder = path = Path(self._uri).expanduser().absolute()
         if self._uri.endswith('/'):
             folder.mkdir(parents=True, exist_ok=True)

@@ -153,11 +153,16 @@ class Imu:
         return np.where(begins_ns > self.since_ns, begins_ns, self._first_begin_ns)
 
 
+# Of a magnetometer: errors of a `Sensor` that have no parameter.
+NO_ERRORS = dict.fromkeys(('mag.turn_on_bias', 'mag.bias_instability', 'mag.bias_stddev',
+                           'mag.bias_correlation_time'), 0.0)
+
+
 class Magnetometer(Sensor):
     """A magnetometer in the frame of the IMU that takes a sample every `period_ns`."""
 
     def __init__(self, values: Mapping[str, Any], period_ns: int) -> None:
-        super().__init__(values, 'mag.', Kind.MAGNETOMETER, period_ns,
+        super().__init__({**values, **NO_ERRORS}, 'mag.', Kind.MAGNETOMETER, period_ns,
                          matrix=values['mag.soft_iron'], offset=values['mag.hard_iron'])
         self._field, self._mounting = values['mag.field'], Mounting(values)
         # Of the world, and on the body.

@@ -13,6 +13,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import Channel, Messages, Samples
 from spinning_top_sim.streams.events import CHANGES, Event
 from spinning_top_sim.streams.imu import LONGEST_NS, Imu
+from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.streams.trajectory import Trajectory
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, NEVER_NS, check_stamp, period_ns
@@ -58,11 +59,13 @@ class Simulation:
         imu = Imu(values, period_ns(values['imu.rate']))
         self.channels = all_channels(values, imu)
         self.trajectory, self.imu, self.epoch_ns = motion, imu, epoch_ns
-        self.values, self._rates = dict(values), dict(values)
+        self.values = dict(values)
+        self._present = dict(values)        # with the changes that take effect at once
         self.history: list[Event] = []
         self.now_ns = -1
         # The trace of the markers, intervals of the IMU and late fixes reach back across events.
-        self._keep_ns = max(round(values['markers.trace_length'] * NANOSECONDS), LONGEST_NS)
+        self._keep_ns = max(LONGEST_NS, *(round(values[name] * NANOSECONDS) for name in (
+            'markers.trace_length', 'gnss.latency')))
 
     def apply(self, kind: str, **details: Any) -> Event:
         """
@@ -79,7 +82,7 @@ class Simulation:
             self.trajectory = self.trajectory.then(event)
             self.now_ns = event.t_ns
         elif kind == 'parameters':
-            self._set_rates(details)
+            self._take_over(details)
         elif kind == 'epoch':
             check_stamp(details['epoch_ns'])
             self.epoch_ns = details['epoch_ns']
@@ -91,11 +94,12 @@ class Simulation:
             self.history.append(event)
         return event
 
-    def _set_rates(self, changes: Mapping[str, Any]) -> None:
-        """Take over new rates of channels after `now_ns`."""
-        self._rates |= {name: value for name, value in changes.items() if name.endswith('.rate')}
-        self.imu = self.imu.at_period(period_ns(self._rates['imu.rate']), max(self.now_ns, 0))
-        self.channels = all_channels(self._rates, self.imu)
+    def _take_over(self, changes: Mapping[str, Any]) -> None:
+        """Make the channels after `now_ns` of the changes that take effect at once."""
+        self._present |= {one.name: changes[one.name] for one in parameters.TABLE
+                          if one.name in changes and one.effect is Effect.NOW}
+        self.imu = self.imu.at_period(period_ns(self._present['imu.rate']), max(self.now_ns, 0))
+        self.channels = all_channels(self._present, self.imu)
 
     def drive_details(self, velocity: Sequence[float]) -> dict[str, Any] | None:
         """

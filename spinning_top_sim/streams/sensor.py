@@ -29,7 +29,7 @@ class Sensor:
     that of the one before.  The bias is a path in time that depends on the seed alone.  So all
     streams agree at the times that they have in common.
 
-    values, prefix : parameters, and what their names begin with; an error that has none is 0
+    values, prefix : parameters, and what their names begin with
     kind : tells the random numbers of sensors apart
     matrix : scale and misalignment, or soft iron, row by row
     offset : constant part of the bias, x, y, z
@@ -43,7 +43,7 @@ class Sensor:
     def __init__(self, values: Mapping[str, Any], prefix: str, kind: noise.Kind, period_ns: int, *,
                  matrix: Sequence[float], offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         def given(error: str) -> float:
-            return float(values.get(prefix + error, 0.0))
+            return float(values[prefix + error])
 
         seed = self._seed = values['seed']
         self._kind, self._period_ns = kind, period_ns

@@ -22,7 +22,7 @@ from spinning_top_sim.physics.states import Point, States, joined
 from spinning_top_sim.physics.top import ContinuedState, State, Top, pole_momentum
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
-from spinning_top_sim.solvers.vertical import Posture
+from spinning_top_sim.solvers.vertical import Posture, PreciseState
 from spinning_top_sim.streams.events import Event
 from spinning_top_sim.times import Times
 
@@ -37,7 +37,6 @@ class Trajectory:
 
     top : in the gravity of the world
     pivot : path of the pivot; None while it rests at the origin
-    l3, lz : as last commanded, Lz about the vertical of the world [kg m^2/s]
     settings : of the solver, keywords of `Piece`
 
     Raises ValueError where no motion begins.
@@ -45,7 +44,7 @@ class Trajectory:
 
     def __init__(self, top: Top, start: State, pivot: PivotPath | None,
                  settings: Mapping[str, Any], *, most_acceleration: float) -> None:
-        self.top, self.pivot, self.lz = top, pivot, start.lz
+        self.top, self.pivot = top, pivot
         self._settings, self._most_acceleration = settings, most_acceleration
         self._drive: Event | None = None            # the newest, while the pivot follows it
         self._jumps: tuple[int, ...] = ()           # when the angular velocity jumps
@@ -55,10 +54,6 @@ class Trajectory:
     def _begin(self, start: State | Posture, start_ns: int) -> Piece:
         ride = self.pivot.lasting(start_ns) if self.pivot else REST
         return Piece(self.top, start, start_ns, ride, **self._settings)
-
-    @property
-    def l3(self) -> float:
-        return self._pieces[-1].l3
 
     @property
     def steps(self) -> int:
@@ -79,7 +74,14 @@ class Trajectory:
         return joined([piece.states(times) for piece, times in self.pieces(t_ns)])
 
     def pieces(self, t_ns: Times) -> list[tuple[Piece, Times]]:
-        """Return the pieces in which times lie, with the times in each; one piece without any."""
+        """
+        Return the pieces in which times lie, with the times in each; one piece without any.
+
+        Raises LookupError for times in a piece that is forgotten.
+        """
+        if len(t_ns) and t_ns[0] < self._pieces[0].start_ns:
+            raise LookupError(f't = {t_ns[0]} ns: the motion before '
+                              f'{self._pieces[0].start_ns} ns is forgotten')
         self._go_on(int(t_ns[-1]) if len(t_ns) else 0)
         if len(self._pieces) == 1:
             return [(self._pieces[0], t_ns)]
@@ -103,6 +105,13 @@ class Trajectory:
             self._go_on(t_ns + 1)
         return self._pieces[bisect_left(
             self._pieces, t_ns + 1, key=attrgetter('start_ns')) - 1]
+
+    def momenta(self, t_ns: int) -> tuple[float, float]:
+        """Return L3, and Lz about the vertical of the world, after a time [kg m^2/s]."""
+        piece = self.after(t_ns)
+        now = piece.start if piece.rests else PreciseState.of_posture(
+            self.top, piece.posture(t_ns).in_doubles())
+        return now.l3, now.lz
 
     def starts(self, begin_ns: int, end_ns: int) -> list[int]:
         """Return the times in [begin, end) at which another piece begins."""
@@ -156,7 +165,7 @@ class Trajectory:
             start = (State(**event.details) if event.kind == 'state'
                      else commanded(now.states(np.array([t_ns])), **event.details))
             after._pieces.append(self._begin(start, t_ns))
-            after.lz, after._jumps = start.lz, (*self._jumps, t_ns)
+            after._jumps = *self._jumps, t_ns
         return after
 
     def _follow(self, drive: Event, now: Piece) -> None:

@@ -96,7 +96,7 @@ class World:
         self.path, self.is_over, self.deleted = None, False, set()
         self.disk = Disk(machine, plan.kill_at, is_slow=plan.is_slow)
         self.simulation = Observed(self, self.values)
-        self.start = dict(self.values), self.simulation.trajectory.lz
+        self.start = dict(self.values), parameters.start_state(self.values).lz
         self.recording = Recording(self.simulation, self._topics, threads=machine,
                                    clock=machine.clock)
         follows = plan.follows
@@ -196,8 +196,7 @@ class World:
         lowest = self.simulation.lowest_imu_rate
         if values['imu.rate'] < lowest:
             raise ValueError
-        self.recording.write(self.simulation.apply('parameters', **changes))
-        self.loop.set_pace(values)
+        self.loop.set_parameters(values, changes)
         self.values = values
 
     def start_recording(self):
