@@ -18,7 +18,7 @@ from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.report import Finding, Mark, Report
 from spinning_top_sim.tools.scene_file import read_scene
 
-SEEDS = {'quick': 3, 'field': 1}        # of the noisy runs, or of the scenes
+SEEDS = {'quick': 3, 'full': 10, 'field': 1}        # of the noisy runs, or of the scenes
 
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
@@ -41,13 +41,14 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     ----------
     make_filter : callable
         Returns a new filter for every run: its class, a function, or one of `adapters.FILTERS`.
-    level : {'quick', 'field'}
-        'field' are scenes of a sensor in a hand instead of the checks.
+    level : {'quick', 'full', 'field'}
+        'field' are scenes of a sensor in a hand instead of the checks; 'full' is both.
     imu : mapping or path, optional
         Parameters imu.* and mag.* that replace those of the noisy runs and of the scenes, or the
         path of a parameter file such as those in config/imu.
     seeds : int or iterable of int, optional
-        Seeds of the noisy runs, or their number; default: 3, of 'field' 1.
+        Seeds of the noisy runs, or their number; default: 3, of 'full' 10 and one of the
+        scenes, of 'field' 1.
     subject : str, optional
         Name in the report; default: that of the filter's class.
     isolated : bool, optional
@@ -78,12 +79,18 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     feed = feed or (feed_apart if isolated else feed_here)
     show = show or (lambda done, total: None)
     subject = one_line(subject or getattr(make_filter, '__name__', 'filter'))
-    if level == 'field':
+    reports = []
+    if level != 'field':
+        of_noise = {name: value for name, value in values.items()
+                    if name.startswith(motions.TAKEN)}
+        reports.append(_sit(Exam(make_filter, feed, {**motions.CALIBRATED, **of_noise}, numbers),
+                            subject, show))
+    if level != 'quick':
         runs = [partial(scenes.record, scene, seed, values)
-                for seed in numbers for scene in scenes.SCENES]
-        return report_of(make_filter, runs, 'field', subject, feed, show)
-    exam = Exam(make_filter, feed, {**motions.CALIBRATED, **values}, numbers)
-    return _sit(exam, subject, show)
+                for seed in (numbers if level == 'field' else numbers[:1])
+                for scene in scenes.SCENES]
+        reports.append(report_of(make_filter, runs, 'field', subject, feed, show))
+    return reports[0].plus(*reports[1:])
 
 
 def checked_imu(imu: Mapping[str, Any] | str | Path | None, level: str) -> Mapping[str, Any]:
@@ -92,7 +99,7 @@ def checked_imu(imu: Mapping[str, Any] | str | Path | None, level: str) -> Mappi
         return {}
     given = imu if isinstance(imu, Mapping) else read_scene(imu)
     checked, source = parameters.checked(given), 'imu' if imu is given else imu
-    taken = motions.TAKEN + motions.OF_SCENES * (level == 'field')
+    taken = motions.TAKEN + motions.OF_SCENES * (level != 'quick')
     for name, value in given.items():
         if not name.startswith(('imu.', 'mag.')):
             raise ValueError(f'{source} has {name}: must have parameters imu.* and mag.* only')
