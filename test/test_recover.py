@@ -44,6 +44,7 @@ from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import compression_of
 from spinning_top_sim.recording.writer import record_bytes
 
 CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8      # bytes before the records in an uncompressed chunk
@@ -298,6 +299,11 @@ def test_a_file_that_is_compressed_and_a_split_bag_are_refused(
     with pytest.raises(LogError) as caught:
         LogReader(tmp_path / 'bag')
     assert str(caught.value).endswith(reason)
+
+
+def test_a_long_record_about_a_bag_is_searched_line_by_line():
+    """Not from each of its empty lines to its end, which takes hours for this one."""
+    assert compression_of('\n' * 4_000_000 + 'compression_mode: FILE') == ('FILE', '')
 
 
 # ----------------------------------------------------------------------------------- hostile
