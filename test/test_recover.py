@@ -325,6 +325,17 @@ def test_what_is_damaged_or_too_large_is_left_out_alone(tmp_path, bad):
         assert reader.damage.lost_bytes == len(bad) and reader.damage.reasons[0]
 
 
+def test_a_small_file_whose_chunks_unpack_to_all_memory_is_refused(tmp_path):
+    bomb = message(5, b'') + message(9, bytes(1 << 16))
+    path = closed(tmp_path, *(chunk_of(bomb, 5, 'zstd', zstandard.compress(bomb),
+                                       message_end_time=9) for _ in range(9)))
+    with LogReader(path, max_bytes=1 << 20) as reader:
+        assert len([*reader.messages()]) == 18
+    with LogReader(path, max_bytes=1 << 18) as reader, pytest.raises(
+            LogError, match='more than 262144 bytes of them are not held'):
+        list(reader.messages())
+
+
 @pytest.mark.parametrize('content', [
     b'', MCAP0_MAGIC[:5], b'SQLite format 3\x00' + bytes(100), MCAP0_MAGIC + bytes(100), None,
     os.mkdir, os.mkfifo])
