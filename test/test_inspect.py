@@ -220,6 +220,17 @@ def test_pictures_overwrite_nothing_and_an_interrupted_one_leaves_no_file(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize('options', [
+    ('--animate', 'a.png'), ('--export', 'tum:./a.png'),
+    ('--export', 'tum:b', '--export', 'euroc_imu:sub/../b')])
+def test_two_outputs_are_two_files(short, tmp_path, capsys, monkeypatch, options):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'sub').mkdir()
+    code, _, err = told(capsys, short, '--plot', 'a.png', *options)
+    assert code == 2 and err.endswith(': must be different files\n')
+    assert [path.name for path in tmp_path.iterdir()] == ['sub']
+
+
 def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path):
     code = ('import sys\nfrom spinning_top_sim.tools import inspect, simulate\n'
             f'simulate.main(["-o", {str(tmp_path / "run.csv")!r}, "--duration", "1"])\n'

@@ -90,10 +90,13 @@ def print_any_text() -> None:
 
 
 def check_output(*paths: Path | None) -> None:
-    """Raise OSError if one of these files cannot be made, such as because it exists."""
-    for path in filter(None, paths):
+    """Raise ValueError or OSError if these files cannot be made, such as because one exists."""
+    given = [path for path in paths if path is not None]
+    if len({path.resolve() for path in given}) < len(given):
+        raise ValueError(f'{", ".join(map(str, given))}: must be different files')
+    for path in given:
         try:
-            with new_file(path, 'xb'):
+            with new_file(path):
                 pass
             path.unlink()
         except OSError as error:
