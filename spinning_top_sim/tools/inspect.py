@@ -76,7 +76,8 @@ def _run(arguments: argparse.Namespace) -> int:
                         (stamp_ns - begin_ns) / NANOSECONDS))
             exported += log_exports.write(reader, found.run, arguments.export)
     if arguments.json:
-        print(json.dumps(_as_json(found, comparison), indent=2, allow_nan=False))
+        with cli.reader_may_end():
+            print(json.dumps(_as_json(found, comparison), indent=2, allow_nan=False))
     else:
         for line in _as_text(found, comparison):
             cli.print_line(line)
