@@ -58,7 +58,8 @@ class LogSource:
         for _, group in reader.groups([run.topics[name]] if name else []):
             for message in group:
                 top = self.track_at(message.log_time - run.epoch_ns)
-                if len(message.data) == len(top.templates[name]):       # else it is none
+                if len(message.data) == len(top.templates[name]) and (      # else it is none
+                        message.log_time <= recorded_run.LAST_LOG_TIME_NS):
                     found[top].append(message)
         for top, messages in found.items():
             top.add_messages(name, [one.data for one in messages],
