@@ -96,8 +96,7 @@ def check_output(*paths: Path | None) -> None:
     for path in given:
         try:
             with new_file(path):
-                pass
-            path.unlink()
+                path.unlink()
         except OSError as error:
             raise OSError(f'cannot write {path}: {why_not_written(path, error)}') from error
 
