@@ -289,6 +289,14 @@ def test_messages_that_rosbag2_compressed_are_decompressed_and_recover_keeps_the
         list(reader.messages())
 
 
+def test_what_stands_beside_a_log_and_cannot_be_read_is_named(tmp_path):
+    write_bag(tmp_path / 'bag', record=False)
+    (tmp_path / 'bag/metadata.yaml').unlink()
+    (tmp_path / 'bag/metadata.yaml').symlink_to('/proc/self/mem')   # reading it at 0 fails
+    with LogReader(tmp_path / 'bag') as reader, pytest.raises(LogError, match=r'\.yaml: '):
+        list(reader.messages())
+
+
 @pytest.mark.parametrize(('form', 'compress', 'split', 'reason'), [
     ('zstd', zstandard.compress, 1, 'zstd: it is compressed as a whole, unpack it by zstd -d'),
     ('lz4', lz4.frame.compress, 1, 'lz4: it is compressed as a whole, unpack it by lz4 -d'),

@@ -161,11 +161,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     @cached_property
     def compression(self) -> tuple[str, str]:
-        """Mode, such as 'MESSAGE', and format of compression, if rosbag2 has compressed more."""
+        """Mode, as 'MESSAGE', and format of compression, if rosbag2 has compressed; LogError."""
         text = self.metadata.get(rosbag2.BAG_METADATA, {}).get('serialized_metadata', '')
         beside = self.path.with_name('metadata.yaml')
-        if not text and beside.is_file():
-            text = beside.read_text(errors='replace')
+        try:
+            if not text and beside.is_file():
+                text = beside.read_text(errors='replace')
+        except OSError as error:
+            raise LogError(f'cannot read {beside}: {error.strerror}') from error
         return rosbag2.compression_of(text)
 
     @cached_property
