@@ -28,11 +28,12 @@ class LogSource:
     def __init__(self, path: Path, open_page: Callable[[], Page]) -> None:
         self._tops: list[SampledTrack] = []     # another one from each reset to another top on
         with LogReader(path) as reader:
-            note = '' if reader.whole else f'*{path.name} is truncated: shown as far as it goes*'
             try:
                 changes_ns = self._read(reader, recorded_run.read_run_description(reader))
             except recorded_run.ForeignLogError as error:
                 raise LogError(f'{path}: {error}') from error
+            note = (f'*{path.name} is truncated: shown as far as it goes*' if not reader.whole else
+                    f'*{path.name} is damaged: shown without some chunks*' * bool(reader.left_out))
         self._tops = [top for top in self._tops if len(top.rows)]
         if not self._tops:
             raise LogError(f'{path}: no attitude of the top in it ({", ".join(TOPICS)})')
