@@ -178,7 +178,7 @@ class NodeView(Node):
         self._is_stale = False
         try:
             answer = self._call('get_parameters', GetParameters.Request(names=names))
-            track = SampledTrack(parameters.checked(dict(zip(
+            track = SampledTrack(parameters.valid(dict(zip(
                 names, map(parameter_value_to_python, answer.values), strict=True))))
         except ConnectionError:
             self._is_stale = True
