@@ -234,8 +234,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             if chosen:
                 size = sum(MESSAGE_BYTES + len(one.data) for one in chosen)
                 held_bytes += size
-                first, *others = chosen
-                heapq.heappush(held, (first.log_time, offset, first, iter(others), size))
+                first, *later = chosen
+                heapq.heappush(held, (first.log_time, offset, first, iter(later), size))
 
     def _decompressed(self, message: LogMessage, form: str) -> LogMessage:
         try:

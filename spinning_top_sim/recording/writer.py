@@ -182,9 +182,9 @@ class McapWriter:
         counts = self.message_counts + Counter({
             channel: len(entries) for channel, entries in index.items()})
         start_and_end = list(span.values())
-        end = self._write(blocks)
+        written = self._write(blocks)
         # An interrupt comes after a call: before all of these or after them.
-        self._end, self.message_counts = end, counts
+        self._end, self.message_counts = written, counts
         self._rows, self._chunk_bytes = [], 0
         self._summary += [summary]
         self._times_ns += start_and_end
