@@ -210,7 +210,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         held_bytes = 0
         mode, form = self.compression
         for start_ns, offset, end_ns, its_end in [*self._places, (1 << 64, 0, 0, 0)]:
-            while held and held[0][:2] < (start_ns, offset):
+            while held and held[0] < (start_ns, offset):
                 _, place, message, others, size = held[0]
                 if (following := next(others, None)) is None:
                     heapq.heappop(held)
