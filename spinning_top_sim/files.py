@@ -8,12 +8,19 @@ from typing import Any
 
 
 @contextlib.contextmanager
-def new_file(path: str | Path, mode: str = 'x') -> Iterator[Any]:
-    """Open a new file.  An OSError in writing it names it, and removes it: it is not whole."""
+def new_file(path: str | Path, mode: str = 'x', *, partial: bool = False) -> Iterator[Any]:
+    """
+    Open a new file; any exception removes it, for it is not whole.  An OSError names it.
+
+    partial : keep what is written but after an OSError, as of a table whose run ends early
+    """
     file = open(path, mode, encoding=None if 'b' in mode else 'utf-8')  # noqa: SIM115
     try:
         with file:
             yield file
-    except OSError as error:
-        Path(path).unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(path)) from error
+    except BaseException as error:
+        if not partial or isinstance(error, OSError):
+            Path(path).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise

@@ -33,7 +33,7 @@ def columns(t: NDArray[np.float64], states: Any, *, pivot_moves: bool) -> Sequen
 def write_csv(path: FilePath, blocks: Iterable[NDArray[np.float64]],
               units: Mapping[str, str]) -> None:
     """Write rows with a head of names and units.  An existing file raises FileExistsError."""
-    with new_file(path) as file:
+    with new_file(path, partial=True) as file:
         file.write(','.join(f'{name} [{unit}]' for name, unit in units.items()) + '\n')
         for rows in blocks:
             # csv.writer looks for what to quote in every number, and takes a third longer.

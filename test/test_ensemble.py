@@ -172,6 +172,9 @@ def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
     assert ensemble(other, '-o', folder, '--overwrite') == 0
     assert (folder / 'notes').read_text() == 'mine'
     assert len([*(folder / 'data').iterdir()]) == 1
+    (folder / 'data').rename(tmp_path / 'data')
+    (folder / 'data').symlink_to(tmp_path / 'data')     # is not removed, and nothing is mixed
+    assert ensemble(other, '-o', folder, '--overwrite') == 1
     assert ensemble(other, '-o', tmp_path, '--overwrite') == 2      # it has no manifest.json
 
 

@@ -8,12 +8,15 @@ from functools import partial
 
 import numpy as np
 import pytest
+from helpers.logs import flipped, records_of
 from helpers.recordings import write_rows
 from helpers.reference import ROOT
+from mcap.opcode import Opcode
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.command import main
 from spinning_top_sim.exam.log import examine_log
+from spinning_top_sim.grade.logs import read_log
 from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
@@ -88,6 +91,17 @@ def beside(log, tmp_path_factory):
 def disturbed(quaternions):
     noise = 0.01 * np.random.default_rng(5).standard_normal((len(quaternions), 3))
     return (Rotation.from_quat(quaternions) * Rotation.from_rotvec(noise)).as_quat()
+
+
+def test_a_chunk_that_cannot_be_read_is_noted_here_and_by_grade(log, tmp_path):
+    content = log.read_bytes()
+    chunks = [end for opcode, _, end in records_of(content) if opcode == Opcode.CHUNK]
+    damaged = tmp_path / 'damaged.mcap'
+    damaged.write_bytes(flipped(content, chunks[len(chunks) // 2] - 9))
+    for path, notes in ((log, []), (damaged, ['damaged chunks of the log are left out'])):
+        report = examine_log(path, 'imu/data')
+        assert report.passed and report.notes == notes
+        assert [note for note in read_log(path).notes if 'chunks' in note] == notes
 
 
 @pytest.mark.parametrize('type_name', TYPES)

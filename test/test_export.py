@@ -8,7 +8,8 @@ import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 
-from spinning_top_sim.tools import inspect, simulate
+from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.tools import inspect, log_exports, simulate
 
 NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-5,
          'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 0.02,
@@ -150,3 +151,14 @@ def test_what_cannot_be_exported_is_told_before_anything_is_computed(
     assert not log.exists()
     assert not (tmp_path / 'a').exists()
     assert (tmp_path / 'there').read_text() == 'precious'
+
+
+def test_an_export_that_ends_early_leaves_no_file(folder, tmp_path, monkeypatch, capsys):
+    def torn(*_):
+        yield from ('one line\n', 'half of')
+        raise LogError('the rest cannot be read')
+
+    monkeypatch.setitem(log_exports.KINDS, 'euroc_imu', ((), torn))
+    output = tmp_path / 'imu.csv'
+    assert inspect.main([str(folder / 'run.mcap'), '--export', f'euroc_imu:{output}']) == 1
+    assert 'the rest cannot be read' in capsys.readouterr().err and not output.exists()

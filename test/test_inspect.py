@@ -220,6 +220,31 @@ def test_pictures_overwrite_nothing_and_an_interrupted_one_leaves_no_file(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize('options', [
+    ('--animate', 'a.png'), ('--export', 'tum:./a.png'),
+    ('--export', 'tum:b', '--export', 'euroc_imu:sub/../b')])
+def test_two_outputs_are_two_files(short, tmp_path, capsys, monkeypatch, options):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'sub').mkdir()
+    code, _, err = told(capsys, short, '--plot', 'a.png', *options)
+    assert code == 2 and err.endswith(': must be different files\n')
+    assert [path.name for path in tmp_path.iterdir()] == ['sub']
+
+
+@pytest.mark.parametrize('option', ['--json', '--verify'])
+def test_without_a_reader_of_the_output_all_is_done_and_the_code_is_kept(short, tmp_path, option):
+    pytest.importorskip('matplotlib')
+    torn, picture = tmp_path / 'torn.mcap', tmp_path / 'a.png'
+    torn.write_bytes(short.read_bytes()[:-100])
+    ours, theirs = os.pipe()
+    os.close(ours)
+    ended = subprocess.run([sys.executable, '-m', 'spinning_top_sim', 'inspect', torn, option,
+                            '--plot', picture], stdout=theirs, stderr=subprocess.PIPE, timeout=60,
+                           check=False)
+    os.close(theirs)
+    assert (ended.returncode, ended.stderr) == (1, b'') and picture.exists()
+
+
 def test_neither_ros_nor_scipy_nor_pictures_are_imported_unasked(short, tmp_path):
     code = ('import sys\nfrom spinning_top_sim.tools import inspect, simulate\n'
             f'simulate.main(["-o", {str(tmp_path / "run.csv")!r}, "--duration", "1"])\n'

@@ -33,9 +33,10 @@ from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.errors import RecordingError
-from spinning_top_sim.recording.recorder import Recorder
+from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import Recorder, single
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, find_definition
-from spinning_top_sim.recording.writer import CHUNK_BYTES
+from spinning_top_sim.recording.writer import CHUNK_BYTES, McapWriter, log_head
 
 COMPRESSIONS = ('zstd', 'lz4', 'none')
 
@@ -174,6 +175,24 @@ def test_what_decides_the_last_bits_is_told(monkeypatch):
     assert (told['format'], told['seed'], told['epoch_ns']) == ('2', '7', '5')
     assert json.loads(told['history']) == [{'event': 'start', 't_ns': 0}]
     assert json.loads(told['parameters_now'])['record.streams'] == ['all']
+
+
+def test_a_chunk_whose_writing_is_interrupted_is_there_once(tmp_path, monkeypatch):
+    path, real = tmp_path / 'run.mcap', McapWriter._write
+    file = McapWriter(path, log_head(TOPICS, METADATA), compression='none')
+    file.add(*single(0, 5, bytes(99)))
+
+    def interrupted(self, blocks):
+        real(self, blocks)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(McapWriter, '_write', interrupted)
+        file.flush()
+    file.finish()
+    with LogReader(path) as reader:
+        assert [one.log_time for one in reader.messages()] == [5]
+        assert not reader.damage.lines()
 
 
 @pytest.mark.parametrize('compression', COMPRESSIONS)

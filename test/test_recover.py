@@ -44,6 +44,7 @@ from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import compression_of
 from spinning_top_sim.recording.writer import record_bytes
 
 CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8      # bytes before the records in an uncompressed chunk
@@ -290,6 +291,14 @@ def test_messages_that_rosbag2_compressed_are_decompressed_and_recover_keeps_the
         list(reader.messages())
 
 
+def test_what_stands_beside_a_log_and_cannot_be_read_is_named(tmp_path):
+    write_bag(tmp_path / 'bag', record=False)
+    (tmp_path / 'bag/metadata.yaml').unlink()
+    (tmp_path / 'bag/metadata.yaml').symlink_to('/proc/self/mem')   # reading it at 0 fails
+    with LogReader(tmp_path / 'bag') as reader, pytest.raises(LogError, match=r'\.yaml: '):
+        list(reader.messages())
+
+
 @pytest.mark.parametrize(('form', 'compress', 'split', 'reason'), [
     ('zstd', zstandard.compress, 1, 'zstd: it is compressed as a whole, unpack it by zstd -d'),
     ('lz4', lz4.frame.compress, 1, 'lz4: it is compressed as a whole, unpack it by lz4 -d'),
@@ -300,6 +309,11 @@ def test_a_file_that_is_compressed_and_a_split_bag_are_refused(
     with pytest.raises(LogError) as caught:
         LogReader(tmp_path / 'bag')
     assert str(caught.value).endswith(reason)
+
+
+def test_a_long_record_about_a_bag_is_searched_line_by_line():
+    """Not from each of its empty lines to its end, which takes hours for this one."""
+    assert compression_of('\n' * 4_000_000 + 'compression_mode: FILE') == ('FILE', '')
 
 
 # ----------------------------------------------------------------------------------- hostile
@@ -319,6 +333,17 @@ def test_what_is_damaged_or_too_large_is_left_out_alone(tmp_path, bad):
     with LogReader(path, max_bytes=4000) as reader:
         assert [one.data for one in reader.messages()] == [b'a', b'c']
         assert reader.damage.lost_bytes == len(bad) and reader.damage.reasons[0]
+
+
+def test_a_small_file_whose_chunks_unpack_to_all_memory_is_refused(tmp_path):
+    bomb = message(5, b'') + message(9, bytes(1 << 16))
+    path = closed(tmp_path, *(chunk_of(bomb, 5, 'zstd', zstandard.compress(bomb),
+                                       message_end_time=9) for _ in range(9)))
+    with LogReader(path, max_bytes=1 << 20) as reader:
+        assert len([*reader.messages()]) == 18
+    with LogReader(path, max_bytes=1 << 18) as reader, pytest.raises(
+            LogError, match='more than 262144 bytes of them are not held'):
+        list(reader.messages())
 
 
 @pytest.mark.parametrize('content', [

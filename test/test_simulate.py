@@ -84,7 +84,7 @@ def test_a_command_exactly_at_the_end_is_applied(tmp_path):
     (['--duration', '1', '-o', '/nowhere/run.mcap'], 'spinning-top simulate: '
      'cannot write /nowhere/run.mcap: there is no directory /nowhere\n'),
     (['--duration', '1', '-o', '/nowhere/run.csv'],
-     'spinning-top simulate: /nowhere/run.csv: No such file or directory\n'),
+     'spinning-top simulate: cannot write /nowhere/run.csv: there is no directory /nowhere\n'),
     (['--duration', '0'], '--duration S, or the parameter duration'),
     (['--duration', '1', '-p', 'top.lambda1:=-1'], 'top.lambda1 = -1'),
     (['--duration', '1', '-p', 'spin.l3=2'], "'spin.l3=2'"),

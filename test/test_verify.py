@@ -35,6 +35,15 @@ def verified(capsys, path):
     return content['verify']
 
 
+def test_a_log_whose_library_is_missing_is_read_and_only_not_computed_again(
+        columns, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(parameters, 'find_spec', lambda name: None)
+    exported = tmp_path / 'imu.csv'
+    code, out, _ = told(capsys, columns, '--verify', '--export', f'euroc_imu:{exported}')
+    assert code == 1 and exported.exists()
+    assert 'cannot be computed again: ValueError: solver.method = exact: needs gmpy2' in out
+
+
 @pytest.mark.parametrize('name', ['stepped', 'columns'])
 def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
         name, tmp_path, capsys, request):

@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from importlib import metadata
 from types import SimpleNamespace
 from xml.etree import ElementTree
@@ -252,7 +253,7 @@ def test_a_reset_to_another_top_shows_that_one_from_its_begin_on(tmp_path):
 
 
 def test_a_log_is_shown_as_far_as_it_can_be_read(log, shown, tmp_path):
-    """Torn; with messages of another size and a quaternion of zeros; of 1."""
+    """Torn; with messages of another size, a quaternion of zeros, and no time; of 1."""
     torn = tmp_path / 'torn.mcap'
     torn.write_bytes(log.read_bytes()[:-60_000])
     part = LogSource(torn, Desk)
@@ -263,9 +264,10 @@ def test_a_log_is_shown_as_far_as_it_can_be_read(log, shown, tmp_path):
     changed = {5: lambda data: data[:-1],
                7: lambda data: data.replace(decode(data)[1].tobytes(), bytes(32))}
     odd = rewritten(log, tmp_path / 'odd.mcap', lambda topic, number, data: changed.get(
-        number * (topic == '/ground_truth/odom'), lambda data: data)(data))
+        number * (topic == '/ground_truth/odom'), lambda data: data)(data),
+        stamp=lambda topic, number, stamp_ns: stamp_ns if number != 9 else 1 << 63)
     assert np.array_equal(LogSource(odd, Desk).track_at(0).stamps_ns,
-                          np.delete(shown.stamps_ns, [5, 7]))
+                          np.delete(shown.stamps_ns, [5, 7, 9]))
 
     old = LogSource(ROOT / 'test/data/log_of_1.mcap', Desk)     # a command, a reset
     assert len(old.player.motions_ns) == 2 and not old.page.message.content
@@ -336,6 +338,35 @@ def test_a_reset_goes_back_to_what_was_forgotten():
     desk.press('time', 'Reset')
     assert own.update(0.0) == 0
     assert np.array_equal(own.track_at(0).state(0).quaternion, start)
+
+
+def test_a_scene_whose_file_has_gone_is_refused_and_the_motion_goes_on(tmp_path):
+    desk, mine = Desk(), tmp_path / 'mine.yaml'
+    mine.write_text(parameter_files('scene')['wavy'].read_text())
+    own = simulation.OwnSimulation(desk, str(mine), values_of('wavy'))
+    desk.put('scene', 'looping')
+    own.update(0.0)
+    before = own.track_at(0)
+    mine.unlink()
+    desk.put('scene', 'mine')
+    assert own.update(0.5) == 500_000_000 and own.track_at(0) is before
+    assert desk.message.content == f'**refused:** {mine}: No such file or directory'
+    assert desk.inputs['scene'].value == 'looping'
+
+
+def test_a_source_that_raises_an_error_is_asked_again_and_the_reason_is_shown(monkeypatch):
+    monkeypatch.setattr('spinning_top_sim.view.page.AFTER_ERROR_S', 0.0)
+    desk, stopped, asked = Desk(), threading.Event(), []
+    desk.server = SimpleNamespace(get_clients=dict)
+
+    def update(seconds):
+        asked.append(seconds)
+        if len(asked) == 3:
+            stopped.set()
+        raise OSError('the disk has gone')
+
+    Page.show(desk, SimpleNamespace(update=update), stopped)
+    assert len(asked) == 3 and desk.message.content == '**OSError: the disk has gone**'
 
 
 def test_equations_that_end_stop_the_page_there():

@@ -7,6 +7,7 @@ import signal
 import numpy as np
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.simulations import play
@@ -58,6 +59,14 @@ def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypa
     live._epoch_ns = epoch_ns + NANOSECONDS // 4
     live.update(0.0)
     assert track.span == (0, NANOSECONDS // 4)
+
+
+def test_what_others_send_under_our_names_changes_nothing(live):
+    values = parameters.checked({})
+    live._is_stale, live._track = False, SampledTrack(values)
+    live._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(name='spinning_top')]))
+    live._inbox.append(('pose', bytes(99)))
+    assert live.update(0.0) == 0 and live.track_at(0) is None
 
 
 def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):

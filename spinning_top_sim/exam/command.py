@@ -33,6 +33,7 @@ from spinning_top_sim.exam.broad import examine_data, trials_in
 from spinning_top_sim.exam.examiner import SEEDS, checked_imu, examine
 from spinning_top_sim.exam.feeding import INTERRUPTED, Filter, feed, feed_apart
 from spinning_top_sim.exam.programs import Program
+from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
 from spinning_top_sim.tools import cli, scene_file
 from spinning_top_sim.tools.report import Report, printed
@@ -81,7 +82,8 @@ def _run(arguments: argparse.Namespace) -> int:
         report = judge(**options)
     code = printed(report, arguments.json)
     if arguments.page is not None:
-        draw_page(report, arguments.page)
+        with new_file(arguments.page):
+            draw_page(report, arguments.page)
     return code
 
 

@@ -77,13 +77,14 @@ def examine_log(path: str | Path, topic: str, truth: str | None = None,
         true_topic = _topic(reader, truth) if truth else _first_truth(reader, examined)
         true = _read(reader, true_topic)
         turns = _of_sensor(reader, true_topic, true, north)
+        notes = ['damaged chunks of the log are left out'] * bool(reader.left_out)
     subject = one_line(f'{topic} of {Path(path).name}')
     if (wrong := invalid(estimates.quaternions, estimates.covariances)) is not None:
         k, why = wrong
         return Report(subject, [Finding('invalid_output', f'the message of '
                                         f'{estimates.stamps_ns[k] * 1e-9:.9f} s: {why}')])
     outcome = _beside(one_line(topic), estimates, true.stamps_ns, turns)
-    return _judge(subject, outcome, north is not None)
+    return replace(_judge(subject, outcome, north is not None), notes=notes)
 
 
 def _topic(reader: LogReader, name: str) -> LogTopic:

@@ -46,4 +46,4 @@ def draw_page(report: Report, path: Path) -> None:
         text = figure.add_subplot(grid[1, :])
         text.axis('off')
         text.text(0.0, 1.0, '\n'.join(lines), va='top', family='monospace', fontsize=8)
-        figure.savefig(path, dpi=110)
+        figure.savefig(path, format=path.suffix[1:] or 'png', dpi=110)

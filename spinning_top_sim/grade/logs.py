@@ -42,6 +42,8 @@ def read_log(path: Path, wanted: Sequence[str] = ()) -> Recorded:
         for one in samples(reader, {name: kind for name, kind in types.items() if kind in PLACES},
                            end_ns):
             found[one.kind][one.source].append(one)
+        if reader.left_out:
+            recorded.notes.append('damaged chunks of the log are left out')
     try:
         _choose(recorded, found, wanted)
         recorded.check()

@@ -40,6 +40,7 @@ from spinning_top_sim.recording.parsing import (
 MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
 MOST_INDEX = 1 << 20        # bytes behind the last chunk that may be torn without a loss
 MOST_REASONS = 20           # of damage that are told
+MESSAGE_BYTES = 300         # of memory that a message takes besides its data
 BLOCK = 16384               # messages that are grouped together
 NOTED = Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT
 # Where log times stand: the earliest and the latest in a chunk, and that of a message
@@ -96,7 +97,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     path : path
         The file, or a folder as `ros2 bag` makes it, which must hold exactly one.
     max_bytes : int
-        Of the largest record, and the largest uncompressed chunk, that is read.
+        Of the largest record, and the largest uncompressed chunk, that is read; and of the
+        messages of other chunks that `messages` holds while it reads one.
 
     Notes
     -----
@@ -133,9 +135,9 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 closed = False
             self._places = sorted(self._find_places())
             self.whole = closed and self._channels_in.keys() <= {
-                offset for _, _, offset, _ in self._places}
+                offset for _, offset, _, _ in self._places}
             self.span = (self._places[0][0] if self._places else 0,
-                         max((end_ns for _, end_ns, *_ in self._places), default=0))
+                         max((end_ns for _, _, end_ns, _ in self._places), default=0))
             if not self.whole or not self.channels:
                 _ = self.damage     # notes what is declared in chunks
         except BaseException:
@@ -164,11 +166,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     @cached_property
     def compression(self) -> tuple[str, str]:
-        """Mode, such as 'MESSAGE', and format of compression, if rosbag2 has compressed more."""
+        """Mode, as 'MESSAGE', and format of compression, if rosbag2 has compressed; LogError."""
         text = self.metadata.get(rosbag2.BAG_METADATA, {}).get('serialized_metadata', '')
         beside = self.path.with_name('metadata.yaml')
-        if not text and beside.is_file():
-            text = beside.read_text(errors='replace')
+        try:
+            if not text and beside.is_file():
+                text = beside.read_text(errors='replace')
+        except OSError as error:
+            raise LogError(f'cannot read {beside}: {error.strerror}') from error
         return rosbag2.compression_of(text)
 
     @cached_property
@@ -198,36 +203,44 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         Raises
         ------
         LogError
-            For a message that cannot be decompressed.
+            For a message that cannot be decompressed, and for too many chunks of one time.
         """
         names = None if topics is None else frozenset(topics)
         wanted = {number for number, channel in self.channels.items()
                   if names is None or channel.topic in names}
         times = range(start or 0, 1 << 64 if end is None else end)
         # Of each chunk that is read and not yet passed: log time of its next message, place,
-        # that message, and those after it
-        held: list[tuple[int, int, LogMessage, Iterator[LogMessage]]] = []
+        # that message, those after it, and the bytes of memory of all
+        held: list[tuple[int, int, LogMessage, Iterator[LogMessage], int]] = []
+        held_bytes = 0
         mode, form = self.compression
-        for start_ns, end_ns, offset, its_end in [*self._places, (1 << 64, 0, 0, 0)]:
-            while held and held[0][0] < start_ns:
-                _, place, message, others = held[0]
+        for start_ns, offset, end_ns, its_end in [*self._places, (1 << 64, 0, 0, 0)]:
+            while held and held[0] < (start_ns, offset):
+                _, place, message, others, size = held[0]
                 if (following := next(others, None)) is None:
                     heapq.heappop(held)
+                    held_bytes -= size
                 else:
-                    heapq.heapreplace(held, (following.log_time, place, following, others))
+                    heapq.heapreplace(held, (following.log_time, place, following, others, size))
                 yield self._decompressed(message, form) if mode == 'MESSAGE' else message
             if end_ns < times.start or start_ns >= times.stop or wanted.isdisjoint(
                     self._channels_in.get(offset) or wanted):
                 continue
+            if held_bytes > self._max_bytes:
+                raise LogError(f'cannot read {self.path}: many chunks have messages of one time, '
+                               f'and more than {self._max_bytes} bytes of them are not held')
             try:
                 messages, _ = self._records(self._at(offset, its_end))
             except UNREADABLE:
                 self._left_out.add(offset)
                 continue
-            chosen = iter(sorted((one for one in messages if one.channel_id in wanted
-                                  and one.log_time in times), key=attrgetter('log_time')))
-            for message in itertools.islice(chosen, 1):
-                heapq.heappush(held, (message.log_time, offset, message, chosen))
+            chosen = sorted((one for one in messages if one.channel_id in wanted
+                             and one.log_time in times), key=attrgetter('log_time'))
+            if chosen:
+                size = sum(MESSAGE_BYTES + len(one.data) for one in chosen)
+                held_bytes += size
+                first, *later = chosen
+                heapq.heappush(held, (first.log_time, offset, first, iter(later), size))
 
     def _decompressed(self, message: LogMessage, form: str) -> LogMessage:
         try:
@@ -365,12 +378,12 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             self._counted = record.message_count
 
     def _find_places(self) -> Iterator[tuple[int, int, int, int]]:
-        """Yield log times and places of messages and chunks, noting what is declared outside."""
+        """Yield begins and ends, (time, place) each, of messages and chunks; note the others."""
         for opcode, offset, end in self._heads():
             with contextlib.suppress(*UNREADABLE):
                 if opcode in TIMES and end <= self.size:
                     times = TIMES[opcode].unpack(self._at(offset, offset + TIMES[opcode].size))
-                    yield times[0], times[-1], offset, end
+                    yield times[0], offset, times[-1], end
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
                     self._records(self._at(offset, end))
 

@@ -116,7 +116,7 @@ def compression_of(text: str) -> tuple[str, str]:
 
     text : of a `rosbag2` record, or of a bag's metadata.yaml
     """
-    mode, form = (re.search(rf'^\s*compression_{key}:[ \t]*["\']?([\w.-]*)', text, re.MULTILINE)
+    mode, form = (re.search(rf'^[ \t]*compression_{key}:[ \t]*["\']?([\w.-]*)', text, re.MULTILINE)
                   for key in ('mode', 'format'))
     if not mode or mode[1].upper() in ('', 'NONE'):
         return '', ''

@@ -73,7 +73,7 @@ class McapWriter:
             self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
             try:
                 self.check_disk(min_free_bytes)
-                self._write([MCAP0_MAGIC])
+                self._end = self._write([MCAP0_MAGIC])
                 for record in head:
                     self.write(record)
                 self.sync()
@@ -91,7 +91,7 @@ class McapWriter:
     def write(self, record: records.McapRecord) -> None:
         """Write a record that is neither a message nor a chunk."""
         offset, raw = self.size, record_bytes(record)
-        self._write([raw])
+        self._end = self._write([raw])
         if isinstance(record, records.Schema):
             self._types[record.id] = record.name
         elif isinstance(record, records.Channel):
@@ -132,7 +132,6 @@ class McapWriter:
         except Exception:
             self._rows, self._chunk_bytes = [], 0
             raise
-        self._rows, self._chunk_bytes = [], 0
 
     def _chunk(self) -> tuple[bytearray, dict[int, NDArray[np.uint64]]]:
         """Return what `write_chunk` takes of the rows in memory."""
@@ -180,11 +179,15 @@ class McapWriter:
             message_index_offsets=dict(zip(index, offsets, strict=True)),
             message_index_length=end - offsets[0], compression=self._compression,
             compressed_size=len(data), uncompressed_size=len(plain), **span))
-        self._write(blocks)
-        self._summary.append(summary)
-        self._times_ns += span.values()
-        self.message_counts += Counter({
+        counts = self.message_counts + Counter({
             channel: len(entries) for channel, entries in index.items()})
+        start_and_end = list(span.values())
+        written = self._write(blocks)
+        # An interrupt comes after a call: before all of these or after them.
+        self._end, self.message_counts = written, counts
+        self._rows, self._chunk_bytes = [], 0
+        self._summary += [summary]
+        self._times_ns += start_and_end
 
     def sync(self) -> None:
         os.fsync(self._file.fileno())
@@ -219,7 +222,7 @@ class McapWriter:
                     [(channel, self._types.get(channel.schema_id, ''),
                       self.message_counts[channel.id]) for channel in self._channels],
                     self._path.name, start_ns, end_ns, compression)))
-            self._write([record_bytes(records.DataEnd(self._end[1]))])
+            self._end = self._write([record_bytes(records.DataEnd(self._end[1]))])
             kinds = Counter(raw[0] for raw in self._summary)
             statistics = record_bytes(records.Statistics(
                 attachment_count=kinds[Opcode.ATTACHMENT_INDEX],
@@ -232,7 +235,8 @@ class McapWriter:
             # The summary's checksum runs on into the footer, up to the checksum itself.
             summary = b''.join([*sorted([*self._summary, statistics], key=itemgetter(0)),
                                 record_bytes(records.Footer(self.size, 0, 0))[:-4]])
-            self._write([summary, zlib.crc32(summary).to_bytes(4, 'little'), MCAP0_MAGIC])
+            self._end = self._write(
+                [summary, zlib.crc32(summary).to_bytes(4, 'little'), MCAP0_MAGIC])
             self.sync()
             _sync_directory(self._path.parent)
         except OSError as error:
@@ -242,8 +246,8 @@ class McapWriter:
             with contextlib.suppress(OSError):      # all is on the disk, or another error is told
                 self._file.close()
 
-    def _write(self, blocks: Iterable[bytes]) -> None:
-        """Write whole records that come in blocks, or none of them."""
+    def _write(self, blocks: Iterable[bytes]) -> tuple[int, int]:
+        """Write whole records that come in blocks, or none of them; return size and checksum."""
         offset, crc = self._end
         descriptor = self._file.fileno()
         try:
@@ -260,7 +264,7 @@ class McapWriter:
             with contextlib.suppress(OSError):
                 os.ftruncate(descriptor, self.size)
             raise
-        self._end = offset, crc
+        return offset, crc
 
 
 def log_head(topics: Sequence[rosbag2.RecordedTopic],

@@ -26,7 +26,7 @@ _DETAILS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     'state': {one.name: float for one in fields(State)},
     'drive': {'x': float, 'y': float, 'z': float, 'stop_ns': operator.index},
     'epoch': {'epoch_ns': operator.index},
-    'reset': {'epoch_ns': operator.index, 'parameters': parameters.checked}}
+    'reset': {'epoch_ns': operator.index, 'parameters': parameters.valid}}
 
 
 @dataclass(frozen=True)

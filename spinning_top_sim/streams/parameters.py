@@ -49,14 +49,20 @@ FASTEST = BY_NAME['pivot.speed'].range.highest  # speed of the pivot [m/s]
 
 
 def checked(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all parameters: these values, else defaults.  Raises ValueError for bad values."""
-    result = {parameter.name: parameter.default for parameter in TABLE} | checked_changes(values)
-    _check_together(result)
+    """Return `valid` values.  Raises ValueError also where a library that they need is missing."""
+    result = valid(values)
     for name, value, library in (('gnss.enabled', True, 'pymap3d'),
                                  ('solver.method', 'exact', 'gmpy2')):
         if result[name] == value and find_spec(library) is None:
             raise ValueError(f'{name} = {value}: needs {library}, which is not installed: '
                              f'{remedy(library)}')
+    return result
+
+
+def valid(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all parameters: these values, else defaults.  Raises ValueError for bad values."""
+    result = {parameter.name: parameter.default for parameter in TABLE} | checked_changes(values)
+    _check_together(result)
     for describe in (top_of, start_state, pivot_path):      # they refuse what cannot be
         describe(result)
     return result

@@ -45,10 +45,8 @@ def run(name: str, help_text: str | None,
     parser = Parser(name, help_text)
     add_arguments(parser)
     arguments = parser.parse_args(argv)
-    code = OK
     try:
-        with reader_may_end():
-            code = command(arguments)
+        return command(arguments)
     except (ValueError, RuntimeError, ArithmeticError, OSError, ImportError) as error:
         print_line(f'{parser.prog}: {text_of(error)}', sys.stderr)
         return WRONG_USAGE if isinstance(error, ValueError) else FAILED
@@ -56,7 +54,6 @@ def run(name: str, help_text: str | None,
         what = f'; {interrupt}' if interrupt.args else ''
         print_line(f'{parser.prog}: interrupted{what}', sys.stderr)
         return INTERRUPTED
-    return code
 
 
 @contextlib.contextmanager
@@ -73,13 +70,15 @@ def handling(handler: Callable[[int, Any], object]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def reader_may_end(ignored: type[OSError] = BrokenPipeError) -> Iterator[None]:
-    """Ignore that the reader of the output, such as a pager, ends before it."""
+def reader_may_end(ignored: type[OSError] = BrokenPipeError,
+                   file: TextIO | None = None) -> Iterator[None]:
+    """Ignore, around printing, that the reader of a stream, such as a pager, ends before it."""
+    stream = file or sys.stdout
     try:
         yield
-        print(end='', flush=True)
+        stream.flush()
     except ignored:         # Python flushes the output again
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def print_any_text() -> None:
@@ -90,12 +89,14 @@ def print_any_text() -> None:
 
 
 def check_output(*paths: Path | None) -> None:
-    """Raise OSError if one of these files cannot be made, such as because it exists."""
-    for path in filter(None, paths):
+    """Raise ValueError or OSError if these files cannot be made, such as because one exists."""
+    given = [path for path in paths if path is not None]
+    if len({path.resolve() for path in given}) < len(given):
+        raise ValueError(f'{", ".join(map(str, given))}: must be different files')
+    for path in given:
         try:
-            with new_file(path, 'xb'):
-                pass
-            path.unlink()
+            with new_file(path):
+                path.unlink()
         except OSError as error:
             raise OSError(f'cannot write {path}: {why_not_written(path, error)}') from error
 
@@ -113,7 +114,8 @@ def one_line(value: object) -> str:
 
 def print_line(text: str, file: TextIO | None = None) -> None:
     """Print a line, by default to the standard output; names in it cannot act on a terminal."""
-    print(printable(text), file=file or sys.stdout)
+    with reader_may_end(file=file):
+        print(printable(text), file=file or sys.stdout)
 
 
 @contextlib.contextmanager

@@ -71,8 +71,8 @@ def _run(arguments: argparse.Namespace) -> int:
     failed: dict[str, str] = {}
     with (cli.progress('computed', specification.runs, 'runs', quiet=arguments.quiet) as show,
           ensemble_cluster.connect(arguments.workers, arguments.scheduler) as client):
-        if arguments.overwrite:
-            shutil.rmtree(folder / DATA, ignore_errors=True)
+        if arguments.overwrite and (folder / DATA).exists():
+            shutil.rmtree(folder / DATA)
         (folder / DATA).mkdir(parents=True, exist_ok=True)
         _write_manifest(folder, manifest)
         task = partial(compute_part, specification, folder=str(folder))

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import reason_of
+from spinning_top_sim.streams import messages
 from spinning_top_sim.streams.channel import Channel, Rows
 from spinning_top_sim.streams.play import Simulation
-from spinning_top_sim.streams.topics import ARRAY, INVARIANTS, JOINTS, TIMING, recorded
+from spinning_top_sim.streams.topics import ARRAY, JOINTS, recorded
 from spinning_top_sim.times import NANOSECONDS, Times
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
 from spinning_top_sim.tools.table import Columns
@@ -38,11 +39,10 @@ EPOCH_NS = NANOSECONDS          # stamp of t = 0, the default of `simulate`
 DATA = 'data'                   # folder of the files of a dataset
 # Key of the metadata of a Parquet file: the reasons of the runs that failed, by run.
 FAILED_KEY = b'failed'
-# Names of the numbers in the fields of a topic, where they are not x, y, z and w.
-GEODETIC = ('latitude', 'longitude', 'altitude')
-LABELS = {('joint_states', 'position'): JOINTS, ('joint_states', 'velocity'): JOINTS,
-          ('~/invariants', 'data'): INVARIANTS, ('ground_truth/imu_timing', 'data'): TIMING,
-          ('gnss/fix', 'position'): GEODETIC, ('ground_truth/gnss/fix', 'position'): GEODETIC}
+# Names of the numbers in fields of messages, where they are not x, y, z and w.
+LABELS = {('sensor_msgs/msg/JointState', 'position'): JOINTS,
+          ('sensor_msgs/msg/JointState', 'velocity'): JOINTS,
+          ('sensor_msgs/msg/NavSatFix', 'position'): ('latitude', 'longitude', 'altitude')}
 
 
 @cache
@@ -56,10 +56,10 @@ def _column_names(channel: Channel) -> list[str]:
     """Return the names of the numbers in the fields of a message."""
     names = []
     for name, count, _ in channel.template.fields:
-        labels: Any = LABELS.get((channel.topic, name)) or (
+        labels: Any = LABELS.get((channel.type_name, name)) or (
             [''] if count == 1 else 'xyzw'[:count] if count <= 4 else range(count))
-        if channel.type_name == ARRAY and (channel.topic, name) not in LABELS:
-            raise ValueError(f'{channel.topic}: its numbers need names in LABELS')
+        if channel.type_name == ARRAY:
+            labels = messages.labels_of(channel.template)
         names += [f'{name}.{label}'.rstrip('.') for label in labels]
     return names
 

@@ -23,6 +23,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
+from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    cli.check_output(arguments.plot, arguments.animate)
+    cli.check_output(arguments.plot, arguments.animate, *(path for _, path in arguments.export))
     with LogReader(arguments.log) as reader:
         found, comparison = survey(reader), None
         exported: list[str] = []
@@ -75,7 +76,8 @@ def _run(arguments: argparse.Namespace) -> int:
                         (stamp_ns - begin_ns) / NANOSECONDS))
             exported += log_exports.write(reader, found.run, arguments.export)
     if arguments.json:
-        print(json.dumps(_as_json(found, comparison), indent=2, allow_nan=False))
+        with cli.reader_may_end():
+            print(json.dumps(_as_json(found, comparison), indent=2, allow_nan=False))
     else:
         for line in _as_text(found, comparison):
             cli.print_line(line)
@@ -100,11 +102,8 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
     for path, draw in ((arguments.plot, log_pictures.draw_page),
                        (arguments.animate, log_pictures.animate)):
         if path is not None:
-            try:
+            with new_file(path):
                 draw(found, path)
-            except BaseException:       # also KeyboardInterrupt
-                path.unlink(missing_ok=True)
-                raise
 
 
 def _as_json(found: Survey, comparison: Comparison | None) -> object:

@@ -29,7 +29,7 @@ def draw_page(found: Survey, path: Path) -> None:
     figure.suptitle(f'{found.path.name}: {", ".join(names[:MOST_NAMES])}{others} '
                     f'({len(names)} of {len(found.motions)} motions, {columns.t[-1]:.4g} s)',
                     fontsize=14)
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, format=path.suffix[1:] or 'png', dpi=120)
 
 
 def animate(found: Survey, path: Path) -> None:

@@ -75,7 +75,7 @@ def read_run_description(reader: LogReader) -> RunDescription:
         raise ForeignLogError('it was not recorded by spinning_top_sim: it has no metadata '
                               f'{METADATA_NAME!r}')
     try:
-        at_start, at_recording = (parameters.checked(json.loads(metadata[key]))
+        at_start, at_recording = (parameters.valid(json.loads(metadata[key]))
                                   for key in ('parameters', 'parameters_now'))
         epoch_ns, begun_ns = int(metadata['epoch_ns']), int(metadata['begun_ns'])
         history = [_event_before(entry) for entry in json.loads(metadata['history'])]
@@ -162,7 +162,7 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
     Raises one of MALFORMED where there is no motion with these parameters and commands, or where
     it takes far more work than a run that fits into the log.
     """
-    simulation = Simulation(run.values_at_start, run.epoch_ns)
+    simulation = Simulation(parameters.checked(run.values_at_start), run.epoch_ns)
     most_steps = LEAST_STEPS + STEPS_A_BYTE * run.log_bytes
     samples_left = most_samples(run)
 

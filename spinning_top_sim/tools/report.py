@@ -158,7 +158,8 @@ def number(value: float) -> float | None:
 def printed(report: Report, as_json: bool) -> int:
     """Print a report; return the exit code of its command."""
     if as_json:
-        print(report.as_json())
+        with cli.reader_may_end():
+            print(report.as_json())
     else:
         for line in str(report).splitlines():
             cli.print_line(line)

@@ -46,6 +46,7 @@ def write_parquet(path: Path, blocks: Iterable[NDArray[np.float64]],
         from pyarrow import parquet  # noqa: PLC0415
     schema = pa.schema([pa.field(name, pa.float64(), metadata={'unit': unit})
                         for name, unit in units.items()])
-    with new_file(path, 'xb') as file, parquet.ParquetWriter(file, schema) as writer:
+    with (new_file(path, 'xb', partial=True) as file,
+          parquet.ParquetWriter(file, schema) as writer):
         for rows in blocks:
             writer.write_table(pa.table(list(rows.T), schema=schema))

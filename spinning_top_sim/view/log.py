@@ -28,11 +28,12 @@ class LogSource:
     def __init__(self, path: Path, open_page: Callable[[], Page]) -> None:
         self._tops: list[SampledTrack] = []     # another one from each reset to another top on
         with LogReader(path) as reader:
-            note = '' if reader.whole else f'*{path.name} is truncated: shown as far as it goes*'
             try:
                 changes_ns = self._read(reader, recorded_run.read_run_description(reader))
             except recorded_run.ForeignLogError as error:
                 raise LogError(f'{path}: {error}') from error
+            note = (f'*{path.name} is truncated: shown as far as it goes*' if not reader.whole else
+                    f'*{path.name} is damaged: shown without some chunks*' * bool(reader.left_out))
         self._tops = [top for top in self._tops if len(top.rows)]
         if not self._tops:
             raise LogError(f'{path}: no attitude of the top in it ({", ".join(TOPICS)})')
@@ -58,7 +59,8 @@ class LogSource:
         for _, group in reader.groups([run.topics[name]] if name else []):
             for message in group:
                 top = self.track_at(message.log_time - run.epoch_ns)
-                if len(message.data) == len(top.templates[name]):       # else it is none
+                if len(message.data) == len(top.templates[name]) and (      # else it is none
+                        message.log_time <= recorded_run.LAST_LOG_TIME_NS):
                     found[top].append(message)
         for top, messages in found.items():
             top.add_messages(name, [one.data for one in messages],

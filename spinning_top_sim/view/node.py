@@ -4,7 +4,6 @@
 import math
 import threading
 import time
-import traceback
 from collections import defaultdict, deque
 from typing import Any
 
@@ -62,7 +61,8 @@ class NodeView(Node):
         self._heard_at = math.inf       # when /diagnostics came last, on the monotonic clock
         self._paused = False
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._show, name='page', daemon=True)
+        self._thread = threading.Thread(target=page.show, args=(self, self._stopped),
+                                        name='page', daemon=True)
         gui = page.gui
         with page.controls:
             self._status = gui.add_markdown('*waiting for sim_node*')
@@ -124,9 +124,11 @@ class NodeView(Node):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name == self._name.lstrip('/'):
+            numbers = {pair.key: pair.value for pair in status.values}
+            # Another node may have the name, too.
+            if status.name == self._name.lstrip('/') and {
+                    STATE, TIME, SPEED, EPOCH} <= numbers.keys():
                 self._heard_at = time.monotonic()
-                numbers = {pair.key: pair.value for pair in status.values}
                 self._show_paused(numbers[STATE] == 'paused')
                 set_content(self._status, f'{status.message} · t = {float(numbers[TIME]):.1f} s '
                             f'· {SPEED} {numbers[SPEED]}')
@@ -136,17 +138,9 @@ class NodeView(Node):
 
     # The thread of the page.
 
-    def _show(self) -> None:
-        while not self._stopped.is_set():
-            try:
-                self._page.show(self, self._stopped)
-            except Exception:
-                if not self.context.ok():       # a signal has ended it
-                    return
-                self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
-
     def update(self, _: float) -> int:
-        ready = self._clients_of['get_parameters'].service_is_ready()
+        ready = (self.context.ok()              # a signal ends it
+                 and self._clients_of['get_parameters'].service_is_ready())
         if not ready or time.monotonic() > self._heard_at + ANSWER_S:
             set_content(self._status, f'**{self._name} has ended, or does not answer**')
         if self._is_stale and ready:
@@ -169,7 +163,8 @@ class NodeView(Node):
         arrived = defaultdict(list)
         while self._inbox:
             topic, data = self._inbox.popleft()
-            arrived[topic].append(data)
+            if len(data) == len(track.templates[topic]):        # else it is none of ours
+                arrived[topic].append(data)
         for topic, messages in arrived.items():
             last_ns = int(track.templates[topic].stamps_ns(messages[-1])[0])
             if len(track.rows) and last_ns < track.stamps_ns[-1] - RESTART_NS:
@@ -183,10 +178,14 @@ class NodeView(Node):
         self._is_stale = False
         try:
             answer = self._call('get_parameters', GetParameters.Request(names=names))
+            track = SampledTrack(parameters.valid(dict(zip(
+                names, map(parameter_value_to_python, answer.values), strict=True))))
         except ConnectionError:
             self._is_stale = True
             return
-        before, self._track = self._track, SampledTrack(parameters.checked(dict(zip(
-            names, map(parameter_value_to_python, answer.values), strict=True))))
-        if before is not None:
-            self._track.stamps_ns, self._track.rows = before.stamps_ns, before.rows
+        except ValueError:
+            self._is_stale = True
+            raise
+        if self._track is not None:
+            track.stamps_ns, track.rows = self._track.stamps_ns, self._track.rows
+        self._track = track

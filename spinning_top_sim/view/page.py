@@ -9,6 +9,7 @@ from typing import Any
 
 import viser
 
+from spinning_top_sim.recording.errors import reason_of
 from spinning_top_sim.view import plots, text
 from spinning_top_sim.view.drawn import ARROWS, BOUNDS, FOOT, TRACE, DrawnTop, axis_length
 from spinning_top_sim.view.server import Server
@@ -17,6 +18,7 @@ from spinning_top_sim.view.source import WINDOW_NS, Source, Track
 RATE = 30.0                     # pictures per second
 LONGEST_STEP_S = 0.2            # of real time between two pictures; a longer one is not made up
 LAST_WORDS_S = 0.2              # time to send the last texts
+AFTER_ERROR_S = 1.0             # till a source that has raised an error is asked again
 PLOT_EVERY, SETTLED = 6, 20     # pictures
 PANEL_WIDTH = 330               # [px]
 STYLE = Path(__file__).with_name('page.css').read_text('utf-8')
@@ -83,14 +85,22 @@ class Page:
         self.server.stop()
 
     def show(self, source: Source, stopped: threading.Event) -> None:
-        """Draw pictures of a source until the event; time passes while somebody looks at it."""
+        """
+        Draw pictures of a source until the event; time passes while somebody looks at it.
+
+        An exception of the source is shown, and does not end the page.
+        """
         before = time.monotonic()
         while not stopped.is_set():
             now = time.monotonic()
             seconds = min(now - before, LONGEST_STEP_S) if self.server.get_clients() else 0.0
-            t_ns = source.update(seconds)
-            if (track := source.track_at(t_ns)) is not None:
-                self.draw(t_ns, track)
+            try:
+                t_ns = source.update(seconds)
+                if (track := source.track_at(t_ns)) is not None:
+                    self.draw(t_ns, track)
+            except Exception as error:
+                set_content(self.message, f'**{reason_of(error)}**')
+                stopped.wait(AFTER_ERROR_S)
             stopped.wait(max(now + 1.0 / RATE - time.monotonic(), 0.0))
             before = now
 

@@ -13,6 +13,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
+from spinning_top_sim.recording.errors import text_of
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.play import Simulation
@@ -173,8 +174,8 @@ class OwnSimulation:
     def update(self, seconds: float) -> int:
         try:
             self._follow_controls()
-        except ValueError as error:
-            self.page.message.content = f'**refused:** {error}'
+        except (OSError, ValueError) as error:      # its file may be gone, or be another one
+            self.page.message.content = f'**refused:** {text_of(error)}'
             self._show(self._track.values)
         t_ns = self.player.advance(seconds)
         if t_ns < self._reached_ns:
