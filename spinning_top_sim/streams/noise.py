@@ -92,9 +92,15 @@ def flicker_parts(shortest: float, longest: float) -> Sequence[tuple[float, floa
     ratio = tau[:, np.newaxis] / times
     closed = 2.0 / ratio * (1.0 - (3.0 - 4.0 * np.exp(-ratio) + np.exp(-2.0 * ratio))
                             / (2.0 * ratio))
-    variances = np.linalg.solve(
-        np.where(ratio < 1e-3, ratio * (2.0 / 3.0 - 0.5 * ratio), closed), np.ones(count))
-    return list(zip(times.tolist(), np.sqrt(variances).tolist(), strict=True))
+    rows = [[*row, 1.0] for row in np.where(
+        ratio < 1e-3, ratio * (2.0 / 3.0 - 0.5 * ratio), closed).tolist()]
+    # By elimination: the last bits of LAPACK depend on the processor.  The diagonal dominates.
+    for k in range(count):
+        pivot = rows[k]
+        rows = [row if j == k else [x - row[k] / pivot[k] * y for x, y in zip(
+            row, pivot, strict=True)] for j, row in enumerate(rows)]
+    return [(time, math.sqrt(row[-1] / row[k]))
+            for k, (time, row) in enumerate(zip(times.tolist(), rows, strict=True))]
 
 
 def _gathered(block: Callable[[int], NDArray[np.float64]], numbers: Times,

@@ -76,7 +76,8 @@ def reader_may_end(ignored: type[OSError] = BrokenPipeError,
     stream = file or sys.stdout
     try:
         yield
-        stream.flush()
+        if stream:              # None where the shell has closed it
+            stream.flush()
     except ignored:         # Python flushes the output again
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
