@@ -250,7 +250,7 @@ def test_the_fixture_for_pytest_fails_a_test_of_a_filter_with_faults(
 
 
 @pytest.mark.parametrize(('options', 'says'), [
-    ({'level': 'slow'}, "level = 'slow': must be one of quick, field"),
+    ({'level': 'slow'}, "level = 'slow': must be one of quick, full, field"),
     ({'imu': {'imu.colour': 1.0}}, 'imu.colour = 1.0: there is no such parameter'),
     ({'imu': ROOT / 'config/cusp.yaml'}, 'cusp.yaml has '),
     ({'imu': {'imu.bandwidth': 9.0}}, 'imu has imu.bandwidth = 9.0: must be 0.0, because'),
