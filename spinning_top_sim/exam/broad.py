@@ -29,8 +29,19 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     Examine a filter with the trials of BROAD in a folder: .mat.
 
     The filter gets each trial from its first sample on.  The measures are the root mean squares
-    of the errors in motion, of each trial and their means.  The other arguments are those of
-    `examine`.  Raises ValueError if there is no folder, no trial in it, or a file is none.
+    of the errors in motion, of each trial and their means.
+
+    Parameters
+    ----------
+    make_filter, subject, feed, show
+        As of `examine`.
+    folder : path
+        With the trials.
+
+    Raises
+    ------
+    ValueError
+        If there is no folder, no trial in it, or a file is none.
     """
     runs = [partial(read_trial, path) for path in trials_in(folder)]
     return report_of(make_filter, runs, 'data', one_line(

@@ -55,9 +55,19 @@ def examine_node(command: str, topic: str, level: str = 'quick',
     """
     Examine a ROS node that `command` starts for each run, without a shell.
 
-    `topic` is that of its attitudes, sensor_msgs/Imu, each with the stamp of its sample; the other
-    arguments are those of `examine`.  Raises NodeError if other nodes publish on its topics, or
-    messages are lost.
+    Parameters
+    ----------
+    command : str
+        Starts the node.
+    topic : str
+        That of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
+    level, imu, seeds, show
+        As of `examine`.
+
+    Raises
+    ------
+    NodeError
+        If other nodes publish on its topics, or messages are lost.
     """
     with NodeExam(command, topic) as node:
         return examine(node.start, level, imu, seeds, subject=command, feed=feed, show=show)

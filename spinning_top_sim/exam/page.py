@@ -19,7 +19,16 @@ LIMITS = 'noisy_deg', 'error_rms_deg'
 
 
 def draw_page(report: Report, path: Path) -> None:
-    """Draw what `examine` has returned into a file, whose suffix decides the format."""
+    """
+    Draw what `examine` has returned.
+
+    Parameters
+    ----------
+    report : Report
+        What `examine` has returned.
+    path : path
+        A new file; its suffix decides the format.
+    """
     lines = [part for line in str(report).splitlines() for part in textwrap.wrap(line, 130)]
     # A heading is judged about its mean where nothing says that north is.
     absolute = 'rest_heading_deg' in report.marks or any(

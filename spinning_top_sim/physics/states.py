@@ -263,7 +263,12 @@ class States:
         """
         Write the columns of `simulate -o FILE.csv`, with a head of names and units.
 
-        Numbers are read back to the last bit.  An existing file raises FileExistsError.
+        Numbers are read back to the last bit.
+
+        Parameters
+        ----------
+        path : str or path
+            A new file; an existing one raises FileExistsError.
         """
         from spinning_top_sim import table  # noqa: PLC0415 - few need it
         moves = bool(self.pivot.position.any() or self.pivot.velocity.any())
