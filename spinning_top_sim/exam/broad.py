@@ -33,10 +33,14 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
 
     Parameters
     ----------
-    make_filter, subject, feed, show
+    make_filter : callable
         As of `examine`.
     folder : path
         With the trials.
+    subject : str, optional
+        As of `examine`.
+    feed, show : callable, optional
+        As of `examine`.
 
     Raises
     ------

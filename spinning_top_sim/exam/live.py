@@ -61,7 +61,13 @@ def examine_node(command: str, topic: str, level: str = 'quick',
         Starts the node.
     topic : str
         That of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
-    level, imu, seeds, show
+    level : {'quick', 'full', 'field'}
+        As of `examine`.
+    imu : mapping or path, optional
+        As of `examine`.
+    seeds : int or iterable of int, optional
+        As of `examine`.
+    show : callable, optional
         As of `examine`.
 
     Raises
