@@ -253,7 +253,9 @@ class World:
         if self.plan.ends != 'close':
             raise Killed
         self._be_quiet()
+        began_ns = self.machine.now_ns
         self.recording.close()
+        assert self.machine.now_ns - began_ns <= 25 * SECOND, 'a disk hangs the end'
         for log in self.logs:
             is_closed = log.recorder.state in ('closed', 'failed')
             assert is_closed or self.disk.is_disturbed, 'a log is closed'
