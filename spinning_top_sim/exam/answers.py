@@ -20,12 +20,12 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import increments, up
 from spinning_top_sim.exam.motions import Reals, Run
-from spinning_top_sim.tools.identify import in_words
+from spinning_top_sim.tools.identify import AXES
 
 SMALL, LARGE = 0.02, 0.3        # kicks [rad], of first order; that a step of first order misses
-# Sample of a kick in a rest, from its end: there is time for late answers.
-EARLY = -40
-LONG = -200     # of a kick that gravity leads back: filters that smooth it do that late
+# Samples from a kick to the end of its rest: there is time for late answers, and for gravity to
+# lead the attitude back where a filter smooths it.
+SHORT, LONG = -40, -200
 FIT = 0.2       # of an effect: what a matrix may leave of it, if the matrix is what is wrong
 
 
@@ -50,7 +50,13 @@ class Rates(NamedTuple):
         return float(np.max(np.abs(self.matrix - np.eye(3)))) if not self.in_world else 1.0
 
     def __str__(self) -> str:
-        text = in_words(self.matrix)
+        off = np.abs(self.matrix - np.eye(3))
+        large = 0.5 * np.max(off)
+        text = '; '.join(
+            f'{AXES[k]} turns the attitude about ' + (' and '.join(
+                f'{AXES[j]} by {column[j]:.3g}' for j in range(3)
+                if abs(column[j]) >= min(large, 0.5)) or 'nothing')
+            for k, column in enumerate(self.matrix.T) if np.max(off[:, k]) >= large)
         return f'a rate about {text}' + (', axes of the world' if self.in_world else '')
 
 
@@ -86,7 +92,7 @@ def kicks(still: Outcome, moved: Outcome) -> Kicks:
     turns = (moved.run.gyroscope - still.run.gyroscope) * still.run.dt[:, np.newaxis]
     steps = np.flatnonzero(np.any(turns, axis=1))
     apart = increments(moved.estimates) - increments(still.estimates)
-    return Kicks(steps, turns[steps], np.cumsum(apart[steps[:, np.newaxis] + np.arange(-EARLY)],
+    return Kicks(steps, turns[steps], np.cumsum(apart[steps[:, np.newaxis] + np.arange(-SHORT)],
                                                 axis=1))
 
 

@@ -63,7 +63,7 @@ class Check(NamedTuple):
 def repeat(exam: Exam) -> Measured:
     """Feed two filters of one process with the same readings."""
     one, other = (outcome.estimates for outcome in exam.outcomes('twice'))
-    apart = float(np.max(np.linalg.norm(measures.turns(one, other), axis=1)))
+    apart = measures.largest_turn(one, other)
     return Measured(apart, 'two new filters of one process that get the same readings are '
                     f'{degrees(apart)} apart: they are random, or share state')
 
@@ -145,10 +145,11 @@ def tilt_at_rest(exam: Exam) -> Measured:
 
 def tilt_answer(exam: Exam) -> Measured | None:
     """Turn the gyroscope alone about each axis, and across it: gravity leads the tilt back."""
-    back = np.array([[answers.led_back(still, moved) for moved in exam.outcomes('tilts')[k:k + 2]]
-                     for k, still in zip((0, 2, 4), exam.level, strict=False)])
-    if not len(back) or _rates(exam).off_identity > answers.FIT:
+    if _rates(exam).off_identity > answers.FIT or not exam.level:
         return None
+    tilts = exam.outcomes('tilts')
+    back = np.array([[answers.led_back(still, moved) for moved in tilts[2 * k:2 * k + 2]]
+                     for k, still in enumerate(exam.level)])
     least = float(np.min(back[:, 0] / np.maximum(back[:, 1], ROUNDING)))
     return Measured(1.0 - least, 'gravity leads a tilt about x, y and z back by ' + ', '.join(
         f'{one:.2g}' for one in back[:, 0]) + f' of it within {-answers.LONG / RATE:g} s, and by '
@@ -271,7 +272,7 @@ def _in_degrees(rates: Reals) -> str:
 def _trembles(exam: Exam) -> float:
     """Return the largest turn of a step in rests [rad]: corrections may have a fixed size."""
     turns = np.abs(measures.increments(exam.outcomes('attitudes')[0].estimates))
-    return float(max(np.max(turns[end + answers.EARLY + 1:end]) for end in exam.ends))
+    return float(max(np.max(turns[end + answers.SHORT + 1:end]) for end in exam.ends))
 
 
 def _at_rest(exam: Exam, name: str, axes: slice) -> float:

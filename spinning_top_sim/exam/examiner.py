@@ -149,6 +149,7 @@ def _sit(exam: Exam, subject: str, show: Callable[[float, float], object]) -> Re
     show(len(CHECKS), len(CHECKS))
     notes = [f'not judged because of {names}: {", ".join(left_out)}'
              for names, left_out in hides.items()]
-    if 'field turned' in exam.done and not exam.heading:
+    absolute = 'field turned' not in exam.done or exam.heading
+    if not absolute:
         notes.append('the magnetometer changes nothing: tilt and steady heading are judged')
-    return Report(subject, found, marks, notes, exam.done.get('noise', ()))
+    return Report(subject, found, marks, notes, exam.done.get('noise', ()), absolute)

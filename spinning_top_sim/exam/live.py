@@ -30,7 +30,7 @@ from spinning_top_sim.exam.feeding import (
     feed,
 )
 from spinning_top_sim.exam.motions import Reals
-from spinning_top_sim.times import NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS, stamp_text
 from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
 from spinning_top_sim.tools.report import Report
@@ -169,9 +169,10 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             if not self._answered:
                 raise RuntimeError(f'it answers none of {AGAIN} samples')
             if not self._reliable:
-                raise NodeError(f'the message of {self._now_ns * 1e-9:.9f} s is lost between exam '
-                                f'and node: make {IMU_TOPIC} and {self._topic} reliable there')
-            raise RuntimeError(f'no attitude has the stamp {self._now_ns * 1e-9:.9f} s of its '
+                raise NodeError(f'the message of {stamp_text(self._now_ns)} s is lost between '
+                                f'exam and node: make {IMU_TOPIC} and {self._topic} reliable '
+                                'there')
+            raise RuntimeError(f'no attitude has the stamp {stamp_text(self._now_ns)} s of its '
                                f'sample within {ANSWER_S:g} s')
         message = self._answers.pop(self._now_ns)
         self._answers.clear()

@@ -23,6 +23,7 @@ from spinning_top_sim.exam.motions import Reals, Run
 from spinning_top_sim.exam.scored import USELESS_DEG
 from spinning_top_sim.recording.provenance import METADATA_NAME
 from spinning_top_sim.recording.reader import LogReader, LogTopic
+from spinning_top_sim.times import stamp_text
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.conventions import errors_of
@@ -82,7 +83,7 @@ def examine_log(path: str | Path, topic: str, truth: str | None = None,
     if (wrong := invalid(estimates.quaternions, estimates.covariances)) is not None:
         k, why = wrong
         return Report(subject, [Finding('invalid_output', f'the message of '
-                                        f'{estimates.stamps_ns[k] * 1e-9:.9f} s: {why}')])
+                                        f'{stamp_text(int(estimates.stamps_ns[k]))} s: {why}')])
     outcome = _beside(one_line(topic), estimates, true.stamps_ns, turns)
     return replace(_judge(subject, outcome, north is not None), notes=notes)
 
@@ -124,7 +125,8 @@ def _read(reader: LogReader, topic: LogTopic) -> Stamped:
 def _of_sensor(reader: LogReader, topic: LogTopic, true: Stamped, north: str | None) -> Rotation:
     """Return the true attitudes of the sensor, in a world with this north.  Raises ValueError."""
     if (wrong := invalid(true.quaternions, np.empty((0, 3, 3)))) is not None:
-        raise ValueError(f'{topic.name} at {true.stamps_ns[wrong[0]] * 1e-9:.9f} s: {wrong[1]}')
+        raise ValueError(f'{topic.name} at {stamp_text(int(true.stamps_ns[wrong[0]]))} s: '
+                         f'{wrong[1]}')
     turns = Rotation.from_quat(true.quaternions)
     values: Mapping[str, Any] = {}
     try:
@@ -215,4 +217,4 @@ def _judge(subject: str, outcome: Outcome, absolute: bool) -> Report:
         marks['nees'] = Mark(nees.ratio, nees.high, nees.band)
         if not findings and not nees.low <= nees.ratio <= nees.high:
             findings.append(Finding('covariance', str(nees)))
-    return Report(subject, findings, marks, (), [outcome])
+    return Report(subject, findings, marks, (), [outcome], absolute)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
-from spinning_top_sim.exam.motions import Reals
+from spinning_top_sim.exam.motions import ROUNDING, Reals
 from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import autocorrelation_time, rms
 
@@ -47,9 +47,14 @@ def turns(one: Reals, other: Reals) -> Reals:
     return vector
 
 
-def moved(quaternions: Reals) -> float:
-    """Return the largest turn from the first of the attitudes (n, 4) [rad]."""
-    return float(np.max(np.linalg.norm(turns(quaternions[:1], quaternions), axis=1)))
+def largest_turn(one: Reals, other: Reals) -> float:
+    """Return the largest turn from attitudes (n or 1, 4) to others (n, 4) [rad]."""
+    return float(np.max(np.linalg.norm(turns(one, other), axis=1)))
+
+
+def differ(one: Reals, other: Reals) -> bool:
+    """Return whether attitudes (n, 4) are others than these, beyond rounding."""
+    return bool(np.max(np.abs(one - other)) > ROUNDING)
 
 
 def degrees(angle: float) -> str:

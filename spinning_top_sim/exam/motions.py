@@ -42,9 +42,10 @@ START = {'theta': 0.7, 'theta_dot': 0.0, 'l3': 0.6, 'lz': 0.6 * math.cos(0.7)}
 # Yaw, pitch and roll [deg]: near the identity, where many filters start, so that slow ones settle
 # soon; and with another axis of the sensor level.
 NEAR, X_UP = (4.0, 3.0, -2.5), (20.0, -80.0, 10.0)
+TURN_RATE = 2.6         # [rad/s]: a turn of the sensor that every filter follows
 # Turns about an axis of the sensor [deg] at a rate [rad/s], each followed by a rest: those that
 # any filter sees, two as fast as a hand turns, and one so slow that a threshold would drop it.
-TURNS = (*(('turn', axis, angle, 2.6) for axis, angle in (
+TURNS = (*(('turn', axis, angle, TURN_RATE) for axis, angle in (
     (0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0), (1, 110.0),
     (2, -120.0))), ('fast', 0, 220.0, 12.0), ('fast', 1, -200.0, 12.0), ('slow', 1, 60.0, 0.15))
 RIPPLE = 0.3            # of the slow turn: some filters take a steady one for their bias
@@ -114,7 +115,7 @@ class Motion:
         n = round(seconds * RATE)
         return self._add('rest', Rotation.from_quat(np.tile(self._now.as_quat(), (n, 1))))
 
-    def turn(self, goal: Rotation | tuple[int, float], rate: float = 2.6,
+    def turn(self, goal: Rotation | tuple[int, float], rate: float = TURN_RATE,
              kind: str = 'turn') -> 'Motion':
         """Add a turn to an attitude, or about an axis of the sensor by an angle [deg]."""
         vector = (self._now.inv() * goal).as_rotvec() if isinstance(goal, Rotation) else (

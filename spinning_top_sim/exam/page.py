@@ -30,9 +30,6 @@ def draw_page(report: Report, path: Path) -> None:
         A new file; its suffix decides the format.
     """
     lines = [part for line in str(report).splitlines() for part in textwrap.wrap(line, 130)]
-    # A heading is judged about its mean where nothing says that north is.
-    absolute = 'rest_heading_deg' in report.marks or any(
-        name.startswith(('field_', 'data_')) for name in report.marks)
     limit = next((report.marks[name].limit for name in LIMITS if name in report.marks), math.nan)
     with rc_context({'axes.spines.right': False, 'axes.spines.top': False, 'font.size': 9,
                      'text.parse_math': False}):        # texts of a filter may contain '$'
@@ -41,7 +38,7 @@ def draw_page(report: Report, path: Path) -> None:
         tilt, heading = (figure.add_subplot(grid[0, column]) for column in (0, 1))
         for outcome in report.outcomes:
             errors = errors_of(outcome.estimates, outcome.run.truth)
-            errors = errors if absolute else errors.about_mean()
+            errors = errors if report.absolute else errors.about_mean()
             for axes, error in ((tilt, errors.tilt), (heading, errors.heading)):
                 axes.semilogy(outcome.run.t, np.maximum(np.degrees(np.abs(error)), LEAST_DEG),
                               linewidth=0.8, label=outcome.run.name)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam import answers, bias, measures, motions
 from spinning_top_sim.exam.feeding import Feed, MakeFilter, Outcome
-from spinning_top_sim.exam.motions import NEAR, RATE, ROUNDING, STILL, Motion, Run
+from spinning_top_sim.exam.motions import NEAR, RATE, STILL, Motion, Run
 from spinning_top_sim.tools.conventions import Convention, Errors, errors_of
 
 # A filter is settled if it is STILL in the second half of a rest at the start; slow ones get
@@ -53,7 +53,7 @@ class Exam:
 
     @cached_property
     def level(self) -> list[Outcome]:
-        """The outcomes of 'attitudes' up to the rests in which x, y and z are most level."""
+        """Return 'attitudes' up to the rests with x, y and z most level: three, or none."""
         (whole,) = self.outcomes('attitudes')
         ups, true = (measures.up(rows[self.ends + answers.LONG - 1])
                      for rows in (whole.estimates, whole.run.truth))
@@ -68,7 +68,11 @@ class Exam:
                 ] if self.convention.parts else told
 
     def read_in(self, convention: Convention) -> None:
-        """Read the attitudes of all runs in another convention than before."""
+        """
+        Read the attitudes of all runs in another convention than before.
+
+        The kicks of 'turns' are about the vertical of the old one: they are fed anew.
+        """
         self.done = {name: [replace(one, estimates=convention.undo(
             self.convention.tell(one.estimates))) for one in outcomes]
             for name, outcomes in self.done.items() if name != 'turns'}
@@ -86,7 +90,8 @@ class Exam:
 
     def _settles_in(self, seconds: float) -> bool:
         (outcome,) = self.fed([Motion(motions.euler(NEAR)).rest(seconds).run('rest')])
-        return measures.moved(outcome.estimates[len(outcome.estimates) // 2:]) < STILL
+        later = outcome.estimates[len(outcome.estimates) // 2:]
+        return measures.largest_turn(later[:1], later) < STILL
 
     @cached_property
     def motion(self) -> Motion:
@@ -106,8 +111,8 @@ class Exam:
     @cached_property
     def heading(self) -> bool:
         """Whether the field changes attitudes: only then the heading is judged against north."""
-        one, other = (self.outcomes(name)[0].estimates for name in ('excitation', 'field turned'))
-        return bool(np.max(np.abs(one - other)) > ROUNDING)
+        return measures.differ(*(self.outcomes(name)[0].estimates
+                                 for name in ('excitation', 'field turned')))
 
     @cached_property
     def bias(self) -> bias.Effects:
@@ -136,7 +141,7 @@ def _field_turned(exam: Exam) -> list[Run]:
     """Turn the field about the vertical, to one side and then to the other."""
     middle = len(exam.run.dt) // 2
     turns = Rotation.from_quat(exam.run.truth)
-    west = np.where(np.arange(2 * middle + 1)[:len(turns)] < middle, FIELD_TURN, -FIELD_TURN)
+    west = np.where(np.arange(len(turns)) < middle, FIELD_TURN, -FIELD_TURN)
     field = turns.inv().apply(Rotation.from_euler('z', west[:, np.newaxis]).apply(
         turns.apply(exam.run.magnetometer)))
     return [replace(exam.run, name='field turned', magnetometer=field)]
@@ -162,7 +167,7 @@ def _uneven_turns(exam: Exam) -> list[Run]:
 
 def _turns(exam: Exam, size: float) -> list[Run]:
     """Return the run with a kick about the vertical in each attitude: nothing leads it back."""
-    ((still,), steps) = exam.outcomes('attitudes'), exam.ends + answers.EARLY
+    ((still,), steps) = exam.outcomes('attitudes'), exam.ends + answers.SHORT
     sizes = np.resize((size, -size), (len(steps), 1))
     return [answers.kicked(still.run, steps, sizes * measures.up(still.estimates[steps - 1]))]
 
@@ -170,7 +175,7 @@ def _turns(exam: Exam, size: float) -> list[Run]:
 def _tilts(exam: Exam) -> list[Run]:
     """Return runs with one kick each: about x, y and z as far as level, and across them."""
     runs = []
-    for axis, still in zip(np.eye(3), exam.level, strict=False):
+    for axis, still in zip(np.eye(3), exam.level, strict=True):
         up = measures.up(still.estimates[answers.LONG - 1])
         across = np.cross(up, axis) * answers.SMALL / np.linalg.norm(np.cross(up, axis))
         runs += [answers.kicked(still.run, [answers.LONG], kick)

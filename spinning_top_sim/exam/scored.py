@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spinning_top_sim.exam import measures
 from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter
-from spinning_top_sim.exam.measures import rmse
-from spinning_top_sim.exam.motions import ROUNDING, Run
+from spinning_top_sim.exam.motions import Run
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
 USELESS_DEG = 10.0      # a larger mean error than that of any published filter with tuned gains
@@ -40,7 +40,7 @@ def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], ScoredRun]], 
                 part = run.part(slice(1000))        # shows whether it uses the field
                 one, other = feed(make_filter, [part, replace(
                     part, magnetometer=part.magnetometer[:, [1, 2, 0]])])
-                whole = bool(np.max(np.abs(one.estimates - other.estimates)) > ROUNDING)
+                whole = measures.differ(one.estimates, other.estimates)
             outcomes.append(feed(make_filter, [run])[0].part(counts))
         except InvalidOutputError as error:
             failed.append(str(error))
@@ -48,7 +48,7 @@ def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], ScoredRun]], 
     faults = [Finding('invalid_output', '; '.join(failed))] if failed else []
     if not outcomes:
         return Report(subject, faults)
-    errors = [rmse(one.estimates, one.run.truth) for one in outcomes]
+    errors = [measures.rmse(one.estimates, one.run.truth) for one in outcomes]
     total, heading, tilt = np.mean(errors, axis=0).tolist()
     judged, name = (total, 'error') if whole else (tilt, 'tilt error')
     if judged > USELESS_DEG:

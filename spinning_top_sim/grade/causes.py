@@ -89,11 +89,11 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
         comparison.compare(lag)
         found, residual, rest = Causes(
             comparison, exact_gravity, placed, slack).find()
-        undo = [one.undo for one in found if one.name and one.undo is not None]
-        if last or not undo:
+        undone = [(one, one.undo) for one in found if one.name and one.undo is not None]
+        if last or not undone:
             break
-        faults.extend(one for one in found if one.name and one.undo is not None)
-        comparison.undo(undo[0])
+        faults.extend(one for one, _ in undone)
+        comparison.undo(undone[0][1])
     faults.extend(found)
     if kind == 'accelerations' and not placed and rest > max(STRANGE, 2.0 * comparison.floor):
         return Report(kind, notes=[f'{kind}: {100.0 * rest:.3g} % of the reading may be the '
@@ -335,7 +335,11 @@ class Causes:
 
 
 def _marks(comparison: Comparison, lag: int) -> dict[str, Mark]:
-    """Return what the sensor is found to be, with intervals of 95 %."""
+    """
+    Return what the sensor is found to be, with intervals of 95 %.
+
+    A matrix of a gyroscope is undone in `comparison`, which the noise is then judged by.
+    """
     kind, always = comparison.kind, comparison.always
     marks = {f'{kind}_discrepancy': Mark(beyond(comparison.target, comparison.floor)),
              f'{kind}_noise': Mark(comparison.reading_noise)}

@@ -28,6 +28,7 @@ from spinning_top_sim.tools.kinematics import (
 UP, AXES = np.array((0.0, 0.0, 1.0)), np.eye(3)
 ENTRIES = [(i, j) for i in range(3) for j in range(3)]
 STANDARD_GRAVITY = 9.80665
+NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 CLEAR = 0.03            # noise of what is differentiated, relative to it, that is small
 NOISY, ROUNDING = 1e-3, 1e-6    # the same, that counts; noise of attitudes that does not
 _per_step = partial(np.gradient, axis=0)        # change per step of values (m, 3)

@@ -18,7 +18,7 @@ from zipfile import is_zipfile
 
 import numpy as np
 
-from spinning_top_sim.grade.columns import LENGTHS, READINGS
+from spinning_top_sim.grade.columns import LENGTHS, NORM, READINGS
 from spinning_top_sim.installation import needed
 from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.kinematics import Reals
@@ -38,7 +38,6 @@ EUROC = {'timestamp': 't', **{f'{a}_{axis}': f'{b}{axis}' for a, b in (
     ('p_RS_R', 'p'), ('q_RS', 'q'), ('w_RS_S', 'g'), ('a_RS_S', 'a')) for axis in 'wxyz'}}
 # Intervals of motions that can be graded [s]: others are those of times in another unit.
 INTERVALS = 1e-5, 0.5
-NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 LEAST_SAMPLES = 20
 _SIGNS = str.maketrans({'µ': 'u', 'μ': 'u', '°': 'deg', '²': '^2'})
 Chosen = dict[str, list[tuple[str, str]]]       # by our name: columns and their units

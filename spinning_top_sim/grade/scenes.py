@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
-from spinning_top_sim.grade.columns import Imu
+from spinning_top_sim.grade.columns import STANDARD_GRAVITY, Imu
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.tools.kinematics import Reals
@@ -116,7 +116,7 @@ class Scene:
 
 
 # The bicycle wheel of config/cusp.yaml, with an IMU off its axis.
-WHEEL = Body(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665,
+WHEEL = Body(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=STANDARD_GRAVITY,
              lever_arm=(0.12, -0.05, 0.2), mounting=(0.4, -0.2, 0.4, 0.8),
              gyroscope_noise_density=0.0, accelerometer_noise_density=0.0)
 TILT = math.radians(30.0)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.grade import dynamics
 from spinning_top_sim.grade.causes import judge
-from spinning_top_sim.grade.columns import KINDS, READINGS
+from spinning_top_sim.grade.columns import KINDS, NORM, READINGS
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Body, Scene, Start
 from spinning_top_sim.physics.states import relative_drift
 from spinning_top_sim.physics.top import State
@@ -27,7 +27,6 @@ TOLERANCE = math.radians(0.1)
 EARLY = 24              # samples at the start by which a convention is known
 WRONG, RIGHT = math.radians(10.0), 0.2      # of their error, in ours, and as a share in another
 MOST = 0.7              # that the top turns in a step [rad]: in longer ones rates are not known
-NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 
 
 class InvalidTrajectoryError(ValueError):

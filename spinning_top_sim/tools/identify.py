@@ -62,16 +62,6 @@ def rms(values: Reals) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def in_words(matrix: Reals) -> str:
-    """Return in words how a matrix (3, 3) differs from the identity, by its columns."""
-    large = 0.5 * np.max(np.abs(matrix - np.eye(3)))
-    return '; '.join(
-        f'{AXES[k]} turns the attitude about ' + (' and '.join(
-            f'{AXES[j]} by {column[j]:.3g}' for j in range(3)
-            if abs(column[j]) >= min(large, 0.5)) or 'nothing')
-        for k, column in enumerate(matrix.T) if np.max(np.abs(column - np.eye(3)[k])) >= large)
-
-
 def autocorrelation_time(values: Reals) -> float:
     """
     Return the integrated autocorrelation time of values (n,) [samples], at least 1.

@@ -65,6 +65,8 @@ class Report:
         What was read, and what was not judged, and why.
     outcomes : sequence
         What the marks are computed from, for figures.
+    absolute : bool
+        Whether the headings of the outcomes are judged against north, or about their mean.
     """
 
     subject: str
@@ -72,6 +74,7 @@ class Report:
     marks: Mapping[str, Mark] = field(default_factory=dict)
     notes: Sequence[str] = ()
     outcomes: Sequence[Any] = field(default=(), repr=False, compare=False)
+    absolute: bool = field(default=True, repr=False, compare=False)
 
     @property
     def passed(self) -> bool:
@@ -113,10 +116,9 @@ class Report:
             if ': ' in name:
                 what, _, scene = name.partition(': ')
                 scenes.setdefault(scene, {})[what] = mark
-        columns = list(dict.fromkeys(what for marks in scenes.values() for what in marks))
         limits = {what: mark.limit for marks in scenes.values() for what, mark in marks.items()}
-        by_scene = [('scene', *columns), *((scene, *(
-            f'{marks[what].value:.4g}' if what in marks else '' for what in columns))
+        by_scene = [('scene', *limits), *((scene, *(
+            f'{marks[what].value:.4g}' if what in marks else '' for what in limits))
             for scene, marks in scenes.items()), ('limit', *map(_limit, limits.values()))]
         others = [('measure', 'value', 'limit', ''), *(
             (name, f'{mark.value:.4g}', _limit(mark.limit), f'  {mark.meaning}')
