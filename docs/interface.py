@@ -11,6 +11,7 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING
 from spinning_top_sim.times import NANOSECONDS
+from spinning_top_sim.tools import scene_file
 from spinning_top_sim.tools.recorded_run import channels_of
 
 HEAD = """<!-- Written by docs/interface.py from the code. -->
@@ -179,8 +180,8 @@ def page() -> str:
         invariants=listed(INVARIANTS), timing=listed(TIMING)))
     for parameter in parameters.TABLE:
         default = parameter.default
-        shown = 'unset' if default is None else list(default) if isinstance(
-            default, tuple) else str(default).lower() if isinstance(default, bool) else default
+        shown = (str(default).lower() if isinstance(default, bool)
+                 else scene_file.default_text(parameter.name))
         allowed = parameter.allowed.removeprefix('must be ')
         lines.append(f'| `{parameter.name}` | {shown} | {parameter.unit} | {allowed} | '
                      f'{EFFECTS[parameter.effect]} | {parameter.text} |\n')

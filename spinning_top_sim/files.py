@@ -10,9 +10,10 @@ from typing import Any
 @contextlib.contextmanager
 def new_file(path: str | Path, mode: str = 'x', *, partial: bool = False) -> Iterator[Any]:
     """
-    Open a new file; any exception removes it, for it is not whole.  An OSError names it.
+    Open a new file for writing.  If the block raises, it is removed; an OSError names it.
 
-    partial : keep what is written but after an OSError, as of a table whose run ends early
+    partial : after another exception than OSError, keep what is written, such as the first rows
+        of a table
     """
     file = open(path, mode, encoding=None if 'b' in mode else 'utf-8')  # noqa: SIM115
     try:
@@ -21,6 +22,6 @@ def new_file(path: str | Path, mode: str = 'x', *, partial: bool = False) -> Ite
     except BaseException as error:
         if not partial or isinstance(error, OSError):
             Path(path).unlink(missing_ok=True)
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and error.strerror:   # some have a text only
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise

@@ -2,7 +2,7 @@
 """
 Times: whole nanoseconds, since the start of a motion or, for stamps, since 1970.
 
-Every room takes them from here.
+All subpackages import these from here.
 """
 
 import numpy as np

@@ -18,7 +18,8 @@ from helpers.recordings import METADATA, TOPICS, opened, write
 from helpers.reference import ROOT
 from rosbags.rosbag2 import Reader
 
-from spinning_top_sim.recording.reader import MAX_BYTES, LogReader
+from spinning_top_sim.recording.errors import MAX_BYTES
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder
 
 

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can go wrong before a recording runs, and in reading and recovering logs."""
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 # What values raise that are not as this package writes them.
 MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 MOST_TEXT = 300             # of a reason
+MOST_REASONS = 20           # of damage that are told
+MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
 
 
 class RecordingError(RuntimeError):
@@ -14,6 +17,22 @@ class RecordingError(RuntimeError):
 
 class LogError(RuntimeError):
     """A log cannot be read or recovered; the text names the path and the reason."""
+
+
+@dataclass
+class Damage:
+    """What is wrong with a log."""
+
+    torn: bool                  # its summary is missing or wrong
+    lost_bytes: int = 0         # that cannot be read; indexes do not count
+    lost_messages: int = 0      # that the summary counts and that are not there either
+    reasons: list[str] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        """Return what is lost, and the first reasons."""
+        lost = {'bytes': self.lost_bytes, 'messages': self.lost_messages}
+        return [*(f'lost: {count} {what}' for what, count in lost.items() if count),
+                *self.reasons[:MOST_REASONS]]
 
 
 def text_of(error: BaseException) -> str:

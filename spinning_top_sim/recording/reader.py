@@ -12,7 +12,6 @@ import os
 import struct
 import zlib
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, field
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
@@ -27,7 +26,7 @@ from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import rosbag2
-from spinning_top_sim.recording.errors import LogError
+from spinning_top_sim.recording.errors import MAX_BYTES, Damage, LogError
 from spinning_top_sim.recording.parsing import (
     HEAD,
     UNREADABLE,
@@ -37,9 +36,7 @@ from spinning_top_sim.recording.parsing import (
     unpacked,
 )
 
-MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
 MOST_INDEX = 1 << 20        # bytes behind the last chunk that may be torn without a loss
-MOST_REASONS = 20           # of damage that are told
 MESSAGE_BYTES = 300         # of memory that a message takes besides its data
 BLOCK = 16384               # messages that are grouped together
 NOTED = Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT
@@ -68,22 +65,6 @@ class LogTopic(NamedTuple):
     encoding: str               # of the messages, such as 'cdr'
     qos: tuple[rosbag2.Qos, ...]    # offered profiles, with the keys of `rosbag2.DEFAULT_QOS`
     channel_id: int
-
-
-@dataclass
-class Damage:
-    """What is wrong with a log."""
-
-    torn: bool                  # its summary is missing or wrong
-    lost_bytes: int = 0         # that cannot be read; indexes do not count
-    lost_messages: int = 0      # that the summary counts besides those
-    reasons: list[str] = field(default_factory=list)
-
-    def lines(self) -> list[str]:
-        """Return what is lost, and the first reasons."""
-        lost = {'bytes': self.lost_bytes, 'messages': self.lost_messages}
-        return [*(f'lost: {count} {what}' for what, count in lost.items() if count),
-                *self.reasons[:MOST_REASONS]]
 
 
 class LogReader(contextlib.AbstractContextManager['LogReader']):
@@ -227,8 +208,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                     self._channels_in.get(offset) or wanted):
                 continue
             if held_bytes > self._max_bytes:
-                raise LogError(f'cannot read {self.path}: many chunks have messages of one time, '
-                               f'and more than {self._max_bytes} bytes of them are not held')
+                raise LogError(f'cannot read {self.path}: its chunks overlap in time, and '
+                               f'more than {self._max_bytes} bytes of them are not held')
             try:
                 messages, _ = self._records(self._at(offset, its_end))
             except UNREADABLE:
@@ -378,7 +359,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             self._counted = record.message_count
 
     def _find_places(self) -> Iterator[tuple[int, int, int, int]]:
-        """Yield begins and ends, (time, place) each, of messages and chunks; note the others."""
+        """Yield (first time, offset, last time, end) of chunks and messages; note the others."""
         for opcode, offset, end in self._heads():
             with contextlib.suppress(*UNREADABLE):
                 if opcode in TIMES and end <= self.size:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.recording.errors import RecordingError, text_of, why_not_written
+from spinning_top_sim.recording.errors import MAX_BYTES, RecordingError, text_of, why_not_written
 from spinning_top_sim.recording.provenance import environment
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 
@@ -193,7 +193,6 @@ class Recorder:
     def _open(self) -> McapWriter:
         """Return the file that `uri` names; in a folder, under the first free name."""
         with needed('a recording', 'mcap'):
-            from spinning_top_sim.recording.reader import MAX_BYTES  # noqa: PLC0415
             from spinning_top_sim.recording.writer import McapWriter, log_head  # noqa: PLC0415
 
         metadata = {**self._metadata(), **environment()}

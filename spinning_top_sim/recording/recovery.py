@@ -30,7 +30,7 @@ def recover(reader: LogReader, output: Path, progress: Callable[[float], object]
     Raises RecordingError or LogError, also if a torn file holds no whole message.
     """
     torn = reader.damage.torn       # now that all is read, all channels are known
-    # The schema 0 says that there is none.
+    # In MCAP the schema id 0 means: no schema.
     schemas = {number: schema for number, schema in reader.schemas.items() if number}
     channels = [channel if channel.schema_id in schemas else replace(channel, schema_id=0)
                 for _, channel in sorted(reader.channels.items())]

@@ -183,7 +183,7 @@ class McapWriter:
             channel: len(entries) for channel, entries in index.items()})
         start_and_end = list(span.values())
         written = self._write(blocks)
-        # An interrupt comes after a call: before all of these or after them.
+        # A KeyboardInterrupt comes behind a call, and none is between these assignments.
         self._end, self.message_counts = written, counts
         self._rows, self._chunk_bytes = [], 0
         self._summary += [summary]

@@ -103,11 +103,6 @@ class Piece:
         """Whether the pivot has always rested."""
         return self._vertical is None
 
-    @property
-    def is_exact(self) -> bool:
-        """Whether the states are those of `truth`."""
-        return not isinstance(self._motion, SteppedMotion)
-
     def describe(self) -> Description | None:
         """Return the motion in numbers; None if it has no closed form or the pivot moves."""
         return self._exact[0].describe() if self.rests and self._exact else None

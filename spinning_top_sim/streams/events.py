@@ -51,7 +51,7 @@ class Event:
 
     @property
     def begins_report(self) -> bool:
-        """Whether a motion begins: of a recording, by a change of it, or by a reset."""
+        """Whether a motion of a report begins: with a recording, a change, or a reset."""
         return self.kind in (*MOTIONS, 'start', 'reset')
 
     def repeats(self, last: 'Event') -> bool:

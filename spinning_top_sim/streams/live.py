@@ -28,8 +28,8 @@ MOST_SAMPLES, MOST_BYTES = 256, 4 << 20     # of a channel that are computed tog
 # What is computed at once: little behind an event, as the next one may come soon.
 FIRST_SPAN_NS, LONGEST_SPAN_NS = 20_000_000, 300_000_000
 FIRST_STRIDE_NS = 1_000     # of the motion, whose pace is not known before it is tried
-GROWTH = 16.0               # of a span over the one before, at most
-PIECE_SECONDS = 1e-2        # of work, half of it the solver's, between two questions to give way
+GROWTH = 16.0               # a span is at most this many times the one before
+PIECE_SECONDS = 1e-2        # of computing between two calls of give_way, half of it for the solver
 BLOCKED_SECONDS = 1.0       # a reader that stalls holds every call for 0.1 s: it gets a rest
 
 # Messages of a topic for a log: its number there, stamps (n,) [ns], messages (n, size).
@@ -97,11 +97,11 @@ class Output:
 
 @dataclass(eq=False)
 class _Group:
-    """The outputs of one grid, whose messages are computed together; none: the motion alone."""
+    """Outputs of one grid, computed together; without outputs: the motion itself."""
 
     outputs: Mapping[Channel, Output]
     computed_ns: int
-    span_ns: int = 0        # for which the time that there is suffices
+    span_ns: int = 0        # that can be computed in the time that a call may take
 
     @property
     def piece_ns(self) -> int:

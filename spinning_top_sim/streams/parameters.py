@@ -44,6 +44,8 @@ _CONTENT = read_table('streams/parameters.toml')
 STREAMS: Mapping[str, str] = {name: row['text'] for name, row in _CONTENT['streams'].items()}
 TABLE = tuple(chain.from_iterable(_described(*entry) for entry in _CONTENT.items()))
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in TABLE}
+# What a change of them does is an event of the run.
+AT_ONCE = frozenset(one.name for one in TABLE if one.effect is Effect.NOW)
 LONGEST = BY_NAME['duration'].range.highest     # time [s], three years
 FASTEST = BY_NAME['pivot.speed'].range.highest  # speed of the pivot [m/s]
 

@@ -13,7 +13,6 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import Channel, Messages, Samples
 from spinning_top_sim.streams.events import CHANGES, Event
 from spinning_top_sim.streams.imu import LONGEST_NS, Imu
-from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.streams.trajectory import Trajectory
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, NEVER_NS, check_stamp, period_ns
@@ -69,7 +68,10 @@ class Simulation:
 
     def apply(self, kind: str, **details: Any) -> Event:
         """
-        Let something change the run now; return the `Event`, which is no 'start'.
+        Apply an event now, and return it.
+
+        kind, details : one of CHANGES, and what docs/logs.md says of it; `drive_details` has
+            those of a drive
 
         Raises ValueError naming what is off; the run goes on unchanged.
         """
@@ -96,8 +98,7 @@ class Simulation:
 
     def _take_over(self, changes: Mapping[str, Any]) -> None:
         """Make the channels after `now_ns` of the changes that take effect at once."""
-        self._present |= {one.name: changes[one.name] for one in parameters.TABLE
-                          if one.name in changes and one.effect is Effect.NOW}
+        self._present |= {name: changes[name] for name in parameters.AT_ONCE & changes.keys()}
         self.imu = self.imu.at_period(period_ns(self._present['imu.rate']), max(self.now_ns, 0))
         self.channels = all_channels(self._present, self.imu)
 

@@ -56,10 +56,9 @@ def _column_names(channel: Channel) -> list[str]:
     """Return the names of the numbers in the fields of a message."""
     names = []
     for name, count, _ in channel.template.fields:
-        labels: Any = LABELS.get((channel.type_name, name)) or (
-            [''] if count == 1 else 'xyzw'[:count] if count <= 4 else range(count))
-        if channel.type_name == ARRAY:
-            labels = messages.labels_of(channel.template)
+        labels: Any = messages.labels_of(channel.template) if channel.type_name == ARRAY else (
+            LABELS.get((channel.type_name, name))
+            or ([''] if count == 1 else 'xyzw'[:count] if count <= 4 else range(count)))
         names += [f'{name}.{label}'.rstrip('.') for label in labels]
     return names
 

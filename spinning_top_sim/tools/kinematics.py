@@ -37,8 +37,8 @@ GAP = 2.5                       # intervals that are a gap
 EVEN = 1e-4                     # share of the interval by which stamps may be uneven
 DEGREE = 5                      # of the splines between samples
 LEAST = 60                      # samples of a stretch
-# Errors of samples that are left out, over the median, and over the second derivative; the largest
-# share of such samples.
+# A sample is left out if the error of its derivative is over OUTLIER times the median error and
+# over ROUGH times the median second derivative; if more than FEW of all would be, none is.
 OUTLIER, ROUGH, FEW = 20.0, 1e-3, 0.1
 
 
@@ -137,7 +137,8 @@ class Smoothed:
         symmetric part that of w x (w x ..) [1/s^2]
     acceleration : of the origin, along axes of the body (m, 3) [m/s^2]
     noise : of turns, of rates, of R^T R'' and of accelerations of the origin
-    smooth : samples (m,) where no force sets in, so that a derivative of samples holds
+    smooth : which samples (m,) are kept: none where a force sets in suddenly, which makes
+        derivatives of samples wrong
     """
 
     def __init__(self, body: Stretch, width: int) -> None:

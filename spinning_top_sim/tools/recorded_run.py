@@ -186,13 +186,13 @@ def rerun(run: RunDescription, end_ns: int, *, samples: bool = False,
         yield from play(event.t_ns, with_messages=False)
         _apply(simulation, event)
     yield from play(run.begun_ns, with_messages=False)
-    at_once = {one.name for one in parameters.TABLE if one.effect is Effect.NOW}
-    simulation.apply('parameters', **{name: run.values_at_recording[name] for name in at_once})
+    simulation.apply('parameters', **{
+        name: run.values_at_recording[name] for name in parameters.AT_ONCE})
     yield simulation, Logged(run.epoch_ns, Event('start', 0, simulation.now_ns))
     for logged in run.events:
         event = logged.event
         if event.kind != 'start' and (event.kind != 'parameters'
-                                      or not at_once.isdisjoint(event.details)):
+                                      or not parameters.AT_ONCE.isdisjoint(event.details)):
             yield from play(event.sent_ns, with_messages=samples)
             _apply(simulation, event)
             yield simulation, logged

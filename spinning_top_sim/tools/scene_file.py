@@ -99,11 +99,12 @@ class _ListParameters(argparse.Action):
 
 def _described(name: str) -> str:
     parameter = parameters.BY_NAME[name]
-    return f'  {name}  (default {_default(name)})\n' + textwrap.indent(
+    return f'  {name}  (default {default_text(name)})\n' + textwrap.indent(
         textwrap.fill(parameter.describe(), 74), 6 * ' ')
 
 
-def _default(name: str) -> object:
+def default_text(name: str) -> object:
+    """Return the default of a parameter as it is shown."""
     default = parameters.BY_NAME[name].default
     return 'unset' if default is None else list(default) if isinstance(default, tuple) else default
 
@@ -111,7 +112,7 @@ def _default(name: str) -> object:
 def most_used() -> str:
     """Return a line for each of the parameters that most people need first."""
     return '\n'.join(textwrap.fill(
-        f'{name} ({_default(name)}): {parameters.BY_NAME[name].text.partition(";")[0]}', 78,
+        f'{name} ({default_text(name)}): {parameters.BY_NAME[name].text.partition(";")[0]}', 78,
         initial_indent='  ', subsequent_indent=6 * ' ') for name in MOST_USED)
 
 

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.recording.errors import MALFORMED, reason_of
-from spinning_top_sim.recording.reader import Damage, LogMessage, LogReader
+from spinning_top_sim.recording.errors import MALFORMED, Damage, reason_of
+from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.play import Block
-from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, stamp_text
+from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, Times, ns_array, stamp_text
 from spinning_top_sim.tools import analysis, recorded_run
 from spinning_top_sim.tools.analysis import Attitudes, Measured
 from spinning_top_sim.tools.recorded_run import LAST_LOG_TIME_NS, RunDescription
@@ -35,7 +35,6 @@ MOST_EXACT = 1000           # motions that are compared with the exact one: 10 m
 # Streams that a motion can be measured from, the most accurate first.
 SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
 ENOUGH_SAMPLES = 12.0       # in a nutation; a higher rate adds no accuracy
-Stamps = NDArray[np.int64]
 Rows = NDArray[np.float64]
 
 
@@ -73,7 +72,7 @@ class MotionReport:
     source: str | None                    # topic that it is measured from
     imu: Imu
     # Log times (n,) [ns] and `Attitudes.rows` of the source
-    samples: list[tuple[Stamps, Rows]] = field(default_factory=list)
+    samples: list[tuple[Times, Rows]] = field(default_factory=list)
     sections: list[Section] = field(default_factory=list)
     measured: Measured | None = None      # the numbers of `exact`, from the samples
 
@@ -173,7 +172,7 @@ def _source(run: RunDescription, channels: Mapping[str, Channel],
                key=lambda name: min(period_ns / channels[name].period_ns, ENOUGH_SAMPLES))
 
 
-def _read_messages(found: Survey, reader: LogReader) -> dict[str, Stamps]:
+def _read_messages(found: Survey, reader: LogReader) -> dict[str, Times]:
     """Compare all messages with their motions; return the log times of each topic [ns]."""
     ends_ns = [motion.end_ns for motion in found.motions[:-1]]
     blocks_ns = {topic: [np.empty(0, np.int64)] for topic in found.topics}
@@ -186,7 +185,7 @@ def _read_messages(found: Survey, reader: LogReader) -> dict[str, Stamps]:
     return {topic: np.concatenate(parts) for topic, parts in blocks_ns.items()}
 
 
-def _stamps(samples: Sequence[LogMessage]) -> Stamps:
+def _stamps(samples: Sequence[LogMessage]) -> Times:
     return np.array([min(sample.log_time, LAST_LOG_TIME_NS) for sample in samples], np.int64)
 
 
@@ -221,7 +220,7 @@ def _largest(values: Rows) -> float:
     return float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
 
 
-def _count(found: Survey, report: TopicReport, stamps_ns: Stamps, sections: list[Section],
+def _count(found: Survey, report: TopicReport, stamps_ns: Times, sections: list[Section],
            topic: str) -> None:
     report.count = len(stamps_ns)
     if report.count > 1:
@@ -242,9 +241,9 @@ def _count(found: Survey, report: TopicReport, stamps_ns: Stamps, sections: list
 
 
 def _count_section(report: TopicReport, section: Section, channel: Channel, times: range,
-                   stamps_ns: Stamps) -> None:
+                   stamps_ns: Times) -> None:
     """Add the missing messages of a section: those that the run has sent and the log lacks."""
-    due_ns = section.epoch_ns + np.unique(channel.due(np.array(times, np.int64)))
+    due_ns = section.epoch_ns + np.unique(channel.due(ns_array(times)))
     missing = ~np.isin(due_ns, stamps_ns)
     report.missing = (report.missing or 0) + int(np.sum(missing))
     edges = np.flatnonzero(np.diff(missing, prepend=False, append=False))

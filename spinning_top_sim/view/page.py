@@ -105,7 +105,17 @@ class Page:
             before = now
 
     def draw(self, t_ns: int, track: Track) -> None:
-        """Draw a top at a time."""
+        """Draw a top at a time, now and then with its plots and words."""
+        self.draw_scene(t_ns, track)
+        if self._number % PLOT_EVERY == 0:
+            set_content(self._plots, ''.join(map(plots.draw, plots.motion_plots(
+                track, t_ns, t_ns - WINDOW_NS, t_ns))))
+            set_content(self._words, text.words(track, t_ns))
+            set_content(self._legend, self.legend())
+        self._number += 1
+
+    def draw_scene(self, t_ns: int, track: Track) -> None:
+        """Draw a top at a time in the scene alone."""
         # Meshes take longer than a picture: they wait till a slider rests.
         if self._top is None or (self._number == SETTLED and self._top.top != track.top):
             self._top = self._new_top(track)
@@ -119,12 +129,6 @@ class Page:
                 self._ground.position = -(x % size), -(y % size), -FOOT * size - z
             self._top.draw(t_ns, trace=self._trace.value, bounds=self._bounds.value, arrows={
                 name for name, switch in self.arrows.items() if switch.value})
-        if self._number % PLOT_EVERY == 0:
-            set_content(self._plots, ''.join(map(plots.draw, plots.motion_plots(
-                track, t_ns, t_ns - WINDOW_NS, t_ns))))
-            set_content(self._words, text.words(track, t_ns))
-            set_content(self._legend, self.legend())
-        self._number += 1
 
     def _new_top(self, track: Track) -> DrawnTop:
         """Return another top in the scene, with its ground and for its size."""

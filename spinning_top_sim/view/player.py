@@ -107,7 +107,7 @@ def write_file(path: Path, page: Page, player: Player, track_at: Callable[[int],
 
     def draw(t_ns: int) -> None:
         clock.position = (t_ns / NANOSECONDS, 0.0, 0.0)      # read by the script of the file
-        page.draw(t_ns, track_at(t_ns))
+        page.draw_scene(t_ns, track_at(t_ns))
 
     draw(begin_ns)
     track = track_at(begin_ns)

@@ -11,9 +11,9 @@ from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import all_channels
-from spinning_top_sim.times import NANOSECONDS, period_ns
+from spinning_top_sim.times import NANOSECONDS, Times, period_ns
 from spinning_top_sim.tools.analysis import RATES, attitudes_of
-from spinning_top_sim.view.source import Reals, Times, Track
+from spinning_top_sim.view.source import Reals, Track
 
 # The topics that tell the attitude, the one that tells most first.
 TOPICS = ('ground_truth/odom', 'joint_states', 'pose', 'ground_truth/imu')

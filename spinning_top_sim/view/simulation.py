@@ -17,11 +17,11 @@ from spinning_top_sim.recording.errors import text_of
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.play import Simulation
-from spinning_top_sim.times import NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS, Times
 from spinning_top_sim.tools.scene_file import read_scene
 from spinning_top_sim.view.page import Page, set_value
 from spinning_top_sim.view.player import Player
-from spinning_top_sim.view.source import WINDOW_NS, Times, Track
+from spinning_top_sim.view.source import WINDOW_NS, Track
 
 PERIOD_NS = 10_000_000          # between the points of a trace
 FILE_S = 20.0                   # length of a file, where `duration` is 0

@@ -22,9 +22,8 @@ from spinning_top_sim.shape import Shape
 from spinning_top_sim.solvers.exact import ExactSolution
 from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.times import NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS, Times
 
-Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
 WINDOW_NS = 10 * NANOSECONDS    # of traces and plots; twice this is kept
 SNAP = 1e-9                 # relative distance within which a motion is taken for a special one
