@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 import pytest
 from helpers.examples import examples
+from helpers.extremes import DOUBLES
 from helpers.simulations import SECOND, play, simulate
 from helpers.tops import COLUMNS, UNIT, time_limit
 from hypothesis import example, given
@@ -19,8 +20,6 @@ from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
 from spinning_top_sim.times import LAST_STAMP_NS
 
-DOUBLES = (0.0, -0.0, 5e-324, 1e-310, 1e-300, 1e-170, 1e-150, 1e-100, 1e-46, 1e-30, 1e-20, 1e-9,
-           1e-3, 0.5, 1.0, math.pi, 14.0, 1e3, 1e9, 1e16, 1e30, 1e100, 1e150, 1e200, 1e300)
 TOP = {'lambda1': 0.123, 'lambda3': 0.15, 'mass': 2.0, 'com_distance': 0.15, 'gravity': 9.8}
 START = {'theta': 0.6, 'theta_dot': 0.4, 'phi': 0.3, 'psi': -1.2, 'l3': 1.6, 'lz': 1.1}
 METHODS = ({'method': 'exact'}, {'method': 'rk45', 'rtol': 1e-6},
@@ -28,7 +27,8 @@ METHODS = ({'method': 'exact'}, {'method': 'rk45', 'rtol': 1e-6},
 # What may be said instead of an answer; a ValueError names the field or says "too far apart".
 REASONS = (r'(theta|theta_dot|l3|lz|lambda1|lambda3|mass|com_distance|gravity|t) = '
            r'|too far apart|closer to the separatrix|at most|at least')
-SIZES = st.sampled_from(DOUBLES) | st.floats(0.0, 1e300)
+# But the largest, of which products overflow.
+SIZES = st.sampled_from((*DOUBLES[:-1], 1e-150, 1e-30, 1e150)) | st.floats(0.0, 1e300)
 FIELDS = st.sampled_from([*TOP, *START])
 
 

@@ -73,7 +73,7 @@ def test_of_a_recording(tmp_path):
             with LogReader(path) as reader:
                 assert reader.whole and len(kept) == 100, failure
         else:
-            assert str(path) in recorder.error and counters.lost >= 0, failure
+            assert str(path) in recorder.error, failure
 
     each_failing(act, check)
 
@@ -143,10 +143,14 @@ def test_of_a_recovery(tmp_path, short, capsys):
 
 @pytest.mark.parametrize('kind', ['euroc', 'csv', 'parquet', 'urdf'])
 def test_of_an_export(tmp_path, capsys, kind):
-    log = log_of(tmp_path / 'run.mcap', '--duration', 0.1, *(
-        f'-p{name}' for name in ('ground_truth_imu_odom.enabled:=true', *(
-            f'imu.{kind}_{noise}:=0.01' for kind in ('gyroscope', 'accelerometer')
-            for noise in ('noise_density', 'random_walk')))))
+    if kind == 'parquet':
+        pytest.importorskip('pyarrow')
+    log = tmp_path / 'run.mcap'
+    if kind == 'euroc':
+        log_of(log, '--duration', 0.1, *(
+            f'-p{name}' for name in ('ground_truth_imu_odom.enabled:=true', *(
+                f'imu.{sensor}_{noise}:=0.01' for sensor in ('gyroscope', 'accelerometer')
+                for noise in ('noise_density', 'random_walk')))))
 
     def act(path):
         if kind in ('csv', 'parquet'):

@@ -65,8 +65,9 @@ def test_the_trace_is_the_path_of_the_tip(values, count):
         assert np.abs(trace[:-1] - tip * axis_of(exact.quaternion)).max() < 1e-12 * abs(tip)
 
 
-def test_bodies_and_lines_are_drawn_to_the_scale_of_the_top(frame='θ'):
+def test_bodies_and_lines_are_drawn_to_the_scale_of_the_top():
     """The axis is 2 % of the distance to the tip wide, the trace half of that."""
+    frame = 'θ'
     pytest.importorskip('rclpy')
     from rclpy.serialization import deserialize_message
     from test_templates import assert_same, axes_of

@@ -93,6 +93,10 @@ class OwnReplay(InThisProcess):
     def of(self, topic):
         return [data for name, data in self.heard if name == topic]
 
+    def messages(self, topic, kind):
+        return [deserialize_message(one, kind) if isinstance(one, bytes) else one
+                for one in self.of(topic)]
+
     @property
     def raw(self):
         return [self.of(publisher.topic_name) for publisher in self.node.outputs.values()]
@@ -128,7 +132,6 @@ def schedule(replay, monkeypatch, cost_ns=0, plan=None):
     with monkeypatch.context() as patch:
         patch.setattr(replayer, 'time', SimpleNamespace(
             monotonic_ns=lambda: now[0], monotonic=time.monotonic))
-        replay.take = take
         for publisher in replay.node.publishers:
             publisher.publish = take
         timer.callback()
@@ -346,9 +349,8 @@ def test_without_a_clock_the_stamps_of_later_rounds_go_on(tmp_path, capfd):
     with OwnReplay(stamped_log(tmp_path / 'run.mcap'), '--loop') as replay:
         replay.spin_until('three rounds', lambda: len(replay.of('/path')) >= 60)
         replay.spin_until('the status', lambda: 'of round ' in capfd.readouterr().out)
-    joints, paths = ([deserialize_message(one, kind) if isinstance(one, bytes) else one
-                      for one in replay.of(topic)] for topic, kind in (
-                          ('/joint_states', JointState), ('/path', PathMessage)))
+    joints, paths = replay.messages('/joint_states', JointState), replay.messages(
+        '/path', PathMessage)
     assert set(replay.of('/chatter')) == {text(7)}, 'what has no stamps keeps its bytes'
     stamps = [ns_of(message.header.stamp) for message in joints]
     assert stamps[:21] == [EPOCH_NS + n * SECOND // 100 for n in range(21)]
@@ -364,8 +366,8 @@ def test_stamps_of_later_rounds_are_later_by_what_was_chosen(tmp_path):
         ('/joint_states', 'sensor_msgs/msg/JointState'), TWO[0]])
     with OwnReplay(path, '--loop', '--topics', '/joint_states') as replay:
         replay.spin_until('three rounds', lambda: len(replay.raw[0]) >= 6)
-    stamps = [ns_of((deserialize_message(one, JointState) if isinstance(one, bytes) else one)
-                    .header.stamp) - EPOCH_NS for one in replay.of('/joint_states')]
+    stamps = [ns_of(one.header.stamp) - EPOCH_NS
+              for one in replay.messages('/joint_states', JointState)]
     gap = replayer.ROUND_GAP_NS + 1
     assert stamps[:6] == [0, 1, gap, gap + 1, 2 * gap, 2 * gap + 1]
 

@@ -208,8 +208,9 @@ def test_the_bias_begins_with_the_turn_on_bias_and_walks_with_its_density():
     assert np.abs(np.diff(biases, axis=0)[seams] / deviations).max() < 5.0
 
 
-def test_a_gauss_markov_bias_is_stationary(time=3.0):
+def test_a_gauss_markov_bias_is_stationary():
     """At the start, at a second and after three years it has one variance: 2400 numbers each."""
+    time = 3.0
     times_ns = np.array([0, SECOND, 94_608_000 * SECOND])
     rows = np.concatenate([noise.RandomPath(
         seed, noise.Kind.GYROSCOPE, noise.Part.GAUSS_MARKOV, ((time, 2.0),)).at(times_ns)

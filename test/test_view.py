@@ -94,7 +94,7 @@ def values_of(scene, **changes):
                                **read_scene(parameter_files('scene')[scene]), **changes})
 
 
-def sampled(top_values, states, times_ns, **columns):
+def sampled(top_values, states, times_ns):
     """Return a track with samples of a motion."""
     track, rows = SampledTrack(top_values), np.full((len(times_ns), 10), np.nan)
     rows[:, :4], rows[:, 4:7] = states.quaternion, states.angular_velocity

@@ -5,6 +5,7 @@ import builtins
 import contextlib
 import io
 import os
+from unittest import mock
 
 CALLS = ('open', 'pwrite', 'fsync', 'ftruncate', 'fstatvfs', 'mkdir', 'unlink', 'rename',
          'replace')
@@ -35,8 +36,7 @@ class Calls:
         self._patches.close()
 
     def _replace(self, owner, name, call):
-        self._patches.callback(setattr, owner, name, getattr(owner, name))
-        setattr(owner, name, call)
+        self._patches.enter_context(mock.patch.object(owner, name, call))
 
     def check(self, name, path=None):
         """Count a call; return whether it is to be short, or raise, with its path if any."""

@@ -27,7 +27,8 @@ TRUTH = {'pose.enabled': True, 'joint_states.enabled': True, 'ground_truth_odom.
 NOISE = {f'imu.{kind}_{name}': value for kind in ('gyroscope', 'accelerometer')
          for name, value in (('noise_density', 0.01), ('random_walk', 0.001),
                              ('turn_on_bias', 0.02), ('bias_instability', 0.003))}
-# Parameters beside `streams` that are on, and how long [s]
+SECONDS = 2.0       # of each run
+# Parameters; streams that are not named are off.
 CASES = {
     'exact': {'solver.method': 'exact', **TRUTH},
     'exact, sleeping': {'solver.method': 'exact', 'initial.theta': 0.0, 'spin.l3': 1.0,
@@ -48,7 +49,7 @@ CASES = {
 }
 
 
-def columns(case, seconds=2.0):
+def columns(case):
     """Return the numbers of a run: {'topic field': array}."""
     from spinning_top_sim.streams import parameters
     from spinning_top_sim.streams.play import Simulation
@@ -57,7 +58,7 @@ def columns(case, seconds=2.0):
     run = Simulation(parameters.checked({**values, 'seed': 7, **CASES[case]}), 10 ** 18)
     channels = [one for one in run.channels if parameters.is_enabled(one.name, run.values)]
     data = {one.topic: [] for one in channels}
-    for block in run.play(channels, round(seconds * 1e9)):
+    for block in run.play(channels, round(SECONDS * 1e9)):
         for channel, _, rows in block.messages:
             data[channel.topic].append(rows.tobytes())
     found = {}
@@ -83,9 +84,9 @@ def golden(case):
     return kept
 
 
-def computed(*, plain):
-    """Return all cases as a process of its own computes them; plain: on any processor."""
-    found = np.show_config(mode='dicts')['SIMD Extensions']['found'] if plain else ()
+def computed():
+    """Return all cases as a process of its own computes them, as on any processor."""
+    found = np.show_config(mode='dicts')['SIMD Extensions']['found']
     done = subprocess.run(
         [sys.executable, __file__], capture_output=True, text=True, check=True, timeout=120,
         env={**os.environ, 'NPY_DISABLE_CPU_FEATURES': ' '.join(found)})
@@ -111,6 +112,6 @@ def differences(found, kept):
 if __name__ == '__main__':
     sys.path.insert(0, str(Path(__file__).parents[2]))
     if sys.argv[1:] == ['--write']:
-        KEPT.write_text(json.dumps(computed(plain=True), indent=0) + '\n')
+        KEPT.write_text(json.dumps(computed(), indent=0) + '\n')
     else:
         print(json.dumps({case: golden(case) for case in CASES}))

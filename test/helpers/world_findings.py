@@ -156,8 +156,9 @@ class Findings:
         if log.path in world.deleted:
             return 'deleted'
         if world.was_killed:
-            content = (world.disk.content(log.path) if world.plan.ends == 'kill' or state in (
-                'failed',) else world.disk.after_a_power_cut(log.path))
+            content = (world.disk.content(log.path)
+                       if world.plan.ends == 'kill' or state == 'failed'
+                       else world.disk.after_a_power_cut(log.path))
             log.path.unlink(missing_ok=True)
             if content is not None and recorder.path is not None:
                 log.path.write_bytes(content)
@@ -168,9 +169,8 @@ class Findings:
         if state == 'failed' and recorder.path is None:
             assert not log.path.exists(), 'no log has begun, and there is a file'
             return 'not begun'
-        kept = self._read(log.path)
+        is_whole, kept = self._read(log.path)
         expected = self._expected(log)
-        is_whole, kept = kept
         for topic, messages in kept.items():
             self._compare_topic(topic, messages, expected[topic])
         self._check_promise(log, state, is_whole, kept, expected)
@@ -236,7 +236,7 @@ class Findings:
                    for counts in boundaries), 'a topic lags behind another'
 
     def _read(self, path):
-        """Return whether a file is whole, and its messages by topic; None: it cannot be read."""
+        """Return whether a file is whole, and its messages by topic: none if it cannot be read."""
         if not path.exists():
             return False, {}
         with contextlib.suppress(LogError), LogReader(path) as reader:

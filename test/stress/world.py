@@ -19,5 +19,6 @@ def check(seed, folder):
 def repeat(seed, numbers):
     """Run a seed with some of its actions again; return the exit code."""
     plan = plan_of(seed).only([int(one) for one in numbers.split(',') if one != '-'])
-    print(failure_of(plan) or f'world: seed {seed}: nothing is wrong')
-    return 1 if failure_of(plan) else 0
+    failure = failure_of(plan)
+    print(failure or f'world: seed {seed}: nothing is wrong')
+    return 1 if failure else 0
