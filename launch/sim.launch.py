@@ -108,7 +108,7 @@ def _parameters(given: dict, namespace: str, files: list, asked: dict) -> tuple[
     prefix = given['frame_prefix']
     if prefix == 'auto':
         prefix = f'{namespace}/' if namespace else ''
-    changes |= {name: prefix + values[name] for name in ('body_frame', 'imu.frame_id')}
+    changes |= {name: prefix + values[name] for name in parameters.FRAMES[1:]}
     if given['markers'] == 'true':
         changes['markers.enabled'] = True
     if given['record'] != 'false':

@@ -193,7 +193,7 @@ def test_without_the_means_there_is_a_line_and_no_tf(installed, monkeypatch, mis
 def log(tmp_path):
     path = tmp_path / 'run.mcap'
     assert simulate.main(['-o', str(path), '--quiet', '--duration', '1', '--namespace', '/a/b',
-                          '-p', 'body_frame:=a/b/wheel', '-p', 'imu.lever_arm:=[0.1,0.2,0.3]',
+                          '-p', 'body_frame:=wheel', '-p', 'imu.lever_arm:=[0.1,0.2,0.3]',
                           ]) == 0
     return path
 
@@ -210,7 +210,7 @@ def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(installed, 
             options.partial) == (log, 2.0, 0.5, True, 50.0, False)
     tf = run.nodes[f'{RSP}/{RSP}']
     assert links_of(tf) == ['world', 'a/b/precession_link', 'a/b/nutation_link', 'a/b/wheel',
-                            'imu_link']
+                            'a/b/imu_link']
     assert 'xyz="0.1 0.2 0.3"' in tf.parameters[0]['robot_description'].args[0]
     assert tf.parameters[0]['use_sim_time'] is True
     assert tf.remappings == [('joint_states', '/a/b/joint_states')]

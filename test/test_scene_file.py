@@ -2,12 +2,14 @@
 """Parameter files: `simulate` finds in them what rclpy finds for `sim_node`."""
 
 import contextlib
+import json
 
 import pytest
 import yaml
 
 from spinning_top_sim import scene as api_scene
 from spinning_top_sim.installation import parameter_files
+from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools.scene_file import parse_assignment, read_scene
 from spinning_top_sim.tools.simulate import main
@@ -99,6 +101,15 @@ def test_a_section_applies_to_the_nodes_that_rcl_applies_it_to(tmp_path, node):
                 read_scene(path, node)
         else:
             assert read_scene(path, node) == {'world_frame': 'map'}, section
+
+
+def test_a_namespace_is_the_prefix_of_frames_but_the_world(tmp_path):
+    path = tmp_path / 'left.mcap'
+    assert main(['--namespace', '/left/', '-p', 'imu.frame_id:=chip', '--duration', '1', '--quiet',
+                 '-o', str(path)]) == 0
+    with LogReader(path) as log:
+        values = json.loads(log.metadata['spinning_top_sim']['parameters'])
+    assert [values[name] for name in parameters.FRAMES] == ['world', 'left/base_link', 'left/chip']
 
 
 def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(tmp_path):

@@ -121,6 +121,8 @@ def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = Fal
     """
     Return the parameters that these options give to a node, not checked; the last value holds.
 
+    A namespace is also the prefix of all frames but the world: several tops share one TF tree.
+
     node : its full name
     to_ros : those that rclpy declares for every node, such as use_sim_time, instead of the others
 
@@ -129,8 +131,12 @@ def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = Fal
     values: dict[str, object] = {}
     for path in chosen_files(arguments):
         values |= read_scene(path, node, to_ros=to_ros)
-    return values | {name: value for name, value in map(parse_assignment, arguments.param)
-                     if is_of_ros(name) == to_ros}
+    values |= {name: value for name, value in map(parse_assignment, arguments.param)
+               if is_of_ros(name) == to_ros}
+    namespace = (getattr(arguments, 'namespace', None) or '').strip('/')
+    return values if to_ros or not namespace else values | {
+        name: f'{namespace}/{values.get(name, parameters.BY_NAME[name].default)}'
+        for name in parameters.FRAMES[1:]}
 
 
 def chosen_files(arguments: argparse.Namespace) -> list[Path]:

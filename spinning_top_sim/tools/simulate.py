@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'applied in the order given')
     add('--epoch', type=float, default=1.0, metavar='S',        # in ROS a stamp of 0 is "no time"
         help='stamp of t = 0 [s], default %(default)g')
-    add('--namespace', default='/', help='of the topics in the log')
+    add('--namespace', default='/', help='of the topics and frames in the log')
     log_exports.add_argument(parser)
     add('--quiet', action='store_true', help='no progress, no summary')
 
