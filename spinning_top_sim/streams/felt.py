@@ -44,7 +44,7 @@ class LowPass:
         self._decay = self._corner / (1.0 if order == 1 else math.sqrt(2.0))
         self.memory_ns = math.ceil(1e9 * TIME_CONSTANTS / self._decay)
         nodes, weights = np.polynomial.legendre.leggauss(NODES)
-        self._nodes, self._weights = 0.5 * (1.0 + nodes), 0.5 * weights
+        self._nodes, self._weights = 0.5 * np.array([1.0 + nodes, weights])[..., np.newaxis]
 
     def response(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the complex gain at frequencies [Hz]."""
@@ -60,36 +60,30 @@ class LowPass:
             # A specific force has squares of rates, thus twice their frequency.
             seconds = ANGLE / (self._corner + 2.0 * piece.fastest_rate)
             panels = min(math.ceil(1e-9 * self.memory_ns / seconds), MOST_PANELS)
-            edges = np.linspace(0.0, self.memory_ns, 1 + panels)
-            # Samples that see this piece alone have the same nodes, each of the others its own.
-            mixed = int(np.searchsorted(times, piece.start_ns + self.memory_ns))
-            found += [self._readings(
-                trajectory, times[at:at + 1], self._edges(trajectory, int(times[at]), edges),
-                signal) for at in range(mixed)]
+            edges = np.linspace(0.0, self.memory_ns, 1 + panels)[:, np.newaxis]
             together = max(1, MOST_TOGETHER // (NODES * panels))
             found += [self._readings(trajectory, times[at:at + together], edges, signal)
-                      for at in range(mixed, len(times), together)]
+                      for at in range(0, len(times), together)]
         return np.concatenate(found, axis=1)
 
-    def _edges(self, trajectory: Trajectory, t_ns: int, edges: Column) -> Column:
-        """Return these edges of panels [ns before a sample], and those of pieces."""
-        oldest = min(t_ns, self.memory_ns)
-        starts = [t_ns - start_ns for start_ns in trajectory.starts(t_ns - oldest, t_ns)]
-        return np.unique(np.concatenate((edges[edges < oldest], starts, [oldest])))
-
-    def _readings(self, trajectory: Trajectory, t_ns: Times, edges: Column,
-                  signal: Signal) -> NDArray[np.float64]:
-        """Return the readings (columns, n) of samples (n,) with these edges [ns before]."""
-        lengths = np.diff(edges)[:, np.newaxis]
-        before = (edges[:-1, np.newaxis] + lengths * self._nodes).ravel()
-        # The signal that was there before t = 0 has the rest of the weight.
-        weights = np.append(
-            1e-9 * (lengths * self._weights).ravel() * self._response(1e-9 * before),
-            self._rest(1e-9 * edges[-1]))
-        back_ns = np.append(np.rint(before), edges[-1]).astype(np.int64)
-        unique, places = np.unique(t_ns - back_ns[:, np.newaxis], return_inverse=True)
+    def _readings(self, trajectory: Trajectory, t_ns: Times, edges: Matrix, signal: Signal,
+                  ) -> Matrix:
+        """Return the readings (columns, n) of samples (n,); `edges` of panels are [ns before]."""
+        oldest_ns = np.minimum(t_ns, self.memory_ns)
+        starts = trajectory.starts(int(t_ns[0]) - self.memory_ns, int(t_ns[-1]))
+        # Each sample has panels of its own, which end where pieces do; empty ones have no weight.
+        edges = np.vstack((np.repeat(edges, len(t_ns), axis=1),
+                           *(t_ns - start_ns for start_ns in starts)))
+        edges = np.sort(np.clip(edges, 0.0, oldest_ns), axis=0)
+        lengths = np.diff(edges, axis=0)[:, np.newaxis]
+        before = edges[:-1, np.newaxis] + lengths * self._nodes
+        weights = 1e-9 * (lengths * self._weights) * self._response(1e-9 * before)
+        back_ns = np.vstack((np.rint(before).reshape(-1, len(t_ns)), oldest_ns)).astype(np.int64)
+        unique, places = np.unique(t_ns - back_ns, return_inverse=True)
         values = np.stack(np.broadcast_arrays(*signal(trajectory.evaluate(unique)), unique)[:-1])
-        values = values[:, places.reshape(len(back_ns), -1)]
+        values = values[:, places.reshape(back_ns.shape)]
+        # The signal that was there before t = 0 has the rest of the weight.
+        weights = np.vstack((weights.reshape(-1, len(t_ns)), self._rest(1e-9 * oldest_ns)))
         total = np.zeros_like(values[:, 0])
         for node, weight in enumerate(weights):     # in one order, however many there are
             total += weight * values[:, node]
@@ -101,11 +95,11 @@ class LowPass:
         fade = self._decay * np.exp(-angle)
         return fade if self._order == 1 else 2.0 * fade * np.sin(angle)
 
-    def _rest(self, seconds: float) -> float:
+    def _rest(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the integral of the impulse response from a time on."""
         angle = self._decay * seconds
-        fade = math.exp(-angle)
-        return fade if self._order == 1 else fade * (math.cos(angle) + math.sin(angle))
+        fade = np.exp(-angle)
+        return fade if self._order == 1 else fade * (np.cos(angle) + np.sin(angle))
 
 
 class Vibration:
