@@ -93,10 +93,10 @@ def by_topic(taken):
 
 def at_once(simulation, until_ns):
     """Nothing is forgotten, either."""
-    block = simulation.block(simulation.channels, simulation.now_ns, until_ns)
-    assert block.until_ns == until_ns
+    assert simulation.reach(simulation.now_ns, until_ns) == until_ns
+    messages = simulation.messages(simulation.channels, simulation.now_ns, until_ns)
     simulation.now_ns = until_ns
-    return entries(simulation, block)
+    return entries(simulation, messages)
 
 
 def in_pieces(dice):

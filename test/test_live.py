@@ -22,7 +22,7 @@ from helpers.simulations import (
 
 from spinning_top_sim import solve
 from spinning_top_sim.solvers import dormand_prince
-from spinning_top_sim.streams import live, parameters
+from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.live import LiveSimulation
 
@@ -130,9 +130,9 @@ def test_each_sample_is_computed_once_for_all_and_what_nobody_takes_is_not(monke
     assert [data for _, data in published] == poses
     counts = total(encoded)
     assert counts.keys() == {'pose', 'joint_states', '/clock'}
-    assert max(count for _, count in encoded) <= live.MOST_SAMPLES
-    assert counts['pose'] == counts['/clock'] <= 1001 + live.MOST_SAMPLES
-    assert counts['joint_states'] <= 501 + live.MOST_SAMPLES
+    assert max(count for _, count in encoded) <= 301
+    assert counts['pose'] == counts['/clock'] <= 1001 + 301
+    assert counts['joint_states'] <= 501 + 151
 
 
 @pytest.mark.parametrize(('before', 'after'), [(100.0, 33.0), (10000.0, 10.0)])

@@ -8,6 +8,7 @@ ahead, and wait as rows.  An event, another rate or another listener drops what 
 
 import contextlib
 import time
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import repeat
@@ -24,11 +25,9 @@ from spinning_top_sim.streams.events import MOTIONS, Event
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.times import NEVER_NS, Times
 
-MOST_SAMPLES, MOST_BYTES = 256, 4 << 20     # of a channel that are computed together
 # What is computed at once: little behind an event, as the next one may come soon.
 FIRST_SPAN_NS, LONGEST_SPAN_NS = 20_000_000, 300_000_000
 FIRST_STRIDE_NS = 1_000     # of the motion, whose pace is not known before it is tried
-GROWTH = 16.0               # a span is at most this many times the one before
 PIECE_SECONDS = 1e-2        # of computing between two calls of give_way, half of it for the solver
 BLOCKED_SECONDS = 1.0       # a reader that stalls holds every call for 0.1 s: it gets a rest
 
@@ -55,9 +54,10 @@ class Output:
     sent: int = 0
     skipped: int = 0
     failed: int = 0
-    # What waits to be sent: times [ns] and messages.
-    _t_ns: Times = field(default_factory=lambda: np.empty(0, np.int64))
+    # Times [ns] and messages of which the first ones are sent, and how many.
+    _times: list[int] = field(default_factory=list)
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
+    _taken: int = 0
     _blocked_until: float = 0.0     # on the clock
 
     @property
@@ -67,19 +67,15 @@ class Output:
 
     def add(self, t_ns: Times, rows: Rows) -> None:
         """Put messages behind those that wait."""
-        if len(self._t_ns):
-            t_ns, rows = np.concatenate((self._t_ns, t_ns)), np.concatenate((self._rows, rows))
-        self._t_ns, self._rows = t_ns, rows
+        waiting = self._times[self._taken:]
+        if waiting:
+            rows = np.concatenate((self._rows[self._taken:], rows))
+        self._times, self._rows, self._taken = waiting + t_ns.tolist(), rows, 0
 
-    def is_due(self, until_ns: int) -> bool:
-        return len(self._t_ns) > 0 and bool(self._t_ns[0] <= until_ns)
-
-    def take(self, until_ns: int) -> tuple[Times, Rows]:
-        """Return what waits up to a time, which waits no longer."""
-        count = int(self._t_ns.searchsorted(until_ns, 'right'))
-        taken = self._t_ns[:count], self._rows[:count]
-        self._t_ns, self._rows = self._t_ns[count:], self._rows[count:]
-        return taken
+    def take(self, until_ns: int) -> tuple[list[int], Rows]:
+        """Return what waits up to a time [ns], which waits no longer."""
+        begin, self._taken = self._taken, bisect_right(self._times, until_ns, self._taken)
+        return self._times[begin:self._taken], self._rows[begin:self._taken]
 
     def send(self, message: bytes) -> None:
         """Publish a message; what the middleware refuses is counted."""
@@ -101,14 +97,7 @@ class _Group:
 
     outputs: Mapping[Channel, Output]
     computed_ns: int
-    span_ns: int = 0        # that can be computed in the time that a call may take
-
-    @property
-    def piece_ns(self) -> int:
-        """How much is computed at once [ns]."""
-        return min([max(self.span_ns, FIRST_SPAN_NS if self.outputs else FIRST_STRIDE_NS), *(
-            max(1, min(MOST_SAMPLES, MOST_BYTES // len(one.encoder))) * one.period_ns
-            for one in self.outputs)])
+    span_ns: int            # that is computed at once
 
 
 class LiveSimulation(Simulation):
@@ -125,9 +114,8 @@ class LiveSimulation(Simulation):
         self.outputs = [Output(channel, clock=clock) for channel in self.channels]
         self._clock = clock
         self._write: Callable[[Sequence[LogRows]], object] = lambda rows: None
-        self._motion = _Group({}, self.now_ns)
-        self._groups: list[_Group] = []             # of what is used
-        self._used: list[tuple[int, Output]] = []   # with their numbers
+        self._motion = _Group({}, self.now_ns, FIRST_STRIDE_NS)
+        self.refresh()
 
     def log_to(self, write: Callable[[Sequence[LogRows]], object] | None,
                channels: Sequence[Channel] = ()) -> None:
@@ -145,19 +133,26 @@ class LiveSimulation(Simulation):
         for output, channel in zip(self.outputs, self.channels, strict=True):
             output.channel = channel
         if event.begins_motion or kind == 'reset':
-            self._motion = _Group({}, self.now_ns)
+            self._motion = _Group({}, self.now_ns, FIRST_STRIDE_NS)
         self.refresh()
         return event
 
     def refresh(self) -> None:
         """Compute anew what waits: the motion, or who takes the messages, has changed."""
+        # Those that are used, with their numbers.
         self._used = [(number, output) for number, output in enumerate(self.outputs)
                       if output.is_used]
         grids: dict[tuple[int, int], dict[Channel, Output]] = {}
         for _, output in self._used:
             output.take(NEVER_NS)
             grids.setdefault(output.channel.grid, {})[output.channel] = output
-        self._groups = [_Group(outputs, self.now_ns) for outputs in grids.values()]
+        self._groups = [_Group(outputs, self.now_ns, FIRST_SPAN_NS)
+                        for outputs in grids.values()]
+
+    @property
+    def _ready_ns(self) -> int:
+        """Time up to which all messages are sent or wait [ns]."""
+        return min(group.computed_ns for group in self._groups or [self._motion])
 
     @property
     def lowest_imu_rate(self) -> float:
@@ -180,22 +175,17 @@ class LiveSimulation(Simulation):
             if self._ready_ns < due_ns:
                 # No further than is computed next: a solver keeps a limited number of steps.
                 self._go_on(self._groups, min([due_ns, *(
-                    one.computed_ns + one.piece_ns for one in self._groups)]), PIECE_SECONDS)
+                    one.computed_ns + one.span_ns for one in self._groups)]), PIECE_SECONDS)
             self._send(min(due_ns, self._ready_ns), publish_from_ns)
             if self.now_ns < due_ns and give_way():
                 return False
         return True
 
-    @property
-    def _ready_ns(self) -> int:
-        """Time up to which all messages are sent or wait [ns]."""
-        return min((group.computed_ns for group in self._groups), default=self._motion.computed_ns)
-
     def look_ahead(self, until_ns: int, seconds: float) -> None:
         """Compute some of what is due up to a time, for one grid; it may take so long."""
-        behind = min(self._groups, key=attrgetter('computed_ns'), default=self._motion)
-        if behind is not self._motion and behind.computed_ns < until_ns:
-            span_ns = min(behind.piece_ns, LONGEST_SPAN_NS)
+        if self._groups and self._ready_ns < until_ns:
+            behind = min(self._groups, key=attrgetter('computed_ns'))
+            span_ns = min(behind.span_ns, LONGEST_SPAN_NS)
             with contextlib.suppress(IntegrationError):     # `send` meets it in time
                 self._go_on([behind], behind.computed_ns + span_ns, seconds)
 
@@ -214,30 +204,29 @@ class LiveSimulation(Simulation):
         """Compute the messages of a group up to a time, or for about so long."""
         now = begin = self._clock()
         while group.computed_ns < until_ns and now < begin + seconds:
-            goal_ns = min(until_ns, group.computed_ns + group.piece_ns)
-            block = self.block([*group.outputs], group.computed_ns, goal_ns)
-            for channel, t_ns, rows in block.messages:
+            goal_ns = min(until_ns, group.computed_ns + group.span_ns)
+            if group is self._motion:
+                goal_ns = self.reach(group.computed_ns, goal_ns)
+            for channel, t_ns, rows in self.messages(group.outputs, group.computed_ns, goal_ns):
                 group.outputs[channel].add(t_ns, rows)
-            done_ns, called = block.until_ns - group.computed_ns, now
-            group.computed_ns, now = block.until_ns, self._clock()
-            room = 0.5 * seconds / max(now - called, 1e-6)
-            group.span_ns = max(int(done_ns * min(room, GROWTH)),
-                                0 if room < 1.0 else group.span_ns)
+            done_ns, called = goal_ns - group.computed_ns, now
+            group.computed_ns, now = goal_ns, self._clock()
+            # Where it took too long, the next piece is a half of it, else up to twice as long.
+            group.span_ns = (max(1, done_ns // 2) if now - called > 0.5 * seconds
+                             else max(group.span_ns, 2 * done_ns))
 
     def _send(self, until_ns: int, publish_from_ns: int) -> None:
         """Send what waits up to a time, to the log before others."""
         logged: list[LogRows] = []
         due: list[tuple[int, int, NDArray[np.uint8]]] = []
         for number, output in self._used:
-            if not output.is_due(until_ns):
-                continue
-            t_ns, rows = output.take(until_ns)
-            if output.log_index is not None:
-                logged.append((output.log_index, self.epoch_ns + t_ns, rows))
+            times, rows = output.take(until_ns)
+            if times and output.log_index is not None:
+                logged.append((output.log_index, self.epoch_ns + np.array(times), rows))
             if output.publish is not None:
-                late = int(t_ns.searchsorted(publish_from_ns))
+                late = bisect_left(times, publish_from_ns)
                 output.skipped += late
-                due += zip(t_ns[late:].tolist(), repeat(number), rows[late:])
+                due += zip(times[late:], repeat(number), rows[late:])
         if logged:
             self._write(logged)
         self.now_ns = until_ns

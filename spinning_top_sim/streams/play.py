@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run: parameters, motion and events, and the one place where its messages are computed."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -123,13 +123,11 @@ class Simulation:
         now_ns = max(self.now_ns, 0)
         return self.trajectory.after(now_ns).states(np.array([now_ns]))
 
-    def block(self, channels: Sequence[Channel], after_ns: int, until_ns: int) -> Block:
+    def reach(self, after_ns: int, until_ns: int) -> int:
         """
-        Return the messages of channels that are due after one time and up to another.
+        Return how far motion and stamps go beyond one time, at most to another.
 
-        A message depends on the parameters, the events and its own time alone, never on the block
-        that it is computed in.  A block ends with the motion; if the motion does not go on at all,
-        this raises IntegrationError.
+        Raises IntegrationError if they do not go on at all.
         """
         last_ns = LAST_STAMP_NS - self.epoch_ns
         if last_ns <= after_ns:
@@ -141,18 +139,29 @@ class Simulation:
         except IntegrationError as error:
             if error.reached_ns <= after_ns:
                 raise
-            until_ns = error.reached_ns
+            return error.reached_ns
+        return until_ns
+
+    def messages(self, channels: Iterable[Channel], after_ns: int, until_ns: int,
+                 ) -> list[Messages]:
+        """
+        Return the messages that are due after one time and up to another, of which it is known
+        that the motion reaches it.
+
+        A message depends on the parameters, the events and its own time alone, never on those
+        that it is computed with.
+        """
         samples: dict[tuple[int, int], Samples] = {}
-        messages: list[Messages] = []
+        found: list[Messages] = []
         for channel in channels:
             if channel.grid not in samples:
                 samples[channel.grid] = Samples(
                     self.trajectory, self.imu, channel.times(after_ns, until_ns), self.epoch_ns)
             if samples[channel.grid].times:
                 t_ns, rows = channel.encode(samples[channel.grid])
-                if len(t_ns):           # a sensor may lose all samples of a block
-                    messages.append((channel, t_ns, rows))
-        return Block(until_ns, messages)
+                if len(t_ns):           # a sensor may lose all samples
+                    found.append((channel, t_ns, rows))
+        return found
 
     def play(self, channels: Sequence[Channel], until_ns: int) -> Iterator[Block]:
         """
@@ -164,9 +173,10 @@ class Simulation:
         span_ns = max(1, int(BLOCK_BYTES / max(per_ns, BLOCK_BYTES / LONGEST_BLOCK_NS)),
                       (until_ns - self.now_ns) // MOST_BLOCKS)
         while self.now_ns < until_ns:
-            block = self.block(channels, self.now_ns, min(until_ns, self.now_ns + span_ns))
-            self.now_ns = block.until_ns
-            yield block
+            end_ns = self.reach(self.now_ns, min(until_ns, self.now_ns + span_ns))
+            messages = self.messages(channels, self.now_ns, end_ns)
+            self.now_ns = end_ns
+            yield Block(end_ns, messages)
             self.forget()
 
     def forget(self) -> None:

@@ -51,12 +51,12 @@ def play(simulation, until_ns, *topics):
     """Return what is sent offline, in the order of blocks: [(topic, stamp_ns, bytes)]."""
     channels = [one for one in simulation.channels if not topics or one.topic in topics]
     return [entry for block in simulation.play(channels, until_ns)
-            for entry in entries(simulation, block)]
+            for entry in entries(simulation, block.messages)]
 
 
-def entries(simulation, block):
+def entries(simulation, messages):
     return [(one.topic, simulation.epoch_ns + t_ns, row.tobytes())
-            for one, times_ns, rows in block.messages
+            for one, times_ns, rows in messages
             for t_ns, row in zip(times_ns.tolist(), rows, strict=True)]
 
 
