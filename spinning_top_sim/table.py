@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The columns of a table of true states, and CSV; numbers are read back to the last bit."""
+"""Tables of true states, as CSV and Parquet; numbers are read back to the last bit."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.files import new_file
+from spinning_top_sim.installation import needed
 
 FilePath = str | Path
 
@@ -38,3 +39,17 @@ def write_csv(path: FilePath, blocks: Iterable[NDArray[np.float64]],
         for rows in blocks:
             # csv.writer looks for what to quote in every number, and takes a third longer.
             file.writelines(','.join(map(repr, row)) + '\n' for row in rows.tolist())
+
+
+def write_parquet(path: FilePath, blocks: Iterable[NDArray[np.float64]],
+                  units: Mapping[str, str]) -> None:
+    """Write a Parquet file.  Raises ImportError, and makes no file, without pyarrow."""
+    with needed('a Parquet file', 'parquet'):
+        import pyarrow as pa  # noqa: PLC0415
+        from pyarrow import parquet  # noqa: PLC0415
+    schema = pa.schema([pa.field(name, pa.float64(), metadata={'unit': unit})
+                        for name, unit in units.items()])
+    with (new_file(path, 'xb', partial=True) as file,
+          parquet.ParquetWriter(file, schema) as writer):
+        for rows in blocks:
+            writer.write_table(pa.table(list(rows.T), schema=schema))

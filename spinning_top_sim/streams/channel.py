@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,8 @@ from spinning_top_sim.streams.sensor import Errors
 from spinning_top_sim.streams.trajectory import Trajectory, increments_within
 from spinning_top_sim.times import LAST_STAMP_NS, Times, ns_array
 
-# Messages as rows (n, size): bytes or, of a table, numbers.
-Rows = NDArray[Any]
+# Messages as rows (n, size).
+Rows = NDArray[np.uint8]
 # A channel, times (n,) at which its messages are due [ns], and these.
 Messages = tuple['Channel', Times, Rows]
 # Returns how late the stamps of samples at times (n,) are [ns], and how often each is sent.
@@ -141,13 +140,6 @@ class Samples:
         return integrals.joined(found)
 
 
-class Encoder(Protocol):
-    """Makes rows of stamps (n,) [ns] and fields; its length is the size of a row [bytes]."""
-
-    def __len__(self) -> int: ...
-    def encode(self, stamps_ns: Times, fields: Sequence[Values]) -> Rows: ...
-
-
 @dataclass(frozen=True, eq=False)
 class Channel:
     """
@@ -156,8 +148,8 @@ class Channel:
     name : prefix of its parameters; several channels may have one
     topic, type_name : such as 'imu/data_raw' and 'sensor_msgs/msg/Imu'
     period_ns : time between two samples [ns]
-    encoder : of its messages
-    fields : returns the numbers that go into the fields of `encoder`
+    template : of its messages
+    fields : returns the numbers that go into the fields of `template`
     faults : of stamps, and losses; None: every sample is sent once, with its time
     delay_ns : time from a sample to its message [ns]
     """
@@ -166,16 +158,10 @@ class Channel:
     topic: str
     type_name: str
     period_ns: int
-    encoder: Encoder
+    template: Template
     fields: Callable[[Samples], Sequence[Values]]
     faults: Faults | None = None
     delay_ns: int = 0
-
-    @property
-    def template(self) -> Template:
-        """The encoder of a channel of messages."""
-        assert isinstance(self.encoder, Template)
-        return self.encoder
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -191,7 +177,7 @@ class Channel:
         """Return when the messages (n,) of samples are due [ns], and these as rows (n, size)."""
         late_ns, copies = self.faults(samples.t_ns) if self.faults else (0, 1)
         try:
-            rows = self.encoder.encode(samples.stamps(late_ns), self.fields(samples))
+            rows = self.template.encode(samples.stamps(late_ns), self.fields(samples))
         except ValueError as error:
             raise ValueError(f'fields of {self.topic}: {error}') from error
         due_ns = samples.t_ns + self.delay_ns

@@ -47,7 +47,7 @@ def channels(values: Mapping[str, Any]) -> list[Channel]:
                     np.where(out[:, np.newaxis], 0.0, variances),
                     [np.where(out, UNKNOWN, DIAGONAL_KNOWN)])
 
-        return channel(topic, 'sensor_msgs/msg/NavSatFix', fields=fields, encoder=message(
+        return channel(topic, 'sensor_msgs/msg/NavSatFix', fields=fields, template=message(
             Header(values['body_frame']), Field('status.status', 1, 'b'), Numbers('H', (1,)),
             Field('position', 3), Field('position_covariance', 9),
             Field('position_covariance_type', 1, 'B')), **more)
@@ -55,7 +55,7 @@ def channels(values: Mapping[str, Any]) -> list[Channel]:
     def velocity(topic: str, deviations: Deviations, **more: Any) -> Channel:
         covariance = messages.diagonal(*(one ** 2 for one in deviations), *3 * (-1.0,))
         return channel(
-            topic, 'geometry_msgs/msg/TwistWithCovarianceStamped', encoder=message(
+            topic, 'geometry_msgs/msg/TwistWithCovarianceStamped', template=message(
                 Header(values['world_frame']), Field('twist.twist.linear', 3),
                 Numbers('d', (*messages.ORIGIN, *covariance))),
             fields=lambda samples: [list(_measured(

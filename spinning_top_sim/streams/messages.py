@@ -98,7 +98,12 @@ class Template:
         rows = np.frombuffer(bytearray(len(stamps_ns) * self.data), self._row_type)
         for name in self._stamps:
             rows[name]['sec'], rows[name]['nanosec'] = np.divmod(stamps_ns, NANOSECONDS)
-        fill([rows[field.name] for field in self.fields], fields)
+        for field, numbers in zip(self.fields, fields, strict=True):
+            if isinstance(numbers, np.ndarray):
+                rows[field.name] = numbers
+            else:
+                for column, given in zip(rows[field.name].T, numbers, strict=True):
+                    column[:] = given
         return rows.view(np.uint8).reshape(len(stamps_ns), len(self))
 
     def encode_one(self, stamp_ns: int, *fields: Values) -> bytes:
@@ -140,16 +145,6 @@ def _append_text(buffer: bytearray, text: str) -> None:
     data = text.encode() + b'\0'
     _append(buffer, 'I', (len(data),))
     buffer += data
-
-
-def fill(rows: Sequence[NDArray[Any]], fields: Sequence[Values]) -> None:
-    """Fill fields (n, count) from those of n messages."""
-    for row, field in zip(rows, fields, strict=True):
-        if isinstance(field, np.ndarray):
-            row[:] = field
-        else:
-            for column, numbers in zip(row.T, field, strict=True):
-                column[:] = numbers
 
 
 def diagonal(*variances: float) -> tuple[float, ...]:

@@ -169,7 +169,7 @@ class Simulation:
 
         Raises IntegrationError behind the last block if the motion does not go on.
         """
-        per_ns = sum(len(channel.encoder) / channel.period_ns for channel in channels)
+        per_ns = sum(len(channel.template) / channel.period_ns for channel in channels)
         span_ns = max(1, int(BLOCK_BYTES / max(per_ns, BLOCK_BYTES / LONGEST_BLOCK_NS)),
                       (until_ns - self.now_ns) // MOST_BLOCKS)
         while self.now_ns < until_ns:

@@ -82,13 +82,13 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
     """
     world, body, frame = values['world_frame'], values['body_frame'], values['imu.frame_id']
 
-    def channel(name: str, topic: str, type_name: str, encoder: Template,
+    def channel(name: str, topic: str, type_name: str, template: Template,
                 fields: Callable[[Samples], Sequence[Values]] = lambda _: (),
                 rate: str = '', timed: bool = False) -> Channel:
         """Return a channel; one that is `timed` has the stamps and the losses of the IMU."""
         period = period_ns(values[rate or f'{name}.rate'])
         timing = Timing(values, period) if timed else None
-        return Channel(name, topic, type_name, period, encoder, fields,
+        return Channel(name, topic, type_name, period, template, fields,
                        None if timing is None or timing.is_right else timing)
 
     # Covariances of angular velocity, specific force and orientation.

@@ -10,7 +10,6 @@ import itertools
 import json
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,12 +21,11 @@ from numpy.typing import NDArray
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import reason_of
 from spinning_top_sim.streams import messages
-from spinning_top_sim.streams.channel import Channel, Rows
+from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.streams.topics import ARRAY, JOINTS, recorded
 from spinning_top_sim.times import NANOSECONDS, Times
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
-from spinning_top_sim.tools.table import Columns
 
 if TYPE_CHECKING:
     import pyarrow
@@ -71,20 +69,15 @@ def samples(specification: Specification, simulation: Simulation) -> Samples:
     have the same columns.  Raises IntegrationError if the motion ends early.
     """
     values = simulation.values
-    names: dict[str, list[str]] = {}
-    tables: list[Channel] = []
-    for channel in simulation.channels:
-        if channel.name in specification.kept:
-            names[channel.topic] = _column_names(channel)
-            tables.append(replace(channel, encoder=Columns(
-                [field.size for field in channel.template.fields])))
+    kept = [channel for channel in simulation.channels if channel.name in specification.kept]
+    names = {channel.topic: _column_names(channel) for channel in kept}
     times: dict[str, list[Times]] = {topic: [] for topic in names}
-    numbers: dict[str, list[Rows]] = {topic: [] for topic in names}
-    for block in simulation.play(recorded(tables, values),
+    numbers: dict[str, list[NDArray[np.float64]]] = {topic: [] for topic in names}
+    for block in simulation.play(recorded(kept, values),
                                  round(values['duration'] * NANOSECONDS)):
         for channel, times_ns, rows in block.messages:
             times[channel.topic].append(times_ns)
-            numbers[channel.topic].append(rows.T)
+            numbers[channel.topic].append(np.hstack(channel.template.decode(rows)).T)
     every_ns = np.sort(_joined([*itertools.chain(*times.values())], 0, np.int64), kind='stable')
     rows_ns = every_ns[np.diff(every_ns, prepend=-1) > 0]
     columns = {'t': (rows_ns / NANOSECONDS, np.zeros(len(rows_ns), bool))}

@@ -26,13 +26,13 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.events import Event
+from spinning_top_sim.streams.messages import Field, Template
 from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.streams.topics import recorded, resolve_topic
-from spinning_top_sim.table import RIDE_UNITS, UNITS, write_csv
+from spinning_top_sim.table import RIDE_UNITS, UNITS, columns, write_csv, write_parquet
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, period_ns
 from spinning_top_sim.tools import cli, log_exports, scene_file
 from spinning_top_sim.tools.recorded_run import read_run_description
-from spinning_top_sim.tools.table import true_states, write_parquet
 
 FORMATS = ('mcap', 'csv', 'parquet')
 
@@ -98,11 +98,14 @@ def _write_table(path: Path, file_format: str, simulation: Simulation, stops: Se
                  show: Callable[[float], object]) -> Mapping[str, str]:
     """Write a table; return the units of its columns."""
     pivot_moves = simulation.trajectory.pivot is not None
-    table = true_states(period_ns(simulation.values['pose.rate']), pivot_moves=pivot_moves)
     units = RIDE_UNITS if pivot_moves else UNITS
+    row = Template(Field('row', len(units)))
+    table = Channel('table', '', '', period_ns(simulation.values['pose.rate']), row,
+                    lambda samples: [columns(samples.t_ns / NANOSECONDS, samples.states,
+                                             pivot_moves=pivot_moves)])
     write = write_csv if file_format == 'csv' else write_parquet
     # A command changes the rows after its time.
-    write(path, (rows for done in _play(simulation, [table], stops, show)
+    write(path, (row.decode(rows)[0] for done in _play(simulation, [table], stops, show)
                  if isinstance(done, Block) for _, _, rows in done.messages), units)
     return units
 
