@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-# PYTHON_ARGCOMPLETE_OK
 """The command `spinning-top`, which is `python -m spinning_top_sim` as well."""
 
 import argparse
@@ -8,11 +7,10 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from types import ModuleType
 
 from spinning_top_sim.installation import needed
 
-# Name: the module with its `main` and `add_arguments`, and what it does.
+# Name: the module with its `main`, and what it does.
 COMMANDS = {
     'node': ('nodes.sim_node', 'simulate a top in real time as a ROS 2 node'),
     'replay': ('nodes.replay_node', 'publish the messages of a log as a ROS 2 node'),
@@ -31,8 +29,6 @@ INTERRUPTED = 130
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, by default the program's; return its exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if '_ARGCOMPLETE' in os.environ:
-        _complete()
     # Ctrl-C ends it at once during imports, where a KeyboardInterrupt may be lost.
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:        # not where it is ignored
@@ -45,17 +41,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             # OpenBLAS starts no threads: nothing here multiplies large matrices.
             os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
         with needed('it'):
-            command: Callable[[Sequence[str]], int] = _module(name).main
+            command: Callable[[Sequence[str]], int] = import_module(
+                f'spinning_top_sim.{COMMANDS[name][0]}').main
     except ImportError as error:
         print(f'spinning-top {name}: {error}', file=sys.stderr)
         return 1
     finally:
         signal.signal(signal.SIGINT, before)
     return command(argv[1:])
-
-
-def _module(name: str) -> ModuleType:
-    return import_module(f'spinning_top_sim.{COMMANDS[name][0]}')
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -67,18 +60,6 @@ def _parser() -> argparse.ArgumentParser:
     for name, (_, what) in COMMANDS.items():
         commands.add_parser(name, help=what, add_help=False)
     return parser
-
-
-def _complete() -> None:
-    """Print what completes the command line in COMP_LINE, and exit."""
-    import argcomplete  # noqa: PLC0415
-    parser = argparse.ArgumentParser()
-    commands = parser.add_subparsers()
-    for name in COMMANDS:
-        options = commands.add_parser(name)
-        if name in os.environ.get('COMP_LINE', '').split():
-            _module(name).add_arguments(options)
-    argcomplete.autocomplete(parser)
 
 
 if __name__ == '__main__':

@@ -52,12 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _interface() -> Iterator[str]:
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
-    from spinning_top_sim.tools import scene_file  # noqa: PLC0415
     yield INTERFACE
     for text in parameters.STREAMS.values():
         yield textwrap.fill(text, 78, initial_indent='  ', subsequent_indent=6 * ' ')
-    yield 'Parameters used most, with their defaults (--help-parameters lists all):'
-    yield scene_file.most_used()
+    yield 'Parameters: see --help-parameters.'
 
 
 def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:

@@ -23,10 +23,6 @@ NODE = '/spinning_top'      # the full name of the node where no other is asked 
 # Parameters that rclpy declares for every node, and those that it declares for publishers.
 OF_RCLPY = 'use_sim_time', 'start_type_description_service'
 ROS_PARAMETERS = (*OF_RCLPY, 'qos_overrides')
-# What most people need first: help shows these, and --help-parameters the others too.
-MOST_USED = ('top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'initial.theta',
-             'spin.l3', 'spin.lz', 'solver.method', 'duration', 'time_scale', 'seed',
-             'record.enabled', 'record.uri')
 
 
 class _Loader(yaml.SafeLoader):
@@ -87,33 +83,16 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
 class _ListParameters(argparse.Action):
     def __call__(self, *_: object) -> NoReturn:
         with cli.reader_may_end():
-            print('Most used:')
-            for name in MOST_USED:
-                print(_described(name))
-            print('\nOthers:')
-            for name in parameters.BY_NAME:
-                if name not in MOST_USED:
-                    print(_described(name))
+            for parameter in parameters.TABLE:
+                print(f'{parameter.name}  (default {default_text(parameter.name)})')
+                print(textwrap.indent(textwrap.fill(parameter.describe(), 74), 6 * ' '))
         raise SystemExit(cli.OK)
-
-
-def _described(name: str) -> str:
-    parameter = parameters.BY_NAME[name]
-    return f'  {name}  (default {default_text(name)})\n' + textwrap.indent(
-        textwrap.fill(parameter.describe(), 74), 6 * ' ')
 
 
 def default_text(name: str) -> object:
     """Return the default of a parameter as it is shown."""
     default = parameters.BY_NAME[name].default
     return 'unset' if default is None else list(default) if isinstance(default, tuple) else default
-
-
-def most_used() -> str:
-    """Return a line for each of the parameters that most people need first."""
-    return '\n'.join(textwrap.fill(
-        f'{name} ({default_text(name)}): {parameters.BY_NAME[name].text.partition(";")[0]}', 78,
-        initial_indent='  ', subsequent_indent=6 * ' ') for name in MOST_USED)
 
 
 def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = False,

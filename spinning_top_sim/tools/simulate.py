@@ -89,8 +89,6 @@ def _run(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         for line in lines:
             cli.print_line(line)
-        if file_format == 'mcap':
-            cli.print_line(f'next: spinning-top inspect {output}', sys.stderr)
     return cli.OK
 
 
