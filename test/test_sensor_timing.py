@@ -14,50 +14,26 @@ from spinning_top_sim.streams.sensor import Timing
 FAULTS = {'imu.stamp_offset': -0.02, 'imu.stamp_jitter': 3e-4, 'imu.clock_drift': 200.0,
           'imu.drop_rate': 0.1, 'imu.duplicate_rate': 0.05}
 PERIOD_NS = 5_000_000
-LABELS, RAW = 'ground_truth/imu_timing', 'imu/data_raw'
 
 
-def labels(found):
-    """Return stamps and true times [ns], and copies, of ground_truth/imu_timing."""
-    *_, rows = found[LABELS]
-    whole = rows.astype(np.int64)
-    assert np.array_equal(whole, rows)
-    return whole[:, 0] * SECOND + whole[:, 1], whole[:, 2] * SECOND + whole[:, 3], whole[:, 4]
-
-
-@pytest.fixture(scope='module')
-def found():
-    """Return what is sent in 30 s: {topic: (times, stamps, *fields)}."""
-    return run({**FAULTS, 'imu.gyroscope_noise_density': 1e-3, 'solver.method': 'exact'},
-               30 * SECOND, LABELS, RAW, 'imu/data', 'ground_truth/imu')[1]
-
-
-def test_each_message_is_labelled_with_its_true_time(found):
-    stamps, true, copies = labels(found)
+def test_each_message_is_labelled_with_its_true_time():
+    _, found = run({**FAULTS, 'solver.method': 'exact'}, 30 * SECOND, 'ground_truth/imu_timing',
+                   'imu/data_raw', 'imu/data', 'ground_truth/imu')
+    (*_, labels), *sent, (times_ns, true_stamps, *_, exact_rates, _) = found.values()
+    whole = labels.astype(np.int64)
+    assert np.array_equal(whole, labels)
+    stamps, true, copies = (whole[:, 0] * SECOND + whole[:, 1], whole[:, 2] * SECOND + whole[:, 3],
+                            whole[:, 4])
     assert np.array_equal(true, EPOCH_NS + PERIOD_NS * np.arange(6001))
-    assert np.all(np.diff(stamps) > 0)
-    # Stamps and times of all messages, with those lost left out and those repeated twice.
-    for topic in (RAW, 'imu/data'):
-        times_ns, sent_stamps, *_, rates, force = found[topic]
-        assert np.array_equal(sent_stamps, np.repeat(stamps, copies)), topic
-        assert np.array_equal(EPOCH_NS + times_ns, np.repeat(true, copies)), topic
-        twice = np.flatnonzero(np.diff(sent_stamps) == 0)
-        assert len(twice) == np.count_nonzero(copies == 2)
-        for rows in (rates, force):
-            assert np.array_equal(rows[twice], rows[twice + 1])
-    # The values are those of the true time, not of the stamp.
-    times_ns, stamps, *_, rates, _ = found['ground_truth/imu']
-    at = np.searchsorted(times_ns, found[RAW][0])
-    assert np.abs(found[RAW][-2] - rates[at]).max() < 6e-3 * math.sqrt(200.0)
-    # All other topics keep their stamps.
-    assert np.array_equal(stamps, true)
-
-
-def test_offset_drift_and_jitter_are_found_by_a_straight_line(found):
-    stamps, true, _ = labels(found)
+    assert np.array_equal(true, true_stamps) and np.all(np.diff(stamps) > 0)
+    # All messages, with those lost left out and those repeated twice; values are of the true time.
+    for sent_ns, sent_stamps, *_, rates, _ in sent:
+        assert np.array_equal(sent_stamps, np.repeat(stamps, copies))
+        assert np.array_equal(EPOCH_NS + sent_ns, np.repeat(true, copies))
+        assert np.array_equal(rates, exact_rates[np.searchsorted(times_ns, sent_ns)])
+    # Offset and drift by a straight line.
     t = (true - true[0]) * 1e-9
-    regressors = np.stack((np.ones(len(t)), t), axis=1)
-    errors = (stamps - true) * 1e-9
+    regressors, errors = np.stack((np.ones(len(t)), t), axis=1), (stamps - true) * 1e-9
     line, *_ = np.linalg.lstsq(regressors, errors, rcond=None)
     jitter = np.std(errors - regressors @ line)
     deviations = jitter * np.sqrt(np.diag(np.linalg.inv(regressors.T @ regressors)))
@@ -78,7 +54,7 @@ def test_losses_and_repetitions_have_their_rates_and_are_independent():
         assert abs(np.mean(is_it[1:] * is_it[:-1])) < 4.0 * share / math.sqrt(n)
 
 
-@pytest.mark.parametrize(('rate', 'drift'), [(1.0, 1e4), (200.0, -1e4), (10_000.0, 1e4)])
+@pytest.mark.parametrize(('rate', 'drift'), [(1.0, 1e4), (10_000.0, -1e4)])
 def test_no_jitter_puts_a_stamp_before_an_earlier_one(rate, drift):
     period_ns = round(SECOND / rate)
     timing = Timing(parameters.checked({'imu.stamp_jitter': 1.0, 'imu.clock_drift': drift}),
