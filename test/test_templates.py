@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Every template of a message against the serializers of ROS itself (rclpy, Fast DDS) and of rosbags.
-
-The former leaves padding as it finds it in memory, so bytes may differ exactly there: where the
-template has a zero and a change of that byte changes no field.
-"""
+"""Every template of a message: the bytes that rosbags makes, and the fields that rclpy reads."""
 
 import random
 import re
@@ -16,7 +11,7 @@ import pytest
 rclpy = pytest.importorskip('rclpy')
 
 from helpers.simulations import EPOCH_NS, SECOND, play, simulate  # noqa: E402
-from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
+from rclpy.serialization import deserialize_message  # noqa: E402
 from rosbags.typesys import Stores, get_typestore  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from std_msgs.msg import Float64MultiArray, String  # noqa: E402
@@ -25,32 +20,23 @@ from spinning_top_sim.nodes.publishers import message_class  # noqa: E402
 from spinning_top_sim.streams import events, messages  # noqa: E402
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
-STAMPS = (0, 1, SECOND - 1, SECOND, 1_700_000_000 * SECOND + 123_456_789, -1, -SECOND,
-          -2 ** 31 * SECOND, (2 ** 31 - 1) * SECOND + SECOND - 1)
+STAMPS = (0, 1, SECOND - 1, 1_700_000_000 * SECOND + 123_456_789, -1, -2 ** 31 * SECOND,
+          (2 ** 31 - 1) * SECOND + SECOND - 1)
 # What follows a string is aligned by its length: all remainders of 8.
 FRAMES = (*('abcdefghi'[:length] for length in range(1, 10)), 'θ/world', 'x' * 300)
 GEODETIC = ('latitude', 'longitude', 'altitude')
 
 
-def assert_same(ours, message):
-    """Whether `ours` is what ROS makes of `message`: field by field, and byte by byte."""
-    kind = type(message)
-    theirs = bytes(serialize_message(message))
-    assert deserialize_message(ours, kind) == message
-    assert ours[:4] == theirs[:4] == b'\x00\x01\x00\x00'
-    # Behind the message ROS leaves bytes that say nothing: it reserves for the padding before the
-    # elements of a sequence even where there are none, and rounds the whole up to four bytes.
+def read(data, type_name):
+    """Return a message that rosbags, which sets padding to zero, serializes to these bytes."""
+    message = JAZZY.deserialize_cdr(data, type_name)
+    theirs = bytes(JAZZY.serialize_cdr(message, type_name))
     # Ours are whole fours, as everything that has gone through RTPS is.
-    assert -4 < len(theirs) - len(ours) < 12
-    assert len(ours) % 4 == 0 or kind is String
-    assert not any(ours[len(theirs):])
-    assert deserialize_message(theirs[:len(ours)], kind) == message
-    for at, (mine, other) in enumerate(zip(ours, theirs, strict=False)):
-        if mine != other:
-            assert mine == 0, f'byte {at} of {kind.__name__}: {mine} for {other}'
-            flipped = bytearray(ours)
-            flipped[at] = other
-            assert deserialize_message(bytes(flipped), kind) == message, f'byte {at} is no padding'
+    assert theirs == data[:len(theirs)] and not any(data[len(theirs):]), type_name
+    assert len(data) % 4 == 0
+    if type_name.startswith('tf2'):     # its package is no part of the wheels of ROS
+        return message
+    return deserialize_message(data, message_class(type_name))
 
 
 def axes_of(part):
@@ -73,7 +59,7 @@ def numbers_at(message, name):
 
 
 @pytest.mark.parametrize('number', range(len(FRAMES)), ids=FRAMES)
-def test_every_channel_sends_what_ros_serializes_with_its_fields_and_frames(number):
+def test_every_channel_sends_its_fields_and_frames(number):
     frame, stamp_ns = FRAMES[number], STAMPS[number % len(STAMPS)]
     body, imu = f'{frame}_body', f'{frame}_imu'
     children = {'ground_truth/odom': body, 'ground_truth/imu_odom': imu}
@@ -83,13 +69,7 @@ def test_every_channel_sends_what_ros_serializes_with_its_fields_and_frames(numb
         # Numbers that differ from slot to slot, so that no two can be mixed up.
         fields = [[dice.uniform(-10.0, 10.0) if field.code == 'd' else dice.randrange(100)
                    for _ in range(field.size)] for field in one.template.fields]
-        data = one.template.encode_one(stamp_ns, *fields)
-        message = JAZZY.deserialize_cdr(data, one.type_name)
-        theirs = bytes(JAZZY.serialize_cdr(message, one.type_name))
-        assert theirs == data[:len(theirs)] and not any(data[len(theirs):]), one.topic
-        if one.topic != '/tf':              # its package is no part of the wheels of ROS
-            message = deserialize_message(data, message_class(one.type_name))
-            assert_same(data, message)
+        message = read(one.template.encode_one(stamp_ns, *fields), one.type_name)
         for field, given in zip(one.template.fields, fields, strict=True):
             assert numbers_at(message, field.name) == given, (one.topic, field.name)
         header = getattr((message.transforms if one.topic == '/tf' else [message])[0], 'header',
@@ -102,13 +82,8 @@ def test_every_channel_sends_what_ros_serializes_with_its_fields_and_frames(numb
             assert header.frame_id == expected, one.topic
         if one.topic in children:
             assert message.child_frame_id == children[one.topic]
-    assert_same(messages.string(frame), String(data=frame))
-
-
-def test_a_command_is_logged_as_labelled_numbers():
-    data = events.command(1.5, -0.25)
-    message = deserialize_message(data, Float64MultiArray)
-    assert_same(data, message)
+    assert deserialize_message(messages.string(frame), String).data == frame
+    message = deserialize_message(events.command(1.5, -0.25), Float64MultiArray)
     (dimension,) = message.layout.dim
     assert (list(message.data), dimension.label, dimension.size) == ([1.5, -0.25], 'l3,lz', 2)
 

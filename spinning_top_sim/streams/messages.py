@@ -8,7 +8,7 @@ string is its length with the closing NUL, then its bytes; a sequence is the num
 elements, then the elements.  Padding is zero, so that equal messages have equal bytes.
 
 Parts are in the order of the .msg definitions (ROS 2 Jazzy, common_interfaces 5.3), fields have
-the names there; a test compares every template with the serializer of rclpy.
+the names there; a test reads every template with rclpy and rosbags.
 """
 
 import struct

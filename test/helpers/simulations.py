@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulations for tests, what they send, and what that costs."""
+"""Simulations for tests, and what they send."""
 
 import numpy as np
 
@@ -105,15 +105,3 @@ def read(imu, times_ns, exact=STILL):
                                   for axis in kind]) for found in (
                                       imu.read(exact, errors),
                                       [bias for _, bias in errors]))
-
-
-def calls_of(monkeypatch, owner, name, number=lambda *arguments: 1):
-    """Count the calls of a public method: a list of what `number` makes of their arguments."""
-    called, original = [], getattr(owner, name)
-
-    def counted(*arguments, **options):
-        called.append(number(*arguments))
-        return original(*arguments, **options)
-
-    monkeypatch.setattr(owner, name, counted)
-    return called
