@@ -2,39 +2,22 @@
 """
 The messages of simulation_interfaces 2.1 for machines without that package: stand-ins.
 
-They have its fields and constants and check types as rclpy's messages do, but have no type
-support: they cannot be sent.  Where the package is installed, a test compares the two.
+They have its fields and constants, and no others, but no type support: they cannot be sent.  Where
+the package is installed, a test compares the two.
 """
 
-from types import MappingProxyType, ModuleType, SimpleNamespace
+from dataclasses import field, make_dataclass
+from types import ModuleType, SimpleNamespace
 
 from geometry_msgs.msg import Accel, Pose, Twist
 from std_msgs.msg import Header
 
 
-class Message:
-    """fields: by name a type, or a list with the type of the items."""
-
-    fields = MappingProxyType({})
-
-    def __init__(self, **given):
-        for name, kind in self.fields.items():
-            setattr(self, name, given.pop(name) if name in given
-                    else [] if isinstance(kind, list) else kind())
-        assert not given, given
-
-    def __setattr__(self, name, value):
-        kind = self.fields[name]
-        if isinstance(kind, list):
-            assert all(isinstance(item, kind[0]) for item in value), (name, value)
-        else:
-            assert isinstance(value, kind), (name, value)
-            assert kind is not int or (value >= 0 and not isinstance(value, bool)), (name, value)
-        super().__setattr__(name, value)
-
-
 def message(name, fields=None, **constants):
-    return type(name, (Message,), {'fields': fields or {}, **constants})
+    """Return a class; fields are by name a type, or a list with the type of the items."""
+    return make_dataclass(name, [
+        (field_name, object, field(default_factory=list if isinstance(kind, list) else kind))
+        for field_name, kind in (fields or {}).items()], namespace=constants, slots=True)
 
 
 def service(request=None, response=None, *, constants=None, codes=None, result=True):
