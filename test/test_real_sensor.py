@@ -7,29 +7,7 @@ import numpy as np
 import pytest
 from helpers.simulations import MILLISECOND, SECOND, run
 
-# A free top whose attitude turns: its rates and forces are sines of two frequencies at most.
-TURNS = 20.0
-FREE = {'top.com_distance': 0.0, 'top.lambda1': 0.1, 'top.lambda3': 0.2, 'initial.theta': 1.0,
-        'initial.theta_dot': 3.0, 'spin.l3': 0.2 * math.tau * TURNS, 'spin.lz': 0.0,
-        'solver.method': 'exact', 'imu.rate': 1000.0, 'ground_truth_imu.rate': 1000.0}
 STANDING = {'initial.theta': 0.0, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method': 'exact'}
-
-
-@pytest.mark.parametrize(('order', 'corner'), [(1, 20.0), (2, 150.0)])
-def test_gain_and_delay_are_those_of_the_analog_filter(order, corner):
-    """In the transverse rate: a sine at |1 - lambda3/lambda1| omega3, the frequency TURNS."""
-    from scipy import signal  # takes long
-
-    values = {**FREE, 'imu.bandwidth': corner, 'imu.bandwidth_order': order}
-    _, found = run(values, 2 * SECOND, 'imu/data_raw', 'ground_truth/imu')
-    (*_, rates, _), (*_, exact, _) = found.values()
-    read, true = (np.ravel([1.0, 1j] @ part[1000:2000, :2].T) for part in (rates, exact))
-    sense = np.sign(np.angle(true[1:] / true[:-1]).mean())
-    b, a = signal.butter(order, math.tau * corner, analog=True)
-    (expected,) = signal.freqs(b, a, [sense * math.tau * TURNS])[1]
-    # The integral has its nodes at whole nanoseconds.
-    assert np.abs(read / true - expected).max() < 0.5e-9 * math.tau * TURNS
-    assert rates[:, 2] == pytest.approx(exact[:, 2], rel=1e-11)
 
 
 @pytest.mark.parametrize('order', [1, 2])

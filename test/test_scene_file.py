@@ -130,14 +130,24 @@ def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(
 
 
 def test_a_scene_is_the_top_and_the_start_of_its_file(tmp_path):
-    for name in ('cusp', 'wavy', 'sleeping'):
-        values = parameters.checked(read_scene(parameter_files('scene')[name]))
-        expected = parameters.top_of(values), parameters.start_state(values)
-        assert api_scene(name) == expected
-    path = tmp_path / 'mine.yaml'
-    path.write_text('/**: {ros__parameters: {top.mass: 3.0}}')
-    assert api_scene(str(path))[0].mass == 3.0
+    values = parameters.checked(read_scene(parameter_files('scene')['wavy']))
+    assert api_scene('wavy') == (parameters.top_of(values), parameters.start_state(values))
+    assert api_scene(str(scene(tmp_path / 'mine.yaml', **{'top.mass': 3})))[0].mass == 3.0
     for name, told in (('shuttle', 'scene shuttle: its pivot moves'),
                        ('lopping', r'^scene lopping: must be the path of a file, or one of brak')):
         with pytest.raises(ValueError, match=told):
             api_scene(name)
+
+
+def test_a_preset_sets_all_errors_of_an_imu_that_another_sets_and_nothing_else():
+    """So any preset replaces any other, and a scene keeps its motion and its mounting."""
+    given = {name: read_scene(path) for name, path in parameter_files('imu').items()}
+    perfect, magnetic = given.pop('perfect'), given.pop('icm_20948')
+    assert parameters.checked(perfect) == parameters.checked({})
+    assert not perfect.keys() & {'imu.lever_arm', 'imu.rpy', 'imu.rate'} and len(given) > 2
+    for one in given.values():
+        assert one.keys() == given['bmi088'].keys() < magnetic.keys()
+        assert one['mag.enabled'] is False
+        for kind in ('gyroscope', 'accelerometer'):     # what 16 bits hold
+            assert one[f'imu.{kind}_range'] <= 32767.5 * one[f'imu.{kind}_resolution']
+    assert magnetic.keys() - {'mag.enabled', 'mag.rate'} < perfect.keys()
