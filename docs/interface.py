@@ -36,8 +36,7 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
 - `joint_states`: {joints}: φ, θ, ψ [rad] and their rates [rad/s]. The angles are
   unwrapped while the pivot rests; once it has moved, θ is in [0, π] and φ and ψ may jump by whole turns.
 - `imu/data_raw` (REP-145): angular velocity [rad/s] and specific force [m/s²] in `imu.frame_id`, +g
-  upwards at rest; `orientation_covariance[0]` = −1, because it has no orientation. With
-  `increments.enabled`, or `imu.sampling` = mean, `imu.rate` must be at least {slowest:g}.
+  upwards at rest; `orientation_covariance[0]` = −1, because it has no orientation.
 - `imu/data`: the same with the orientation of the IMU in the world. There is one IMU, which takes a
   sample every 1/`imu.rate`: at other rates a reading has the white noise of the newest sample.
   [sensor.md](sensor.md) has the errors of all sensors.
@@ -175,7 +174,6 @@ def page() -> str:
         return ', '.join(f'`{name}`' for name in names)
 
     lines.append(AFTER_TOPICS.format(
-        slowest=parameters.LOWEST_RATE_OF_INTERVALS,
         jump=JUMP_NS / NANOSECONDS, states=listed(state.name.lower() for state in LoopState), joints=listed(JOINTS),
         invariants=listed(INVARIANTS), timing=listed(TIMING)))
     for parameter in parameters.TABLE:

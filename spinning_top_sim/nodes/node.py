@@ -254,10 +254,6 @@ class Simulator(Node):
             raise ValueError('clock.enabled = True: must be false while this node follows another '
                              '/clock (use_sim_time)')
         self._topics.check(values)
-        lowest = self.simulation.lowest_imu_rate
-        if values['imu.rate'] < lowest:
-            raise ValueError(f'imu.rate = {values["imu.rate"]!r}: must be >= {lowest:g} while '
-                             'means or increments are taken, published or recorded')
 
     def _show_status(self, values: Mapping[str, Any]) -> None:
         self._every('status', values['status_period'],

@@ -176,10 +176,7 @@ class Channel:
     def encode(self, samples: Samples) -> tuple[Times, Rows]:
         """Return when the messages (n,) of samples are due [ns], and these as rows (n, size)."""
         late_ns, copies = self.faults(samples.t_ns) if self.faults else (0, 1)
-        try:
-            rows = self.template.encode(samples.stamps(late_ns), self.fields(samples))
-        except ValueError as error:
-            raise ValueError(f'fields of {self.topic}: {error}') from error
+        rows = self.template.encode(samples.stamps(late_ns), self.fields(samples))
         due_ns = samples.t_ns + self.delay_ns
         return (due_ns, rows) if self.faults is None else (
             np.repeat(due_ns, copies), np.repeat(rows, copies, axis=0))

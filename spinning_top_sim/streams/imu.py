@@ -17,12 +17,8 @@ from spinning_top_sim.physics.states import Point, States
 from spinning_top_sim.streams import noise
 from spinning_top_sim.streams.felt import LowPass, Vibration
 from spinning_top_sim.streams.noise import Kind
-from spinning_top_sim.streams.parameters import LOWEST_RATE_OF_INTERVALS
 from spinning_top_sim.streams.sensor import Errors, Sensor, summed, transformed
 from spinning_top_sim.times import NANOSECONDS, Times
-
-# The longest interval over which means and increments are taken [ns].
-LONGEST_NS = round(NANOSECONDS / LOWEST_RATE_OF_INTERVALS)
 
 
 class Mounting:
@@ -100,7 +96,7 @@ class Imu:
         self._vibrations = [Vibration(
             values, name, self.low_pass.response if self.low_pass else np.ones_like)
             for name in ('rate', 'force')]
-        interval_ns = min(period_ns, LONGEST_NS) + since_ns - first_begin_ns
+        interval_ns = period_ns + since_ns - first_begin_ns
         self.memory_ns = max(interval_ns, self.low_pass.memory_ns if self.low_pass else 0)
 
     @property
@@ -144,8 +140,7 @@ class Imu:
         last_ns = now_ns // self.period_ns * self.period_ns
         if last_ns <= self.since_ns:        # no sample since the change before this one
             last_ns = self._first_begin_ns
-        return Imu(self._values, period_ns, since_ns=now_ns,
-                   first_begin_ns=max(last_ns, now_ns - LONGEST_NS))
+        return Imu(self._values, period_ns, since_ns=now_ns, first_begin_ns=last_ns)
 
     def begins_ns(self, t_ns: Times) -> Times:
         """Return where the intervals that end with samples (n,) begin [ns]."""

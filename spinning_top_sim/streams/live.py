@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
-from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import Channel, Rows
 from spinning_top_sim.streams.events import MOTIONS, Event
 from spinning_top_sim.streams.play import Simulation
@@ -153,13 +152,6 @@ class LiveSimulation(Simulation):
     def _ready_ns(self) -> int:
         """Time up to which all messages are sent or wait [ns]."""
         return min(group.computed_ns for group in self._groups or [self._motion])
-
-    @property
-    def lowest_imu_rate(self) -> float:
-        """The lowest `imu.rate` [Hz] with which means and increments in use can go on."""
-        uses = self.imu.takes_means or any(
-            output.channel.name == 'increments' and output.is_used for output in self.outputs)
-        return parameters.LOWEST_RATE_OF_INTERVALS if uses else 0.0
 
     def send(self, due_ns: int, publish_from_ns: int = 0,
              give_way: Callable[[], bool] = lambda: False) -> bool:

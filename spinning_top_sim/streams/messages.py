@@ -187,13 +187,6 @@ def float64_multi_array(labels: tuple[str, ...]) -> Template:
                    Numbers('I', (count, count, 0, count)), Field('data', count))
 
 
-def labels_of(template: Template) -> list[str]:
-    """Return the labels of a `float64_multi_array`."""
-    # They follow the number of dimensions.
-    (length,) = struct.unpack_from('<I', template.data, 8)
-    return template.data[12:11 + length].decode().split(',')
-
-
 def string(text: str) -> bytes:
     """Return a serialized std_msgs/String."""
     return Template(text).data

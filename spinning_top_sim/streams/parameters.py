@@ -19,7 +19,6 @@ from spinning_top_sim.streams.parameter import ANY, Effect, Parameter, Range
 FRAMES = ('world_frame', 'body_frame', 'imu.frame_id')      # each the parent of the next one
 REMOVED = ('pacing', 'max_error', 'publish_clock')      # in logs of 1.x
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-LOWEST_RATE_OF_INTERVALS = 1.0      # of increments and means: the motion is kept for a second
 
 
 def _described(name: str, row: Mapping[str, Any]) -> Iterator[Parameter]:
@@ -36,7 +35,8 @@ def _described(name: str, row: Mapping[str, Any]) -> Iterator[Parameter]:
                         'the streams that it began with', one['enabled'], effect=Effect.NOW)
         if 'rate' in one:
             yield Parameter(f'{stream}.rate', f'Rate of {one["text"]}', one['rate'],
-                            Range(1e-6, 1e4), unit='Hz', effect=Effect.NOW)
+                            Range(one.get('lowest_rate', 1e-6), 1e4), unit='Hz',
+                            effect=Effect.NOW)
 
 
 _CONTENT = read_table('streams/parameters.toml')
@@ -98,12 +98,7 @@ def _check_together(values: Mapping[str, Any]) -> None:
              f'{name!r} is no stream; must be all or some of {", ".join(STREAMS)}')
     need(_ascend(values['imu.bias_instability_band']), 'imu.bias_instability_band',
          'the second number must be larger than the first')
-    is_mean = values['imu.sampling'] == 'mean'
-    need(values['imu.rate'] >= LOWEST_RATE_OF_INTERVALS
-         or not (is_mean or values['increments.enabled']), 'imu.rate',
-         f'must be >= {LOWEST_RATE_OF_INTERVALS:g} with increments.enabled, or with '
-         'imu.sampling = mean')
-    need(not (is_mean and values['imu.bandwidth']), 'imu.bandwidth',
+    need(values['imu.sampling'] != 'mean' or not values['imu.bandwidth'], 'imu.bandwidth',
          'must be 0 with imu.sampling = mean, which is a low pass itself')
     for name in ('imu.vibration.force_psd', 'imu.vibration.rate_psd'):
         profile = values[name]

@@ -12,7 +12,7 @@ from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import Channel, Messages, Samples
 from spinning_top_sim.streams.events import CHANGES, Event
-from spinning_top_sim.streams.imu import LONGEST_NS, Imu
+from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.streams.trajectory import Trajectory
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, NEVER_NS, check_stamp, period_ns
@@ -62,9 +62,9 @@ class Simulation:
         self._present = dict(values)        # with the changes that take effect at once
         self.history: list[Event] = []
         self.now_ns = -1
-        # The trace of the markers, intervals of the IMU and late fixes reach back across events.
-        self._keep_ns = max(LONGEST_NS, *(round(values[name] * NANOSECONDS) for name in (
-            'markers.trace_length', 'gnss.latency')))
+        # The trace of the markers and late fixes reach back across events.
+        self._keep_ns = max(round(values[name] * NANOSECONDS) for name in (
+            'markers.trace_length', 'gnss.latency'))
 
     def apply(self, kind: str, **details: Any) -> Event:
         """

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording.errors import reason_of
-from spinning_top_sim.streams import messages
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.play import Simulation
-from spinning_top_sim.streams.topics import ARRAY, JOINTS, recorded
+from spinning_top_sim.streams.topics import INVARIANTS, JOINTS, TIMING, recorded
 from spinning_top_sim.times import NANOSECONDS, Times
 from spinning_top_sim.tools.ensemble_spec import ROWS_IN_A_PART, Specification
 
@@ -38,6 +37,7 @@ DATA = 'data'                   # folder of the files of a dataset
 # Key of the metadata of a Parquet file: the reasons of the runs that failed, by run.
 FAILED_KEY = b'failed'
 # Names of the numbers in fields of messages, where they are not x, y, z and w.
+ARRAYS = {'~/invariants': INVARIANTS, 'ground_truth/imu_timing': TIMING}
 LABELS = {('sensor_msgs/msg/JointState', 'position'): JOINTS,
           ('sensor_msgs/msg/JointState', 'velocity'): JOINTS,
           ('sensor_msgs/msg/NavSatFix', 'position'): ('latitude', 'longitude', 'altitude')}
@@ -54,8 +54,8 @@ def _column_names(channel: Channel) -> list[str]:
     """Return the names of the numbers in the fields of a message."""
     names = []
     for name, count, _ in channel.template.fields:
-        labels: Any = messages.labels_of(channel.template) if channel.type_name == ARRAY else (
-            LABELS.get((channel.type_name, name))
+        labels: Any = (
+            ARRAYS.get(channel.topic) or LABELS.get((channel.type_name, name))
             or ([''] if count == 1 else 'xyzw'[:count] if count <= 4 else range(count)))
         names += [f'{name}.{label}'.rstrip('.') for label in labels]
     return names

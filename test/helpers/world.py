@@ -193,9 +193,6 @@ class World:
 
     def change(self, changes):
         values = {**self.values, **changes}
-        lowest = self.simulation.lowest_imu_rate
-        if values['imu.rate'] < lowest:
-            raise ValueError
         self.loop.set_parameters(values, changes)
         self.values = values
 
