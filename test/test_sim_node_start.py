@@ -50,7 +50,7 @@ def test_the_version_and_the_help_are_printed_and_nothing_runs(main, capfd):
     said = main('--help').out
     for name in ('~/commands', '~/cmd_vel', '~/set_pause', '~/record', '~/step', '~/reset',
                  '/diagnostics', 'imu/data_raw', '~/invariants',
-                 '/clock', '--help-parameters'):
+                 '/clock', 'spin.l3', '--help-parameters'):
         assert name in said
     said = main('--help-parameters').out
     assert all(f'{name}  (default' in said for name in parameters.BY_NAME)

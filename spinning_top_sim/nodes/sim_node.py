@@ -52,10 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _interface() -> Iterator[str]:
     from spinning_top_sim.streams import parameters  # noqa: PLC0415
+    from spinning_top_sim.tools import scene_file  # noqa: PLC0415
     yield INTERFACE
     for text in parameters.STREAMS.values():
         yield textwrap.fill(text, 78, initial_indent='  ', subsequent_indent=6 * ' ')
-    yield 'Parameters: see --help-parameters.'
+    yield textwrap.fill('Parameters used most (--help-parameters lists all): '
+                        + ', '.join(scene_file.MOST_USED), 78, subsequent_indent=2 * ' ')
 
 
 def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:

@@ -23,6 +23,10 @@ NODE = '/spinning_top'      # the full name of the node where no other is asked 
 # Parameters that rclpy declares for every node, and those that it declares for publishers.
 OF_RCLPY = 'use_sim_time', 'start_type_description_service'
 ROS_PARAMETERS = (*OF_RCLPY, 'qos_overrides')
+# What most people need comes first in lists.
+MOST_USED = ('top.mass', 'top.com_distance', 'top.lambda1', 'top.lambda3', 'initial.theta',
+             'spin.l3', 'spin.lz', 'solver.method', 'duration', 'time_scale', 'seed',
+             'record.enabled', 'record.uri')
 
 
 class _Loader(yaml.SafeLoader):
@@ -83,9 +87,9 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
 class _ListParameters(argparse.Action):
     def __call__(self, *_: object) -> NoReturn:
         with cli.reader_may_end():
-            for parameter in parameters.TABLE:
-                print(f'{parameter.name}  (default {default_text(parameter.name)})')
-                print(textwrap.indent(textwrap.fill(parameter.describe(), 74), 6 * ' '))
+            for name in dict.fromkeys((*MOST_USED, *parameters.BY_NAME)):
+                print(f'{name}  (default {default_text(name)})', textwrap.indent(
+                    textwrap.fill(parameters.BY_NAME[name].describe(), 74), 6 * ' '), sep='\n')
         raise SystemExit(cli.OK)
 
 
