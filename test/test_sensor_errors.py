@@ -7,10 +7,11 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 from helpers.reference import scene_parameters
-from helpers.simulations import MILLISECOND, SECOND, read, run
+from helpers.simulations import MILLISECOND, SECOND, run
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.streams import noise
+from spinning_top_sim.streams import noise, parameters
+from spinning_top_sim.streams.imu import Imu
 
 KINDS = ('gyroscope', 'accelerometer')
 SENSITIVITY, *others = 0.03 * np.random.default_rng(1).standard_normal((4, 3, 3))
@@ -42,6 +43,14 @@ def test_readings_are_the_truth_with_the_errors_and_the_noise_that_is_left_is_wh
         assert np.std(noise_left, axis=0) / deviation == pytest.approx(
             np.ones(3), rel=4.5 / math.sqrt(2.0 * count))
         assert np.abs(noise_left.mean(axis=0) / deviation).max() < 4.5 / math.sqrt(count)
+
+
+def read(values, times_ns, exact=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
+    """Return what an IMU with a sample at each of these times reads, and its bias, (n, 6) each."""
+    imu, shape = Imu(parameters.checked(values), times_ns.step), (3, len(times_ns))
+    errors = imu.errors(np.asarray(times_ns))
+    return (np.vstack([np.broadcast_to(one, shape) for one in imu.read(exact, errors)]).T,
+            np.vstack([np.broadcast_to(bias, shape) for _, bias in errors]).T)
 
 
 def at_rest(count, band=(1.0, 1000.0), **errors):

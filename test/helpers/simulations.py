@@ -4,13 +4,11 @@
 import numpy as np
 
 from spinning_top_sim.streams import parameters
-from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.live import LiveSimulation
 
 SECOND = 1_000_000_000
 MILLISECOND = 1_000_000
 EPOCH_NS = 1_700_000_000 * SECOND
-STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 def simulate(values=None, **more):
@@ -90,18 +88,3 @@ def fields(simulation, taken, topic):
 def drive(simulation, *velocity):
     """Let the pivot go to a velocity [m/s]; return the event."""
     return simulation.apply('drive', **simulation.drive_details(velocity))
-
-
-def read(imu, times_ns, exact=STILL):
-    """
-    Return what an IMU reads at these times [ns], and its bias, (n, 6) each.
-
-    imu : or the parameters of one that takes its samples at these times
-    """
-    imu = imu if isinstance(imu, Imu) else Imu(parameters.checked(imu), times_ns.step)
-    t_ns = np.asarray(times_ns)
-    errors = imu.errors(t_ns)
-    return tuple(np.column_stack([np.broadcast_to(axis, len(t_ns)) for kind in found
-                                  for axis in kind]) for found in (
-                                      imu.read(exact, errors),
-                                      [bias for _, bias in errors]))
