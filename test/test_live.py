@@ -20,6 +20,7 @@ from helpers.simulations import (
 
 from spinning_top_sim import solve
 from spinning_top_sim.solvers import dormand_prince
+from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.live import LiveSimulation
@@ -81,6 +82,19 @@ def test_a_clock_far_ahead_leaves_a_state_to_read(monkeypatch):
     while simulation.trajectory.steps < 4000:
         simulation.send(10 ** 6 * SECOND, give_way=lambda: True)
         assert simulation.state().theta[0] > 0.5
+
+
+def test_a_motion_that_ends_is_sent_up_to_its_end():
+    """The equations of the paper have no way through a pole."""
+    values = {'initial.theta': 0.8, 'initial.theta_dot': -3.5, 'spin.l3': 0.5, 'spin.lz': 0.5,
+              'solver.equations': 'euler', 'pose.rate': 1000.0}
+    for advance in (lambda one: [*one.play((), SECOND)], lambda one: one.send(SECOND)):
+        simulation = simulate(values)
+        taken = record(simulation, 'pose')
+        with pytest.raises(IntegrationError, match='pole') as error:
+            advance(simulation)
+        assert simulation.now_ns == error.value.reached_ns > SECOND // 10
+    assert times(taken, 'pose') == [*range(0, simulation.now_ns + 1, MILLISECOND)]
 
 
 def test_each_sample_is_computed_once_for_all_and_what_nobody_takes_is_not(monkeypatch):
