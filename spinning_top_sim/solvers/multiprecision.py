@@ -185,7 +185,7 @@ def _isolated_root(a2: mpfr, a1: mpfr, a0: mpfr) -> tuple[mpfr, int]:
 # of which these are the first two, for n = 0 and 2 or n = 1 and 3; f(n + 2) = (2 - 4 xi) f(n) -
 # f(n - 2).
 COS_EVEN, COS_ODD, SIN_ODD, SIN_EVEN = range(4)
-FIRST_POLYNOMIALS = ([1], [1, -2]), ([1], [1, -4]), ([1], [3, -4]), ([0], [2])
+FIRST_POLYNOMIALS = ([1], [1, -2]), ([1], [1, -4]), ([1], [3, -4]), ([0], [2, 0])
 MOST_TERMS = 6
 # Of the polynomials in doubles, and of rates, and states that are handed over: motions between
 # changes of the vertical can be chaotic, and every error grows.
@@ -226,8 +226,11 @@ class Series:
 
     def at(self, sin: mpfr, cos: mpfr, xi: mpfr) -> mpfr:
         """Return the sum."""
-        value = reduce(lambda value, coefficient: value * xi + coefficient,
-                       reversed(self.polynomial()))
+        (before, *_), (constant, slope) = FIRST_POLYNOMIALS[self.prefactor]
+        now, factor, value = constant + slope * xi, 2 - 4 * xi, ZERO
+        for weight in self.weights:
+            value += weight * before
+            before, now = now, factor * now - before
         return value * (ONE, cos, sin, sin * cos)[self.prefactor]
 
     @property
