@@ -159,7 +159,7 @@ print(solve(top, State(theta=0.0, l3=1.6, lz=1.6), [1.0], method='rk45').phi_dot
 path = PivotPath([(10 ** 9, (1.0, 0.0, 0.0))])
 first = Piece(top, State(theta=0.5, l3=1.6, lz=1.3), 0, path.lasting(0))
 second = Piece(top, first.posture(10 ** 9), 10 ** 9, path.lasting(10 ** 9))
-print(len(second.states(range(10 ** 9, 2 * 10 ** 9, 10 ** 8))), second.truth(range(3)))
+print(len(second.states(range(10 ** 9, 2 * 10 ** 9, 10 ** 8))), second.exact)
 try:
     solve(top, State(theta=0.5, l3=1.6, lz=1.3), [1.0])
 except ImportError as error:
