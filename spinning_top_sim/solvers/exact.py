@@ -187,7 +187,7 @@ def exact_about(top: Top, start: State | Posture,
     with precision():
         posture = start if isinstance(start, Posture) else precise(start).posture(top)
         vertical = Vertical.of(top, acceleration, mpfr)
-        state = PreciseState.of_posture(vertical.top, vertical.to_frame(posture), mpfr)
+        state = PreciseState.of_posture(vertical.top, vertical.to_frame(posture))
     return ExactSolution(vertical.top, state, vertical.gravity), vertical
 
 
