@@ -9,6 +9,7 @@ import pytest
 from spinning_top_sim import State, Top, solve
 
 pytest.importorskip('matplotlib')
+pictures = pytest.importorskip('spinning_top_sim.pictures')
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
 CUSP = State(theta=0.5, l3=1.6, lz=float(1.6 * np.cos(0.5)))
 
@@ -38,8 +39,7 @@ def test_plot_draws_the_columns():
 
 def test_animate_shows_samples_in_time():
     motion = solve(TOP, CUSP, np.linspace(0.0, 1.0, 101))
-    animation = motion.animate(fps=5.0, speed=0.5)
-    html = animation.to_jshtml()
+    html = pictures.animate(motion, fps=5.0, speed=0.5).to_jshtml()
     assert len(re.findall(r'frames\[\d+\] = ', html)) == 11
 
 
@@ -50,4 +50,4 @@ def test_animate_shows_samples_in_time():
 def test_what_makes_no_picture_is_refused(times, argument, says):
     motion = solve(TOP, CUSP, np.array(times))
     with pytest.raises(ValueError, match=re.escape(says)):
-        motion.animate(**argument) if argument else motion.plot()
+        pictures.animate(motion, **argument) if argument else motion.plot()

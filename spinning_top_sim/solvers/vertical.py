@@ -94,12 +94,14 @@ class PreciseState(NamedTuple):
 
         pole : within which tilt the axis is vertical [rad]
         """
-        alpha, beta, transverse, l3 = posture
+        alpha, beta, transverse, _ = posture
         cosine2, sine2 = _norm(alpha), _norm(beta)
         size2 = cosine2 + sine2
         cosine, sine = (cosine2 / size2) ** 0.5, (sine2 / size2) ** 0.5
+        none = 0 * sine
+        l3 = posture.l3 + none          # in numbers of the same kind
         if 2 * min(sine, cosine) < pole:
-            rate, none = abs(transverse), 0 * sine
+            rate = abs(transverse)
             turn = -1j * transverse if rate else 1 + 0j         # exp(-i psi) theta'
             if sine < cosine:
                 return cls(none, 1 + none, rate, alpha, alpha * turn, l3, l3)
