@@ -134,10 +134,9 @@ KINDS = (generic, at_a_pole, next_to_a_pole, near_pass, planar, no_torque, upsid
 
 
 def random_case(seed):
-    """Return the kind of a top, the top and its start."""
-    d, kind = Draw(seed), KINDS[seed % len(KINDS)]
-    kind(d)
+    """Return a top and its start."""
+    d = Draw(seed)
+    KINDS[seed % len(KINDS)](d)
     top = Top(lambda1=d.lambda1, lambda3=d.lambda3, mass=d.mass, com_distance=d.com_distance,
               gravity=d.gravity)
-    return kind.__name__, top, State(theta=d.theta, theta_dot=d.theta_dot, phi=d.phi, psi=d.psi,
-                                     l3=d.l3, lz=d.lz)
+    return top, State(theta=d.theta, theta_dot=d.theta_dot, phi=d.phi, psi=d.psi, l3=d.l3, lz=d.lz)
