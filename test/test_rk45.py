@@ -114,7 +114,7 @@ def test_steps_need_no_multiprecision_and_the_exact_solution_says_what_it_needs(
     monkeypatch.delitem(sys.modules, 'spinning_top_sim.solvers.exact')
     sleeping = State(theta=0.0, l3=1.6, lz=1.6)
     assert solve(TOP, sleeping, [1.0], method='rk45').phi_dot[0] == pytest.approx(0.8, rel=1e-12)
-    with pytest.raises(ImportError, match="method = 'exact' needs gmpy2, .*not installed: .*pip"):
+    with pytest.raises(ImportError, match=r"method = 'exact' needs gmpy2, .*not installed"):
         solve(TOP, sleeping, [1.0])
 
 
