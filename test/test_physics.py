@@ -142,7 +142,7 @@ def test_every_top_can_be_drawn(changed):
     (math.pi, 0.0, 2.0, -1.0, 'hanging'), (0.8, -3.5, 0.5, 1.0, 'through the top'),
     (2.0, 3.5, 0.5, -1.0, 'through the bottom')])
 def test_a_motion_at_or_through_a_pole_has_its_name(theta, theta_dot, l3, lz, name):
-    """It sleeps where L3^2 > 4 lambda1 P, with lambda1 = P = 1: both sides are exact in doubles."""
+    """It sleeps where L3^2 > 4 lambda1 P; with lambda1 = P = 1 both sides are exact."""
     top = Top(lambda1=1.0, lambda3=0.5, mass=1.0, com_distance=1.0, gravity=1.0)
     start = State(theta=theta, theta_dot=theta_dot, l3=l3, lz=lz * l3)
     assert ExactSolution(top, start).describe().name == name

@@ -5,14 +5,6 @@ Multiprecision numbers, `mpfr` and `mpc` of gmpy2, and what the closed form comp
 `precision` sets the precision of results.  L. Fousse et al., "MPFR: A multiple-precision binary
 floating-point library with correct rounding", ACM Trans. Math. Softw. 33 (2007), 13.
 
-`GaussMean`: elliptic integrals by Gauss' arithmetic-geometric mean of a_0 and g_0 [DLMF 19.8(i)].
-No step subtracts numbers of one size, and all converge quadratically.
-
-    a_(n+1) = (a_n + g_n)/2,  g_(n+1) = sqrt(a_n g_n),  c_n = sqrt(a_n^2 - g_n^2)
-
-The modulus is k = c_0/a_0, its complement k' = g_0/a_0: only the ratios of a_0, g_0 and c_0 count,
-but for the mean itself.
-
 `cubic_roots`: the roots of the nutation's cubic and their distances, without cancellation.
 
 `ThetaForm`: Jacobi's theta functions as short polynomials.  theta1 .. theta4 of y are used in the
@@ -66,7 +58,13 @@ NEGLIGIBLE = 1e-21      # a ratio whose fourth power does not count
 
 class GaussMean:
     """
-    The arithmetic-geometric mean M of a_0 and g_0; the caller knows c_0 without cancellation.
+    Gauss' arithmetic-geometric mean M of a_0 and g_0, for elliptic integrals [DLMF 19.8(i)].
+
+    No step subtracts numbers of one size, and all converge quadratically.
+
+        a_(n+1) = (a_n + g_n)/2,  g_(n+1) = sqrt(a_n g_n),  c_n = sqrt(a_n^2 - g_n^2)
+
+    The modulus is k = c_0/a_0, its complement k' = g_0/a_0: only ratios count, but for M itself.
 
     mean : M; the quarter period K(k) is (pi/2) a_0/M [DLMF 19.8.5]
     """
