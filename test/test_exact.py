@@ -11,7 +11,6 @@ import doctest
 import json
 import math
 import os
-import pickle
 from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
@@ -119,15 +118,6 @@ def test_times_end_where_the_fastest_phase_has_made_2_to_the_52_turns(top, state
     first, second = solution.states(np.array([2 ** 53 + 1, 2 ** 53 + 2])).quaternion
     rate = np.linalg.norm(solution.states(range(1)).angular_velocity)
     assert math.dist(first, second) == pytest.approx(0.5e-9 * rate, rel=1e-6)
-
-
-@pytest.mark.parametrize('settings', [
-    {'method': 'exact'}, {'method': 'rk45'}, {'method': 'rk45', 'equations': 'euler'}])
-def test_states_can_be_pickled(settings):
-    states = solve(*LOOPING, [0.0, 1.0], **settings)
-    copy = pickle.loads(pickle.dumps(states))           # before a column is computed
-    for name in ('t', 'phi', 'theta_dot', 'quaternion', 'angular_velocity', 'energy', 'l3'):
-        assert getattr(copy, name).tobytes() == getattr(states, name).tobytes(), name
 
 
 @pytest.mark.parametrize('motion', [LOOPING, NOTHING_MOVES])

@@ -23,7 +23,6 @@ from hypothesis import strategies as st
 from spinning_top_sim import State, Top
 from spinning_top_sim.physics import attitude, pivot
 from spinning_top_sim.physics.pivot import Kinematics, PivotPath
-from spinning_top_sim.physics.states import joined
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.solvers.multiprecision import precision
@@ -133,23 +132,10 @@ def test_where_the_equations_cannot_go_on_the_error_says_up_to_when_they_do():
         piece.states(np.array([reached_ns + S // 10]))
 
 
-def test_pieces_are_joined():
-    """States of two pieces side by side, the pivot with them."""
-    path = PivotPath([(S, (1.0, 2.0, 0.5)), (S, (0.0, 0.0, -9.80665))])
-    first = Piece(TOP, State(theta=0.5, theta_dot=0.3, phi=0.1, psi=0.2, l3=1.6, lz=1.3), 0,
-                  path.lasting(0), method='exact')
-    second = Piece(TOP, first.posture(S), S, path.lasting(S), method='exact')
-    parts = first.states(np.arange(0, S, S // 10)), second.states(np.arange(S, 2 * S, S // 10))
-    both, point = joined(parts), (0.1, -0.2, 0.3)
-    for name in ('t', 'phi', 'phi_dot', 'psi_dot', 'theta_dot', 'theta_folded', 'quaternion',
-                 'angular_velocity', 'angular_acceleration', 'energy', 'l3', 'lz'):
-        assert (getattr(both, name) == np.concatenate([getattr(x, name) for x in parts])).all()
-    for name in ('specific_force', 'velocity', 'position', 'world_velocity'):
-        assert (np.array(getattr(both, name)(point)) == np.hstack(
-            [getattr(one, name)(point) for one in parts])).all(), name
-    assert both.pivot.velocity[:, 11] == pytest.approx([1.0, 2.0, 0.5 - 0.980665])
-    # The velocity is that of the position.
-    near = first.states(np.arange(S // 2 - 100_000, S // 2 + 100_001, 100_000))
+def test_the_velocity_of_a_point_is_that_of_its_position():
+    start, point = State(theta=0.5, theta_dot=0.3, l3=1.6, lz=1.3), (0.1, -0.2, 0.3)
+    near = Piece(TOP, start, 0, ride((1.0, 2.0, 0.5)), method='exact').states(
+        np.arange(S // 2 - 100_000, S // 2 + 100_001, 100_000))
     moved = np.diff(np.array(near.position(point))[:, ::2], axis=1)[:, 0] / 2e-4
     velocity = np.array(attitude.rotated(near.rows_quaternion, near.world_velocity(point)))[:, 1]
     assert moved == pytest.approx(velocity, abs=1e-6)

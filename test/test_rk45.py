@@ -6,10 +6,8 @@ The judge is the reference data (30 digits), and where that has no time the exac
 test_exact.py holds against the same data.
 """
 
-import gc
 import math
 import sys
-import weakref
 
 import numpy as np
 import pytest
@@ -154,19 +152,3 @@ def test_a_time_that_takes_too_many_steps_is_refused_at_once(equations):
     with pytest.raises(IntegrationError, match=r'steps of .* s away: use|leapt over a pole'):
         solve(top, State(theta=0.7, l3=40.0, lz=-11.0), [1.0], method='rk45', equations=equations,
               rtol=1e-6)
-
-
-@pytest.mark.parametrize('settings', [
-    {'method': 'exact'}, {'method': 'rk45'}, {'method': 'rk45', 'equations': 'euler'}])
-def test_a_motion_leaves_nothing_for_the_garbage_collector(settings):
-    """A node makes one at each command; its states go too."""
-    motion = motion_of(*LOOPING, **settings)
-    states = motion.states(range(0, SECOND, SECOND // 10))
-    assert states.phi.shape == states.rows_quaternion[0].shape == (10,)
-    there = [weakref.ref(thing) for thing in (motion, states)]
-    gc.disable()
-    try:
-        del motion, states
-        assert [reference() for reference in there] == [None, None]
-    finally:
-        gc.enable()
