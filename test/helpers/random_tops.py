@@ -48,7 +48,8 @@ class Draw:
 
 
 def generic(d):
-    """As drawn."""
+    """As drawn, with the centre of mass above or below."""
+    d.com_distance *= d.sign()
 
 
 def at_a_pole(d):
@@ -79,12 +80,8 @@ def no_torque(d):
         d.lz = d.l3 * (d.sign() if d.chance(0.5) else math.cos(d.theta))
 
 
-def upside_down(d):
-    name = 'gravity' if d.chance(0.5) else 'com_distance'
-    setattr(d, name, -getattr(d, name))
-
-
 def fast(d):
+    """Spinning, with cusps or without."""
     d.l3 = d.sign() * d.critical * d.log(0.5, 4)
     d.across(0.0 if d.chance(0.5) else d.sign() * d.l0 * d.log(-2, 1))
 
@@ -97,19 +94,6 @@ def near_separatrix(d):
     d.theta_dot = d.sign() * math.sqrt(max(square, 0.0)) * (1.0 + d.sign() * d.log(-16, -3))
 
 
-def waking_sleeper(d):
-    d.theta, d.theta_dot = d.log(-15, -3), 0.0
-    d.l3 = d.sign() * d.critical * d.uniform(0.1, 0.999)
-    d.lz = d.l3
-    if d.chance(0.5):
-        d.across(0.0)
-
-
-def cusp(d):
-    d.across(0.0)
-    d.theta_dot = 0.0
-
-
 def steady(d):
     """Slow steady precession, as well as doubles say it, and a little off."""
     cosine, torque = math.cos(d.theta), d.w0 ** 2 * d.lambda1
@@ -120,17 +104,17 @@ def steady(d):
 
 
 def near_rest(d):
-    """Hanging or sleeping, but for a little."""
+    """Hanging, sleeping or waking, but for a little."""
     hangs, aside = d.chance(0.5), d.log(-15, -3)
     d.theta, d.theta_dot = math.pi - aside if hangs else aside, 0.0
-    d.l3 = d.l3 if hangs else d.sign() * d.critical * d.uniform(1.0, 4.0)
+    d.l3 = d.l3 if hangs else d.sign() * d.critical * d.uniform(0.1, 4.0)
     d.across(0.0)
     if d.chance(0.5):
         d.lz, d.theta_dot = -d.l3 if hangs else d.l3, d.w0 * d.log(-12, -2)
 
 
-KINDS = (generic, at_a_pole, next_to_a_pole, near_pass, planar, no_torque, upside_down, fast,
-         near_separatrix, waking_sleeper, cusp, steady, near_rest)
+KINDS = (generic, at_a_pole, next_to_a_pole, near_pass, planar, no_torque, fast, near_separatrix,
+         steady, near_rest)
 
 
 def random_case(seed):
