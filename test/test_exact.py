@@ -23,10 +23,9 @@ from helpers.reference import CASES, ROOT, start_of, top_of
 from helpers.tops import EXACT, check_motion, time_limit
 
 from spinning_top_sim import State, Top, solve
-from spinning_top_sim.physics.states import TIMES_TOGETHER
 from spinning_top_sim.physics.top import ContinuedState
 from spinning_top_sim.solvers import solve as solve_module
-from spinning_top_sim.solvers.exact import ExactSolution
+from spinning_top_sim.solvers.exact import TIMES_TOGETHER, ExactSolution
 from spinning_top_sim.solvers.multiprecision import precision
 from spinning_top_sim.solvers.solve import motion_of
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from spinning_top_sim.table import FilePath
 
 Point = tuple[float, float, float]
-# Times that are evaluated together: the temporaries of more do not fit into the cache.
-TIMES_TOGETHER = 8192
 AT_REST = Kinematics(*np.zeros((3, 3, 1)))
 _LARGEST = np.finfo(float).max
 

@@ -23,7 +23,7 @@ from spinning_top_sim.physics.regimes import (
     precession_momentum,
     regime,
 )
-from spinning_top_sim.physics.states import TIMES_TOGETHER, States, joined
+from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set_up
 from spinning_top_sim.solvers.evaluate import ExactStates, ThetaArrays
@@ -33,6 +33,8 @@ from spinning_top_sim.times import NANOSECONDS, ns_array
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
+# Times that are evaluated together: the temporaries of more do not fit into the cache.
+TIMES_TOGETHER = 8192
 
 
 class ExactSolution:
