@@ -64,6 +64,8 @@ def test_any_size_of_any_number_gives_an_answer_or_a_reason(method, name, size, 
 @given(st.dictionaries(FIELDS, st.tuples(SIZES, st.sampled_from((1.0, -1.0))), min_size=2),
        st.sampled_from((None, 1.0, -1.0)))
 @example({'lambda3': (5e-324, 1.0)}, None)
+@example({'mass': (0.0, 1.0), 'lambda3': (1e-9, 1.0), 'theta_dot': (0.0, 1.0),
+          'l3': (8.415608806031649e291, 1.0)}, None)
 def test_any_sizes_of_all_numbers_give_the_start_exactly_or_a_reason(changed, lz_of_l3):
     values = {**TOP, **START, **{
         name: size * (side if name not in ('theta', 'lambda1', 'lambda3', 'mass') else 1.0)
