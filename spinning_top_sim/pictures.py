@@ -125,8 +125,19 @@ def plot(motion: Any, drift: Reals, begins: Sequence[float] = ()) -> Figure:
     return figure
 
 
-def animate(motion: Any, fps: float, speed: float) -> FuncAnimation:
-    """Return an animation, for which `motion` has t, rows_axis and quaternion."""
+def animate(motion: Any, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
+    """
+    Return an animation of the body, its axis and the path of the tip; raises as `States.plot`.
+
+    Parameters
+    ----------
+    motion : States
+        Or what has its t, rows_axis and quaternion.
+    fps : float
+        Frames per second, > 0; each shows the newest sample: no others are computed.
+    speed : float
+        Simulated over real time, > 0.
+    """
     path, bounds = _outline(motion)
     for name, value in (('fps', fps), ('speed', speed)):
         if not 0.0 < value < np.inf:

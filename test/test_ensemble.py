@@ -219,7 +219,7 @@ def test_failed_runs_are_told_with_their_reason(
         assert said.count('\n') == 1
         why = json.loads((folder / 'manifest.json').read_text())['failed']
         assert list(why) == failed
-        assert 'ValueError: no motion from theta = ' in why['1'] and 'spin.lz = ' in why['1']
+        assert 'ValueError: no motion from State(theta=' in why['1'] and 'spin.lz = ' in why['1']
 
 
 def test_a_receiver_without_reception_is_no_failure_and_has_no_fix():

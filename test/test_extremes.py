@@ -64,6 +64,8 @@ def test_any_size_of_any_number_gives_an_answer_or_a_reason(method, name, size, 
 @given(st.dictionaries(FIELDS, st.tuples(SIZES, st.sampled_from((1.0, -1.0))), min_size=2),
        st.sampled_from((None, 1.0, -1.0)))
 @example({'lambda3': (5e-324, 1.0)}, None)
+@example({'mass': (0.0, 1.0), 'lambda3': (1e-9, 1.0), 'theta_dot': (0.0, 1.0),
+          'l3': (8.415608806031649e291, 1.0)}, None)
 def test_any_sizes_of_all_numbers_give_the_start_exactly_or_a_reason(changed, lz_of_l3):
     values = {**TOP, **START, **{
         name: size * (side if name not in ('theta', 'lambda1', 'lambda3', 'mass') else 1.0)
@@ -89,7 +91,6 @@ SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.repeat': Tr
         ('record.min_free_bytes', 2 ** 63), ('pivot.waypoints', (1.0, math.nan, 0.0)),
         ('imu.bandwidth_order', 3))),
     ({'imu.bandwidth': 0.5}, 'imu.bandwidth.*must be a number 0 or >= 1 and <= 100000'),
-    ({'imu.vibration.force_psd': (20.0, 0.1)}, 'force_psd.*two or more ascending'),
     ({'imu.vibration.rate_psd': (20.0, 0.1, 20.0, 0.1)}, 'rate_psd.*two or more ascending'),
     ({'imu.vibration.rate_psd': (1e-300, 1e-300, 1e6, 1e6)}, 'rate_psd.*0 or >= 1e-100'),
     ({'mag.disturbance.body': (2.0, 1.0, 0.0, 0.0, 0.0)}, 'must not end before'),
@@ -97,8 +98,6 @@ SHUTTLE = {'pivot.waypoints': (0.0, 0.0, 0.0, 2.0, 1.0, 0.5), 'pivot.repeat': Tr
     ({'imu.bandwidth': 9.0, 'imu.sampling': 'mean'}, 'imu.bandwidth = 9.0: must be 0 with'),
     ({'imu.rate': 0.5}, r'imu\.rate = 0\.5: must be a number >= 1'),
     ({'gnss.origin': (90.5, 0.0, 0.0)}, 'gnss.origin'),
-    ({'gnss.origin': (0.0, -181.0, 0.0)}, 'gnss.origin'),
-    ({'gnss.outages': (1.0,)}, 'gnss.outages'), ({'gnss.outages': (2.0, 1.0)}, 'gnss.outages'),
     ({'gnss.outages': (1.0, 3.0, 2.0, 4.0)}, 'gnss.outages'),
     ({'gnss.position_noise': (1.0, math.nan)}, 'gnss.position_noise'),
     ({'pivot.path': (1.0, 2.0, 3.0)}, 'pivot.path = .*4 numbers, or a multiple'),

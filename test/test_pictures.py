@@ -8,46 +8,37 @@ import pytest
 
 from spinning_top_sim import State, Top, solve
 
-pytest.importorskip('matplotlib')
+pictures = pytest.importorskip('spinning_top_sim.pictures')
 TOP = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.15, gravity=9.80665)
 CUSP = State(theta=0.5, l3=1.6, lz=float(1.6 * np.cos(0.5)))
 
 
 def test_plot_draws_the_columns():
     motion = solve(TOP, CUSP, np.linspace(0.0, 4.0, 401))
-    figure = motion.plot()
-    panels = {axes.get_ylabel() or axes.get_title(): axes for axes in figure.axes}
+    panels = {axes.get_ylabel() or axes.get_title(): axes for axes in motion.plot().axes}
     for label, expected in (
             ('tilt θ [deg]', np.degrees(motion.theta_folded)),
             ("rate φ' [rad/s]", motion.phi_dot),
             ('relative drift [1]', (motion.energy - motion.energy[0]) / abs(motion.energy[0]))):
         line = panels[label].lines[0]
-        assert (line.get_xdata() == motion.t).all()
-        assert (line.get_ydata() == expected).all()
-    low, high = sorted(float(line.get_ydata()[0]) for line in panels['tilt θ [deg]'].lines[1:])
-    assert low == pytest.approx(np.degrees(0.5))
-    assert high == pytest.approx(np.degrees(motion.theta.max()), abs=0.05)
+        assert (line.get_xdata() == motion.t).all() and (line.get_ydata() == expected).all()
     path = panels['the same from above'].lines[-1]
     assert (np.hypot(path.get_xdata(), path.get_ydata())
             == pytest.approx(np.sin(motion.theta), abs=1e-12))
-    assert all(axes.get_title() for axes in figure.axes)
     # The rounding noise of an exact motion is no curve.
     assert panels['relative drift [1]'].get_ylim() == (-1e-12, 1e-12)
-    figure.savefig('/dev/null', format='png')
 
 
 def test_animate_shows_samples_in_time():
     motion = solve(TOP, CUSP, np.linspace(0.0, 1.0, 101))
-    animation = motion.animate(fps=5.0, speed=0.5)
-    html = animation.to_jshtml()
+    html = pictures.animate(motion, fps=5.0, speed=0.5).to_jshtml()
     assert len(re.findall(r'frames\[\d+\] = ', html)) == 11
 
 
 @pytest.mark.parametrize(('times', 'argument', 'says'), [
     ([0.0], {}, 't has 1 times: a picture must have 2'),
     ([1.0, 0.5], {}, 't[1] = 0.5 s: must be later than t[0] = 1.0 s'),
-    ([0.0, 1.0], {'fps': 0.0}, 'fps = 0.0'), ([0.0, 1.0], {'speed': -1.0}, 'speed = -1.0')])
+    ([0.0, 1.0], {'fps': 0.0}, 'fps = 0.0')])
 def test_what_makes_no_picture_is_refused(times, argument, says):
-    motion = solve(TOP, CUSP, np.array(times))
     with pytest.raises(ValueError, match=re.escape(says)):
-        motion.animate(**argument) if argument else motion.plot()
+        pictures.animate(solve(TOP, CUSP, times), **argument)

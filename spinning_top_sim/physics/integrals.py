@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
-from spinning_top_sim.physics.states import TIMES_TOGETHER, Point, States
+from spinning_top_sim.physics.states import Point, States
 from spinning_top_sim.physics.top import Top
 
 # Increments over panels of a larger angle are differences: the rounding is below 1e-13 of them.
@@ -85,17 +85,9 @@ def increments(states: Callable[[NDArray[np.int64]], States], begins: range, len
     """
     angle = rate * length_ns * 1e-9
     rule = _rule(length_ns, _nodes(angle))
-    offsets_ns = np.array([0, *(offset_ns for offset_ns, _ in rule), length_ns])
-    # All times of a panel together: each call takes the time of many states.
-    together = max(1, TIMES_TOGETHER // len(offsets_ns))
-    return joined([_panels(states, np.array(begins[first:first + together])[:, np.newaxis]
-                           + offsets_ns, [weight for _, weight in rule], point, angle)
-                   for first in range(0, len(begins), together)])
-
-
-def _panels(states: Callable[[NDArray[np.int64]], States], times_ns: NDArray[np.int64],
-            weights: list[float], point: Point, angle: float) -> Increments:
-    """Return the increments over panels with these times, (n, nodes and both ends) [ns]."""
+    # Of each panel both ends and the nodes between them, (n, nodes and ends).
+    times_ns = np.array(begins)[:, np.newaxis] + [
+        0, *(offset_ns for offset_ns, _ in rule), length_ns]
     now = states(times_ns.ravel())
 
     def rows_of(vector: Sequence[Column | float]) -> Matrix:
@@ -117,11 +109,11 @@ def _panels(states: Callable[[NDArray[np.int64]], States], times_ns: NDArray[np.
         attitude.rotated_back((-x, -y, -z, w), (f1, f2, f3)), (w1, w2, w3), (f1, f2, f3)])
     # Rotation less the identity, velocity, angles and forces: 4, 3, 3 and 3 rows.
     sums = np.zeros((13, len(times_ns)))
-    for node, weight in enumerate(weights):
+    for node, (_, weight) in enumerate(rule):
         sums += weight * derivatives[:, node]
     sums[3] += 1.0              # w of the identity
     if angle >= LEAST_ANGLE:
-        seconds = 1e-9 * float(times_ns[0, -1] - times_ns[0, 0])
+        seconds = 1e-9 * length_ns
         fall = now.pivot.acceleration[:, :1] * seconds
         fall[2] += now.top.gravity * seconds
         sums[:7] = _differences(quaternions[:, [0, -1]], rows_of(now.velocity(point))[:, [0, -1]],

@@ -62,7 +62,7 @@ class PivotPath:
 
     pieces : durations > 0 [ns], and accelerations (3,) [m/s^2]
     repeat : whether they are repeated for ever.  Then they must leave the velocity as it was, but
-        for rounding, which the last acceleration takes; and last SHORTEST_S each on average
+        for rounding, and last SHORTEST_S each on average
     position, velocity : (3,) at the start, in the world [m], [m/s]
 
     Raises ValueError for a path that cannot be repeated, and for a piece of 9e9 s or more.
@@ -73,20 +73,19 @@ class PivotPath:
         self.start_ns = start_ns
         self._starts, self._accelerations = [0], []
         places, velocities = [_fractions(position)], [_fractions(velocity)]
-        steps = [(duration_ns, _fractions(given)) for duration_ns, given in pieces]
-        for duration_ns, acceleration in _closed(steps) if repeat else steps:
-            t = Fraction(duration_ns, NANOSECONDS)
-            v = velocities[-1]
+        for duration_ns, given in pieces:
+            t, v = Fraction(duration_ns, NANOSECONDS), velocities[-1]
+            acceleration = _fractions(given)
             places.append(_sum((1, places[-1]), (t, v), (t * t / 2, acceleration)))
             velocities.append(_sum((1, v), (t, acceleration)))
             self._starts.append(self._starts[-1] + duration_ns)
             self._accelerations.append(acceleration)
         self._cycle_ns, self._per_cycle = 0, np.zeros(9)
         if repeat and any(any(one) for one in self._accelerations):
-            if velocities[-1] != velocities[0]:
-                change = [float(x) for x in _sum((1, velocities[-1]), (-1, velocities[0]))]
-                raise ValueError(f'a repeated path changes the velocity by {change} m/s: it must '
-                                 'end with the velocity that it starts with')
+            change = _sum((1, velocities[-1]), (-1, velocities[0]))
+            if _length(change) > ROUNDING * max(map(_length, velocities)):
+                raise ValueError(f'a repeated path changes the velocity by {_length(change):g} '
+                                 'm/s: it must end with the velocity that it starts with')
             self._cycle_ns = self._starts.pop()
             if self._cycle_ns < len(self._starts) * SHORTEST_S * NANOSECONDS:
                 raise ValueError(f'a repeated path has {len(self._starts)} pieces in '
@@ -165,18 +164,6 @@ class PivotPath:
                 after := self.piece(piece.end_ns)).acceleration == piece.acceleration:
             piece = piece._replace(end_ns=after.end_ns)
         return piece
-
-
-def _closed(steps: Sequence[tuple[int, Fractions]]) -> Sequence[tuple[int, Fractions]]:
-    """Return the steps; the last one cancels a change of the velocity by rounding errors."""
-    changes = [_sum((Fraction(duration_ns, NANOSECONDS), a)) for duration_ns, a in steps]
-    change = _sum(*((1, one) for one in changes))
-    if not any(change) or _length(change) > ROUNDING * max(map(_length, changes)):
-        return steps
-    last = max(k for k, one in enumerate(changes) if any(one))
-    duration_ns, a = steps[last]
-    return [*steps[:last], (duration_ns, _sum((1, a), (Fraction(-NANOSECONDS, duration_ns),
-                                                       change))), *steps[last + 1:]]
 
 
 def _ramp(begin: Fractions, end: Fractions,

@@ -18,14 +18,11 @@ from spinning_top_sim.physics.pivot import Kinematics, Ride, kinematics
 from spinning_top_sim.physics.top import State, Top
 
 if TYPE_CHECKING:
-    from matplotlib.animation import FuncAnimation
     from matplotlib.figure import Figure
 
     from spinning_top_sim.table import FilePath
 
 Point = tuple[float, float, float]
-# Times that are evaluated together: the temporaries of more do not fit into the cache.
-TIMES_TOGETHER = 8192
 AT_REST = Kinematics(*np.zeros((3, 3, 1)))
 _LARGEST = np.finfo(float).max
 
@@ -286,21 +283,6 @@ class States:
         with needed('a picture', 'plot'):
             from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
         return pictures.plot(self, relative_drift(self.energy, self.energy[:1]))
-
-    def animate(self, fps: float = 20.0, speed: float = 1.0) -> FuncAnimation:
-        """
-        Return an animation of the body, its axis and the path of the tip; raises as `plot`.
-
-        Parameters
-        ----------
-        fps : float
-            Frames per second, > 0; each shows the newest sample: no others are computed.
-        speed : float
-            Simulated over real time, > 0.
-        """
-        with needed('a picture', 'plot'):
-            from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
-        return pictures.animate(self, fps, speed)
 
 
 class WorldStates(States):

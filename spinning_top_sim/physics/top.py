@@ -10,7 +10,9 @@ the precession, theta the tilt from the upward vertical, psi the spin about the 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, fields
+from typing import Any
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,10 +147,8 @@ class State:
         ValueError
             Naming the argument or field, its value and what is allowed.
         """
-        for name, value in (('theta', theta), ('precession', precession), ('spin', spin)):
-            if isinstance(value, bool) or not isinstance(value, int | float) or (
-                    not math.isfinite(value)):
-                raise ValueError(f'{name} = {shown(value)}: must be a finite number')
+        theta, precession, spin = (_finite(name, value) for name, value in (
+            ('theta', theta), ('precession', precession), ('spin', spin)))
         cosine = math.cos(theta)
         l3 = top.lambda3 * (spin + precession * cosine)
         pole = pole_momentum(theta, l3)
@@ -180,11 +180,13 @@ def shown(value: object) -> str:
 def _freeze_as_floats(record: Top | State) -> None:
     """Store every field as a finite float, or say which one is not."""
     for field in fields(record):
-        value = getattr(record, field.name)
-        try:
-            number = math.nan if isinstance(value, bool) else float(value)
-        except (TypeError, ValueError, OverflowError):
-            number = math.nan
-        if not math.isfinite(number):
-            raise ValueError(f'{field.name} = {shown(value)}: must be a finite number')
-        object.__setattr__(record, field.name, number)
+        object.__setattr__(record, field.name, _finite(
+            field.name, getattr(record, field.name)))
+
+
+def _finite(name: str, value: Any) -> float:
+    """Return a value as a float.  Raises ValueError, naming it, if it is no finite number."""
+    with suppress(TypeError, ValueError, OverflowError):
+        if not isinstance(value, bool) and math.isfinite(number := float(value)):
+            return number
+    raise ValueError(f'{name} = {shown(value)}: must be a finite number')

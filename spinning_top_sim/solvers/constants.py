@@ -43,29 +43,11 @@ from gmpy2 import sign as sign_of
 
 from spinning_top_sim.physics.regimes import nutation_cubic
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.multiprecision import (
-    BITS,
-    COS_EVEN,
-    MOST_TERMS,
-    NOTHING,
-    ONE,
-    SIN_ODD,
-    ZERO,
-    GaussMean,
-    Parts,
-    Roots,
-    RootsTooCloseError,
-    Series,
-    ThetaForm,
-    argument,
-    atan2,
-    cubic_roots,
-    precision,
-)
+from spinning_top_sim.solvers import multiprecision as mp
 from spinning_top_sim.solvers.vertical import PreciseState
 
-BITS_TO_TRY = BITS, 2 * BITS, 4 * BITS, 8 * BITS
-with precision():
+BITS_TO_TRY = mp.BITS, 2 * mp.BITS, 4 * mp.BITS, 8 * mp.BITS
+with mp.precision():
     NO_GRAVITY = mpfr('1e-1000')    # so small that u3 is infinite to all bits
 
 
@@ -77,7 +59,7 @@ class Factor(NamedTuple):
     drift: mpfr                     # kappa
     # R and s J at even and at odd N, less common factors.  If X changes its sign at a pole, R is a
     # sine series at one of them, and has the factor (-1)^floor(N/2).
-    parts: tuple[Parts, Parts]
+    parts: tuple[mp.Parts, mp.Parts]
     scales: tuple[mpfr, mpfr]       # these factors
     pole_rate: mpfr                 # (Lz +- L3)/(2 lambda1) [rad/s]; its sign is s
     start_argument: mpfr            # of X exp(i kappa y) at t = 0 [rad]
@@ -89,16 +71,16 @@ class ThetaMotion(NamedTuple):
     alpha: Factor
     beta: Factor
     stretch: mpfr | None = None     # K/K' if the series are in the imaginary form, of stretch y
-    quarter_rate: mpfr = ZERO       # quarter periods per second, w/K
+    quarter_rate: mpfr = mp.ZERO    # quarter periods per second, w/K
     start_whole: int = 0            # N at t = 0
-    start_offset: mpfr = ZERO       # 2y/pi at t = 0, accurate relative to itself
-    u_dot: tuple[mpfr, mpfr] = (ZERO, ZERO)     # c of u' = c theta1(2y)/D^4
-    u_dot_series: Series = NOTHING              # theta1
+    start_offset: mpfr = mp.ZERO       # 2y/pi at t = 0, accurate relative to itself
+    u_dot: tuple[mpfr, mpfr] = (mp.ZERO, mp.ZERO)   # c of u' = c theta1(2y)/D^4
+    u_dot_series: mp.Series = mp.NOTHING           # theta1
     # p and q of (Lz - L3 u)/lambda1 = p + q theta1(y)^2/D^2
-    precession: tuple[mpfr, mpfr] = (ZERO, ZERO)
-    swing: tuple[mpfr, mpfr] = (ZERO, ZERO)
-    m1: mpfr = ONE
-    size: int = MOST_TERMS          # coefficients of each polynomial that doubles need
+    precession: tuple[mpfr, mpfr] = (mp.ZERO, mp.ZERO)
+    swing: tuple[mpfr, mpfr] = (mp.ZERO, mp.ZERO)
+    m1: mpfr = mp.ONE
+    size: int = mp.MOST_TERMS          # coefficients of each polynomial that doubles need
 
 
 def precise(start: State | PreciseState) -> PreciseState:
@@ -118,10 +100,10 @@ def set_up(top: Top, start: State | PreciseState, gravity: mpfr | None = None) -
     algebraic, and no double but 0 has an algebraic cosine.
     """
     for tried in BITS_TO_TRY:
-        with precision(tried):
+        with mp.precision(tried):
             try:
                 return _set_up(top, mpfr(top.gravity) if gravity is None else gravity, start)
-            except RootsTooCloseError:
+            except mp.RootsTooCloseError:
                 continue
             except ArithmeticError as error:
                 raise ValueError(f'{top} from {start}: the constants are too far apart in size '
@@ -142,8 +124,8 @@ class _Side(NamedTuple):
     # c = (2K/pi) a or (2K/pi) b, sn^2(c, m1) in the imaginary form, -sn^2(ic, m) in the real one
     # [DLMF 22.6(iv)], or None if there is no zero
     is_beta: bool = False
-    x1: mpfr = ZERO
-    x2: mpfr = ZERO
+    x1: mpfr = mp.ZERO
+    x2: mpfr = mp.ZERO
     zero: mpfr | None = None
 
 
@@ -152,8 +134,8 @@ def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion
     lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
     sin_half, cos_half, theta_dot, alpha, beta, l3, lz = precise(start)
     spin = l3 * (1 / lambda3 - 1 / lambda1)
-    sides = (_Side(lz + l3, spin, argument(alpha), cos_half, -sin_half * theta_dot),
-             _Side(lz - l3, -spin, argument(beta), sin_half, cos_half * theta_dot))
+    sides = (_Side(lz + l3, spin, mp.argument(alpha), cos_half, -sin_half * theta_dot),
+             _Side(lz - l3, -spin, mp.argument(beta), sin_half, cos_half * theta_dot))
     f0, f1, f2, f3 = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     if not f0 and not f1:
         return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))
@@ -169,9 +151,9 @@ def _resting(side: _Side, lambda1: mpfr) -> Factor:
     rate = side.spin / 2
     if side.momentum:
         rate += side.momentum / (4 * lambda1 * side.modulus ** 2)
-    parts = Series(COS_EVEN, (ONE,)), NOTHING
-    return Factor(rate, side.argument / (2 * const_pi()), ZERO, (parts, parts),
-                  (side.modulus, side.modulus), side.momentum / (2 * lambda1), ZERO)
+    parts = mp.Series(mp.COS_EVEN, (mp.ONE,)), mp.NOTHING
+    return Factor(rate, side.argument / (2 * const_pi()), mp.ZERO, (parts, parts),
+                  (side.modulus, side.modulus), side.momentum / (2 * lambda1), mp.ZERO)
 
 
 def _nutating(sides: Sequence[_Side], lambda1: mpfr, mirror: int, l3: mpfr,
@@ -182,17 +164,17 @@ def _nutating(sides: Sequence[_Side], lambda1: mpfr, mirror: int, l3: mpfr,
 
     momentum : Lz - L3 u at the start of the motion itself
     """
-    roots, f3 = cubic_roots(*cubic), cubic[3]
+    roots, f3 = mp.cubic_roots(*cubic), cubic[3]
     imaginary = roots.gap21 > roots.gap32
     a, g, c = sqrt(roots.gap31), sqrt(roots.gap32), sqrt(roots.gap21)
-    mean = GaussMean(a, g, c)
-    form = ThetaForm(GaussMean(a, c, g) if imaginary else mean, imaginary)
+    mean = mp.GaussMean(a, g, c)
+    form = mp.ThetaForm(mp.GaussMean(a, c, g) if imaginary else mean, imaginary)
     start_whole, direction, square = _nearest_quarter(roots, g / a, falling, imaginary)
     stretch = form.mean.mean / mean.mean if imaginary else None
     sin = form.mean.amplitude(square, 1 if imaginary else -1)
     xi = -sin * sin if imaginary else sin * sin
     cos = sqrt(1 - xi)
-    y0 = direction * (asinh(sin) / stretch if stretch else atan2(sin, cos))
+    y0 = direction * (asinh(sin) / stretch if stretch else mp.atan2(sin, cos))
     root_f3 = sqrt(f3)
     # w = sqrt(f3 (u3 - u1))/2 and K = (pi/2) sqrt(u3 - u1)/M
     y_rate = root_f3 * mean.mean / 2
@@ -214,7 +196,7 @@ def _nutating(sides: Sequence[_Side], lambda1: mpfr, mirror: int, l3: mpfr,
         m1=roots.gap32 / roots.gap31, size=form.size)
 
 
-def _with_poles(sides: Sequence[_Side], roots: Roots, two_p_lambda1: mpfr,
+def _with_poles(sides: Sequence[_Side], roots: mp.Roots, two_p_lambda1: mpfr,
                 imaginary: bool) -> tuple[_Side, _Side]:
     """
     Return alpha and beta with their poles.
@@ -239,7 +221,7 @@ def _with_poles(sides: Sequence[_Side], roots: Roots, two_p_lambda1: mpfr,
             beta._replace(is_beta=True, x1=below1, x2=below2, zero=zero))
 
 
-def _nearest_quarter(roots: Roots, complement: mpfr, falling: bool,
+def _nearest_quarter(roots: mp.Roots, complement: mpfr, falling: bool,
                      imaginary: bool) -> tuple[int, int, mpfr]:
     """
     Return N at t = 0, the sign of y, and sn^2 or sn^2/cn^2 of the distance of chi from N K.
@@ -256,7 +238,7 @@ def _nearest_quarter(roots: Roots, complement: mpfr, falling: bool,
         low * roots.gap32 if imaginary else roots.gap21 * roots.y3))
 
 
-def _quotient(form: ThetaForm, side: _Side, lambda1: mpfr, x_rate: mpfr, y_rate: mpfr,
+def _quotient(form: mp.ThetaForm, side: _Side, lambda1: mpfr, x_rate: mpfr, y_rate: mpfr,
               quarters: int, y: mpfr, point: tuple[mpfr, mpfr, mpfr]) -> Factor:
     """
     Return alpha or beta as a quotient of theta functions.
@@ -264,16 +246,16 @@ def _quotient(form: ThetaForm, side: _Side, lambda1: mpfr, x_rate: mpfr, y_rate:
     x_rate, y_rate : of x and y, the arguments of the imaginary and of the real form [rad/s]
     quarters, y, point : N, y and the arguments of `Series.at` at t = 0
     """
-    sense, drift, rate = sign_of(side.momentum), ZERO, side.spin / 2
-    farthest, real, imag = max(side.x1, side.x2), ONE, ZERO
+    sense, drift, rate = sign_of(side.momentum), mp.ZERO, side.spin / 2
+    farthest, real, imag = max(side.x1, side.x2), mp.ONE, mp.ZERO
     scale = sqrt(farthest / 2)
     starts_in_first = quarters % 2 == side.is_beta       # where X is theta1
     if side.zero is None:           # proportional to dn
-        first, second = (form.theta4, NOTHING), (form.theta3, NOTHING)
+        first, second = (form.theta4, mp.NOTHING), (form.theta3, mp.NOTHING)
     elif not sense:
         sign = -1 if side.is_beta else 1
-        first = Series(SIN_ODD, [sign * x for x in form.theta1.weights]), NOTHING
-        second = form.theta2, NOTHING
+        first = mp.Series(mp.SIN_ODD, [sign * x for x in form.theta1.weights]), mp.NOTHING
+        second = form.theta2, mp.NOTHING
         # The sign is that of cos(theta0/2) or sin(theta0/2), which are not negative.  Where they
         # vanish they leave 0 with the slope.
         series, _ = first if starts_in_first else second
@@ -283,9 +265,9 @@ def _quotient(form: ThetaForm, side: _Side, lambda1: mpfr, x_rate: mpfr, y_rate:
     else:
         amplitude = form.mean.amplitude(side.zero, -1 if form.imaginary else 1)
         first, second = form.shifted(amplitude, sense)
-        drift = -sense * ONE
+        drift = -sense * mp.ONE
         if form.imaginary:
-            drift += sense * 2 / const_pi() * atan2(amplitude, sqrt(1 - amplitude * amplitude))
+            drift += sense * 2 / const_pi() * mp.atan2(amplitude, sqrt(1 - amplitude * amplitude))
         rate += (side.momentum / (2 * lambda1 * farthest) - drift * y_rate
                  - second[1].leading / second[0].leading * x_rate)
         real, imag = (part.at(*point) for part in (first if starts_in_first else second))
@@ -293,6 +275,6 @@ def _quotient(form: ThetaForm, side: _Side, lambda1: mpfr, x_rate: mpfr, y_rate:
     scale *= (form.middle4 if side.is_beta else form.middle3) / second[0].leading
     parts, scales = (((second, first), (scale, scale * form.odd_over_even)) if side.is_beta
                      else ((first, second), (scale, scale)))
-    start_argument = drift * y + atan2(imag, real)
+    start_argument = drift * y + mp.atan2(imag, real)
     return Factor(rate, (side.argument - start_argument) / (2 * const_pi()), drift, parts, scales,
                   side.momentum / (2 * lambda1), start_argument)

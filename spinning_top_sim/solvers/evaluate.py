@@ -16,16 +16,17 @@ import math
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from operator import sub
-from typing import NamedTuple
 
 import numpy as np
 from gmpy2 import const_pi, mpfr, rint
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics.attitude import Column, Number
+from spinning_top_sim.physics import attitude
+from spinning_top_sim.physics.attitude import Column, Number, Quaternion
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import ThetaMotion
 from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
-from spinning_top_sim.times import NANOSECONDS, ns_array
 
 Matrix = NDArray[np.float64]
 QUARTER = 0.5 * math.pi         # the angle of a quarter period [rad]
@@ -40,39 +41,6 @@ SPLITTER = 134217729.0
 np.empty(2 ** 22, np.uint8)
 
 
-class Times(NamedTuple):
-    """Times since the start of a motion, as sums of two doubles."""
-
-    per_second: int                 # 1 for times in s, 10^9 in ns
-    high: Column                    # (n,) nearest doubles
-    low: Column | float = 0.0       # what they leave out, perhaps nothing
-
-    @classmethod
-    def from_ns(cls, ns: NDArray[np.int64] | range) -> Times:
-        """Return the times of integer nanoseconds (n,).  Raises ValueError."""
-        if isinstance(ns, range) and not all(
-                abs(x) < 2 ** 63 for x in (ns.start, ns.stop, ns.step)):
-            raise ValueError(f'times_ns = {ns!r}: must be within int64')
-        count = ns_array(ns)
-        if count.ndim != 1 or count.dtype.kind != 'i':
-            raise ValueError(f'times_ns has shape {count.shape} and type {count.dtype}: must be '
-                             '(n,) nanoseconds, int64')
-        high = count.astype(np.float64)
-        if np.abs(high).max(initial=0.0) < 2.0 ** 53:
-            return cls(NANOSECONDS, high)
-        # Half of it, as `high` may be 2^63.
-        rest = count - 2 * (0.5 * high).astype(np.int64)
-        return cls(NANOSECONDS, high, rest.astype(np.float64))
-
-    @property
-    def seconds(self) -> Column:
-        return self.high / self.per_second + self.low / self.per_second
-
-    def part(self, rows: slice) -> Times:
-        return self._replace(high=self.high[rows], low=self.low if isinstance(self.low, float)
-                             else self.low[rows])
-
-
 def halves(x: Number) -> tuple[Number, Number]:
     """Split doubles into two of 26 bits each; products of such halves are exact."""
     big = SPLITTER * x
@@ -81,10 +49,21 @@ def halves(x: Number) -> tuple[Number, Number]:
 
 
 class ThetaArrays:
-    """The constants of a motion in doubles.  Raises ValueError if these cannot hold one."""
+    """
+    The constants of a motion in doubles.
 
-    def __init__(self, motion: ThetaMotion) -> None:
-        factors = motion.alpha, motion.beta
+    phi_phase, psi_phase : phi and psi at t = 0 less the arguments of alpha and beta [rad]
+    sign, turn : theta is sign * (theta in [0, pi]) + turn, for a start beyond a pole
+
+    Raises ValueError if doubles cannot hold one.
+    """
+
+    def __init__(self, motion: ThetaMotion, start: State) -> None:
+        factors = alpha, beta = motion.alpha, motion.beta
+        self.phi_phase = float(start.phi - alpha.start_argument - beta.start_argument)
+        self.psi_phase = float(start.psi - alpha.start_argument + beta.start_argument)
+        self.turn = math.tau * round(start.theta / math.tau)
+        self.sign = -1.0 if start.theta < self.turn else 1.0
         # (Lz + L3)/(2 lambda1) and (Lz - L3)/(2 lambda1) [rad/s]
         self.bottom_rate, self.top_rate = (float(x.pole_rate) for x in factors)
         # The three phases at t = 0 are the sum of whole, offset and rest.
@@ -104,7 +83,7 @@ class ThetaArrays:
             [float(scale * x) for x in one.polynomial(motion.size)]
             for row, factor in zip(rows, 2 * factors, strict=True)
             for one, scale in zip(row, factor.scales, strict=True)).reshape(-1, 4, 2)
-        for name, factor in (('alpha', motion.alpha), ('beta', motion.beta)):
+        for name, factor in (('alpha', alpha), ('beta', beta)):
             size = min(abs(scale) * max(map(abs, real.weights)) for (real, _), scale in zip(
                 factor.parts, factor.scales, strict=True))
             if 0 < size < LEAST_AMPLITUDE:
@@ -123,30 +102,30 @@ class ThetaArrays:
             [[*map(float, motion.precession)], [*map(float, motion.swing)]])
         self._scaled: dict[int, list[Matrix]] = {}
 
-    def phases(self, times: Times) -> tuple[Matrix, Matrix, NDArray[np.int64], Matrix]:
+    def phases(self, per_second: int, t: Column, t_low: Column | None,
+               ) -> tuple[Matrix, Matrix, NDArray[np.int64], Matrix]:
         """
-        Return the three phases, (3, n) each.
+        Return the three phases, (3, n) each; the arguments are those of `ExactStates`.
 
         As what they have grown by, rate * t, in doubles and what these leave out; and from their
         values at t = 0 on, as the nearest integers and what is left.
         """
-        unit = times.per_second
-        if unit not in self._scaled:
+        if per_second not in self._scaled:
             with precision():
-                rate, rate_low = _columns([x / unit for x in self._rates])
-            self._scaled[unit] = [rate, *halves(rate), rate_low]
-        rate, r1, r2, rate_low = self._scaled[unit]
-        t1, t2 = halves(times.high)
-        high = rate * times.high
+                rate, rate_low = _columns([x / per_second for x in self._rates])
+            self._scaled[per_second] = [rate, *halves(rate), rate_low]
+        rate, r1, r2, rate_low = self._scaled[per_second]
+        t1, t2 = halves(t)
+        high = rate * t
         # Exact up to the last product of halves (Dekker).
         rest = r1 * t1
         rest -= high
         rest += r1 * t2
         rest += r2 * t1
         rest += r2 * t2
-        small = rate_low * times.high
-        if not isinstance(times.low, float):
-            small += rate * times.low
+        small = rate_low * t
+        if t_low is not None:
+            small += rate * t_low
         rest += small
         whole = np.rint(high)
         part = high - whole
@@ -203,12 +182,22 @@ class ThetaArrays:
         return start - slope * start_whole, slope
 
 
-class ThetaValues:
-    """The motion at n times, in columns that are computed when they are first asked for."""
+class ExactStates(States):
+    """
+    The states of an exact solution, on the branch of its start.
 
-    def __init__(self, arrays: ThetaArrays, times: Times) -> None:
+    per_second : 1 for times in s, 10^9 in ns
+    t, t_low : (n,) nearest doubles of the times, and what they leave out, if anything
+    """
+
+    method = 'exact'
+
+    def __init__(self, top: Top, start: State, arrays: ThetaArrays, per_second: int, t: Column,
+                 t_low: Column | None = None) -> None:
+        super().__init__(top, start, len(t))
+        self.t = t / per_second + (0.0 if t_low is None else t_low / per_second)
         self._arrays = arrays
-        self._turned, self._turned_rest, self._whole, part = arrays.phases(times)
+        self._turned, self._turned_rest, self._whole, part = arrays.phases(per_second, t, t_low)
         self._offset = part[0].copy()
         part[1:] += arrays.drifts * self._offset
         # Cosine and sine by the tangent of half the angle, which is at most 1.
@@ -259,39 +248,38 @@ class ThetaValues:
         return real * cos - imag * sin, real * sin + imag * cos
 
     @cached_property
-    def quaternion(self) -> Matrix:
-        """Q(world <- body) as x, y, z, w, (4, n)."""
-        real, imag = self._alpha_beta
+    def rows_quaternion(self) -> Quaternion:
+        (alpha, beta), (alpha_imag, beta_imag) = self._alpha_beta
         squares = self._real * self._real + self._imag * self._imag
         scale = 1.0 / np.sqrt(squares[0] + squares[1])
-        found = np.empty((4, len(scale)))
-        np.multiply(real[::-1], scale, out=found[1::2])
-        np.multiply(imag[::-1], scale, out=found[::2])
-        np.negative(found[0], out=found[0])
-        return found
+        return -(beta_imag * scale), beta * scale, alpha_imag * scale, alpha * scale
 
     @cached_property
-    def angles(self) -> Matrix:
-        """
-        phi, theta and psi, continued through the poles [rad], (5, n).
-
-        phi and psi in two parts each, what grows with time and the rest, less a constant.
-        """
-        (_, alpha, beta), (_, alpha_rest, beta_rest) = self._turned, self._turned_rest
+    def angles(self) -> tuple[Column, Column, Column]:
+        # phi and psi in two parts each, what grows with time and the rest.
+        arrays, (_, alpha, beta), (_, alpha_rest, beta_rest) = (
+            self._arrays, self._turned, self._turned_rest)
         arguments = np.arctan2(self._imag, self._real)
-        arguments += (math.pi * self._arrays.drifts) * self._offset
-        arguments[self._arrays.on_line] = 0.0
+        arguments += (math.pi * arrays.drifts) * self._offset
+        arguments[arrays.on_line] = 0.0
         half = np.arctan2(self.moduli[1], self.moduli[0])
-        if self._arrays.planar_rotation:
-            i, j = self._arrays.planar_rotation
+        if arrays.planar_rotation:
+            i, j = arrays.planar_rotation
             half += math.tau * np.rint((QUARTER * (i + j * self._whole[0]) - half) / math.tau)
-        return np.stack((
-            math.pi * ((alpha + beta) + (alpha_rest + beta_rest)), arguments[0] + arguments[1],
-            2.0 * half,
-            math.pi * ((alpha - beta) + (alpha_rest - beta_rest)), arguments[0] - arguments[1]))
+        return (math.pi * ((alpha + beta) + (alpha_rest + beta_rest))
+                + ((arguments[0] + arguments[1]) + arrays.phi_phase),
+                arrays.sign * (2.0 * half) + arrays.turn,
+                math.pi * ((alpha - beta) + (alpha_rest - beta_rest))
+                + ((arguments[0] - arguments[1]) + arrays.psi_phase))
 
     @cached_property
     def theta_dot(self) -> Column:
+        theta_dot: Column = self._arrays.sign * self.tilt_rate
+        return theta_dot
+
+    @cached_property
+    def tilt_rate(self) -> Column:
+        """The rate of theta in [0, pi] [rad/s], continued through a pole that is passed."""
         # theta' = -u'/sin(theta), and u' is a theta series of 2y.
         arrays, xi, (alpha, beta) = self._arrays, self._xi, self.moduli
         if not arrays.u_dot.any():      # it rests, perhaps at a pole
@@ -303,9 +291,9 @@ class ThetaValues:
             without[k] = np.where(here, self._without_zero[k], without[k])
         series = prefactor * _horner(arrays.u_dot_coefficients, 4.0 * xi * (1.0 - xi))
         # In this order nothing overflows on the separatrix, where all grow like cosh x.
-        theta_dot: Column = -arrays.u_dot.take(self._parity) * (series / size) / (
+        rate: Column = -arrays.u_dot.take(self._parity) * (series / size) / (
             without[0] * without[1])
-        return theta_dot
+        return rate
 
     @cached_property
     def across(self) -> Column:
@@ -329,8 +317,7 @@ class ThetaValues:
         return rate
 
     @cached_property
-    def rates(self) -> Matrix:
-        """The rate of theta, phi' sin(theta) [rad/s], cosine and sine of psi, (4, n)."""
+    def transverse_velocity(self) -> tuple[Column, Column]:
         # psi is the argument of alpha less that of beta.
         real, imag = self._alpha_beta
         moduli = self.moduli.copy()
@@ -338,8 +325,8 @@ class ThetaValues:
         cos, sin = real / moduli, imag / moduli
         for k in self._arrays.on_line:
             cos[k], sin[k] = self._rotations[0][k], self._rotations[1][k]
-        return np.stack((self.theta_dot, self.across, cos[0] * cos[1] + sin[0] * sin[1],
-                         sin[0] * cos[1] - cos[0] * sin[1]))
+        return attitude.transverse(self.tilt_rate, self.across, cos[0] * cos[1] + sin[0] * sin[1],
+                                   sin[0] * cos[1] - cos[0] * sin[1])
 
 
 def _columns(numbers: Sequence[mpfr]) -> Matrix:

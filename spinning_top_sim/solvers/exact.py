@@ -8,15 +8,12 @@ The exact motion of the heavy symmetric top, at the same cost and accuracy for e
 from __future__ import annotations
 
 import math
-from functools import cached_property
-from typing import Any
 
 import numpy as np
 from gmpy2 import const_pi, mpc, mpfr, rint, sin_cos, sinh, sqrt
 from numpy.typing import NDArray
 
-from spinning_top_sim.physics import attitude
-from spinning_top_sim.physics.attitude import Column, Quaternion
+from spinning_top_sim.physics.attitude import Column
 from spinning_top_sim.physics.pivot import Fractions
 from spinning_top_sim.physics.regimes import (
     COINCIDE,
@@ -26,16 +23,20 @@ from spinning_top_sim.physics.regimes import (
     precession_momentum,
     regime,
 )
-from spinning_top_sim.physics.states import TIMES_TOGETHER, States
+from spinning_top_sim.physics.states import States, joined
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.solvers.constants import Factor, ThetaMotion, precise, set_up
-from spinning_top_sim.solvers.evaluate import ThetaArrays, ThetaValues, Times
+from spinning_top_sim.solvers.evaluate import ExactStates, ThetaArrays
 from spinning_top_sim.solvers.multiprecision import SIN_ODD, precision
 from spinning_top_sim.solvers.vertical import Posture, PreciseState, Vertical
-from spinning_top_sim.times import NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS, ns_array
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
+# Doubles hold the constants of all motions whose numbers are between this and its inverse, or 0.
+USUAL = 1e-20
+# Times that are evaluated together: the temporaries of more do not fit into the cache.
+TIMES_TOGETHER = 8192
 
 
 class ExactSolution:
@@ -81,9 +82,6 @@ class ExactSolution:
         # A motion about another vertical has its start and its `gravity` in multiprecision.
         self.top, self._given = top, start
         self.start = start = start if isinstance(start, State) else start.rounded()
-        # theta = sign * (theta in [0, pi]) + turn, for a start that goes on beyond a pole
-        self.turn = math.tau * round(start.theta / math.tau)
-        self.sign = -1.0 if start.theta < self.turn else 1.0
         with precision():
             self._motion = motion = set_up(top, self._given, gravity)
             alpha, beta, self.m1 = motion.alpha, motion.beta, float(motion.m1)
@@ -91,38 +89,34 @@ class ExactSolution:
             self.nutation_period = float(2 / motion.quarter_rate) if motion.quarter_rate else None
             self.mean_precession_rate = float(alpha.rate + beta.rate)
             self.mean_spin_rate = float(alpha.rate - beta.rate)
-            # phi = precession rate * t + phase + alpha's and beta's arguments; psi with a minus.
-            self.phi_phase = float(start.phi - alpha.start_argument - beta.start_argument)
-            self.psi_phase = float(start.psi - alpha.start_argument + beta.start_argument)
             self.time_limit = MOST_TURNS / max(
                 abs(float(motion.quarter_rate)), 1e-290,
                 (abs(self.mean_precession_rate) + abs(self.mean_spin_rate)) / (4.0 * math.pi))
-            self.arrays = ThetaArrays(motion)
+            self.arrays = ThetaArrays(motion, start)
         self.theta_min, self.theta_max = self.arrays.bounds
-        if gravity is None:
+        # Only of sizes that are far apart: it takes a fourth of the time.
+        if gravity is None and not all(USUAL < abs(x) < 1.0 / USUAL for x in (
+                *vars(top).values(), *vars(start).values()) if x):
             self._check_start()
 
     def _check_start(self) -> None:
         """Refuse constants so large, or so far apart, that doubles lose the start among them."""
-        start, arrays = self.start, self.arrays
-        if not self.time_limit > 0.0:
-            raise ValueError(f'lambda3 = {self.top.lambda3!r} kg m^2 with l3 = {start.l3!r}: '
-                             'l3/lambda3 must be a double')
-        with np.errstate(all='ignore'):
-            first = ThetaValues(arrays, Times(1, np.zeros(1)))
-            alpha, beta, theta_dot = (float(x[0]) for x in (*first.moduli, first.theta_dot))
-        cosine, sine = abs(math.cos(0.5 * start.theta)), abs(math.sin(0.5 * start.theta))
-        across = sum(rate * x / y for rate, x, y in (       # phi' sin(theta)
-            (arrays.bottom_rate, sine, cosine), (arrays.top_rate, cosine, sine)) if rate)
-        # Relative to the distance from either pole, and to a small velocity of the axis.
-        for name, error, size in (
-                ('theta', beta * cosine - alpha * sine, alpha * sine),
-                ('theta_dot', self.sign * theta_dot - start.theta_dot,
-                 min(math.hypot(start.theta_dot, across), max(1.0, abs(start.theta_dot))))):
-            if not abs(error) <= 1e-14 * abs(size):
-                raise ValueError(f'{name} = {getattr(start, name)!r} cannot be held in doubles: '
-                                 f'the constants of {self.top} and {start} are too far apart in '
-                                 'size')
+        start, arrays, held = self.start, self.arrays, self.time_limit > 0.0
+        if held:
+            with np.errstate(all='ignore'):
+                first = ExactStates(self.top, start, arrays, 1, np.zeros(1))
+                alpha, beta, theta_dot = (
+                    float(x[0]) for x in (*first.moduli, first.theta_dot))
+            cosine, sine = abs(math.cos(0.5 * start.theta)), abs(math.sin(0.5 * start.theta))
+            across = sum(rate * x / y for rate, x, y in (       # phi' sin(theta)
+                (arrays.bottom_rate, sine, cosine), (arrays.top_rate, cosine, sine)) if rate)
+            # Relative to the distance from either pole, and to a small velocity of the axis.
+            held = (abs(beta * cosine - alpha * sine) <= 1e-14 * abs(alpha * sine)
+                    and abs(theta_dot - start.theta_dot) <= 1e-14 * min(
+                        math.hypot(start.theta_dot, across), max(1.0, abs(start.theta_dot))))
+        if not held:
+            raise ValueError(f'the constants of {self.top} and {start} are too far apart in size '
+                             'for doubles to hold the motion')
 
     def describe(self, coincide: float = COINCIDE) -> Description:
         """
@@ -148,19 +142,26 @@ class ExactSolution:
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
         """Return the states at integer nanoseconds (n,), in any order and of any sign."""
-        return self._states_at(Times.from_ns(times_ns))
+        count = ns_array(times_ns)
+        t, t_low = count.astype(np.float64), None
+        if np.abs(t).max(initial=0.0) >= 2.0 ** 53:
+            # Half of it, as `t` may be 2^63.
+            t_low = (count - 2 * (0.5 * t).astype(np.int64)).astype(np.float64)
+        return self._states_at(NANOSECONDS, t, t_low)
 
     def states_at_seconds(self, t: Column) -> States:
         """Return the states at t (n,) [s], in any order and of any sign."""
-        return self._states_at(Times(1, t.copy()))
+        return self._states_at(1, t)
 
-    def _states_at(self, times: Times) -> States:
-        latest = float(np.abs(times.high).max(initial=0.0)) / times.per_second
+    def _states_at(self, per_second: int, t: Column, t_low: Column | None = None) -> States:
+        latest = float(np.abs(t).max(initial=0.0)) / per_second
         if not latest <= self.time_limit:       # catches NaN too
             raise ValueError(
                 f't = {latest!r} s: must be finite and within {self.time_limit:.6g} s, where a '
                 'phase of this motion reaches 2^52 turns')
-        return _ExactStates(self, times)
+        parts = (slice(k, k + TIMES_TOGETHER) for k in range(0, len(t) or 1, TIMES_TOGETHER))
+        return joined([ExactStates(self.top, self.start, self.arrays, per_second, t[part],
+                                   None if t_low is None else t_low[part]) for part in parts])
 
     def posture(self, t_ns: int, vertical: Vertical | None = None) -> Posture:
         """
@@ -192,7 +193,7 @@ def exact_about(top: Top, start: State | Posture,
     with precision():
         posture = start if isinstance(start, Posture) else precise(start).posture(top)
         vertical = Vertical.of(top, acceleration, mpfr)
-        state = PreciseState.of_posture(vertical.top, vertical.to_frame(posture), mpfr)
+        state = PreciseState.of_posture(vertical.top, vertical.to_frame(posture))
     return ExactSolution(vertical.top, state, vertical.gravity), vertical
 
 
@@ -220,56 +221,3 @@ def _at(motion: ThetaMotion, t: mpfr) -> tuple[mpc, mpc, mpfr]:
     size = sqrt(abs(alpha) ** 2 + abs(beta) ** 2)
     slope = motion.u_dot_series.at(2 * sine * point[1], 1 - 2 * xi, 4 * xi * (1 - xi))
     return alpha / size, beta / size, motion.u_dot[whole % 2] * slope / size ** 4
-
-
-class _ExactStates(States):
-    """The states of an exact solution, on the branch of its start."""
-
-    method = 'exact'
-
-    def __init__(self, solution: ExactSolution, times: Times) -> None:
-        super().__init__(solution.top, solution.start, len(times.high))
-        self._solution, self._times = solution, times
-
-    @cached_property
-    def t(self) -> Column:
-        return self._times.seconds
-
-    @cached_property
-    def _values(self) -> ThetaValues:
-        return ThetaValues(self._solution.arrays, self._times)
-
-    def _rows(self, name: str) -> Any:
-        """Return an attribute (k, n) of `ThetaValues`; of many times, a block after the other."""
-        if len(self) <= TIMES_TOGETHER:
-            return getattr(self._values, name)
-        parts = (self._times.part(slice(k, k + TIMES_TOGETHER))
-                 for k in range(0, len(self), TIMES_TOGETHER))
-        return np.concatenate([
-            getattr(ThetaValues(self._solution.arrays, part), name) for part in parts], axis=1)
-
-    @cached_property
-    def rows_quaternion(self) -> Quaternion:
-        x, y, z, w = self._rows('quaternion')
-        return x, y, z, w
-
-    @cached_property
-    def angles(self) -> tuple[Column, Column, Column]:
-        solution = self._solution
-        precession, phi, theta, spin, psi = self._rows('angles')
-        return (precession + (phi + solution.phi_phase),
-                solution.sign * theta + solution.turn,
-                spin + (psi + solution.psi_phase))
-
-    @cached_property
-    def _rates(self) -> Any:
-        return self._rows('rates')
-
-    @cached_property
-    def theta_dot(self) -> Column:
-        theta_dot: Column = self._solution.sign * self._rates[0]
-        return theta_dot
-
-    @cached_property
-    def transverse_velocity(self) -> tuple[Column, Column]:
-        return attitude.transverse(*self._rates)

@@ -5,14 +5,6 @@ Multiprecision numbers, `mpfr` and `mpc` of gmpy2, and what the closed form comp
 `precision` sets the precision of results.  L. Fousse et al., "MPFR: A multiple-precision binary
 floating-point library with correct rounding", ACM Trans. Math. Softw. 33 (2007), 13.
 
-`GaussMean`: elliptic integrals by Gauss' arithmetic-geometric mean of a_0 and g_0 [DLMF 19.8(i)].
-No step subtracts numbers of one size, and all converge quadratically.
-
-    a_(n+1) = (a_n + g_n)/2,  g_(n+1) = sqrt(a_n g_n),  c_n = sqrt(a_n^2 - g_n^2)
-
-The modulus is k = c_0/a_0, its complement k' = g_0/a_0: only the ratios of a_0, g_0 and c_0 count,
-but for the mean itself.
-
 `cubic_roots`: the roots of the nutation's cubic and their distances, without cancellation.
 
 `ThetaForm`: Jacobi's theta functions as short polynomials.  theta1 .. theta4 of y are used in the
@@ -66,7 +58,13 @@ NEGLIGIBLE = 1e-21      # a ratio whose fourth power does not count
 
 class GaussMean:
     """
-    The arithmetic-geometric mean M of a_0 and g_0; the caller knows c_0 without cancellation.
+    Gauss' arithmetic-geometric mean M of a_0 and g_0, for elliptic integrals [DLMF 19.8(i)].
+
+    No step subtracts numbers of one size, and all converge quadratically.
+
+        a_(n+1) = (a_n + g_n)/2,  g_(n+1) = sqrt(a_n g_n),  c_n = sqrt(a_n^2 - g_n^2)
+
+    The modulus is k = c_0/a_0, its complement k' = g_0/a_0: only ratios count, but for M itself.
 
     mean : M; the quarter period K(k) is (pi/2) a_0/M [DLMF 19.8.5]
     """
@@ -185,7 +183,7 @@ def _isolated_root(a2: mpfr, a1: mpfr, a0: mpfr) -> tuple[mpfr, int]:
 # of which these are the first two, for n = 0 and 2 or n = 1 and 3; f(n + 2) = (2 - 4 xi) f(n) -
 # f(n - 2).
 COS_EVEN, COS_ODD, SIN_ODD, SIN_EVEN = range(4)
-FIRST_POLYNOMIALS = ([1], [1, -2]), ([1], [1, -4]), ([1], [3, -4]), ([0], [2])
+FIRST_POLYNOMIALS = ([1], [1, -2]), ([1], [1, -4]), ([1], [3, -4]), ([0], [2, 0])
 MOST_TERMS = 6
 # Of the polynomials in doubles, and of rates, and states that are handed over: motions between
 # changes of the vertical can be chaotic, and every error grows.
@@ -226,8 +224,11 @@ class Series:
 
     def at(self, sin: mpfr, cos: mpfr, xi: mpfr) -> mpfr:
         """Return the sum."""
-        value = reduce(lambda value, coefficient: value * xi + coefficient,
-                       reversed(self.polynomial()))
+        (before, *_), (constant, slope) = FIRST_POLYNOMIALS[self.prefactor]
+        now, factor, value = constant + slope * xi, 2 - 4 * xi, ZERO
+        for weight in self.weights:
+            value += weight * before
+            before, now = now, factor * now - before
         return value * (ONE, cos, sin, sin * cos)[self.prefactor]
 
     @property

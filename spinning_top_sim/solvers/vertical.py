@@ -31,9 +31,6 @@ Complex = Any
 # many digits there as this has zeros; in doubles, the rounding of Lz changes the angular velocity
 # of a tilted axis by as much as the tilt that is left out does, relative to L3/lambda1.
 POLE_IN_BITS, POLE_IN_DOUBLES = 1e-30, 1.5e-8
-# A motion that misses a pole by less than this share of the largest possible passes it exactly:
-# this is what rounding leaves of Lz - L3 in multiprecision.
-THROUGH = 1e-40
 
 
 class Posture(NamedTuple):
@@ -88,8 +85,7 @@ class PreciseState(NamedTuple):
         return cls(sine, cosine, theta_dot, alpha, beta, real(state.l3), real(state.lz))
 
     @classmethod
-    def of_posture(cls, top: Top, posture: Posture, real: Callable[[Any], Real] = float,
-                   pole: float = POLE_IN_BITS) -> PreciseState:
+    def of_posture(cls, top: Top, posture: Posture, pole: float = POLE_IN_BITS) -> PreciseState:
         """
         Return the state of a posture about the same vertical.
 
@@ -99,11 +95,13 @@ class PreciseState(NamedTuple):
         pole : within which tilt the axis is vertical [rad]
         """
         alpha, beta, transverse, _ = posture
-        cosine2, sine2, l3 = _norm(alpha), _norm(beta), real(posture.l3)
+        cosine2, sine2 = _norm(alpha), _norm(beta)
         size2 = cosine2 + sine2
         cosine, sine = (cosine2 / size2) ** 0.5, (sine2 / size2) ** 0.5
+        none = 0 * sine
+        l3 = posture.l3 + none          # in numbers of the same kind
         if 2 * min(sine, cosine) < pole:
-            rate, none = abs(transverse), 0 * sine
+            rate = abs(transverse)
             turn = -1j * transverse if rate else 1 + 0j         # exp(-i psi) theta'
             if sine < cosine:
                 return cls(none, 1 + none, rate, alpha, alpha * turn, l3, l3)
@@ -111,12 +109,8 @@ class PreciseState(NamedTuple):
         # alpha conj(beta) = sin(theta)/2 exp(i psi), omega_1 + i omega_2 = (-phi' sin(theta)
         # + i theta') exp(-i psi)
         rates = transverse * (alpha * beta.conjugate()) / (cosine * sine * size2)
-        lambda1 = real(top.lambda1)
         lz = (cosine - sine) * (cosine + sine) * l3 - (
-            2 * lambda1 * rates.real * cosine * sine)
-        most2 = THROUGH ** 2 * (l3 * l3 + (cosine * sine) ** 2 * lambda1 * (
-            lambda1 * _norm(transverse) + abs(top.gravity_torque)))
-        lz = next((pole for pole in (l3, -l3) if (lz - pole) ** 2 <= most2), lz)
+            2 * top.lambda1 * rates.real * cosine * sine)
         return cls(sine, cosine, rates.imag, alpha, beta, l3, lz)
 
     def posture(self, top: Top) -> Posture:

@@ -58,12 +58,13 @@ class Trajectory:
     @property
     def steps(self) -> int:
         """Integration steps taken so far."""
-        return self._forgotten[0] + sum(piece.steps for piece in self._pieces)
+        return self._forgotten[0] + sum(piece.motion.steps for piece in self._pieces)
 
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side so far."""
-        return self._forgotten[1] + sum(piece.evaluations for piece in self._pieces)
+        return self._forgotten[1] + sum(
+            piece.motion.evaluations for piece in self._pieces)
 
     def evaluate(self, t_ns: Times) -> States:
         """
@@ -109,7 +110,7 @@ class Trajectory:
     def momenta(self, t_ns: int) -> tuple[float, float]:
         """Return L3, and Lz about the vertical of the world, after a time [kg m^2/s]."""
         piece = self.after(t_ns)
-        now = piece.start if piece.rests else PreciseState.of_posture(
+        now = piece.motion.start if piece.rests else PreciseState.of_posture(
             self.top, piece.posture(t_ns).in_doubles())
         return now.l3, now.lz
 
@@ -149,8 +150,9 @@ class Trajectory:
     def exact_attitude(self, t_ns: Times) -> Quaternion:
         """Return q(world <- body) of the exact solution at times (n,); NaN: it is not known."""
         def of(piece: Piece, times: Times) -> ArrayLike:
-            states = piece.truth(times)
-            return np.full((4, len(times)), np.nan) if states is None else states.rows_quaternion
+            exact = piece.exact
+            return exact.states(times).rows_quaternion if exact else np.full(
+                (4, len(times)), np.nan)
 
         x, y, z, w = self._joined(of, t_ns)
         return x, y, z, w
@@ -188,8 +190,8 @@ class Trajectory:
         count = max(bisect_left(self._pieces, before_ns, key=attrgetter('start_ns')) - 1, 0)
         gone, self._pieces = self._pieces[:count], self._pieces[count:]
         self._jumps = tuple(t_ns for t_ns in self._jumps if t_ns >= self._pieces[0].start_ns)
-        self._forgotten = (self._forgotten[0] + sum(piece.steps for piece in gone),
-                           self._forgotten[1] + sum(piece.evaluations for piece in gone))
+        self._forgotten = (self._forgotten[0] + sum(piece.motion.steps for piece in gone),
+                           self._forgotten[1] + sum(piece.motion.evaluations for piece in gone))
         for piece in self._pieces:
             piece.forget(steps_before_ns)
 

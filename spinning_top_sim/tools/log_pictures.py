@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the samples in a log, as `States.plot` and `States.animate` draw a solution."""
+"""Pictures of the samples in a log, as a solution is drawn."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,7 +36,7 @@ def animate(found: Survey, path: Path) -> None:
     """Draw the turning top in the begin of the first motion as a GIF."""
     motion, data = found.shown[0]
     begin = data.first(max(2, int(np.searchsorted(data.time, LONGEST_S, 'right'))))
-    pictures.animate(_columns([(motion, begin)])[0], FRAMES_PER_S, 1.0).save(
+    pictures.animate(_columns([(motion, begin)])[0], FRAMES_PER_S).save(
         path, writer=PillowWriter(fps=FRAMES_PER_S), dpi=GIF_PIXELS / 4.0)     # of 4 inches
 
 

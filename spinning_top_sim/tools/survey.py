@@ -210,8 +210,9 @@ def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogM
             drifts[name] = max(largest, _largest(drift))
     # Log times of the run; those of a log that was changed may lie anywhere.
     times_ns = np.clip(data.stamps_ns - section.epoch_ns, piece.start_ns, LAST_STAMP_NS)
-    if motion.exact is not None and (truth := piece.truth(times_ns)) is not None:
-        error = _largest(angle_between(data.quaternion, truth.rows_quaternion))
+    if motion.exact is not None and piece.exact:
+        error = _largest(angle_between(
+            data.quaternion, piece.exact.states(times_ns).rows_quaternion))
         found.errors[topic] = max(found.errors.get(topic, 0.0), error)
 
 
