@@ -141,6 +141,7 @@ def test_a_node(browser, peer, tmp_path):
         poses = peer.listen(node.topic('pose'), PoseStamped)
         with view, Visit(browser, address_of(view)) as visit:
             visit.read('[Cc]usps')
+            poses.wait(1)               # none comes later: the node is paused
             # A refused command says why.
             visit.press('Step')
             visit.read('refused: ')
