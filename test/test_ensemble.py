@@ -240,7 +240,7 @@ def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(
 
 
 def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(tmp_path):
-    """A magnetometer in one of two IMUs; a value that is unset in some runs; a run without rows."""
+    """A magnetometer in one of two IMUs; a value unset in some runs; a run without rows."""
     sets = [str(ROOT / f'config/imu/{name}.yaml') for name in ('bmi088', 'icm_20948')]
     specification = ensemble_spec.parse({'runs': 6, 'duration': 0.05, 'sample': {
         'params': {'values': [*sets, {'record.streams': ['gnss']}]},
