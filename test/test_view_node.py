@@ -49,7 +49,7 @@ def test_the_page_goes_on_with_the_topics_and_the_clock_that_come(live, monkeypa
         taken = play(Simulation(values, epoch_ns), NANOSECONDS // 2, topic)
         live._inbox.extend((topic, data) for topic, _, data in taken)
         t_ns = live.update(0.0)
-        track = live.track_at(t_ns)
+        track = live.track
         assert t_ns + track.epoch_ns == epoch_ns + NANOSECONDS // 2
         motion = track.motion_at(t_ns)
         assert (motion is None) is (topic == 'pose')        # which has no rates
@@ -66,7 +66,7 @@ def test_what_others_send_under_our_names_changes_nothing(live):
     live._is_stale, live._track = False, SampledTrack(values)
     live._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(name='spinning_top')]))
     live._inbox.append(('pose', bytes(99)))
-    assert live.update(0.0) == 0 and live.track_at(0) is None
+    assert live.update(0.0) == 0 and live.track is None
 
 
 def test_a_page_in_trouble_does_not_slow_the_node(peer, diagnostics, tmp_path):

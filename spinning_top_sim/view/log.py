@@ -60,6 +60,9 @@ class LogSource:
 
 def _end_of_top(run: recorded_run.RunDescription) -> int | None:
     """Return the last log time before a reset to another top [ns], None if there is none."""
-    return next((event.details['epoch_ns'] - 1 for _, event in run.events if event.kind == 'reset' and any(
-        value != run.values_in_effect[key] for key, value in event.details['parameters'].items()
-        if key.startswith('top.') or key == 'imu.rpy')), None)
+    for _, event in run.events:
+        values = event.details['parameters'] if event.kind == 'reset' else {}
+        if any(values[key] != run.values_in_effect[key] for key in values
+               if key.startswith('top.') or key == 'imu.rpy'):
+            return int(event.details['epoch_ns']) - 1
+    return None
