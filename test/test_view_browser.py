@@ -144,7 +144,7 @@ def test_a_node(browser, peer, tmp_path):
             poses.wait(1)               # none comes later: the node is paused
             # A refused command says why.
             visit.press('Step')
-            visit.read('refused: ')
+            visit.read('refused: step')
             visit.press('Pause')
             visit.read(r'pause: paused at t = ([\d.]+) s')
 
