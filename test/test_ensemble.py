@@ -193,12 +193,13 @@ def test_a_receiver_without_reception_is_no_failure_and_has_no_fix():
 
 
 def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names():
-    given = {'runs': 2000, 'duration': 1.0, 'seed': 3}
+    given = {'runs': 2030, 'duration': 1.0, 'seed': 3}
     lists = {'initial.theta': {'values': [0.1, 0.2]}}
     one = ensemble_spec.parse({**given, 'sample': {'spin.l3': {'uniform': [1, 3]}, **lists}}, '')
     more = ensemble_spec.parse({**given, 'sample': {
         'top.mass': {'log_uniform': [0.1, 10.0]}, 'spin.l3': {'uniform': [1.0, 3.0]},
         'spin.lz': {'normal': [2.0, 0.5]}, **lists, 'imu.rate': {'values': [10, 20, 30]}}}, '')
+    assert [run for part in more.parts for run in part] == [*range(2030)] and len(more.parts) == 51
     drawn = [more.drawn(run) for run in range(2000)]
     for run in (0, 1, 1999):
         assert one.drawn(run).items() <= drawn[run].items()

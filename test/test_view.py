@@ -261,6 +261,8 @@ def test_sliders_and_scenes_begin_the_motions_of_their_numbers():
     assert track.state(NANOSECONDS).quaternion == pytest.approx(
         solve(top, start, [1.0]).quaternion, abs=1e-9)
     assert track.about.startswith('Scene looping with other numbers; ')
+    own.update(0.5)
+    assert own.update(0.5) == NANOSECONDS and own.track is track
     desk.put('scene', 'sleeping')
     assert own.update(0.25) == 250_000_000
     assert own.track.motion_at(0).description.name == 'sleeping'
