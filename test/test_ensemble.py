@@ -110,45 +110,20 @@ def test_a_run_has_the_samples_that_simulate_sends(whole):
         assert cells.count(None) >= lost
 
 
-def test_two_workers_of_which_one_is_killed_make_the_same_dataset(
+def test_interrupted_killed_and_torn_it_makes_the_same_dataset(
         whole, tmp_path, cluster, ensemble, monkeypatch):
-    from distributed.client import Future
-
-    data, path = whole
-    folder, killed, ordinary = tmp_path / 'other', [], Future.result
-    first, _ = cluster.run(os.getpid).values()
-
-    def result(future):
-        if not killed:
-            killed.append(os.kill(first, signal.SIGKILL))
-        return ordinary(future)
-
-    monkeypatch.setattr(Future, 'result', result)
-    assert ensemble(path, '-o', folder) == 0
-    assert killed
-    assert contents(folder / 'data') == contents(data)
-    manifest = json.loads((folder / 'manifest.json').read_text())
-    assert manifest['complete'] and manifest['failed'] == {}
-    assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(manifest['versions'])
-    assert ensemble_spec.parse(manifest['specification'], 'test') == ensemble_spec.read(path)
-    # It is complete: nothing is computed again, and no other ensemble goes there.
-    assert ensemble(path, '-o', folder) == 0
-    other = written(tmp_path, runs=1)
-    assert ensemble(other, '-o', folder) == ensemble(other, '-o', tmp_path) == 2
-    assert contents(folder / 'data') == contents(data)
-
-
-def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_scheduler(
-        whole, tmp_path, ensemble, cluster, monkeypatch):
-    """A part that is there is not computed again; a torn one is."""
+    """The same command goes on; a part that is there is not computed again, a torn one is."""
     from distributed import Future, comm
 
     (data, path), folder, ordinary, results = whole, tmp_path / 'other', Future.result, []
+    first, _ = cluster.run(os.getpid).values()
 
     def result(future):
         results.append(future)
         if len(results) in (4, 8):
             raise (KeyboardInterrupt if len(results) == 4 else comm.CommClosedError)
+        if len(results) == 9:
+            os.kill(first, signal.SIGKILL)      # another worker takes its tasks
         return ordinary(future)
 
     monkeypatch.setattr(Future, 'result', result)
@@ -156,12 +131,22 @@ def test_the_same_command_goes_on_after_an_interruption_or_the_loss_of_the_sched
     assert not json.loads((folder / 'manifest.json').read_text())['complete']
     cluster.gather([cluster.submit(os.getpid, workers=[one], pure=False)    # after running tasks
                     for one in cluster.scheduler_info()['workers']])
-    torn, *kept = sorted((folder / 'data').iterdir())
-    then = [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept]
-    torn.write_bytes(torn.read_bytes()[:-1])
-    assert ensemble(path, '-o', folder) == 0
+    *torn, kept = sorted((folder / 'data').iterdir())
+    then = kept.stat().st_ino, kept.stat().st_mtime_ns
+    for part in torn:
+        part.write_bytes(part.read_bytes()[:-1])
+    for _ in range(2):          # when it is complete, nothing is computed again
+        assert ensemble(path, '-o', folder) == 0
+        assert contents(folder / 'data') == contents(data)
+        assert (kept.stat().st_ino, kept.stat().st_mtime_ns) == then
+    manifest = json.loads((folder / 'manifest.json').read_text())
+    assert manifest['complete'] and manifest['failed'] == {}
+    assert {'spinning_top_sim', 'numpy', 'pyarrow', 'python'} <= set(manifest['versions'])
+    assert ensemble_spec.parse(manifest['specification'], 'test') == ensemble_spec.read(path)
+    # No other ensemble goes there, nor where other files are.
+    other = written(tmp_path, runs=1)
+    assert ensemble(other, '-o', folder) == ensemble(other, '-o', tmp_path) == 2
     assert contents(folder / 'data') == contents(data)
-    assert [(part.stat().st_ino, part.stat().st_mtime_ns) for part in kept] == then
 
 
 @pytest.mark.parametrize(('momenta', 'failed', 'code'), [

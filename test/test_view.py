@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the page draws, as numbers, and what its controls do; no browser, no ROS."""
 
-import base64
 import math
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -29,7 +27,10 @@ from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.scene_file import read_scene
 
 pytest.importorskip('viser')
-from spinning_top_sim.view import command, drawn, player, plots, simulation, text
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from spinning_top_sim.view import command, drawn, player, plots, server, simulation, text
 from spinning_top_sim.view.log import LogSource
 from spinning_top_sim.view.page import Page
 from spinning_top_sim.view.samples import TOPICS, SampledTrack
@@ -312,31 +313,24 @@ def test_wrong_arguments_are_told_in_one_line(log, capsys, arguments, told):
     assert told in capsys.readouterr().err
 
 
-def test_a_page_of_another_site_is_refused():
-    """Raw handshakes, as a browser sends them for a page that it has from elsewhere."""
+def test_a_page_of_another_site_is_refused(monkeypatch):
+    monkeypatch.setenv('no_proxy', '*')
     page = Page('one', '127.0.0.1', None)
     port = page.server.get_port()
     with pytest.raises(OSError, match=f'127.0.0.1 port {port}: '):
         Page('two', '127.0.0.1', port)
-    own = f'127.0.0.1:{port}'
-    for host, origin, is_taken in (
-            (own, f'http://{own}', True), (own, None, True),        # None: no browser
-            (own, 'http://evil.example', False),
-            # A name of another site that stands for this address.
-            (f'evil.example:{port}', f'http://evil.example:{port}', False), ('[::1', None, False),
-            (f'LOCALHOST:{port}', f'http://localhost:{port}', True)):
-        lines = ['GET / HTTP/1.1', f'Host: {host}', 'Upgrade: websocket', 'Connection: Upgrade',
-                 f'Sec-WebSocket-Key: {base64.b64encode(bytes(16)).decode()}',
-                 'Sec-WebSocket-Version: 13',
-                 'Sec-WebSocket-Protocol: viser-v' + metadata.version('viser'),
-                 *([f'Origin: {origin}'] if origin else []), '', '']
-        with socket.create_connection(('127.0.0.1', port), 30.0) as connection:
-            connection.sendall('\r\n'.join(lines).encode())
-            stream = connection.makefile('rb')
-            while stream.readline().strip():
-                pass
-            # The first frame: binary messages, or the end with a code.
-            opcode, _, *code = stream.read(4)
-            assert (opcode & 15 == 2) is is_taken, (host, origin)
-            assert is_taken or int.from_bytes(code) == 1008
+    protocol = 'viser-v' + metadata.version('viser')
+    for origin in (page.address, None):         # None: no browser
+        with connect(f'ws://127.0.0.1:{port}', origin=origin, subprotocols=[protocol]) as one:
+            assert isinstance(one.recv(), bytes)
+    with (connect(f'ws://127.0.0.1:{port}', origin='http://evil.example',
+                  subprotocols=[protocol]) as one,
+          pytest.raises(ConnectionClosed, match=r'1008.*Origin: http://evil')):
+        one.recv()
     page.close()
+    for host, origin, is_refused in (
+            ('LOCALHOST:8', 'http://localhost:8', False), ('127.0.0.1:8', 'null', True),
+            # A name of another site that stands for this address.
+            ('evil.example:8', 'http://evil.example:8', True), ('[::1', None, True)):
+        headers = {'Host': host} | ({'Origin': origin} if origin else {})
+        assert bool(server.refusal(headers, {'localhost'})) is is_refused
