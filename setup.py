@@ -33,8 +33,8 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.11',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'recording/*.json', 'streams/*.toml', 'view/*.css',
-                         'view/*.html', 'view/*.toml']},
+    package_data={NAME: ['py.typed', 'recording/*.json', 'streams/*.toml', 'tools/*.toml',
+                         'view/*.css', 'view/*.html', 'view/*.toml']},
     data_files=[(folder, sorted(files)) for folder, files in DATA_FILES.items() if files],
     entry_points={'console_scripts': [
         f'{command} = {function}' for command, function in PROJECT['scripts'].items()]},

@@ -17,7 +17,7 @@ from typing import Any
 from cases import ROOT
 
 MEASURED = ROOT / 'docs/measured'
-PACKAGES = 'numpy', 'scipy', 'heyoka', 'mujoco', 'jax', 'diffrax', 'matplotlib'
+PACKAGES = 'numpy', 'scipy', 'heyoka', 'matplotlib'
 
 
 def preamble(title: str, packages: Sequence[str] = PACKAGES) -> str:

@@ -51,8 +51,7 @@ SITUATIONS = (
 METHODS = (
     ('exact, any times', 0.0), ('rk45 transport', 1e-11), ('rk45 euler', 1e-11),
     ('SciPy RK45', 1e-6), ('SciPy DOP853', 1e-9), ('SciPy DOP853', 1e-12),
-    ('SciPy LSODA', 1e-9), ('heyoka Euler', 2.0 ** -52), ('heyoka quadratic', 2.0 ** -52),
-    ('MuJoCo RK4', 2048.0))
+    ('SciPy LSODA', 1e-9), ('heyoka quadratic', 2.0 ** -52))
 # Bounds of right attitudes and angles [rad]: a missed passage of a pole is an error of pi.
 LOST_ATTITUDE, LOST_ANGLE = 0.01, 1.0
 
@@ -66,8 +65,7 @@ CHECKPOINTS = (10, 100, 1000, 3600)
 RUNNERS = (
     ('exact, any times', 0.0), ('rk45 transport', 1e-11), ('rk45 transport', 1e-13),
     ('rk45 euler', 1e-11), ('SciPy RK45', 1e-6), ('SciPy DOP853', 1e-9),
-    ('SciPy DOP853', 1e-12), ('heyoka Euler', 2.0 ** -52), ('heyoka quadratic', 2.0 ** -52),
-    ('MuJoCo RK4', 512.0))
+    ('SciPy DOP853', 1e-12), ('heyoka quadratic', 2.0 ** -52))
 
 
 @dataclasses.dataclass

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from scipy.spatial.transform import Rotation
 
@@ -133,44 +132,6 @@ def test_a_simulation_without_a_node(browser, tmp_path):
             visit.read('The pivot moves')
             visit.wait("window.__viserMutable.nodePoseData['/ground'].position[0] < 0")
         assert own.end(signal.SIGTERM) == 0, own.err
-
-
-def test_a_node(browser, peer, tmp_path):
-    with SimNode(tmp_path, {'record.uri': f'{tmp_path}/', 'tick_rate': 50.0}) as node:
-        view = SimNode(tmp_path / 'view', namespace=node.namespace, program=(*VIEW, '--node'))
-        poses = peer.listen(node.topic('pose'), PoseStamped)
-        with view, Visit(browser, address_of(view)) as visit:
-            visit.read('[Cc]usps')
-            # A refused command says why.
-            visit.press('Step')
-            visit.read('refused: ')
-            visit.press('Pause')
-            visit.read(r'pause: paused at t = ([\d.]+) s')
-
-            def stamp():
-                seconds, nanoseconds = visit.read(r'stamp (\d+)\.(\d{9})')
-                return int(seconds), int(nanoseconds)
-
-            def shown_is_published():
-                message, attitude = poses.last(), visit.attitude()
-                q, at = message.pose.orientation, message.header.stamp
-                return stamp() == (at.sec, at.nanosec) and np.allclose(
-                    attitude, [q.x, q.y, q.z, q.w], atol=1e-6)
-
-            wait_for('the last pose to be shown', shown_is_published)
-            before = stamp()
-            visit.press('Step')
-            wait_for('a step', lambda: stamp() > before)
-            visit.press('Resume')
-            # Another motion, whoever commands it.
-            assert peer.set_together(node, spin__l3=2.0, spin__lz=1.5).successful
-            visit.read('[Ll]oops')
-            visit.press('Reset')
-            visit.read('reset: at t = 0')
-            # The page says when the node ends, and when it ends itself.
-            assert node.end() == 0
-            visit.read('spinning_top has ended')
-            assert view.end(signal.SIGINT) == 0, view.err
 
 
 def test_a_file_without_a_network(browser, tmp_path):

@@ -17,21 +17,38 @@ exit codes:
 """
 
 import argparse
+import asyncio
+import concurrent.futures
 import contextlib
 import json
-import shutil
+import logging
+import os
+import platform
+import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
+from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from spinning_top_sim.installation import needed
+from spinning_top_sim.installation import needed, version
 from spinning_top_sim.tools import cli, ensemble_spec
-from spinning_top_sim.tools.ensemble_part import DATA, compute_part, versions
+from spinning_top_sim.tools.ensemble_part import DATA, compute_part
+
+if TYPE_CHECKING:
+    import distributed
 
 MANIFEST = 'manifest.json'
+LOOPBACK = '127.0.0.1'
+CONNECT_S, FIRST_WORKER_S = 10.0, 60.0
+CONFIGURATION = {
+    'distributed.worker.profile.enabled': False,        # it grows with time
+    # With Dask's threshold of 64 KiB, glibc returns each array to the system, which takes a third
+    # of the time of a run.  Variables of the environment go first.
+    'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2 ** 26,
+    'distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_': 2 ** 25}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +62,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     workers.add_argument('--scheduler', metavar='ADDRESS',
         help='of a Dask cluster, such as tcp://host:8786, whose machines all have the package and '
         'DIR')
-    add('--overwrite', action='store_true', help='replace the dataset in DIR')
     add('--quiet', action='store_true', help='no progress, no summary')
 
 
@@ -53,33 +69,35 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.workers is not None and arguments.workers < 1:
         raise ValueError(f'--workers {arguments.workers}: must be >= 1')
     with needed('an ensemble', 'ensemble'):     # before anything is written
+        import distributed  # noqa: PLC0415
         import pyarrow  # noqa: F401, PLC0415
-
-        from spinning_top_sim.tools import ensemble_cluster  # noqa: PLC0415
 
     specification = ensemble_spec.read(arguments.specification)
     folder = arguments.output.absolute()
-    manifest: dict[str, Any] = json.loads(json.dumps({
-        'format': 3, 'complete': False, 'versions': versions(),
-        'specification': asdict(specification), 'failed': {}}))
-    if (folder / MANIFEST).exists():
-        if not arguments.overwrite and not _is_of(folder / MANIFEST, manifest):
-            raise ValueError(f'{folder} has another ensemble, or one of other versions: choose a '
-                             'new folder, or --overwrite')
-    elif folder.exists() and any(folder.iterdir()):
-        raise ValueError(f'{folder} exists and has no {MANIFEST}: choose a new folder')
+    # The bytes of a dataset depend on these versions, too.
+    manifest: dict[str, Any] = {
+        'complete': False, 'specification': asdict(specification), 'failed': {}, 'versions': {
+            'python': platform.python_version(), 'machine': platform.machine(),
+            **{name: version(name) for name in ('spinning_top_sim', 'numpy', 'pyarrow')}}}
+    if folder.exists() and any(folder.iterdir()) and not _is_of(folder / MANIFEST, manifest):
+        raise ValueError(f'{folder}: it has other files, another ensemble, or one of other '
+                         'versions: choose a new folder')
     failed: dict[str, str] = {}
     with (cli.progress('computed', specification.runs, 'runs', quiet=arguments.quiet) as show,
-          ensemble_cluster.connect(arguments.workers, arguments.scheduler) as client):
-        if arguments.overwrite and (folder / DATA).exists():
-            shutil.rmtree(folder / DATA)
+          connect(arguments.workers, arguments.scheduler) as client):
         (folder / DATA).mkdir(parents=True, exist_ok=True)
         _write_manifest(folder, manifest)
-        task = partial(compute_part, specification, folder=str(folder))
-        parts = ensemble_cluster.compute(client, task, range(specification.parts))
-        for done, reasons in enumerate(parts, start=1):
-            failed.update(reasons)
-            show(min(done * specification.runs_per_part, specification.runs))
+        # If a worker is killed, another one computes its task again.
+        tasks = client.map(partial(compute_part, specification, folder=str(folder)),
+                           list(range(len(specification.parts))), pure=False)
+        try:
+            for done, part in enumerate(distributed.as_completed(tasks, loop=client.loop), 1):
+                failed.update(part.result())
+                show(specification.runs * done / len(tasks))
+        except (distributed.KilledWorker, distributed.comm.CommClosedError,
+                concurrent.futures.CancelledError, asyncio.CancelledError) as error:
+            raise RuntimeError('the scheduler is lost, or several workers died of one task: '
+                               f'{error}') from error
     failed = dict(sorted(failed.items(), key=lambda item: int(item[0])))
     _write_manifest(folder, {**manifest, 'complete': True, 'failed': failed})
     for path in (folder / DATA).glob('.*'):     # of a worker that was killed
@@ -95,18 +113,54 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _is_of(path: Path, manifest: Mapping[str, Any]) -> bool:
     """Return whether a file is a manifest of the same runs."""
-    with contextlib.suppress(ValueError, LookupError, TypeError):
+    try:
         old = json.loads(path.read_bytes())
         # As text: the order in entries counts, as in a grid of samples.
         return all(json.dumps(old[key]) == json.dumps(manifest[key])
                    for key in ('specification', 'versions'))
-    return False
+    except (FileNotFoundError, ValueError, LookupError, TypeError):
+        return False
 
 
 def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     written = folder / f'{MANIFEST}.new'
     written.write_text(json.dumps(manifest, indent=1), encoding='utf-8')
     written.replace(folder / MANIFEST)
+
+
+@contextlib.contextmanager
+def connect(workers: int | None, scheduler: str | None) -> Iterator['distributed.Client']:
+    """
+    Yield a client of the cluster at the address `scheduler`, else of processes on this machine.
+
+    workers : number of processes on this machine, None for one a core
+
+    Raises OSError if the cluster cannot be reached, or has no workers.
+    """
+    import dask  # noqa: PLC0415
+    import distributed  # noqa: PLC0415
+
+    for handler in logging.getLogger('distributed').handlers:
+        handler.setLevel(logging.CRITICAL)          # errors are raised by the client
+    with contextlib.ExitStack() as stack:
+        address: Any = scheduler
+        if scheduler is None:
+            stack.enter_context(dask.config.set(CONFIGURATION))
+            resource_tracker.ensure_running()   # if it started later, it would unblock SIGINT
+            # A terminal sends Ctrl-C to the workers, too, but only this process reacts.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                # No dashboard, and no port that other machines can reach.
+                address = stack.enter_context(distributed.LocalCluster(
+                    n_workers=workers or len(os.sched_getaffinity(0)), threads_per_worker=1,
+                    host=LOOPBACK, dashboard_address=f'{LOOPBACK}:0',
+                    scheduler_kwargs={'dashboard': False}, silence_logs=logging.CRITICAL))
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        client = stack.enter_context(distributed.Client(
+            address, timeout=CONNECT_S, set_as_default=False))
+        client.wait_for_workers(1, FIRST_WORKER_S)
+        yield client
 
 
 main = partial(cli.run, 'ensemble', __doc__, add_arguments, _run)

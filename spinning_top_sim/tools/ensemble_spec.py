@@ -3,7 +3,6 @@
 
 import hashlib
 import math
-from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
@@ -20,33 +19,21 @@ from spinning_top_sim.tools.scene_file import parse_section, parse_yaml, read_sc
 DEFAULTS = {parameter.name: parameter.default for parameter in parameters.TABLE}
 # Streams that a table can have; only a log has the others.
 STREAMS = tuple(name for name in parameters.STREAMS if name not in ('clock', 'markers'))
-# By default a part has at most this many rows, or one run, and a large ensemble at least this
-# many parts.  Larger parts take more memory, and are no faster.
+# A part has at most this many rows, or one run, and a large ensemble at least this many parts.
+# Larger parts take more memory, and are no faster.
 ROWS_IN_A_PART, LEAST_PARTS = 50_000, 50
 VALUES, PARAMS = 'values', 'params'
 _entry = partial(Parameter, text='')
-_COUNT = Range(0, 2 ** 63 - 1)
 ENTRIES = (
     _entry('runs', default=1, range=Range(1, 2 ** 63 - 1)),
     _entry('duration', default=1.0, range=Range(1e-9, parameters.LONGEST)),
-    _entry('seed', default=0, range=_COUNT), _entry('streams', default=('imu',)),
-    _entry('runs_per_part', default=0, range=_COUNT))
-
-
-def _log_uniform(random: np.random.Generator, low: float, high: float) -> float:
-    return min(max(low * math.exp(math.log(high / low) * random.random()), low), high)
-
-
-# By name: the function that draws from two numbers, what these must be, and the check of that.
-DISTRIBUTIONS: Mapping[str, tuple[Callable[[np.random.Generator, float, float], float], str,
-                                  Callable[[float, float], bool]]] = {
-    'uniform': (np.random.Generator.uniform,
-                '[low, high] with low <= high and a finite difference',
-                lambda low, high: 0.0 <= high - low < math.inf),
-    'normal': (np.random.Generator.normal, '[mean, deviation] with deviation >= 0',
-               lambda mean, deviation: 0.0 <= deviation < math.inf),
-    'log_uniform': (_log_uniform, '[low, high] with 0 < low <= high and a finite ratio',
-                    lambda low, high: 0.0 < low <= high and high / low < math.inf)}
+    _entry('seed', default=0, range=Range(0, 2 ** 63 - 1)),
+    _entry('streams', default=('imu',), choices=STREAMS))
+# By name, the function that draws from two numbers.  Raises ValueError or OverflowError.
+DISTRIBUTIONS: Mapping[str, Callable[[np.random.Generator, float, float], float]] = {
+    'uniform': np.random.Generator.uniform, 'normal': np.random.Generator.normal,
+    'log_uniform': lambda random, low, high: math.exp(
+        random.uniform(math.log(low), math.log(high)))}
 
 
 def generator(seed: int, run: int, name: str) -> np.random.Generator:
@@ -65,8 +52,7 @@ class Specification:
     duration : of a run [s]
     params : mappings of parameters; a later one overrides those before it
     sample : name of a parameter to {distribution: [a, b]}, or to {values: [...]}
-    streams : names of the streams to keep; empty: those that the parameters of a run enable
-    runs_per_part : runs that are computed by one task, and share a file
+    streams : names of the streams to keep; empty: those that the parameters enable
     """
 
     runs: int
@@ -75,14 +61,6 @@ class Specification:
     params: Sequence[Mapping[str, Any]] = ()
     sample: Mapping[str, Mapping[str, Sequence[Any]]] | None = None
     streams: Sequence[str] = ()
-    runs_per_part: int = 0
-
-    @property
-    def parts(self) -> int:
-        return -(-self.runs // self.runs_per_part)
-
-    def part(self, number: int) -> range:
-        return range(self.runs)[number * self.runs_per_part:][:self.runs_per_part]
 
     def drawn(self, run: int) -> dict[str, Any]:
         """
@@ -101,29 +79,40 @@ class Specification:
                 point, index = divmod(point, len(items))
                 found[name] = index if name == PARAMS else items[index]
             else:
-                found[name] = DISTRIBUTIONS[kind][0](generator(self.seed, run, name), *items)
+                found[name] = DISTRIBUTIONS[kind](generator(self.seed, run, name), *items)
         return found
 
-    def values(self, run: int) -> dict[str, Any]:
-        """Return the checked parameters of a run.  Raises ValueError as `parameters.checked`."""
-        drawn = self.drawn(run)
-        return parameters.checked({**self.alternatives[drawn.pop(PARAMS, 0)], **drawn})
+    def values(self, drawn: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the checked parameters of a run with what is drawn for it.  Raises ValueError."""
+        others = {name: value for name, value in drawn.items() if name != PARAMS}
+        return parameters.checked({**self._given[drawn.get(PARAMS, 0)], **others})
 
     @cached_property
-    def alternatives(self) -> Sequence[Mapping[str, Any]]:
-        """The parameters given for the runs with each set in `sample`, before it is applied."""
-        last: dict[str, Any] = {'duration': self.duration}
+    def _given(self) -> Sequence[Mapping[str, Any]]:
+        """What is given for the runs with each set in `sample`."""
+        common = {name: value for one in self.params for name, value in one.items()}
+        streams: dict[str, Any] = {f'{name}.enabled': True for name in self.streams}
         if self.streams:
-            last['record.streams'] = self.streams
-            last.update((f'{name}.enabled', True) for name in self.streams)
+            streams['record.streams'] = self.streams
         sets = (self.sample or {}).get(PARAMS, {VALUES: [{}]})[VALUES]
-        return [dict(ChainMap(last, chosen, *reversed(self.params))) for chosen in sets]
+        return [{**common, **chosen, **streams, 'duration': self.duration} for chosen in sets]
 
     @cached_property
     def kept(self) -> Sequence[str]:
-        """Names of the streams that any of the runs keeps: the columns of the table of each."""
+        """Names of the streams that any set of parameters keeps: the columns of every run."""
         return [name for name in STREAMS if any(
-            topics.is_recorded(name, {**DEFAULTS, **values}) for values in self.alternatives)]
+            topics.is_recorded(name, {**DEFAULTS, **values}) for values in self._given)]
+
+    @cached_property
+    def parts(self) -> Sequence[range]:
+        """The runs that one task computes each, and that share a file."""
+        values = {**DEFAULTS, **self._given[0]}
+        # A stream without a rate of its own has that of the IMU.
+        rows = self.duration * max(values.get(f'{name}.rate', values['imu.rate'])
+                                   for name in self.kept)
+        count = max(1, min(int(ROWS_IN_A_PART / max(rows, 1.0)), self.runs // LEAST_PARTS))
+        return [range(first, min(first + count, self.runs))
+                for first in range(0, self.runs, count)]
 
 
 def read(path: Path) -> Specification:
@@ -141,34 +130,23 @@ def parse(content: object, source: str, folder: Path = Path()) -> Specification:
     """
     known = [one.name for one in fields(Specification)]
     try:
-        if not isinstance(content, Mapping) or not {'runs', 'duration'} <= content.keys():
-            raise ValueError('must be a mapping with runs and duration')
-        for name in content.keys() - known:
-            raise ValueError(f'there is no entry {name!r}: must be one of {", ".join(known)}')
-        return _checked(Specification(**content), folder)
+        if not isinstance(content, Mapping) or not {'runs', 'duration'} <= content.keys() <= {
+                *known}:
+            raise ValueError(f'{shown(content)}: must be a mapping with runs and duration, of '
+                             f'{", ".join(known)}')
+        given = Specification(**content)
+        sample = given.sample or {}
+        if not isinstance(sample, Mapping) or not isinstance(given.params, list | tuple):
+            raise ValueError('sample must be a mapping of parameters, params a list of sets')
+        found = replace(
+            given, **{entry.name: entry.check(getattr(given, entry.name)) for entry in ENTRIES},
+            params=[_parameter_set(one, 'params', folder) for one in given.params],
+            sample={name: _rule(name, rule, folder) for name, rule in sample.items()})
+        if not found.kept:
+            raise ValueError('no stream is enabled')
     except (TypeError, ValueError) as error:
         raise ValueError(f'{source}: {error}') from error
-
-
-def _checked(given: Specification, folder: Path) -> Specification:
-    sample = given.sample or {}
-    if not isinstance(sample, Mapping):
-        raise ValueError(f'sample = {shown(sample)}: must be a mapping of parameters')
-    checked = replace(
-        given, **{entry.name: entry.check(getattr(given, entry.name)) for entry in ENTRIES},
-        params=[_parameter_set(one, 'params', folder) for one in _list(given.params, 'params')],
-        sample={name: _rule(name, rule, folder) for name, rule in sample.items()})
-    for name in checked.streams:
-        if name not in STREAMS:
-            raise ValueError(f'streams: {shown(name)}: must be some of {", ".join(STREAMS)}')
-    return checked if checked.runs_per_part else replace(
-        checked, runs_per_part=_runs_per_part(checked))
-
-
-def _list(value: object, what: str) -> Sequence[Any]:
-    if not isinstance(value, list | tuple):
-        raise ValueError(f'{what} = {shown(value)}: must be a list')
-    return value
+    return found
 
 
 def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
@@ -183,41 +161,29 @@ def _parameter_set(given: object, what: str, folder: Path) -> dict[str, Any]:
     return {name: parameters.BY_NAME[name].check(value) for name, value in found.items()}
 
 
-def _rule(name: object, rule: object, folder: Path) -> dict[str, list[Any]]:
+def _rule(name: str, rule: object, folder: Path) -> dict[str, list[Any]]:
     """Return how a parameter is sampled, checked: {distribution: [a, b]}, or {values: [...]}."""
     what, kinds = f'sample: {name}', (*DISTRIBUTIONS, VALUES)
-    if name != PARAMS:
-        ours = parse_section({name: 0.0}, 'sample')         # refuses an unknown name
-        if not ours or str(name).endswith(('.enabled', 'record.streams')):
-            raise ValueError(f'{what} must not be sampled: `streams`, or a set of `params`, says '
-                             'which streams there are')
-    if not isinstance(rule, Mapping) or len(rule) != 1 or not set(rule) <= set(kinds):
+    if not isinstance(rule, Mapping) or len(rule) != 1 or not set(rule) <= {*kinds}:
         raise ValueError(f'{what} = {shown(rule)}: must be one of {", ".join(kinds)} with a list')
-    (kind, given), = rule.items()
-    items = _list(given, f'{what}: {kind}')
-    parameter = parameters.BY_NAME.get(str(name))
+    (kind, items), = rule.items()
+    if not isinstance(items, list | tuple) or not items:
+        raise ValueError(f'{what}: {kind} = {shown(items)}: must be a list with an item')
+    if name == PARAMS:
+        return {VALUES: [_parameter_set(one, what, folder) for one in items]}
+    if not parse_section({name: 0.0}, 'sample'):        # which raises for an unknown name
+        raise ValueError(f'{what}: must be a parameter of the simulation')
+    parameter = parameters.BY_NAME[name]
     if kind == VALUES:
-        check = parameter.check if parameter else partial(_parameter_set, what=what, folder=folder)
-        if not items:
-            raise ValueError(f'{what}: values = []: must have one value at least')
-        return {kind: [*map(check, items)]}
-    if parameter is None or parameter.is_list or parameter.kind is not float:
+        return {kind: [*map(parameter.check, items)]}
+    if parameter.is_list or parameter.kind is not float:
         raise ValueError(f'{what}: {kind}: must be values, because the parameter is no double')
-    _, allowed, is_allowed = DISTRIBUTIONS[kind]
     bounds = list(_entry(f'{what}: {kind}', default=(0.0, 0.0)).check(items))
-    if not is_allowed(*bounds):
-        raise ValueError(f'{what}: {kind} = {shown(items)}: must be {allowed}')
     for bound in bounds[:1] if kind == 'normal' else bounds:
         parameter.check(bound)
+    try:
+        DISTRIBUTIONS[kind](np.random.default_rng(0), *bounds)
+    except (ValueError, OverflowError):
+        raise ValueError(f'{what}: {kind} = {shown(items)}: must be [low, high] with low <= high, '
+                         'above 0 if log_uniform, or [mean, deviation >= 0]') from None
     return {kind: bounds}
-
-
-def _runs_per_part(specification: Specification) -> int:
-    """Return how many runs are worth a task."""
-    if not specification.kept:
-        raise ValueError('no stream is enabled')
-    values = {**DEFAULTS, **specification.alternatives[0]}
-    # A stream without a rate of its own has that of the IMU.
-    rows = values['duration'] * max(
-        values.get(f'{name}.rate', values['imu.rate']) for name in specification.kept)
-    return max(1, min(int(ROWS_IN_A_PART / max(rows, 1.0)), specification.runs // LEAST_PARTS))

@@ -106,7 +106,7 @@ def _show(arguments: argparse.Namespace) -> int:
                 source.page.show(source, stopped)
         else:
             cli.print_line(f'{arguments.html}: ' + player.write_file(
-                arguments.html, source.page, source.player, source.track_at))
+                arguments.html, source.page, source.player, source.track))
     finally:
         source.page.close()
     return cli.OK

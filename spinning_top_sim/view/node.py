@@ -156,7 +156,8 @@ class NodeView(Node):
         track.drop_before(max(newest_ns - 2 * WINDOW_NS, min(self._epoch_ns, newest_ns)))
         return track.span[1]
 
-    def track_at(self, _: int) -> SampledTrack | None:
+    @property
+    def track(self) -> SampledTrack | None:
         return self._track if self._track is not None and len(self._track.rows) else None
 
     def _take_messages(self, track: SampledTrack) -> None:

@@ -96,8 +96,8 @@ class Page:
             seconds = min(now - before, LONGEST_STEP_S) if self.server.get_clients() else 0.0
             try:
                 t_ns = source.update(seconds)
-                if (track := source.track_at(t_ns)) is not None:
-                    self.draw(t_ns, track)
+                if source.track is not None:
+                    self.draw(t_ns, source.track)
             except Exception as error:
                 set_content(self.message, f'**{reason_of(error)}**')
                 stopped.wait(AFTER_ERROR_S)

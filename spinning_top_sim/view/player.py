@@ -2,7 +2,6 @@
 """The time of a page that has its own: buttons play it, and a file plays it by itself."""
 
 import html
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import SimpleQueue
@@ -41,8 +40,6 @@ class Player:
         with page.controls:
             self._pause = gui.add_button('Pause')
             buttons = {'Step': self._step, 'Reset': self._reset}
-            if motions_ns:
-                buttons['Next motion'] = self._go_to_next
             group = gui.add_button_group('time', tuple(buttons))
             self._speed = gui.add_dropdown('speed', SPEEDS, initial_value='1')
             length = self._seconds(end_ns) if end_ns is not None else 0.0
@@ -95,22 +92,17 @@ class Player:
     def _reset(self) -> None:
         self.now_ns = self.begin_ns
 
-    def _go_to_next(self) -> None:
-        behind = bisect_right(self.motions_ns, self.now_ns)
-        self.now_ns = self.motions_ns[behind % len(self.motions_ns)]
 
-
-def write_file(path: Path, page: Page, player: Player, track_at: Callable[[int], Track]) -> str:
+def write_file(path: Path, page: Page, player: Player, track: Track) -> str:
     """Write a file that plays by itself what a player plays; return its length and size."""
     begin_ns, end_ns = player.begin_ns, player.file_end_ns
     clock = page.server.scene.add_frame('/clock', show_axes=False)
 
     def draw(t_ns: int) -> None:
         clock.position = (t_ns / NANOSECONDS, 0.0, 0.0)      # read by the script of the file
-        page.draw_scene(t_ns, track_at(t_ns))
+        page.draw_scene(t_ns, track)
 
     draw(begin_ns)
-    track = track_at(begin_ns)
     words = ''.join(text.words(track, t_ns) for t_ns in (begin_ns, *player.motions_ns)
                     if t_ns <= end_ns)
     drawn = ''.join(map(plots.draw, plots.motion_plots(track, begin_ns, begin_ns, end_ns)))

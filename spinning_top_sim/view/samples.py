@@ -42,16 +42,11 @@ class SampledStates(States):
 
 
 class SampledTrack(Track):
-    """
-    The samples of a top.
-
-    begin_ns : of a log, the time from which on this is the top
-    """
+    """The samples of a top."""
 
     def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
         super().__init__(values, epoch_ns=epoch_ns)
         self.stamps_ns, self.rows = np.empty(0, np.int64), np.empty((0, WIDTH))
-        self.begin_ns = 0
         self._imu = Imu(values, period_ns(values['imu.rate']))
         self.templates = {channel.topic: channel.template for channel in all_channels(
             values, self._imu) if channel.topic in TOPICS}

@@ -40,9 +40,6 @@ class Server(viser.ViserServer):
 
         sockets.on_client_connect(check)
 
-    def request_share_url(self, verbose: bool = True) -> None:
-        """Do nothing: viser would share the page by a public server."""
-
     def stop(self) -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             super().stop()

@@ -14,7 +14,6 @@ from spinning_top_sim.physics.regimes import natural_momentum
 from spinning_top_sim.physics.states import States
 from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.recording.errors import text_of
-from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.times import NANOSECONDS, Times
@@ -79,8 +78,8 @@ def ranges(numbers: Sequence[float], natural: float) -> list[tuple[float, float]
 class SimulatedTrack(Track):
     """A top whose states are computed when they are asked for.  Raises ValueError like `Top`."""
 
-    def __init__(self, values: Mapping[str, Any], about: str) -> None:
-        super().__init__(values, about=about, epoch_ns=NANOSECONDS)
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values, epoch_ns=NANOSECONDS)
         self.trajectory = Simulation(values).trajectory
 
     def times(self, begin_ns: int, end_ns: int) -> Times:
@@ -96,95 +95,80 @@ class SimulatedTrack(Track):
     def pivot_moves(self, t_ns: int) -> bool:
         return self.trajectory.pivot is not None
 
-    def go_on(self, t_ns: int) -> int:
-        """Solve up to a time, or as far as the motion goes; return the time that is reached."""
-        try:
-            self.trajectory.evaluate(np.array([t_ns]))
-        except IntegrationError as error:
-            return error.reached_ns
+    def go_on(self, t_ns: int) -> None:
+        """Solve up to a time.  Raises IntegrationError if the motion ends before."""
+        self.trajectory.evaluate(np.array([t_ns]))
         self.trajectory.forget(t_ns - 2 * WINDOW_NS, t_ns - 2 * WINDOW_NS)
-        return t_ns
 
 
 class OwnSimulation:
     """The source of a page that simulates a scene: the name of a file, or its path."""
 
     def __init__(self, page: Page, scene: str, values: Mapping[str, Any]) -> None:
-        self.page, self._reached_ns = page, 0
+        self.page, self._scene = page, ''
         self.player = Player(page)
         self.player.file_end_ns = min(self.player.file_end_ns, round(
             (values['duration'] or FILE_S) * NANOSECONDS))
-        self._files, self._scene = parameter_files('scene'), Path(scene).stem
-        if scene != self._scene:
-            self._files[self._scene] = Path(scene)
+        name = Path(scene).stem
+        self._files = parameter_files('scene') | ({name: Path(scene)} if scene != name else {})
         gui = page.gui
         with page.controls:
-            self._field = gui.add_dropdown('scene', tuple(self._files), initial_value=self._scene)
+            self._field = gui.add_dropdown('scene', tuple(self._files), initial_value=name)
         with page.controls, gui.add_folder('Top and start'):
             self._sliders = [gui.add_slider(f'{label} [{unit}]', 0.0, 1.0, 1.0 / STEPS, 0.0,
                                             hint=hint) for label, unit, hint in SLIDERS]
-        self._show(values)
-        self._track = SimulatedTrack(values, self._about())
+        self._begin(name, values)
+
+    def _begin(self, scene: str, values: Mapping[str, Any]) -> None:
+        """Begin a motion at t = 0.  Raises OSError, or ValueError where there is none."""
+        track = SimulatedTrack(values)
+        if scene != self._scene:
+            self._plain = parameters.checked(read_scene(self._files[scene]))
+            self._scene = scene
+            self._show(values)
+        other = '' if np.allclose(numbers_of(values), numbers_of(self._plain), 1e-9, 0.0) else (
+            ' with other numbers')
+        track.about = f'Scene {scene}{other}; the title names the motion that its numbers make.'
+        self.track = track
+        self.page.message.content = track.top.objection
+        self._now_ns = self.player.now_ns = 0
 
     def _show(self, values: Mapping[str, Any]) -> None:
         """Show the scene and these parameters on the controls."""
-        plain = parameters.checked(read_scene(self._files[self._scene]))
-        self._plain, self._numbers = numbers_of(plain), numbers_of(values)
         set_value(self._field, self._scene)
-        for slider, number, (low, high) in zip(self._sliders, self._numbers, ranges(
-                self._plain, natural_momentum(parameters.top_of(plain))), strict=True):
+        for slider, number, (low, high) in zip(self._sliders, numbers_of(values), ranges(
+                numbers_of(self._plain), natural_momentum(parameters.top_of(self._plain))),
+                strict=True):
             slider.min, slider.max = min(low, number), max(high, number)
             slider.step = (slider.max - slider.min) / STEPS
             set_value(slider, number)
         self._shown = [slider.value for slider in self._sliders]
 
-    def _about(self) -> str:
-        """The scene, and what is other than in it."""
-        changed = [label for (label, *_), number, plain in zip(
-            SLIDERS, self._numbers, self._plain, strict=True)
-            if abs(number - plain) > 1e-9 * max(abs(number), abs(plain))]
-        other = f' with another {", ".join(changed)}' if changed else ''
-        return f'Scene {self._scene}{other}; the title names the motion that its numbers make.'
-
     def _follow_controls(self) -> None:
         """
-        Begin another motion at t = 0 if somebody has chosen one.
+        Begin another motion if somebody has chosen one.
 
         Raises ValueError where there is none.  A slider stays under the hand that moves it.
         """
         scene, shown = self._field.value, [one.value for one in self._sliders]
         if scene != self._scene:
-            kept = {name: value for name, value in self._track.values.items()
+            kept = {name: value for name, value in self.track.values.items()
                     if not name.startswith(GROUPS)}
-            values = parameters.checked({**kept, **read_scene(self._files[scene])})
-            track = SimulatedTrack(values, '')
-            self._scene = scene
-            self._show(values)
+            self._begin(scene, parameters.checked({**kept, **read_scene(self._files[scene])}))
         elif shown != self._shown:
-            self._numbers = [new if new != old else number for new, old, number in zip(
-                shown, self._shown, self._numbers, strict=True)]
+            self._begin(scene, with_numbers(self.track.values, shown))
             self._shown = shown
-            track = SimulatedTrack(with_numbers(self._track.values, self._numbers), '')
-        else:
-            return
-        track.about, self._track = self._about(), track
-        self.page.message.content = track.top.objection
-        self._reached_ns = self.player.now_ns = 0
 
     def update(self, seconds: float) -> int:
         try:
             self._follow_controls()
         except (OSError, ValueError) as error:      # its file may be gone, or be another one
             self.page.message.content = f'**refused:** {text_of(error)}'
-            self._show(self._track.values)
+            self._show(self.track.values)
         t_ns = self.player.advance(seconds)
-        if t_ns < self._reached_ns:
-            self._track = SimulatedTrack(self._track.values, self._track.about)
-        self._reached_ns = self._track.go_on(t_ns)
-        if self._reached_ns < t_ns:
-            self.page.message.content = f'The equations end at {self._reached_ns * 1e-9:g} s.'
-            self.player.stop_at(self._reached_ns)
-        return self._reached_ns
-
-    def track_at(self, _: int) -> SimulatedTrack:
-        return self._track
+        if t_ns < self._now_ns:
+            self._begin(self._scene, self.track.values)
+            t_ns = 0
+        self.track.go_on(t_ns)
+        self._now_ns = t_ns
+        return t_ns

@@ -75,8 +75,8 @@ class Track(ABC):
     epoch_ns : stamp of t = 0 [ns]
     """
 
-    def __init__(self, values: Mapping[str, Any], about: str = '', epoch_ns: int = 0) -> None:
-        self.values, self.about, self.epoch_ns = values, about, epoch_ns
+    def __init__(self, values: Mapping[str, Any], epoch_ns: int = 0) -> None:
+        self.values, self.about, self.epoch_ns = values, '', epoch_ns
         self.top = parameters.top_of(values)
         self.shape = Shape(self.top)
         self._known: tuple[tuple[float, ...], Motion] | None = None     # the newest motion
@@ -128,11 +128,12 @@ class Track(ABC):
 class Source(Protocol):
     """What a page shows, and the controls that it has put there."""
 
+    @property
+    def track(self) -> Track | None:
+        """The top, None if there is none yet."""
+
     def update(self, seconds: float) -> int:
         """Do what the controls ask for, let real time pass [s]; return the time to draw."""
-
-    def track_at(self, t_ns: int) -> Track | None:
-        """Return the top that is there at a time, None if there is none yet."""
 
 
 def effective_potential(top: Top, l3: float, lz: float, theta: Reals) -> Reals:
