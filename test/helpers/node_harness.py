@@ -36,7 +36,6 @@ import helpers.own_domain  # noqa: F401, for programs without conftest.py
 import spinning_top_sim
 
 PATIENCE_S = 60.0           # for what takes a second on an idle machine
-LIFETIME_S = 300.0          # a node that is still there is killed
 
 
 def wait_for(what, condition):
@@ -64,17 +63,15 @@ class SimNode:
 
     def __init__(self, folder, parameters=None, *, namespace=None, arguments=(), program=None,
                  executor='events'):
-        if namespace is None:
-            namespace = f'/top{next(self._number)}'     # tests share a domain, not names
+        namespace = namespace or f'/top{next(self._number)}'    # tests share a domain, not names
         self.folder = Path(folder) / (namespace.strip('/') or 'root')
         self.folder.mkdir(parents=True, exist_ok=True)
         self.name = f'{namespace.rstrip("/")}/spinning_top'
         self.namespace = namespace.rstrip('/')
         self._path = []
         if executor == 'single':
-            self._path = [str(self.folder / 'hidden')]
-            (self.folder / 'hidden').mkdir()
-            (self.folder / 'hidden/sitecustomize.py').write_text(
+            self._path = [str(self.folder)]
+            (self.folder / 'sitecustomize.py').write_text(
                 "import sys; sys.modules['rclpy.experimental'] = None")
         self.command = [
             *DIE_WITH_PARENT, sys.executable,
@@ -91,14 +88,10 @@ class SimNode:
             self.process = subprocess.Popen(
                 self.command, cwd=self.folder, env=environment, start_new_session=True,
                 stdin=subprocess.DEVNULL, stdout=out, stderr=err)
-        self._killer = threading.Timer(LIFETIME_S, self.kill)
-        self._killer.daemon = True
-        self._killer.start()
         return self
 
     def __exit__(self, *_):
         self.kill()
-        self._killer.cancel()
 
     def kill(self):
         """Kill the process group, if it is there."""
@@ -119,20 +112,15 @@ class SimNode:
     def alive(self):
         return self.process.poll() is None
 
-    def wait(self, timeout=PATIENCE_S):
-        """Wait until the node ends; return its exit code (-9: it had to be killed)."""
-        try:
-            return self.process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            return -signal.SIGKILL
+    def signal(self, number):
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, number)
 
-    def end(self, number=signal.SIGINT, times=1):
+    def end(self, *numbers):
         """Signal the process group, wait, and return the exit code."""
-        for _ in range(times):
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self.process.pid, number)
-        return self.wait(10.0)
+        for number in numbers or (signal.SIGINT,):
+            self.signal(number)
+        return self.process.wait(PATIENCE_S)
 
     def topic(self, name):
         """Return the full name of a topic or service, `~` for the node's own."""
@@ -248,15 +236,14 @@ class Peer:
         assert client.wait_for_service(PATIENCE_S), f'no service {name}'
         # A server that has not discovered a new client drops its answer after 0.1 s
         # ("client will not receive response", rmw_fastrtps).
-        for patience in (PATIENCE_S / 10, PATIENCE_S) if new or again else (PATIENCE_S,):
-            done = threading.Event()
-            future = client.call_async(request)
-            future.add_done_callback(lambda _, done=done: done.set())
-            if done.wait(patience):
-                break
-        else:
-            raise AssertionError(f'no answer from {name}')
-        return future.result()
+        asked = []
+
+        def answered():
+            if not asked or ((new or again) and time.monotonic() > asked[-1][0] + PATIENCE_S / 10):
+                asked.append((time.monotonic(), client.call_async(request)))
+            return next((future for _, future in asked if future.done()), None)
+
+        return wait_for(f'an answer from {name}', answered).result()
 
     def trigger(self, node, name):
         return self.call(Trigger, node.topic(f'~/{name}'), Trigger.Request())
@@ -325,9 +312,6 @@ class DrivenClock:
             self.set(self.now_ns + step_ns)
             return until()
         wait_for(what, goes_on)
-
-    def stop(self):
-        self._peer.node.destroy_publisher(self._publisher)
 
 
 def numbers(status):
