@@ -7,17 +7,18 @@ import helpers.own_domain  # noqa: F401, before any node starts
 import pytest
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config, log):
-    if config.getvalue('dist') != 'load':
-        return None
-    from helpers.scheduling import BySharedFixture
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """
+    Let one worker of pytest-xdist run the tests that share a fixture of their module.
 
-    return BySharedFixture(config, log)
-
-
-def pytest_collection_modifyitems(items):
-    """Begin with the files of the longest tests, so that at the end no worker waits for one."""
+    Begin with the files of the longest tests, so that at the end no worker waits for one.
+    """
+    for item in items if config.pluginmanager.hasplugin('xdist') else ():
+        shared = [name for name, found in item._fixtureinfo.name2fixturedefs.items()
+                  if found[-1].scope == 'module']
+        if shared:
+            item.add_marker(pytest.mark.xdist_group(f'{item.path.name}: {shared[0]}'))
     long = {f'test_{name}.py' for name in (
         'docs', 'examine', 'view_node', 'sim_node_life', 'grade_files', 'recover')}
     items.sort(key=lambda item: item.path.name not in long)
@@ -33,7 +34,7 @@ def _signals():
         signal.signal(number, handler)
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='session')
 def peer():
     from helpers.node_harness import Peer
 
@@ -41,7 +42,7 @@ def peer():
         yield peer
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='session')
 def diagnostics(peer):
     from helpers.node_harness import Diagnostics
 

@@ -9,7 +9,6 @@ speed of the machine decides nothing.
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import json
 import os
@@ -64,13 +63,11 @@ class SimNode:
     def __init__(self, folder, parameters=None, *, namespace=None, arguments=(), program=None,
                  executor='events'):
         namespace = namespace or f'/top{next(self._number)}'    # tests share a domain, not names
+        self.namespace = namespace.rstrip('/')
+        self.name = f'{self.namespace}/spinning_top'
         self.folder = Path(folder) / (namespace.strip('/') or 'root')
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.name = f'{namespace.rstrip("/")}/spinning_top'
-        self.namespace = namespace.rstrip('/')
-        self._path = []
         if executor == 'single':
-            self._path = [str(self.folder)]
             (self.folder / 'sitecustomize.py').write_text(
                 "import sys; sys.modules['rclpy.experimental'] = None")
         self.command = [
@@ -79,9 +76,9 @@ class SimNode:
             '--ros-args', '-r', f'__ns:={namespace}', *options(parameters or {}), *arguments]
 
     def __enter__(self):
-        source = str(Path(spinning_top_sim.__file__).parents[1])
-        paths = [*self._path, source, *filter(None, [os.environ.get('PYTHONPATH')])]
-        environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
+        source = Path(spinning_top_sim.__file__).parents[1]
+        environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
+            [f'{self.folder}', f'{source}', os.environ.get('PYTHONPATH', '')]).rstrip(os.pathsep)}
         if 'LD_LIBRARY_PATH' not in environment:        # then the wheels must start python anew
             environment.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None)
         with (self.folder / 'out').open('wb') as out, (self.folder / 'err').open('wb') as err:
@@ -93,12 +90,25 @@ class SimNode:
     def __exit__(self, *_):
         self.kill()
 
+    def signal(self, number):
+        """Signal the process group, if it is there."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, number)
+
     def kill(self):
-        """Kill the process group, if it is there."""
-        if self.process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self.process.pid, signal.SIGKILL)
+        if self.alive:
+            self.signal(signal.SIGKILL)
             self.process.wait()
+
+    def end(self, *numbers):
+        """Signal the process group, wait, and return the exit code."""
+        for number in numbers or (signal.SIGINT,):
+            self.signal(number)
+        return self.process.wait(PATIENCE_S)
+
+    @property
+    def alive(self):
+        return self.process.poll() is None
 
     @property
     def out(self):
@@ -108,25 +118,9 @@ class SimNode:
     def err(self):
         return (self.folder / 'err').read_text()
 
-    @property
-    def alive(self):
-        return self.process.poll() is None
-
-    def signal(self, number):
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.process.pid, number)
-
-    def end(self, *numbers):
-        """Signal the process group, wait, and return the exit code."""
-        for number in numbers or (signal.SIGINT,):
-            self.signal(number)
-        return self.process.wait(PATIENCE_S)
-
     def topic(self, name):
         """Return the full name of a topic or service, `~` for the node's own."""
-        if name.startswith('~'):
-            return self.name + name[1:]
-        return name if name.startswith('/') else f'{self.namespace}/{name}'
+        return self.name + name[1:] if name.startswith('~') else f'{self.namespace}/{name}'
 
 
 def options(parameters):
@@ -161,33 +155,20 @@ class Topic:
         """Wait until `count` more messages have arrived."""
         return self.wait(len(self.raw) + count)
 
-    def messages(self):
-        return [deserialize_message(data, self.kind) for data in self.raw]
+    def messages(self, first=0):
+        return [deserialize_message(data, self.kind) for data in self.raw[first:]]
 
     def last(self):
         return deserialize_message(self.raw[-1], self.kind)
 
 
-@functools.cache
-def _participant():
-    """
-    Return the context of all peers of this process, and a node that keeps it in DDS.
-
-    Without a node, the context's DDS participant would be destroyed with each peer: where others
-    come and go at the same time, that has ended in a segmentation fault in Fast DDS.
-    """
-    context = Context()
-    rclpy.init(context=context)
-    return context, Node('participant', context=context, enable_rosout=False,
-                         start_parameter_services=False)
-
-
 class Peer:
-    """A node in the test's process, with a thread that listens."""
+    """A node in the test's process, with a thread that listens, within the `with`."""
 
-    def __init__(self, name='peer'):
-        context, _ = _participant()
-        self.node = Node(name, context=context)
+    def __init__(self):
+        context = Context()
+        rclpy.init(context=context)
+        self.node = Node('peer', context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
         self._closed = False
@@ -201,18 +182,15 @@ class Peer:
             while not self._closed:
                 self._executor.spin_once(timeout_sec=0.5)
 
-    def close(self):
-        self._closed = True
-        self._thread.join(PATIENCE_S)
-        assert not self._thread.is_alive(), 'the peer still listens'
-        self._executor.shutdown()
-        self.node.destroy_node()
-
     def __enter__(self):
         return self
 
     def __exit__(self, *_):
-        self.close()
+        self._closed = True
+        self._thread.join()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.node.context)
 
     def listen(self, name, kind, reliability=ReliabilityPolicy.RELIABLE):
         """Subscribe with a queue that is long enough for any test."""
@@ -273,24 +251,16 @@ class Diagnostics:
         from diagnostic_msgs.msg import DiagnosticArray
         self._topic = peer.listen('/diagnostics', DiagnosticArray)
 
-    def _of(self, node):
-        return [status for message in self._topic.messages() for status in message.status
-                if status.name == node.name.lstrip('/')]
-
-    def wait_for(self, node, what, condition):
-        """Wait for a status for which the condition holds; return it."""
-        return wait_for(f'/diagnostics with {what}', lambda: next(
-            (one for one in self._of(node)[-1:] if condition(one)), None))
-
     def next(self, node):
         """Return the numbers of the next status but one, which is measured entirely after now."""
-        count = len(self._of(node))
-        wait_for('two /diagnostics', lambda: len(self._of(node)) >= count + 2)
-        return numbers(self._of(node)[-1])
+        first, name = len(self._topic.raw), node.name.lstrip('/')
 
-    def text(self, node, key):
-        """Return the newest value of this name."""
-        return numbers(self.wait_for(node, key, lambda _: True))[key]
+        def second():
+            return [status for message in self._topic.messages(first) for status in message.status
+                    if status.name == name][1:]
+
+        (status, *_) = wait_for('two /diagnostics', second)
+        return numbers(status)
 
 
 class DrivenClock:
