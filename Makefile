@@ -39,7 +39,7 @@ BIN := '$(VENV)/bin
 PIP = $(BIN)/python' -m pip --disable-pip-version-check install $(if $(MAKE_TERMOUT),,--quiet --quiet)
 # Each worker would import the other plug-ins, and rewrite their assertions, in two seconds.
 test coverage: export PYTEST_DISABLE_PLUGIN_AUTOLOAD := 1
-PYTEST = $(BIN)/pytest' -p xdist -n $(WORKERS) --dist loadgroup --max-worker-restart=0
+PYTEST = $(BIN)/pytest' -p xdist -n $(WORKERS) --max-worker-restart=0
 # The package and the wheels of ROS.
 WITH_ROS := $(VENV)/.deps-ros-$(ROS) $(VENV)/.package
 INSTALL = @flock --nonblock Makefile true || echo 'Another make installs: waiting for it'; \

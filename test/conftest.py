@@ -1,24 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures of the tests that talk to running nodes, and the order of many workers."""
 
+import functools
 import signal
+from pathlib import Path
 
 import helpers.own_domain  # noqa: F401, before any node starts
 import pytest
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config, items):
-    """
-    Let one worker of pytest-xdist run the tests that share a fixture of their module.
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Let one worker run the tests of a file that shares fixtures, and any worker the others."""
+    from xdist.scheduler import LoadScopeScheduling
 
-    Begin with the files of the longest tests, so that at the end no worker waits for one.
-    """
-    for item in items if config.pluginmanager.hasplugin('xdist') else ():
-        shared = [name for name, found in item._fixtureinfo.name2fixturedefs.items()
-                  if found[-1].scope == 'module']
-        if shared:
-            item.add_marker(pytest.mark.xdist_group(f'{item.path.name}: {shared[0]}'))
+    class BySharedFixtures(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            file = nodeid.partition('::')[0]
+            return file if "scope='module'" in read(config.rootpath / file) else nodeid
+
+    read = functools.cache(Path.read_text)
+    return BySharedFixtures(config, log)
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the files of the longest tests, so that at the end no worker waits for one."""
     long = {f'test_{name}.py' for name in (
         'docs', 'examine', 'view_node', 'sim_node_life', 'grade_files', 'recover')}
     items.sort(key=lambda item: item.path.name not in long)
