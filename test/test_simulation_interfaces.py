@@ -26,21 +26,11 @@ from scipy.spatial.transform import Rotation
 from spinning_top_sim.nodes.simulation_handlers import FEATURES, SimulationHandlers
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
-STOPPED, PLAYING, PAUSED, QUITTING, NO_WORLD = range(5)
+STOPPED, PLAYING, PAUSED, QUITTING = range(4)
 ALREADY = INVALID_POSE = 101
 TRANSITION_ERROR, INCORRECT_TRANSITION = 102, 103
 NAME = 'spinning_top'
-
-
 INSTALLED = importlib.util.find_spec('simulation_interfaces') is not None
-
-
-def types_of(kind):
-    """Return simulation_interfaces.msg and .srv."""
-    if kind == 'stand-in':
-        return standard_types.modules()
-    return [importlib.import_module(f'simulation_interfaces.{part}')
-            for part in ('msg', 'srv')]
 
 
 class StandardNode(OwnNode):
@@ -48,7 +38,8 @@ class StandardNode(OwnNode):
 
     def __init__(self, folder, kind='stand-in', **values):
         super().__init__(folder, start_paused=True, **values)
-        self.messages, self.services = types_of(kind)
+        self.messages, self.services = standard_types.modules() if kind == 'stand-in' else [
+            importlib.import_module(f'simulation_interfaces.{part}') for part in ('msg', 'srv')]
         self.handlers = SimulationHandlers(self.node, self.messages)
 
     def call(self, name, **request):
@@ -59,16 +50,21 @@ class StandardNode(OwnNode):
     def done(self, name, **request):
         """Return the response to a request that succeeds."""
         response = self.call(name, **request)
-        assert response.result.result == self.messages.Result.RESULT_OK, (
-            response.result.error_message)
+        assert response.result.result == OK, response.result.error_message
         return response
 
     def refused(self, name, **request):
         """Return the code of a refusal, and its text."""
         result = self.call(name, **request).result
-        assert result.result != self.messages.Result.RESULT_OK
         assert result.error_message
         return result.result, result.error_message
+
+    def put(self, state, **flags):
+        return {'entity': NAME, 'state': state, 'set_pose': True, 'set_twist': True, **flags}
+
+    @property
+    def entity(self):
+        return self.done('GetEntityState', entity=NAME).state
 
     @property
     def state(self):
@@ -80,10 +76,24 @@ class StandardNode(OwnNode):
         return self.call('SetSimulationState', state=self.messages.SimulationState(
             state=number)).result.result
 
-    def pause(self):
-        """Leave the stopped state without a step."""
-        assert self.set_state('PAUSED') == self.messages.Result.RESULT_OK
+    def pause(self, steps=0):
+        """Leave the stopped state, and make some steps."""
+        assert self.set_state('PAUSED') == OK
+        if steps:
+            self.done('StepSimulation', steps=steps)
         return self
+
+    def upright(self, **changes):
+        """Return a state with these numbers, by paths such as twist__linear__x."""
+        state = self.messages.EntityState()
+        state.pose.orientation.w = 1.0
+        for path, value in changes.items():
+            *way, name = path.split('__')
+            target = state
+            for part in way:
+                target = getattr(target, part)
+            setattr(target, name, value)
+        return state
 
 
 @pytest.fixture(params=('stand-in', 'installed') if INSTALLED else ('stand-in',))
@@ -92,13 +102,16 @@ def top(request, tmp_path):
         yield top
 
 
+def numbers(state):
+    """Return attitude, angular velocity and acceleration of an EntityState, as one array."""
+    return np.array([*xyzw(state.pose.orientation), *xyz(state.twist.angular),
+                     *xyz(state.acceleration.angular)])
+
+
 def test_features_are_those_of_the_services(top):
     known = top.messages.SimulatorFeatures
-    features = top.call('GetSimulatorFeatures').features
-    names = {name for name in dir(known) if name.isupper()
-             and getattr(known, name) in list(features.features)}
-    assert names == {name for row in FEATURES.values() for name in row}
-    assert not features.spawn_formats
+    found = {*top.call('GetSimulatorFeatures').features.features}
+    assert found == {getattr(known, name) for row in FEATURES.values() for name in row}
 
 
 def test_states_change_as_the_standard_says(top):
@@ -121,18 +134,16 @@ def test_what_cannot_be_is_refused_with_its_values(top):
     assert code == INCORRECT_TRANSITION and text.startswith('state = 4 from STOPPED: must be one')
     assert top.refused('StepSimulation', steps=1) == (
         FAILED, 'the simulation is STOPPED: must be PAUSED')
-    top.pause()
+    now_ns = top.pause().simulation.now_ns
     assert top.refused('StepSimulation', steps=0) == (FAILED, 'steps = 0: must be >= 1')
-    now_ns = top.simulation.now_ns
     code, text = top.refused('ResetSimulation', scope=1)
     assert code == UNSUPPORTED and text.startswith('scope = 1: must be 0, 255 or 3')
     info = top.done('GetEntityInfo', entity=NAME).info
     assert info.category.category == top.messages.EntityCategory.CATEGORY_ROBOT
     assert 'mass=2.0' in info.description and 'imu' in info.tags
-    for service, name in (('GetEntityState', ''), ('SetEntityState', 'Spinning_top'),
-                          ('GetEntityInfo', '/spinning_top')):
-        assert top.refused(service, entity=name) == (
-            NOT_FOUND, f"entity = {name!r}: must be 'spinning_top'")
+    for service in ('GetEntityState', 'SetEntityState', 'GetEntityInfo'):
+        assert top.refused(service, entity='Top') == (
+            NOT_FOUND, "entity = 'Top': must be 'spinning_top'")
     category = top.messages.EntityCategory(category=1)
     for service in ('GetEntities', 'GetEntitiesStates'):
         assert top.done(service).entities == [NAME]
@@ -145,18 +156,16 @@ def test_what_cannot_be_is_refused_with_its_values(top):
 
 
 def test_a_failed_motion_is_paused_until_it_is_stopped_and_quitting_ends_the_node(top):
-    top.pause()
-    top.loop.fail('the equations end')
+    top.pause().loop.fail('the equations end')
     response = top.done('GetSimulationState')
     assert (response.state.state, response.result.error_message) == (PAUSED, 'the equations end')
-    number = top.messages.SimulationState(state=PLAYING)
-    code, text = top.refused('SetSimulationState', state=number)
+    code, text = top.refused('SetSimulationState', state=top.messages.SimulationState(
+        state=PLAYING))
     assert code == TRANSITION_ERROR and 'the equations end' in text
     assert top.refused('StepSimulation', steps=1)[0] == FAILED
-    assert top.set_state('STOPPED') == OK
-    assert (top.state, top.loop.failure) == (STOPPED, None)
-    assert top.set_state('QUITTING') == OK and top.state == QUITTING
-    assert top.set_state('QUITTING') == ALREADY
+    assert (top.set_state('STOPPED'), top.state, top.loop.failure) == (OK, STOPPED, None)
+    assert (top.set_state('QUITTING'), top.state, top.set_state('QUITTING')) == (
+        OK, QUITTING, ALREADY)
     for name in ('STOPPED', 'PLAYING', 'PAUSED'):
         assert top.set_state(name) == INCORRECT_TRANSITION
     assert top.refused('ResetSimulation', scope=0)[0] == INCORRECT_STATE
@@ -165,42 +174,16 @@ def test_a_failed_motion_is_paused_until_it_is_stopped_and_quitting_ends_the_nod
     assert top.node.finished.result() is None       # exit code 0
 
 
-def numbers(state):
-    """Return attitude, angular velocity and acceleration of an EntityState, as one array."""
-    assert xyz(state.pose.position) == xyz(state.twist.linear) == (0.0, 0.0, 0.0)
-    assert xyz(state.acceleration.linear) == (0.0, 0.0, 0.0)
-    return np.array([*xyzw(state.pose.orientation), *xyz(state.twist.angular),
-                     *xyz(state.acceleration.angular)])
-
-
-def upright(top, **changes):
-    """Return a state with these numbers, by paths such as twist__linear__x."""
-    state = top.messages.EntityState()
-    state.pose.orientation.w = 1.0
-    for path, value in changes.items():
-        *way, name = path.split('__')
-        target = state
-        for part in way:
-            target = getattr(target, part)
-        setattr(target, name, value)
-    return state
-
-
-def state_of(top):
-    return top.done('GetEntityState', entity=NAME).state
-
-
 @pytest.mark.parametrize(('scope', 'now_ns', 'state'), [
     (0, -1, STOPPED), (3, -1, STOPPED), (2, 3 * 333_333_333, PAUSED)])
 def test_a_reset_begins_the_motion_again_or_lets_time_go_on(top, scope, now_ns, state):
-    start = numbers(state_of(top))
+    start = numbers(top.entity)
     assert top.set(step__dt=1.0 / 3.0).successful
-    top.pause().done('StepSimulation', steps=1)
-    top.done('StepSimulation', steps=2)
+    top.pause(steps=1).done('StepSimulation', steps=2)
     assert top.set(spin__l3=2.5).successful
     top.done('ResetSimulation', scope=scope)
     assert (top.simulation.now_ns, top.state, top.get('spin.l3')) == (now_ns, state, [1.6])
-    assert (numbers(state_of(top)) == start).all()
+    assert (numbers(top.entity) == start).all()
 
 
 @pytest.mark.parametrize('method', ['rk45', 'exact'])
@@ -210,16 +193,14 @@ def test_a_log_of_all_this_verifies_and_has_the_states(top, tmp_path, method):
     assert top.set(solver__method=method, markers__enabled=True, mag__enabled=True,
                    imu__lever_arm=[0.1, 0.0, 0.02]).successful
     top.done('ResetSimulation', scope=0)
-    put = {'entity': NAME, 'set_twist': True,
-           'state': upright(top, twist__angular__x=0.5, twist__angular__z=11.0)}
-    top.pause().done('StepSimulation', steps=3)
-    top.done('SetEntityState', **put)
+    put = top.put(top.upright(twist__angular__x=0.5, twist__angular__z=11.0))
+    top.pause(steps=3).done('SetEntityState', **{**put, 'set_pose': False})
     assert top.switch('record', True).success
     top.done('StepSimulation', steps=7)
-    top.done('SetEntityState', set_pose=True, **put)
+    top.done('SetEntityState', **put)
     top.done('ResetSimulation', scope=2)
     top.done('StepSimulation', steps=25)
-    state, (other,) = state_of(top), top.done('GetEntitiesStates').states
+    state, (other,) = top.entity, top.done('GetEntitiesStates').states
     assert (numbers(other) == numbers(state)).all() and state.header.frame_id == 'world'
     assert top.switch('record', False).success
     assert verified(path)['identical']
@@ -236,13 +217,14 @@ def test_a_log_of_all_this_verifies_and_has_the_states(top, tmp_path, method):
 
 @pytest.mark.parametrize('which', ['pose', 'twist'])
 def test_a_state_that_is_set_is_the_state(top, which):
-    top.pause().done('StepSimulation', steps=20)
-    before, q, rates = numbers(state_of(top)), np.array([0.2, -0.4, 0.4, 0.8]), (1.0, -2.0, 9.0)
-    wanted = upright(top, **{f'pose__orientation__{axis}': value for axis, value in zip(
+    top.pause(steps=20)
+    before, q, rates = numbers(top.entity), np.array([0.2, -0.4, 0.4, 0.8]), (1.0, -2.0, 9.0)
+    wanted = top.upright(**{f'pose__orientation__{axis}': value for axis, value in zip(
         'xyzw', q.tolist(), strict=True)}, **{
             f'twist__angular__{axis}': value for axis, value in zip('xyz', rates, strict=True)})
-    top.done('SetEntityState', entity=NAME, state=wanted, **{f'set_{which}': True})
-    after = numbers(state_of(top))
+    top.done('SetEntityState', **top.put(wanted, set_pose=which == 'pose',
+                                         set_twist=which == 'twist'))
+    after = numbers(top.entity)
     expected = ([*q, *before[4:7]] if which == 'pose' else [*before[:4], *rates])
     assert np.allclose(after[:7], expected, rtol=0.0, atol=1e-12)
     assert (top.state, top.simulation.now_ns) == (PAUSED, 200_000_000)
@@ -251,7 +233,7 @@ def test_a_state_that_is_set_is_the_state(top, which):
     assert top.get('spin.l3', 'spin.lz') == pytest.approx(
         [float(now.l3[0]), float(now.lz[0])], rel=1e-12)
     top.done('StepSimulation', steps=1)
-    assert np.allclose(numbers(state_of(top))[4:7], after[4:7] + 0.01 * after[7:], rtol=0.0,
+    assert np.allclose(numbers(top.entity)[4:7], after[4:7] + 0.01 * after[7:], rtol=0.0,
                        atol=0.05)
 
 
@@ -268,20 +250,18 @@ BAD_STATES = [
 
 
 def test_a_bad_state_changes_nothing(top):
-    top.pause().done('StepSimulation', steps=5)
-    before = state_of(top)
+    before = top.pause(steps=5).entity
     for changes, code, text in BAD_STATES:
-        found, reason = top.refused('SetEntityState', entity=NAME, state=upright(
-            top, **changes), set_pose=True, set_twist=True)
+        found, reason = top.refused('SetEntityState', **top.put(top.upright(**changes)))
         assert (found, text in reason) == (code, True), (found, reason)
-        assert (numbers(state_of(top)) == numbers(before)).all()
+        assert (numbers(top.entity) == numbers(before)).all()
 
 
 @pytest.mark.parametrize(('x', 'w', 'theta'), [(3e-9, 1.0, 0.0), (1.0, 3e-9, math.pi)])
 def test_next_to_a_pole_what_is_not_spin_is_nutation(top, x, w, theta):
-    state = upright(top, pose__orientation__x=x, pose__orientation__w=w, twist__angular__x=0.3,
-                    twist__angular__z=2.0)
-    top.done('SetEntityState', entity=NAME, state=state, set_pose=True, set_twist=True)
+    top.done('SetEntityState', **top.put(top.upright(
+        pose__orientation__x=x, pose__orientation__w=w, twist__angular__x=0.3,
+        twist__angular__z=2.0)))
     start = top.simulation.state()
     assert start.theta == theta and abs(start.lz) == abs(start.l3)
     assert start.theta_dot == pytest.approx(0.3)
@@ -291,21 +271,18 @@ def test_a_state_can_be_set_where_the_pivot_is(top):
     """What the node says of a moving pivot can be sent back to it, and nothing else."""
     top.pause().receive('cmd_vel', Twist(linear=Vector3(x=0.5)))
     top.done('StepSimulation', steps=30)
-    state = state_of(top)
+    state = top.entity
     assert state.pose.position.x > 0.01 and state.twist.linear.x > 0.1
-    assert top.refused('SetEntityState', entity=NAME, state=upright(top), set_pose=True,
-                       set_twist=False)[0] == INVALID_POSE
-    top.done('SetEntityState', entity=NAME, state=state, set_pose=True, set_twist=True)
-    after = state_of(top)
+    assert top.refused('SetEntityState', **top.put(top.upright(), set_twist=False))[0] == (
+        INVALID_POSE)
+    top.done('SetEntityState', **top.put(state))
+    after = top.entity
     assert xyz(after.pose.position) == xyz(state.pose.position)
     assert xyz(after.twist.linear) == xyz(state.twist.linear)
-    assert xyzw(after.pose.orientation) == pytest.approx(xyzw(state.pose.orientation), abs=1e-12)
-    assert xyz(after.twist.angular) == pytest.approx(xyz(state.twist.angular), abs=1e-12)
-    top.done('StepSimulation', steps=1)
-    assert state_of(top).pose.position.x > after.pose.position.x
+    assert numbers(after)[:7] == pytest.approx(numbers(state)[:7], abs=1e-12)
 
 
-def test_before_the_clock_nothing_can_be_set(tmp_path):
+def test_before_the_clock_and_after_the_end_nothing_can_be_set(tmp_path):
     with StandardNode(tmp_path, use_sim_time=True) as top:
         assert top.state == STOPPED
         for name in ('PLAYING', 'PAUSED'):
@@ -314,9 +291,6 @@ def test_before_the_clock_nothing_can_be_set(tmp_path):
                               ('SetEntityState', {'entity': NAME})):
             assert top.refused(name, **request) == (
                 INCORRECT_STATE, 'waiting for /clock (use_sim_time is set)')
-
-
-def test_steps_beyond_the_duration_say_so(tmp_path):
     with StandardNode(tmp_path, duration=0.05) as top:
         assert top.pause().refused('StepSimulation', steps=6) == (
             FAILED, 'at t = 0.050000000 s: `duration` ends before the steps do')
