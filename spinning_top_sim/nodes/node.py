@@ -13,7 +13,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -53,6 +53,8 @@ class Simulator(Node):
         log = self._log = self.get_logger()
         overrides = ros_parameters.take_overrides(self)
         values = self.values = ros_parameters.declare(self, given, overrides)
+        self.set_descriptor('use_sim_time', ParameterDescriptor(
+            read_only=True, dynamic_typing=True))
         simulation = self.simulation = LiveSimulation(values)
         self.add_pre_set_parameters_callback(ros_parameters.all_with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
@@ -61,7 +63,10 @@ class Simulator(Node):
         # Whether there is a /clock of another node: a node does not follow its own.
         self._follows = self.get_parameter('use_sim_time').value and not (
             parameters.is_enabled('clock', values))
-        self.clock = self._make_clock()
+        topic = self.resolve_topic_name('/clock')
+        self.clock = SimulatedClock(
+            (lambda: int(self.get_clock().now().nanoseconds)) if self._follows else time.time_ns,
+            log.warning, partial(self.count_publishers, topic) if self._follows else None)
         self.loop = Loop(
             simulation, values, self._recording, self.clock,
             error=log.error, update_subscribers=self._topics.update_subscribers)
@@ -82,13 +87,6 @@ class Simulator(Node):
             log.warning(warning)
         if objection := simulation.trajectory.top.objection:
             log.warning(objection)
-
-    def _make_clock(self) -> SimulatedClock:
-        if not self._follows:
-            return SimulatedClock(time.time_ns, self._log.warning)
-        topic = self.resolve_topic_name('/clock')
-        return SimulatedClock(lambda: int(self.get_clock().now().nanoseconds), self._log.warning,
-                              lambda: int(self.count_publishers(topic)))
 
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
@@ -175,12 +173,8 @@ class Simulator(Node):
 
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes or none."""
-        for p in given:
-            if p.name == 'use_sim_time' and p.value != self.get_parameter(p.name).value:
-                return SetParametersResult(successful=False, reason=(
-                    f'{p.name} = {p.value!r}: cannot be changed while the node runs'))
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
-        if not changes:
+        if changes.items() <= self._spin().items():     # nothing changes
             return SetParametersResult(successful=True)
         error, reason = self.outcome(lambda: self._change(changes))
         if error is not None and ros_parameters.is_command(changes):
@@ -288,12 +282,8 @@ class Simulator(Node):
 
     def show_spin(self) -> None:
         """Let the parameters show the present spin."""
-        self.remove_on_set_parameters_callback(self._on_set_parameters)
-        try:
-            self.set_parameters([
-                Parameter(name, value=value) for name, value in self._spin().items()])
-        finally:
-            self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.set_parameters_atomically([
+            Parameter(name, value=value) for name, value in self._spin().items()])
 
     def _record(self, request: SetBool.Request, response: SetBool.Response) -> Future:
         """Return the response, which is there when the log is open or closed."""

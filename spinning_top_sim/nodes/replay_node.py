@@ -17,14 +17,9 @@ Publish the messages of a ROS 2 log (.mcap) with their recorded spacing.
 """
 
 EPILOG = """\
-Topics keep their recorded names, whatever the namespace of this node
-(`replay`); remapping with `--ros-args -r FROM:=TO` works on them. They have the
-recorded QoS, which the parameters
-`qos_overrides.<topic>.publisher.{history,depth,reliability}` override. A topic
-that cannot be published is named and left out. Messages go out in the order of
-their log times and with their recorded bytes, old stamps included; what is late
-is sent at once. A message without log time (0, before the first /clock of what
-was recorded) goes out at the begin.
+Topics keep their recorded names and QoS, which `--ros-args -r FROM:=TO` and
+`-p qos_overrides.<topic>.publisher.<policy>:=...` change. Messages go out in
+the order of their log times and with their recorded bytes, old stamps included.
 
 With --loop, time on /clock begins anew in each round, and so do nodes with
 use_sim_time, such as robot_state_publisher. Others ignore old stamps.

@@ -31,8 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from spinning_top_sim.tools import scene_file  # noqa: PLC0415 - YAML takes 10 ms
     scene_file.add_parameters(parser)
     parser.add_argument('--namespace', metavar='NAME', help='of node, topics and frames')
-    parser.add_argument('--ros-args', metavar='...', nargs='*',
-                        help='arguments of ROS 2, such as -p NAME:=VALUE and --params-file FILE')
 
 
 def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], executable.RunnableNode]]:
