@@ -105,8 +105,8 @@ def test_a_stream_that_cannot_be_published_is_refused_before_anything_changes(
         tmp_path, monkeypatch, fault):
     with OwnNode(tmp_path, '-p', 'qos_overrides./imu/mag.publisher.reliability:=foo',
                  start_paused=True) as node:
-        before, topics, rates = (node.node.values, {one.topic_name for one in node.node.publishers},
-                                 [one.period_ns for one in node.simulation.channels])
+        before, rates = node.node.values, [one.period_ns for one in node.simulation.channels]
+        topics = {one.topic_name for one in node.node.publishers}
         with monkeypatch.context() as patch:
             if fault == 'messages':
                 patch.setattr(publishers, 'check_for_type_support', None)   # a call raises

@@ -50,10 +50,15 @@ def run_node(name: str, argv: Sequence[str] | None,
     try:
         with needed('it'):
             argv, make_node = prepare(argv)
-        interrupts = _initialize_ros([name, *argv])
+        import rclpy  # noqa: PLC0415
+        # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
+        # SIGINT twice, from the terminal and from launch.
+        interrupts: list[int] = []
+        _handle(lambda number, _: interrupts.append(number), signal.SIGINT, signal.SIGTERM)
+        _handle(lambda *_: signal.raise_signal(signal.SIGTERM), signal.SIGHUP, signal.SIGQUIT)
+        rclpy.init(args=[name, *argv])
     except Exception as error:
         return _cannot_start(name, error)
-    import rclpy  # noqa: PLC0415
     node, started = None, False
     try:
         node = make_node()
@@ -77,18 +82,6 @@ def run_node(name: str, argv: Sequence[str] | None,
             node.destroy_node()
         rclpy.try_shutdown()
         _handle(signal.SIG_IGN, *signals)       # rclpy has restored the handlers that it found
-
-
-def _initialize_ros(argv: list[str]) -> list[int]:
-    """Initialize rclpy; return the list to which SIGINT and SIGTERM are appended from now on."""
-    import rclpy  # noqa: PLC0415
-    # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
-    # SIGINT twice, from the terminal and from launch.
-    interrupts: list[int] = []
-    _handle(lambda number, _: interrupts.append(number), signal.SIGINT, signal.SIGTERM)
-    _handle(lambda *_: signal.raise_signal(signal.SIGTERM), signal.SIGHUP, signal.SIGQUIT)
-    rclpy.init(args=argv)
-    return interrupts
 
 
 def _handle(handler: Any, *signals: signal.Signals) -> None:

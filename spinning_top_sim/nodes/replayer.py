@@ -5,11 +5,10 @@ import argparse
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -90,7 +89,7 @@ class Replayer(Node):
                     outputs[topic.channel_id] = self._publisher(topic)
                 except Exception as error:  # a log may ask for anything; the others are played
                     warn(short_reason(f'{topic.name} is not played: {error}'))
-        if wanted and not outputs and not self._clock_rate:
+        if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
         return outputs
@@ -102,14 +101,11 @@ class Replayer(Node):
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
         profiles = topic.qos or (DEFAULT_QOS,)
         # It serves all subscribers that the recorded publishers have served together.
-        qos = {**profiles[0], **{key: min(one[key] for one in profiles)
-                                 for key in ('reliability', 'durability')},
-               'history': max(one['history'] for one in profiles),
-               'depth': min(sum(one['depth'] for one in profiles), 2 ** 31 - 1) or 10}
-        publisher = create_publisher(
-            self, message_class(topic.type_name), topic.name, QoSProfile(**{
-                key: Duration(seconds=value['sec'], nanoseconds=value['nsec'])
-                if isinstance(value, Mapping) else value for key, value in qos.items()}))
+        publisher = create_publisher(self, message_class(topic.type_name), topic.name, QoSProfile(
+            reliability=min(one['reliability'] for one in profiles),
+            durability=min(one['durability'] for one in profiles),
+            history=max(one['history'] for one in profiles),
+            depth=min(sum(one['depth'] for one in profiles), 2 ** 31 - 1) or 10))
         if any(one != profiles[0] for one in profiles):
             played = publisher.qos_profile
             self.get_logger().warning(
