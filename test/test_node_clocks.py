@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes that follow a /clock, whatever it does, or the date."""
+"""A node that follows a /clock, whatever it does, or the date."""
 
 import time
 from types import SimpleNamespace
@@ -9,70 +9,57 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import PoseStamped
-from helpers.node_harness import DrivenClock, SimNode, wait_for
-from helpers.node_logs import (
-    SECOND,
-    assert_clean_end,
-    events_in,
-    log_of,
-    stamp_of,
-    the_log,
-    verified,
-)
+from helpers.node_logs import SECOND, events_in, log_of, stamp_of, verified
 from helpers.own_node import OwnNode
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
 GRID_NS = 10_000_000        # of the stamps, and of pose
 
 
-def test_a_node_waits_for_a_clock_follows_its_steps_and_names_its_jumps(peer, tmp_path):
-    clock = DrivenClock(peer, '/other_clock', 1000 * SECOND + 3_000_000)
+def test_a_node_waits_for_a_clock_follows_its_steps_and_names_its_jumps(tmp_path, capfd):
+    with OwnNode(tmp_path, '-r', '/clock:=/other_clock', use_sim_time=True,
+                 record__enabled=True).listen('pose') as node:
+        clock = node.node.create_publisher(Clock, '/other_clock', 10)
+        heard, said = node.heard['pose'], []
 
-    def goes(step_ns):
-        """Let the clock make a step, and wait until the stamps are there too."""
-        clock.now_ns += step_ns
-        clock.drive('the samples', step_ns=0, until=lambda: (
-            0 <= clock.now_ns - stamp_of(pose.raw[-1]) < GRID_NS))
+        def show(now_ns):
+            """Let the clock show a time, and wait until the stamps are there."""
+            clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+            node.spin_until('the samples', lambda: (
+                heard and 0 <= now_ns - stamp_of(heard[-1]) < GRID_NS))
 
-    def told(text, now_ns):
-        clock.now_ns = now_ns
-        clock.drive(text, lambda: text in node.err, step_ns=0)
+        def told(text, now_ns):
+            clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+            node.spin_until(text, lambda: (
+                said.append(capfd.readouterr().err) or text in ''.join(said)))
 
-    with SimNode(tmp_path, {
-            'use_sim_time': True, 'status_period': 0.2, 'record.enabled': True,
-            # With the default depth of 10, what one message makes due would reach no slow reader.
-            'qos_overrides./clocked/pose.publisher.depth': 1000},
-            namespace='/clocked', arguments=('-r', '/clock:=/other_clock')) as node:
-        wait_for('the status line', lambda: ' s waiting | ' in node.out)
-        refused = peer.set_together(node, spin__l3=2.0)     # it would send t = 0 to nobody
-        assert not refused.successful and 'waiting for /clock' in refused.reason
-        assert 'follows another /clock' in peer.set_together(node, clock__enabled=True).reason
-        for answer in (peer.trigger(node, 'step'), peer.trigger(node, 'reset'),
-                       peer.switch(node, 'record', True)):
+        assert node.diagnostics()[:2] == (1, 'waiting for /clock (use_sim_time is set)')
+        for answer in (node.trigger('step'), node.trigger('reset'), node.switch('record', True)):
             assert not answer.success and 'waiting for /clock' in answer.message
-        pose = peer.listen(node.topic('pose'), PoseStamped)
-        clock.drive('the motion', lambda: len(pose.raw) > 20)
-        for step_ns in (1, 1, 2, 2):
-            goes(step_ns * SECOND)
-        stamps = [stamp_of(data) for data in pose.raw]
-        assert set(np.diff(stamps)) == {GRID_NS}, 'every sample is published'
+        assert 'waiting for /clock' in node.set(spin__l3=2.0).reason    # it would send t = 0
+        assert 'follows another /clock' in node.set(clock__enabled=True).reason
+        now_ns = 1000 * SECOND + 3_000_000
+        for step in (0, 1, 1, 2, 2):
+            now_ns += step * SECOND
+            show(now_ns)
+        assert set(np.diff([*map(stamp_of, heard)])) == {GRID_NS}, 'every sample is published'
         for jump in (10, 985):
-            told(f'/clock jumped forward by {jump} s: so do the stamps',
-                 clock.now_ns + jump * SECOND)
-            goes(SECOND)
+            now_ns += jump * SECOND
+            told(f'/clock jumped forward by {jump} s: so do the stamps', now_ns)
+            now_ns += SECOND
+            show(now_ns)
         told('/clock stepped back by ', 7 * SECOND)
-        goes_on_from = stamp_of(pose.raw[-1])
-        clock.drive('samples', lambda: stamp_of(pose.raw[-1]) > goes_on_from)
-        answer = peer.trigger(node, 'reset')
-        assert int(answer.message.split()[-2]) == clock.now_ns // GRID_NS * GRID_NS
-        goes(SECOND)
-        wait_for('the end of the recording', lambda: 'recording stopped: stamps have' in node.err)
-        pose.muted = True
-        assert_clean_end(node, node.end())
-    for text, count in (('/clock jumped', 2), ('stepped back', 1), ('cannot keep up', 0)):
-        assert node.err.count(text) == count
-    path = the_log(node.folder)
+        count = len(heard)
+        clock.publish(Clock(clock=Time(nanoseconds=8 * SECOND).to_msg()))
+        node.spin_until('samples', lambda: len(heard) >= count + 100)
+        assert stamp_of(heard[-1]) > now_ns
+        answer = node.trigger('reset')
+        assert int(answer.message.split()[-2]) == 8 * SECOND
+        told('recording stopped: stamps have gone back', 9 * SECOND)
+        show(9 * SECOND)
+    assert ''.join(said).count('/clock jumped') == 2 and 'keep up' not in ''.join(said)
+    path = tmp_path / 'run.mcap'
     assert verified(path)['identical']
     assert [event['event'] for event in events_in(log_of(path)[0])] == ['start', 'epoch', 'epoch']
 

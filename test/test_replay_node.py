@@ -157,13 +157,18 @@ def test_what_is_late_is_sent_at_once_and_a_pause_catches_nothing_up(tmp_path, m
         assert 0 <= at - begin - due <= most
 
 
-def test_start_and_topics_choose_what_is_played(tmp_path, capfd):
+def test_start_and_topics_choose_what_is_played_and_what_is_not_taken_is_counted(
+        tmp_path, capfd):
     path = write_log(tmp_path / 'run.mcap', texts(60, 20_000_000))
     raw, _ = play_all(path, '--topics', '/ours/chatter', '/nobody', '--start', '0.4', '--rate',
                       '100')
     assert raw == [[text(n) for n in range(20, 60, 2)]]
     said = capfd.readouterr()
     assert 'played 20 messages' in said.out and 'the log has no topic /nobody\n' in said.err
+    with OwnReplay(path, '--rate', '100') as replay:
+        replay.node.outputs[1].publish = None       # it raises, as with a reader that stalls
+        replay.spin_until('the end', replay.node.finished.done)
+    assert 'played 30 messages; 30 not published: a reader that' in capfd.readouterr().out
 
 
 def test_odd_channels_and_times_do_not_stop_the_others(tmp_path, capfd):
@@ -214,24 +219,6 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, capfd):
         assert 'Traceback' not in run.err
 
 
-def test_what_a_stalled_reader_does_not_take_is_counted(tmp_path, capfd):
-    with OwnReplay(write_log(tmp_path / 'run.mcap', texts(10))) as replay:
-        replay.node.outputs[1].publish = None       # a call of it raises an error
-        replay.spin_until('the end', replay.node.finished.done)
-    assert 'played 5 messages; 5 not published: a reader that' in capfd.readouterr().out
-
-
-def test_a_publisher_serves_all_whom_the_recorded_ones_have_served(tmp_path, capfd):
-    path = write_log(tmp_path / 'run.mcap', texts(2), [
-        ('/all', STRING, {'reliability': 2, 'depth': 3}, {'history': 2, 'depth': 4}), TWO[1]])
-    with OwnReplay(path) as replay:
-        (found,) = (publisher.qos_profile for publisher in replay.node.publishers
-                    if publisher.topic_name == '/all')
-    assert (found.history.name, found.reliability.name) == ('KEEP_ALL', 'RELIABLE')
-    assert ('/all was recorded with several QoS profiles: it is played as reliable and volatile'
-            in capfd.readouterr().err)
-
-
 def test_each_round_begins_with_the_clock_of_its_begin(tmp_path):
     """What robot_state_publisher takes: stamps that go back after the time went back."""
     path = write_log(tmp_path / 'run.mcap', texts(21, 10_000_000), [TWO[0], ('/clock', STRING)])
@@ -279,6 +266,8 @@ def test_a_log_is_played_over_dds_with_its_qos_or_another_until_a_signal(peer, t
         clock.muted = True
     peer.node.destroy_subscription(subscription)
     assert sorted(late.raw) == [text('one'), text('two')] and 'Traceback' not in node.err
+    assert node.err.count('/map was recorded with several QoS profiles: it is played as '
+                          'reliable and transient_local') == 1
     wanted = of_each(texts(60))
     assert first.raw == wanted[0]
     # What nobody acknowledges may get lost, but neither change nor change places.

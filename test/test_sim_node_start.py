@@ -7,10 +7,9 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-import yaml
 from helpers.node_harness import SimNode
 from helpers.node_logs import TRACEBACK, log_of, the_log
-from helpers.own_node import OwnNode, run_main
+from helpers.own_node import run_main
 from test_scene_file import scene
 
 from spinning_top_sim.nodes import replay_node, sim_node, simulation_handlers
@@ -90,13 +89,16 @@ def test_what_cannot_be_started_is_said_in_a_line_with_exit_code_2(
 def test_a_run_warns_of_what_is_odd_and_tells_where_its_log_is(main, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     run = main('-p', 'record.enabled:=true', '-p', 'duration:=0.5', '-p', 'status_period:=0.1',
-               '-p', 'top.lambda3:=0.5', '--ros-args', '-p', 'spin.l33:=1.0', '-p',
-               'qos_overrides./pose.publisher.dept:=3')
+               '-p', 'top.lambda3:=0.5', '--ros-args', '-p', 'spin.l33:=1.0', '-r',
+               'pose:=attitude', '-p', 'qos_overrides./attitude.publisher.depth:=3', '-p',
+               'qos_overrides./pose.publisher.depth:=3')
     assert (run.code, TRACEBACK in run.err) == (0, False)
     path = the_log(tmp_path)
-    assert len(log_of(path)[0]['/pose']) == 51
+    assert len(log_of(path)[0]['/attitude']) == 51
+    with LogReader(path) as log:        # overrides are for the remapped topic
+        assert {one.name: one.qos for one in log.topics}['/attitude'][0]['depth'] == 3
     for text in ('there is no parameter spin.l33: ignored; did you mean spin.l3?',
-                 'qos_overrides./pose.publisher.dept is not obeyed',
+                 'qos_overrides./pose.publisher.depth is not obeyed',
                  'top.lambda3 = 0.5 kg m^2: no rigid body', f'recording to {path}'):
         assert text in run.err
     assert ' s running | ' in run.out and '\x1b' not in run.out and '\r' not in run.out
@@ -161,36 +163,3 @@ def test_simulation_interfaces_is_offered_where_it_is_installed_and_not_switched
     monkeypatch.setattr(simulation_handlers, 'offer', offered.append)
     start_values('--ros-args', '-p', f'simulation_interfaces:={str(wanted).lower()}')
     assert len(offered) == (installed and wanted)
-
-
-def test_a_dump_of_the_parameters_gives_the_same_start(tmp_path, start_values):
-    """With lz unset, lists, integers, and what was changed meanwhile."""
-    with OwnNode(tmp_path, seed=7, pose__rate=37.5, imu__lever_arm=[0.1, 0.0, 0.02],
-                 imu__frame_id='sensor', ground_truth_odom__enabled=False,
-                 record__streams=['pose', 'imu'], initial__theta=0.7) as node:
-        assert node.set(solver__rtol=1e-10, seed=8).successful
-        dumped = {name: one.value for name, one in node.node.get_parameters_by_prefix('').items()}
-        expected = {**node.node.values, 'spin.lz': node.get('spin.lz')[0]}
-    file = tmp_path / 'dump.yaml'           # as ros2 param dump does
-    file.write_text(yaml.dump({'/**': {'ros__parameters': {
-        name: value.tolist() if hasattr(value, 'tolist') else value
-        for name, value in dumped.items()}}}))
-    _, found = start_values('--ros-args', '--params-file', str(file))
-    assert {name: value for name, value in found.items() if value != expected[name]}.keys() == {
-        'duration', 'record.enabled', 'record.uri'}
-
-
-def test_remapping_and_qos_overrides_work(tmp_path):
-    arguments = ['-r', '__ns:=/ns', '-r', 'pose:=attitude', '-p',
-                 'qos_overrides./ns/attitude.publisher.reliability:=best_effort', '-p',
-                 'qos_overrides./ns/imu/data_raw.publisher.depth:=3']
-    with OwnNode(tmp_path, *arguments, record__enabled=True) as node:
-        pose, imu = (node.publisher(name) for name in ('attitude', 'imu/data_raw'))
-        assert (pose.topic_name, pose.qos_profile.reliability.name) == (
-            '/ns/attitude', 'BEST_EFFORT')
-        assert (imu.qos_profile.depth, imu.qos_profile.reliability.name) == (3, 'RELIABLE')
-    with LogReader(tmp_path / 'run.mcap') as reader:
-        offered = {topic.name: topic.qos[0] for topic in reader.topics if topic.qos}
-    assert '/ns/pose' not in offered
-    assert offered['/ns/attitude']['reliability'] == 2
-    assert offered['/ns/imu/data_raw']['depth'] == 3

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Helpers for tests of running nodes: a node in a process of its own, and a peer that talks to it.
+A node in a process of its own, and a peer that talks to it, in the domain of own_domain.
 
-Nodes and peer use the domain of own_domain.  A test waits for an event, at most PATIENCE_S: the
-speed of the machine decides nothing.
+A test waits for an event, at most PATIENCE_S: the speed of the machine decides nothing.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 import helpers.own_domain  # noqa: F401, for programs without conftest.py
@@ -261,27 +259,6 @@ class Diagnostics:
 
         (status, *_) = wait_for('two /diagnostics', second)
         return numbers(status)
-
-
-class DrivenClock:
-    """A publisher of a clock [ns] on a topic."""
-
-    def __init__(self, peer, topic, now_ns):
-        self._peer, self.now_ns = peer, now_ns
-        self._publisher = peer.node.create_publisher(Clock, topic, 10)
-
-    def set(self, now_ns):
-        self.now_ns = now_ns
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = divmod(now_ns, 10 ** 9)
-        self._publisher.publish(message)
-
-    def drive(self, what, until, step_ns=5_000_000):
-        """Advance with each check of a condition."""
-        def goes_on():
-            self.set(self.now_ns + step_ns)
-            return until()
-        wait_for(what, goes_on)
 
 
 def numbers(status):
