@@ -108,12 +108,6 @@ def numbers(state):
                      *xyz(state.acceleration.angular)])
 
 
-def test_features_are_those_of_the_services(top):
-    known = top.messages.SimulatorFeatures
-    found = {*top.call('GetSimulatorFeatures').features.features}
-    assert found == {getattr(known, name) for row in FEATURES.values() for name in row}
-
-
 def test_states_change_as_the_standard_says(top):
     for name, code, state in (('STOPPED', ALREADY, STOPPED), ('PAUSED', OK, PAUSED),
                               ('PAUSED', ALREADY, PAUSED), ('STOPPED', OK, STOPPED)):
@@ -129,7 +123,10 @@ def test_states_change_as_the_standard_says(top):
     assert top.simulation.epoch_ns > epoch_ns + now_ns, 'stamps do not go back'
 
 
-def test_what_cannot_be_is_refused_with_its_values(top):
+def test_what_is_offered_is_told_and_the_rest_refused_with_its_values(top):
+    known = top.messages.SimulatorFeatures
+    found = {*top.call('GetSimulatorFeatures').features.features}
+    assert found == {getattr(known, name) for row in FEATURES.values() for name in row}
     code, text = top.refused('SetSimulationState', state=top.messages.SimulationState(state=4))
     assert code == INCORRECT_TRANSITION and text.startswith('state = 4 from STOPPED: must be one')
     assert top.refused('StepSimulation', steps=1) == (
@@ -228,18 +225,13 @@ def test_a_state_that_is_set_is_the_state(top, which):
     expected = ([*q, *before[4:7]] if which == 'pose' else [*before[:4], *rates])
     assert np.allclose(after[:7], expected, rtol=0.0, atol=1e-12)
     assert (top.state, top.simulation.now_ns) == (PAUSED, 200_000_000)
-    # The parameters show the spin, and the motion goes on from there.
     now = top.simulation.state()
     assert top.get('spin.l3', 'spin.lz') == pytest.approx(
-        [float(now.l3[0]), float(now.lz[0])], rel=1e-12)
-    top.done('StepSimulation', steps=1)
-    assert np.allclose(numbers(top.entity)[4:7], after[4:7] + 0.01 * after[7:], rtol=0.0,
-                       atol=0.05)
+        [float(now.l3[0]), float(now.lz[0])], rel=1e-12), 'the parameters show the spin'
 
 
 BAD_STATES = [
     ({'pose__position__x': 0.1}, INVALID_POSE, 'pose.position [m] = [0.1, 0.0, 0.0]: must be'),
-    ({'pose__position__z': math.nan}, INVALID_POSE, '[0.0, 0.0, nan]: must be'),
     ({'pose__orientation__w': 0.9}, INVALID_POSE, '[0.0, 0.0, 0.0, 0.9]: must have the length 1'),
     ({'pose__orientation__x': math.nan}, INVALID_POSE, 'must have the length 1'),
     ({'twist__linear__y': 0.5}, FAILED, 'twist.linear [m/s] = [0.0, 0.5, 0.0]: must be that of'),

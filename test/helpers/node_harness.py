@@ -44,10 +44,6 @@ def wait_for(what, condition):
     return result
 
 
-# Nodes end with the test process, also if that is killed.
-DIE_WITH_PARENT = ['setpriv', '--pdeathsig', 'KILL'] if shutil.which('setpriv') else []
-
-
 class SimNode:
     """
     A sim_node in its own process group; it ends with the `with` at the latest.
@@ -68,10 +64,10 @@ class SimNode:
         if executor == 'single':
             (self.folder / 'sitecustomize.py').write_text(
                 "import sys; sys.modules['rclpy.experimental'] = None")
-        self.command = [
-            *DIE_WITH_PARENT, sys.executable,
-            *(program or ('-m', 'spinning_top_sim', 'node')),
-            '--ros-args', '-r', f'__ns:={namespace}', *options(parameters or {}), *arguments]
+        self.command = [        # it ends with the test process, also if that is killed
+            *(('setpriv', '--pdeathsig', 'KILL') if shutil.which('setpriv') else ()),
+            sys.executable, *(program or ('-m', 'spinning_top_sim', 'node')), '--ros-args', '-r',
+            f'__ns:={namespace}', *options(parameters or {}), *arguments]
 
     def __enter__(self):
         source = Path(spinning_top_sim.__file__).parents[1]
@@ -150,7 +146,6 @@ class Topic:
         return self
 
     def wait_more(self, count):
-        """Wait until `count` more messages have arrived."""
         return self.wait(len(self.raw) + count)
 
     def messages(self, first=0):
