@@ -5,6 +5,7 @@ Replays of logs, in this process and over real DDS.
 No test is decided by how long something took, except that nothing may come before its time.
 """
 
+import importlib
 import math
 import time
 from argparse import ArgumentParser
@@ -28,6 +29,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import replay_node, replayer
+from spinning_top_sim.nodes.publishers import message_class
 from spinning_top_sim.nodes.replayer import Replayer, open_log
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 
@@ -185,6 +187,14 @@ def test_odd_channels_and_times_do_not_stop_the_others(tmp_path, capfd):
         assert err.count(name.replace('\x1b', '\\x1b') + ' is not played') == 1, name
     assert '/unknown is not played: nowhere_msgs/msg/Thing: must be an installed type' in err
     assert '\x1b[31' not in err
+
+
+def test_only_message_classes_of_installed_ros_packages_are_found(monkeypatch):
+    assert message_class('std_msgs/String') is message_class(STRING) is String
+    monkeypatch.setattr(importlib, 'import_module', pytest.fail)
+    for name in ('antigravity/msg/X', '/msg/String', 'std_msgs', '../std_msgs/msg/String'):
+        with pytest.raises(ValueError, match='must be an installed type'):
+            message_class(name)
 
 
 def test_a_torn_log_is_refused_with_a_hint_and_played_in_part(tmp_path, capfd):

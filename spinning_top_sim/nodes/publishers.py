@@ -2,8 +2,11 @@
 """Publishers: of types by name, with the QoS of parameters, and those of a simulation."""
 
 import importlib
+import os
+import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rclpy.duration import Duration
@@ -26,7 +29,12 @@ def message_class(type_name: str) -> type:
     Raises ValueError for any other name.
     """
     package, _, name = type_name.replace('/msg/', '/').partition('/')
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
     try:
+        # Other Python packages must not be imported because a log names them.
+        if not any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
+                   for prefix in prefixes):
+            raise LookupError(package)
         kind: type = getattr(importlib.import_module(f'{package}.msg'), name)
         check_for_type_support(kind)
     except Exception as error:      # importing a broken package may raise anything
