@@ -68,7 +68,7 @@ def test_what_a_slow_clock_makes_due_is_on_time_for_half_a_second():
         assert top.tick(steady_ns * MS, second * S)[1] == late_ns
 
 
-@pytest.mark.parametrize('jump_ns', [10 * S, 985 * S])
+@pytest.mark.parametrize('jump_ns', [10 * S, 985 * S + 3 * MS])
 def test_a_jump_forward_moves_the_stamps_and_not_the_motion(jump_ns):
     top = Top(publishers=1).begin(10 * S + 7 * MS)
     top.tick(1 * S, 11 * S)
@@ -78,7 +78,7 @@ def test_a_jump_forward_moves_the_stamps_and_not_the_motion(jump_ns):
     top.tick(3 * S, 12 * S + jump_ns)
     assert top.sent_ns == sent_ns + S
     assert 0 <= 12 * S + jump_ns - top.stamp_ns < EPOCH_GRID_NS
-    assert top.warnings == [f'/clock jumped forward by {jump_ns // S} s: so do the stamps']
+    assert top.warnings == [f'/clock jumped forward by {jump_ns / S:g} s: so do the stamps']
 
 
 def test_a_step_back_is_named_and_a_reset_brings_the_stamps_back():

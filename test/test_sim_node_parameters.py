@@ -58,6 +58,12 @@ def test_a_command_sets_the_momenta(node, command, l3, lz):
     assert np.abs(invariants[1:3] - (l3, lz)).max() < 1e-11
 
 
+def test_a_spin_that_is_set_beside_the_start_is_that_of_the_next_start(node):
+    assert node.set(initial__theta=0.5, spin__l3=2.0).successful
+    assert node.loop.commands == 0 and node.trigger('reset').success
+    assert node.get('spin.l3') == [2.0] and node.simulation.state().theta == 0.5
+
+
 REFUSED_COMMANDS = {
     (): '0 values', (1.0, 1.0, 1.0): '3 values', (math.nan, 1.0): 'nan', (1.0, -math.inf): 'inf',
     (1e300, 1e300): '1e+300', (1e20, 1.0): '1e+20', (-1e150, 1e15): '1e+150'}
