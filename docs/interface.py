@@ -71,7 +71,7 @@ AFTER_TOPICS = """| `/diagnostics` | diagnostic_msgs/msg/DiagnosticArray | 1 | y
 | kind | name | type | effect |
 |---|---|---|---|
 | topic | `~/commands` | std_msgs/Float64MultiArray | sets [L3, Lz] in kg m²/s, as an impulsive torque does; the angles and θ' stay |
-| topic | `~/cmd_vel` | geometry_msgs/Twist | drives the pivot: `linear` is its velocity in the world in m/s, each within 10000, `angular` must be 0; of several in 20 ms, or in the time that a new motion takes, the last one counts |
+| topic | `~/cmd_vel` | geometry_msgs/Twist | drives the pivot: `linear` is its velocity in the world in m/s, each within 10000, `angular` must be 0 |
 | service | `~/set_pause` | std_srvs/SetBool | pauses, resumes; the simulated time stands still meanwhile |
 | service | `~/step` | std_srvs/Trigger | advances by `step.count` × `step.dt`; only while paused |
 | service | `~/reset` | std_srvs/Trigger | starts again with the start state, spin and seed; the next stamp is the date |

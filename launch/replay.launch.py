@@ -11,6 +11,7 @@ from pathlib import Path
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from spinning_top_sim.nodes import launch_helpers
@@ -32,9 +33,9 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             'loop', default_value='false', choices=SWITCH, description='Start again at the end'),
         DeclareLaunchArgument(
-            'clock', default_value='false',
+            'clock', default_value=LaunchConfiguration('loop'),
             description='true, or a rate [Hz]: publish the time of the log on /clock, for TF and '
-            'RViz too'),
+            'RViz too; default: the value of loop'),
         DeclareLaunchArgument(
             'partial', default_value='false', choices=SWITCH,
             description='Play the intact part of a truncated log'),
@@ -71,10 +72,10 @@ def _nodes(context: LaunchContext) -> list:
         return [*actions, LogInfo(msg=f'neither TF nor RViz: {error}')]
     namespace, values = _namespace(run.topics), run.values_in_effect
     if on['tf'] and 'joint_states' in run.topics:
-        actions += launch_helpers.state_publisher(
-            SHARE, values, namespace, run.topics['joint_states'], clocked)
+        actions.append(launch_helpers.state_publisher(
+            SHARE, values, namespace, run.topics['joint_states'], clocked))
     if on['rviz']:
-        actions += launch_helpers.rviz(SHARE, values['world_frame'], namespace, clocked)
+        actions.append(launch_helpers.rviz(SHARE, values['world_frame'], namespace, clocked))
     return actions
 
 

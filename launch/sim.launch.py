@@ -87,15 +87,15 @@ def _nodes(context: LaunchContext) -> list:
         arguments=[word for option in options for word in option],
         parameters=[{**of_ros, 'use_sim_time': on['use_sim_time']}])]
     if on['tf']:
-        actions += launch_helpers.state_publisher(
+        actions.append(launch_helpers.state_publisher(
             SHARE, values, namespace, resolve_topic('joint_states', namespace),
-            on['use_sim_time'])
+            on['use_sim_time']))
     if on['view']:
         actions.append(Node(package='spinning_top_sim', executable='view', namespace=namespace,
                             arguments=['--node'], output='screen'))
     if on['rviz']:
-        actions += launch_helpers.rviz(SHARE, values['world_frame'], namespace,
-                                       on['use_sim_time'])
+        actions.append(launch_helpers.rviz(SHARE, values['world_frame'], namespace,
+                                           on['use_sim_time']))
     return actions
 
 

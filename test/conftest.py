@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures of the tests that talk to running nodes, and the order of many workers."""
 
+import functools
 import signal
+from pathlib import Path
 
 import helpers.own_domain  # noqa: F401, before any node starts
 import pytest
@@ -9,11 +11,16 @@ import pytest
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    if config.getvalue('dist') != 'load':
-        return None
-    from helpers.scheduling import BySharedFixture
+    """Let one worker run the tests of a file that shares fixtures, and any worker the others."""
+    from xdist.scheduler import LoadScopeScheduling
 
-    return BySharedFixture(config, log)
+    class BySharedFixtures(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            file = nodeid.partition('::')[0]
+            return file if "scope='module'" in read(config.rootpath / file) else nodeid
+
+    read = functools.cache(Path.read_text)
+    return BySharedFixtures(config, log)
 
 
 def pytest_collection_modifyitems(items):
@@ -33,7 +40,7 @@ def _signals():
         signal.signal(number, handler)
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='session')
 def peer():
     from helpers.node_harness import Peer
 
@@ -41,7 +48,7 @@ def peer():
         yield peer
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='session')
 def diagnostics(peer):
     from helpers.node_harness import Diagnostics
 

@@ -34,7 +34,7 @@ class Run:
             self.simulation, self.values, recording, SimulatedClock(
                 lambda: DATE_NS + self.now_ns - 77, self.told.append,
                 (lambda: 1) if follows else None, self.read),
-            update_subscribers=self.count, warn=self.told.append, error=self.told.append)
+            update_subscribers=self.count, error=self.told.append)
         self.simulation.log_to(lambda entries: self._taken.extend(
             stamp_ns for _, stamps_ns, _ in entries for stamp_ns in stamps_ns.tolist()),
             [channel(self.simulation, 'pose')])
@@ -65,9 +65,8 @@ class Run:
             self.tick()
         return self
 
-
-def command(run, l3):
-    run.loop.change('command', lambda: {'l3': l3, 'lz': 1.0})
+    def command(self, l3):
+        self.loop.change('command', lambda: {'l3': l3, 'lz': 1.0})
 
 
 def grid(until_ns, period_ns=POSE_NS):
@@ -77,7 +76,7 @@ def grid(until_ns, period_ns=POSE_NS):
 def test_ticks_send_all_that_is_due_however_late_they_come_and_late_ones_are_counted():
     run = Run().ticks(20)
     loop = run.loop
-    assert run.times == grid(20 * TICK_NS) and (loop.late_ticks, loop.skipped_ticks) == (0, 0)
+    assert run.times == grid(20 * TICK_NS)
     run.tick(7_400_000)                             # not yet 1.5 periods
     assert (loop.late_ticks, loop.skipped_ticks) == (0, 0)
     run.tick(10_100_000)
@@ -110,17 +109,11 @@ def test_a_step_is_exact_while_clocks_go_on_or_says_what_is_left(monkeypatch):
         run.loop.step(SECOND)
     run.step_ns = 1_333                             # any code takes time
     run.loop.pause()
-    for length_ns in (210_000_000, 10_000_000, 333_333_333, 1):
+    for length_ns in (210_000_000, 333_333_333, 1):
         run.ticks(5)
         before = run.loop.now_ns
         run.loop.step(length_ns)
         assert run.loop.now_ns - before == length_ns
-    run.step_ns = 0
-    run.loop.step(30 * SECOND)                      # in several pieces
-    run.room = False
-    with pytest.raises(RuntimeError, match='takes too long'):
-        run.loop.step(30 * SECOND)
-    run.room = True
     monkeypatch.setattr(module, 'STEP_BUDGET_NS', 150_000)
     run.step_ns, before = 100_000, run.loop.now_ns
     with pytest.raises(RuntimeError, match=r'takes too long, \d+\.\d+ s are left') as error:
@@ -146,16 +139,16 @@ def test_the_duration_ends_with_its_last_sample_and_nothing_leads_on():
     for act in (run.loop.pause, run.loop.resume, lambda: run.loop.fail('a test')):
         act()
         assert run.loop.state is LoopState.ENDED
-    with pytest.raises(RuntimeError, match='`duration` are sent: nothing follows'):
+    with pytest.raises(RuntimeError, match='at the end: nothing follows'):
         run.loop.reset(run.values)
     assert run.loop.now_ns == 72_300_000 and run.kinds == []
     assert run.ticks(5).times == grid(72_300_000)
 
 
-@pytest.mark.parametrize('scale', [1.0, 2.0])
 def test_what_a_tick_has_no_time_or_room_for_comes_later_and_a_clock_too_far_ahead_slips(
-        monkeypatch, scale):
+        monkeypatch):
     """By a second of real time."""
+    scale = 2.0
     monkeypatch.setattr(module, 'TICK_BUDGET_NS', 50_000)
     run = Run(time_scale=scale, pose__rate=1000.0).ticks(4)
     run.step_ns = 100_000
@@ -168,8 +161,6 @@ def test_what_a_tick_has_no_time_or_room_for_comes_later_and_a_clock_too_far_ahe
     run.tick(900_000_000)
     run.tick(200_000_000)
     assert (run.loop.now_ns, run.loop.slipped_ns) == (stands_at, scale * 1_100_000_000)
-    run.tick(1_200_000_000)
-    assert run.loop.slipped_ns == scale * 2_300_000_000     # all together
     run.room = True
     run.ticks(4)
     assert run.loop.now_ns == stands_at + scale * 4 * TICK_NS
@@ -189,6 +180,8 @@ def test_a_reset_begins_again_at_a_later_stamp_and_a_pause_remains():
     run.loop.reset(run.values)
     run.ticks(30)
     assert (run.loop.now_ns, run.times, run.kinds) == (0, [], ['reset', 'reset'])
+    run.command(2.0)
+    assert run.counted > 0 and run.times == [0], 'a change sends the first sample to those there'
     run.loop.reset(run.values, paused=False)
     assert run.ticks(4).loop.state is LoopState.RUNNING
 
@@ -199,50 +192,29 @@ FAILING = {
     # At the edge of a piece of the path the pivot turns too fast for this top.
     'no motion from t = 0.05 s on': {
         'pivot__path': (0.05, 0.0, 0.0, 0.0, 0.001, 1e5, 0.0, 0.0), 'top__lambda1': 1e-9,
-        'top__lambda3': 1e-9, 'spin__l3': 0.0, 'solver__method': 'exact'},
-    'January 2038': {'solver__method': 'exact'}}
+        'top__lambda3': 1e-9, 'spin__l3': 0.0, 'solver__method': 'exact'}}
 
 
 @pytest.mark.parametrize('reason', FAILING)
 def test_a_motion_that_cannot_go_on_stands_until_a_reset(reason):
     run = Run(**FAILING[reason])
-    if '2038' in reason:
-        run.simulation.epoch_ns = (2 ** 31 - 1) * SECOND
     run.ticks(400)
     stands_at = run.loop.now_ns
     assert reason in run.loop.failure and run.loop.state is LoopState.FAILED
     assert run.times == grid(stands_at)
     assert sum('until ~/reset' in told for told in run.told) == 1
     assert run.simulation.state().theta[0] >= 0.0, 'it can be described'
-    for act in (lambda: command(run, 1.0), lambda: run.loop.step(POSE_NS),
-                run.loop.resume):
+    for act in (lambda: run.command(1.0), lambda: run.loop.step(POSE_NS), run.loop.resume):
         with pytest.raises((ValueError, RuntimeError), match=f'stands still: .*{reason}'):
             act()
     assert run.ticks(5).loop.now_ns == stands_at
-    if '2038' in reason:
-        with pytest.raises(ValueError, match='2038'):
-            run.loop.reset(run.values)
-        assert run.loop.state is LoopState.FAILED
-    else:
-        run.loop.reset(simulate().values)
-        assert run.loop.failure is None and run.ticks(404).loop.now_ns > stands_at
+    run.loop.reset(simulate().values)
+    assert run.loop.failure is None and run.ticks(404).loop.now_ns > stands_at
 
 
-def test_a_change_before_the_first_sample_sends_that_to_those_who_listen():
-    run = Run(start_paused=True)
-    command(run, 2.0)
-    assert run.counted == 1 and run.times == [0]
-
-
-def test_of_the_velocities_in_twenty_milliseconds_the_last_one_counts():
-    run = Run()
-    for number in range(1, 12):
-        run.loop.drive((number, 0.0, 0.0))
-        run.tick()
-    assert [(event.t_ns, event.details['x']) for event in run.simulation.history] == [
-        (5_000_000, 1.0), (25_000_000, 5.0), (45_000_000, 9.0)]
-    run.loop.reset(run.values)
-    run.loop.drive((12.0, 0.0, 0.0))
-    run.tick(20_000_000)
-    (event,) = run.simulation.history
-    assert event.t_ns < 20_000_000, 'a new motion does not wait for the last one'
+def test_a_velocity_drives_the_pivot_from_now_on_and_rest_at_rest_is_no_event():
+    run = Run().ticks(3)
+    for velocity in (0.0, 1.0):
+        run.loop.change('drive', lambda at=velocity: run.simulation.drive_details((at, 0.0, 0.0)))
+    assert run.kinds == ['drive'] and run.loop.commands == 1
+    assert [event.t_ns for event in run.simulation.history] == [3 * TICK_NS]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What the running node publishes: over real DDS, seen from another process.
+Running nodes: over real DDS, seen from another process, until a signal ends them.
 
-What it sends is compared with its log, and that with the run computed in this process.
+What a node sends is compared with its log, and that with the run computed in this process.
 """
 
 import signal
@@ -12,11 +12,9 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.node_logs import (
-    KINDS,
-    PERIODS_NS,
-    SECOND,
     assert_clean_end,
     assert_received_from,
     log_of,
@@ -24,41 +22,37 @@ from helpers.node_logs import (
     the_log,
     verified,
 )
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import MarkerArray
 
-WATCHED_S = 1
-
-RUNS = {
-    'plain': {},
-    'mounted': {'imu.lever_arm': [0.1, -0.05, 0.3], 'imu.rpy': [0.3, -0.2, 1.1],
-               'initial.theta': 0.8, 'initial.theta_dot': 0.4, 'spin.l3': 1.2, 'spin.lz': 0.5,
-               'imu.frame_id': 'sensor', 'world_frame': 'map', 'body_frame': 'wheel',
-               'markers.enabled': True},
-}
+KINDS = {'pose': PoseStamped, 'joint_states': JointState, 'imu/data_raw': Imu,
+         'ground_truth/imu': Imu, 'ground_truth/odom': Odometry, 'ground_truth/imu_bias': Imu}
+INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+MOUNTED = {'imu.lever_arm': [0.1, -0.05, 0.3], 'imu.rpy': [0.3, -0.2, 1.1],
+           'initial.theta': 0.8, 'initial.theta_dot': 0.4, 'spin.l3': 1.2, 'spin.lz': 0.5,
+           'imu.frame_id': 'sensor', 'world_frame': 'map', 'body_frame': 'wheel',
+           'markers.enabled': True}
 
 
 @pytest.fixture(scope='module')
 def both_runs(peer, diagnostics, tmp_path_factory):
     """Two nodes side by side on either executor, recorded, watched, told, and ended."""
     folder = tmp_path_factory.mktemp('runs')
-    runs = {}
     # With the default depth of 10, a subscriber that stands still for 50 ms misses samples.
     one, two = ({**values, 'record.enabled': True, **{
         f'qos_overrides./{name}/{topic}.publisher.depth': 1000 for topic in (*KINDS, 'markers')}}
-        for name, values in RUNS.items())
+        for name, values in (('plain', {}), ('mounted', MOUNTED)))
     with (SimNode(folder, one, namespace='/plain') as one,
           SimNode(folder, two, namespace='/mounted', executor='single') as two):
-        for node in (one, two):
-            topics = {name: peer.listen(node.topic(name), kind) for name, kind in KINDS.items()}
-            runs[node.namespace[1:]] = SimpleNamespace(node=node, topics=topics)
-        runs['mounted'].topics['markers'] = peer.listen(two.topic('markers'), MarkerArray)
-        for run in runs.values():
+        runs = [SimpleNamespace(node=node, topics={
+            name: peer.listen(node.topic(name), kind) for name, kind in kinds.items()})
+            for node, kinds in ((one, KINDS), (two, {**KINDS, 'markers': MarkerArray}))]
+        for run in runs:
             for name, topic in run.topics.items():
-                topic.wait(WATCHED_S * SECOND // PERIODS_NS.get(name, 50_000_000))
-            for topic in run.topics.values():
+                topic.wait(10 if name == 'markers' else 100)
                 topic.muted = True
-            run.said = diagnostics.next(run.node)
         # What is said to one, after what is watched, and does not reach the other.
         commands = peer.node.create_publisher(Float64MultiArray, one.topic('~/commands'), 10)
         wait_for('the command', lambda: commands.publish(Float64MultiArray(
@@ -66,36 +60,81 @@ def both_runs(peer, diagnostics, tmp_path_factory):
         assert peer.set_together(one, seed=99, pose__rate=50.0).successful
         assert peer.switch(one, 'set_pause', True).success
         assert peer.trigger(one, 'step').success and peer.trigger(one, 'reset').success
-        for run in runs.values():       # its answer waits for the file, on either executor
-            assert f'{run.node.folder}/' in peer.switch(run.node, 'record', False).message
-            assert peer.switch(run.node, 'record', False).message == 'not recording'
+        for node in (one, two):         # its answer waits for the file, on either executor
+            assert f'{node.folder}/' in peer.switch(node, 'record', False).message
         said = diagnostics.next(two)
         assert [said[key] for key in ('state', 'commands', 'rejected commands')] == [
             'running', '0', '0']
         assert peer.get(two, 'spin.l3', 'spin.lz', 'seed', 'pose.rate') == [1.2, 0.5, 0, 100.0]
-        runs['plain'].code = one.end(signal.SIGINT)
-        runs['mounted'].code = two.end(signal.SIGTERM)
-    for run in runs.values():
-        run.log, run.metadata = log_of(the_log(run.node.folder))
+        runs[0].code, runs[1].code = one.end(INT, INT), two.end(TERM, INT)
     return runs
 
 
-@pytest.mark.parametrize('name', RUNS)
-def test_a_node_sends_records_and_ends_as_it_is_computed_offline(both_runs, name):
+@pytest.mark.parametrize('number', [0, 1])
+def test_a_node_sends_records_and_ends_as_it_is_computed_offline(both_runs, number):
     """The same bytes, in order, with nothing missing between the first and the last."""
-    run = both_runs[name]
+    run = both_runs[number]
     assert_clean_end(run.node, run.code)
-    verdict = verified(the_log(run.node.folder))
-    assert verdict['identical']
-    assert {topic.split('/', 2)[2] for topic in verdict['compared']} >= {*run.topics}
-    assert all(topic.startswith(f'/{name}/') for topic in run.log)
+    path = the_log(run.node.folder)
+    log, verdict = log_of(path)[0], verified(path)
+    assert verdict['identical'] and {run.node.topic(topic) for topic in run.topics} <= {
+        *verdict['compared']}
+    assert all(topic.startswith(f'{run.node.namespace}/') for topic in log)
     for topic, heard in run.topics.items():
-        logged = [data for _, data in run.log[run.node.topic(topic)]]
+        times, logged = zip(*log[run.node.topic(topic)], strict=True)
         if topic in KINDS:
-            assert [stamp for stamp, _ in run.log[run.node.topic(topic)]] == [
-                stamp_of(data) for data in logged]
-        first = logged.index(heard.raw[0])
-        if int(run.said['skipped samples']) == 0:
-            assert logged[first:first + len(heard.raw)] == heard.raw, topic
+            assert [*times] == [stamp_of(data) for data in logged]
+        if 'live topics skip samples' not in run.node.err:
+            first = logged.index(heard.raw[0])
+            assert [*logged[first:first + len(heard.raw)]] == heard.raw, topic
         else:
             assert_received_from(heard.raw, logged)
+
+
+# A node whose log is opened when there is a file `go`
+SLOW = """
+import pathlib, sys, time
+from spinning_top_sim.recording.writer import McapWriter
+from spinning_top_sim.__main__ import main
+ordinary = McapWriter.__init__
+def opened(*arguments, **options):
+    while not pathlib.Path('go').exists():
+        time.sleep(0.01)
+    ordinary(*arguments, **options)
+McapWriter.__init__ = opened
+sys.exit(main())
+"""
+
+
+def test_a_log_that_is_still_being_opened_is_whole_in_the_end(tmp_path):
+    with SimNode(tmp_path, {'record.enabled': True, 'status_period': 0.1},
+                 program=('-c', SLOW, 'node')) as node:
+        wait_for('the motion', lambda: ' s running | ' in node.out)
+        node.signal(HUP)
+        (node.folder / 'go').touch()
+        assert_clean_end(node, node.end(INT))
+    path = the_log(node.folder)
+    assert f'next: spinning-top inspect {path}\n      spinning-top view {path}\n' in node.out
+    assert verified(path)['identical']
+
+
+# A node that is interrupted when it calls a function
+EARLY = """
+import os, signal, sys
+import {0} as module
+from spinning_top_sim.__main__ import main
+ordinary = module.{1}
+def interrupted(*arguments, **options):
+    os.kill(os.getpid(), signal.SIGINT)
+    return ordinary(*arguments, **options)
+module.{1} = interrupted
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize(('module', 'name', 'code'), [
+    ('spinning_top_sim.nodes.executable', 'needed', 130), ('rclpy', 'init', 0)])
+def test_a_signal_while_it_starts_ends_it_quietly(tmp_path, module, name, code):
+    with SimNode(tmp_path, program=('-c', EARLY.format(module, name), 'node')) as node:
+        assert node.process.wait(60.0) == code, node.err
+    assert node.err == ''

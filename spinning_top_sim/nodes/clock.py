@@ -5,17 +5,14 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.times import NANOSECONDS
 
 # The stamp of t = 0 is a multiple of this, so that grids meet across streams and runs.
 EPOCH_GRID_NS = 10_000_000
-# No motion begins later than a day before the stamps end.
-LAST_EPOCH_NS = LAST_STAMP_NS - 86_400 * NANOSECONDS
 LATEST_NS = 500_000_000         # samples later than this are recorded, but not published any more
 # Further behind than this, simulated time slips: the real-time factor falls below 1.
 LONGEST_LAG_NS = 1_000_000_000
 JUMP_NS = 5_000_000_000         # the motion does not run through a longer step of a /clock
-PATIENCE_NS = 2_000_000_000     # a /clock that does not change for longer has stopped
 
 Reading = Callable[[], int]     # of a clock [ns]
 
@@ -42,7 +39,6 @@ class SimulatedClock:
         self._late_ns = 0                           # what was due LATEST_NS ago
         self._became_due: deque[tuple[int, int]] = deque()      # steady and simulated times
         self._told_of_several = False
-        self._seen_ns, self._changed_ns = 0, steady()       # of the date, by `is_missing`
 
     def next_epoch(self, last_stamp_ns: int = 0) -> int:
         """
@@ -50,8 +46,6 @@ class SimulatedClock:
 
         It is the date, rounded up, or the /clock that is followed, rounded down.  It is after the
         last stamp that was sent, unless /clock has gone back meanwhile.
-
-        Raises ValueError if it is too late for a stamp of ROS.
         """
         date_ns = self._counting(self.date())
         epoch_ns = date_ns - date_ns % EPOCH_GRID_NS or EPOCH_GRID_NS   # 0 means "no time"
@@ -59,8 +53,6 @@ class SimulatedClock:
             epoch_ns += EPOCH_GRID_NS
         if not self._publishers or last_stamp_ns <= date_ns:
             epoch_ns = max(epoch_ns, last_stamp_ns + EPOCH_GRID_NS - last_stamp_ns % EPOCH_GRID_NS)
-        if epoch_ns > LAST_EPOCH_NS:
-            raise ValueError('the seconds of a ROS stamp, an int32, end in January 2038')
         return epoch_ns
 
     def begin(self, epoch_ns: int) -> None:
@@ -74,14 +66,6 @@ class SimulatedClock:
         self._anchor(sent_ns, self._counting(self._source()))
         self._late_ns = sent_ns
         self._became_due.clear()
-
-    def is_missing(self) -> bool:
-        """Return whether the /clock that is followed has not begun, or has stopped."""
-        date_ns, steady_ns = self.date(), self.steady()
-        if date_ns != self._seen_ns:
-            self._seen_ns, self._changed_ns = date_ns, steady_ns
-        return self._publishers is not None and (
-            date_ns == 0 or steady_ns > self._changed_ns + PATIENCE_NS)
 
     def set_scale(self, scale: float) -> None:
         source_ns = self._counting(self._source())

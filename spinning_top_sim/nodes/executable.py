@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from spinning_top_sim.installation import needed, remedy
 from spinning_top_sim.recording.errors import text_of
-from spinning_top_sim.times import NANOSECONDS, check_stamp
 from spinning_top_sim.tools import cli
 
 if TYPE_CHECKING:
@@ -48,21 +47,21 @@ def run_node(name: str, argv: Sequence[str] | None,
     name = f'spinning-top {name}'
     # Nothing is open yet, and a KeyboardInterrupt is easily lost during imports.
     _handle(lambda *_: os._exit(cli.INTERRUPTED), signal.SIGINT)
-    # Open the streams that the shell has closed (2>&-); otherwise a log gets their number.
-    while os.open(os.devnull, os.O_RDWR) <= 2:
-        pass
-    sys.stderr = sys.stderr or open(2, 'w')     # noqa: SIM115 - rclpy needs it to the end
     try:
         with needed('it'):
             argv, make_node = prepare(argv)
-        interrupts = _initialize_ros([name, *argv])
+        import rclpy  # noqa: PLC0415
+        # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
+        # SIGINT twice, from the terminal and from launch.
+        interrupts: list[int] = []
+        _handle(lambda number, _: interrupts.append(number), signal.SIGINT, signal.SIGTERM)
+        _handle(lambda *_: signal.raise_signal(signal.SIGTERM), signal.SIGHUP, signal.SIGQUIT)
+        rclpy.init(args=[name, *argv])
     except Exception as error:
         return _cannot_start(name, error)
-    import rclpy  # noqa: PLC0415
     node, started = None, False
     try:
         node = make_node()
-        guard_clock(cast('Node', node))
         executor = _executor(node)
         node.start()
         started = True
@@ -83,41 +82,6 @@ def run_node(name: str, argv: Sequence[str] | None,
             node.destroy_node()
         rclpy.try_shutdown()
         _handle(signal.SIG_IGN, *signals)       # rclpy has restored the handlers that it found
-
-
-def guard_clock(node: Node) -> None:
-    """Let a node that has use_sim_time leave out what on /clock is no time: rclpy would raise."""
-    from rosgraph_msgs.msg import Clock  # noqa: PLC0415
-
-    def guarded(take: Callable[[Clock], object]) -> Callable[[Clock], None]:
-        def receive(message: Clock) -> None:
-            try:
-                check_stamp(message.clock.sec * NANOSECONDS + message.clock.nanosec)
-            except ValueError as error:
-                node.get_logger().warning(f'/clock is left out: {error}', once=True)
-            else:
-                take(message)
-        return receive
-
-    for subscription in node.subscriptions:
-        if subscription.msg_type is Clock:
-            subscription.callback = guarded(subscription.callback)
-
-
-def _initialize_ros(argv: list[str]) -> list[int]:
-    """Initialize rclpy; return the list to which SIGINT and SIGTERM are appended from now on."""
-    import rclpy  # noqa: PLC0415
-    from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level  # noqa: PLC0415
-    # From `init` on, rclpy shuts the context down at SIGINT and SIGTERM.  A launched node gets
-    # SIGINT twice, from the terminal and from launch.
-    interrupts: list[int] = []
-    _handle(lambda number, _: interrupts.append(number), signal.SIGINT, signal.SIGTERM)
-    _handle(lambda *_: signal.raise_signal(signal.SIGTERM), signal.SIGHUP, signal.SIGQUIT)
-    set_logger_level('rcl', LoggingSeverity.FATAL)      # it says what the exception says
-    rclpy.init(args=argv)
-    if get_logger_level('rcl') is LoggingSeverity.FATAL:    # no argument has set another
-        set_logger_level('rcl', LoggingSeverity.UNSET)
-    return interrupts
 
 
 def _handle(handler: Any, *signals: signal.Signals) -> None:
@@ -154,21 +118,16 @@ def node_name(for_ros: Sequence[str]) -> str:
 
 
 def _cannot_start(name: str, error: Exception) -> int:
-    kind = type(error).__name__
     if isinstance(error, ImportError) and not find_spec('rclpy'):
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
                              f'{remedy("ros")}')
-    expected = (isinstance(error, ValueError | RuntimeError | OSError | ImportError)
-                or kind.startswith('Invalid'))
-    print(f'{name}: cannot start: {"" if expected else f"{kind}: "}{short_reason(text_of(error))}',
-          file=sys.stderr)
+    print(f'{name}: cannot start: {short_reason(text_of(error))}', file=sys.stderr)
     return cli.WRONG_USAGE
 
 
 def short_reason(text: object) -> str:
-    """Return a text as one line, without positions in the code of rcl, and not too long."""
-    line = cli.one_line(re.sub(r',\s*at \S+:\d+', '', str(text)))
-    return line if len(line) <= 600 else f'{line[:300]} ... {line[-300:]}'
+    """Return a text as one line, without positions in the code of rcl."""
+    return cli.one_line(re.sub(r',\s*at \S+:\d+', '', str(text)))
 
 
 def _executor(node: RunnableNode) -> Executor:

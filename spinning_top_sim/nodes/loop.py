@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a tick does: which samples are sent now, in real time, without ROS."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import Any
 
@@ -16,19 +16,16 @@ AHEAD_NS = 50_000_000                   # of what is due, so much is computed ah
 # One tick works at most this long before services and signals get their turn; so does one step.
 TICK_BUDGET_NS = 50_000_000
 STEP_BUDGET_NS = 2_000_000_000
-# Velocities of the pivot are applied at most this often, the last of several: each of them begins
-# another motion.
-DRIVE_PERIOD_NS = 20_000_000
 
 
 class LoopState(Enum):
     """What a `Loop` does; simulated time runs in RUNNING only."""
 
-    WAITING = 'waiting for the start'
+    WAITING = 'waiting for /clock (use_sim_time is set)'
     RUNNING = 'running'
     PAUSED = 'paused'
     FAILED = 'failed'
-    ENDED = 'all samples of `duration` are sent'
+    ENDED = 'at the end: nothing follows'
 
 
 class Loop:
@@ -38,24 +35,20 @@ class Loop:
     What is sent does not depend on when ticks come: each sends all samples that are due.
 
     update_subscribers : sets `publish` of each output that has subscribers
-    warn, error : take a text for the log; `error` why the motion has failed
+    error : takes a text for the log: why the motion has failed, or a recording ends
     """
 
     def __init__(self, simulation: LiveSimulation, values: Mapping[str, Any],
-                 recording: Recording, clock: SimulatedClock, *, warn: Callable[[str], object],
+                 recording: Recording, clock: SimulatedClock, *,
                  error: Callable[[str], object], update_subscribers: Callable[[], object],
                  ) -> None:
         self.late_ticks = self.skipped_ticks = self.slipped_ns = 0      # since the start
         self.commands = self.rejected_commands = 0
         self.paused: bool = values['start_paused']      # asked for; a failure does not change it
         self.failure: str | None = None         # why the motion stands still until `reset`
-        self._started = False
         self._simulation, self._recording, self._clock = simulation, recording, clock
-        self._update_subscribers, self._warn, self._error = update_subscribers, warn, error
+        self._update_subscribers, self._error = update_subscribers, error
         self._subscribers_due_ns = self._last_tick_ns = 0       # on the steady clock
-        # Asked for the pivot, and not yet applied
-        self._velocity: Sequence[float] | None = None
-        self._drive_from_ns = 0                 # simulated time of the next velocity
         self._set_pace(values)
 
     @property
@@ -64,7 +57,7 @@ class Loop:
             return LoopState.ENDED              # which is final
         if self.failure:
             return LoopState.FAILED             # until a reset
-        if not self._started:
+        if self._simulation.epoch_ns == 0:
             return LoopState.WAITING
         return LoopState.PAUSED if self.paused else LoopState.RUNNING
 
@@ -87,17 +80,13 @@ class Loop:
         self._clock.set_scale(values['time_scale'])
 
     def start(self) -> None:
-        """
-        Let simulated time run from 0 on, unless a pause is asked for.
-
-        Raises ValueError where t = 0 would have no stamp.
-        """
+        """Let simulated time run from 0 on, unless a pause is asked for."""
         self._simulation.epoch_ns = self._clock.next_epoch()
         self._begin()
 
     def _begin(self) -> None:
         self._clock.begin(self._simulation.epoch_ns)
-        self._started, self._last_tick_ns = True, self._clock.steady()
+        self._last_tick_ns = self._clock.steady()
 
     def tick(self) -> None:
         """Send what is due, then compute some of what is due next."""
@@ -112,7 +101,6 @@ class Loop:
             self._update_subscribers()
             self._subscribers_due_ns = steady_ns + SUBSCRIBERS_PERIOD_NS
         target_ns = self._advance()
-        self._apply_velocity()
         if self._simulation.now_ns >= target_ns:
             self._simulation.look_ahead(target_ns + self._ahead_ns,
                                         self.tick_period_ns / NANOSECONDS)
@@ -152,7 +140,7 @@ class Loop:
 
         Raises RuntimeError if the motion has failed; a pause remains then.
         """
-        self._check_failure()
+        self._check_motion()
         if self.paused:
             self.paused = False
             self._clock.run(self.now_ns)
@@ -160,11 +148,10 @@ class Loop:
 
     def step(self, length_ns: int) -> None:
         """Move a paused motion on, at most to `duration`, or raise RuntimeError."""
-        self._check_failure()
+        self._check_motion()
         if not self.paused:
             raise RuntimeError('running: ~/step works while paused (~/set_pause true)')
         self._update_subscribers()
-        self._apply_velocity()
         target_ns = min(self.now_ns + length_ns, self._duration_ns)
         stop_at_ns = self._clock.steady() + STEP_BUDGET_NS
 
@@ -177,20 +164,21 @@ class Loop:
             raise RuntimeError(f'{self.time_text}: this takes too long, '
                                f'{(target_ns - self.now_ns) / NANOSECONDS:.9g} s are left')
 
-    def change(self, kind: str, details: Callable[[], Mapping[str, Any]]) -> None:
+    def change(self, kind: str, details: Callable[[], Mapping[str, Any] | None]) -> None:
         """
         Send what is due, then let an event change the motion.
 
-        details : returns those of the event, of what is the present state then
+        details : returns those of the event, of what is the present state then; None: no event
 
-        Raises ValueError for what cannot be, and RuntimeError if the motion has failed.
+        Raises ValueError for what cannot be, and RuntimeError in WAITING and FAILED.
         """
         if self._simulation.now_ns < 0:         # the change sends the samples of t = 0
             self._update_subscribers()
         self._advance()
-        self._check_failure()
-        self._recording.write(self._simulation.apply(kind, **details()))
-        self.commands += 1
+        self._check_motion()
+        if found := details():
+            self._recording.write(self._simulation.apply(kind, **found))
+            self.commands += 1
 
     def set_parameters(self, values: Mapping[str, Any], changes: Mapping[str, Any]) -> None:
         """Send what is due, then take over changes, of which all `values` are the result."""
@@ -198,25 +186,9 @@ class Loop:
         self._recording.write(self._simulation.apply('parameters', **changes))
         self._set_pace(values)
 
-    def drive(self, velocity: Sequence[float]) -> None:
-        """Let the pivot go to a velocity [m/s] from the end of a tick on, or raise ValueError."""
-        self._simulation.drive_details(velocity)
-        self._velocity = velocity
-
-    def _apply_velocity(self) -> None:
-        velocity, now_ns = self._velocity, self.now_ns
-        if velocity is None or self.failure or now_ns < self._drive_from_ns:
-            return
-        self._velocity, self._drive_from_ns = None, now_ns + DRIVE_PERIOD_NS
-        if details := self._simulation.drive_details(velocity):
-            try:
-                self._recording.write(self._simulation.apply('drive', **details))
-                self.commands += 1
-            except ValueError as error:
-                self.rejected_commands += 1
-                self._warn(f'~/cmd_vel: refused: {error}')
-
-    def _check_failure(self) -> None:
+    def _check_motion(self) -> None:
+        if self.state is LoopState.WAITING:
+            raise RuntimeError(self.state.value)
         if self.failure:
             raise RuntimeError(f'the motion stands still: {self.failure}')
 
@@ -224,25 +196,28 @@ class Loop:
         """
         Go back to the start state of these parameters, and out of a failure.
 
-        A pause remains, or is as `paused` says.  Raises RuntimeError in ENDED, and ValueError if
-        no motion begins there; the present one goes on then.
+        A pause remains, or is as `paused` says.  Raises RuntimeError in WAITING and ENDED, and
+        ValueError if no motion begins there; the present one goes on then.
         """
-        if self.state is LoopState.ENDED:
-            raise RuntimeError(f'{self.state.value}: nothing follows')
+        if self.state in (LoopState.WAITING, LoopState.ENDED):
+            raise RuntimeError(self.state.value)
         simulation = self._simulation
         last_stamp_ns = simulation.epoch_ns + simulation.now_ns
         event = simulation.apply('reset', parameters=values,
                                  epoch_ns=self._clock.next_epoch(last_stamp_ns))
-        self.failure = self._velocity = None
-        self._drive_from_ns = 0
+        self.failure = None
         if paused is not None:
             self.paused = paused
         self._begin()
         if simulation.epoch_ns < last_stamp_ns and self._recording.is_on:
             reason = 'stamps have gone back with /clock, and a log keeps them in order'
             self._recording.end(error=reason)
-            self._warn(f'recording stopped: {reason}; ~/record starts another')
+            self._error(f'recording stopped: {reason}; ~/record starts another')
         self._recording.write(event)
+
+    def end(self) -> None:
+        """Let nothing follow what is sent."""
+        self._duration_ns = self._simulation.now_ns
 
     def fail(self, reason: str) -> None:
         """Hold the motion until `reset`."""

@@ -7,14 +7,13 @@ Everything happens in the thread of the executor; a steady timer ticks.
 
 import sys
 import time
-import traceback
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -24,21 +23,15 @@ from rclpy.timer import Timer
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from spinning_top_sim.nodes import ros_parameters
+from spinning_top_sim.nodes import publishers, ros_parameters
 from spinning_top_sim.nodes.clock import SimulatedClock
 from spinning_top_sim.nodes.executable import tell
 from spinning_top_sim.nodes.loop import Loop, LoopState
-from spinning_top_sim.nodes.publishers import (
-    ChannelPublishers,
-    create_publisher,
-    wait_for_all_acked,
-)
 from spinning_top_sim.nodes.recording import Recording
 from spinning_top_sim.nodes.ros_parameters import SPIN
 from spinning_top_sim.nodes.status import NodeStatus
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.live import LiveSimulation
-from spinning_top_sim.streams.parameter import Effect
 from spinning_top_sim.times import NANOSECONDS
 
 LAST_ANSWERS_S = 0.2            # time for the last answers before the node ends
@@ -60,24 +53,29 @@ class Simulator(Node):
         log = self._log = self.get_logger()
         overrides = ros_parameters.take_overrides(self)
         values = self.values = ros_parameters.declare(self, given, overrides)
+        self.set_descriptor('use_sim_time', ParameterDescriptor(
+            read_only=True, dynamic_typing=True))
         simulation = self.simulation = LiveSimulation(values)
         self.add_pre_set_parameters_callback(ros_parameters.all_with_doubles)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self._topics = ChannelPublishers(self, simulation)
+        self._topics = publishers.ChannelPublishers(self, simulation)
         self._recording = Recording(simulation, self._topics.topics_to_record)
         # Whether there is a /clock of another node: a node does not follow its own.
         self._follows = self.get_parameter('use_sim_time').value and not (
             parameters.is_enabled('clock', values))
-        self.clock = self._make_clock()
+        topic = self.resolve_topic_name('/clock')
+        self.clock = SimulatedClock(
+            (lambda: int(self.get_clock().now().nanoseconds)) if self._follows else time.time_ns,
+            log.warning, partial(self.count_publishers, topic) if self._follows else None)
         self.loop = Loop(
             simulation, values, self._recording, self.clock,
-            warn=log.warning, error=log.error, update_subscribers=self._topics.update_subscribers)
+            error=log.error, update_subscribers=self._topics.update_subscribers)
         self._report = NodeStatus(simulation, self.loop, self._recording)
         self._alarms: dict[str, Timer] = {}
-        self._topics.check(values)
         self._topics.open(values)
         self._show_status(values)
-        self._diagnostics = create_publisher(self, DiagnosticArray, '/diagnostics')
+        self._diagnostics = publishers.create_publisher(
+            self, DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
         self.create_subscription(Twist, '~/cmd_vel', self._on_velocity, 10)
         for name, kind, act in (('set_pause', SetBool, self._set_pause),
@@ -90,13 +88,6 @@ class Simulator(Node):
         if objection := simulation.trajectory.top.objection:
             log.warning(objection)
 
-    def _make_clock(self) -> SimulatedClock:
-        if not self._follows:
-            return SimulatedClock(time.time_ns, self._log.warning)
-        topic = self.resolve_topic_name('/clock')
-        return SimulatedClock(lambda: int(self.get_clock().now().nanoseconds), self._log.warning,
-                              lambda: int(self.count_publishers(topic)))
-
     def start(self) -> None:
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
         # The recorder's thread releases the interpreter this soon when a tick is due.
@@ -107,17 +98,12 @@ class Simulator(Node):
     def _begin(self) -> None:
         """Let time run if the clock that is followed has begun; ticks try it until then."""
         if self.clock.date() == 0:
+            self._log.warning(self.loop.state.value, once=True)
             return
-        try:
-            self.loop.start()
-        except ValueError as error:
-            if not self._follows:
-                raise
-            self._log.warning(f'/clock: {error}', once=True)
-            return
+        self.loop.start()
         if self.values['record.enabled']:
             self._recording.start(self.values, lambda success, text: (
-                self._log.info(text) if success else self._log.error(f'not recording: {text}')))
+                self._log.info(text) if success else None))
 
     def _align_ticks(self) -> None:
         """Let ticks come just after samples are due."""
@@ -132,45 +118,25 @@ class Simulator(Node):
     def _tick(self) -> None:
         self.loop.tick()
         if reason := self._recording.check():
-            self._log.error(f'recording stopped: {reason}; the simulation goes on')
+            self._log.error(f'not recording: {reason}; the simulation goes on')
         state = self.loop.state
         if state is LoopState.WAITING:
             self._begin()
-        elif state is LoopState.ENDED and not self.finished.done():
-            wait_for_all_acked(self._topics.by_topic.values(), 1.0)
-            self.finished.set_result(None)
+        elif state is LoopState.ENDED and 'end' not in self._alarms:
+            publishers.wait_for_all_acked(self._topics.by_topic.values(), 1.0)
+            self._every('end', LAST_ANSWERS_S, lambda: self.finished.set_result(None))
 
     def _every(self, name: str, period: float, callback: Callable[[], object]) -> None:
         """
         Call back periodically [s], 0 = never, instead of what this timer did before.
 
-        The timer follows no /clock; unexpected errors stop the motion.
+        The timer follows no /clock.
         """
-        def call() -> None:
-            try:
-                callback()
-            except Exception as error:
-                self.fail(error)
-
         if name in self._alarms:
             self.destroy_timer(self._alarms.pop(name))
         if period:
             self._alarms[name] = self.create_timer(
-                period, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def fail(self, error: Exception) -> None:
-        """Stop the motion after an unexpected error, and close the log while it is whole."""
-        if not self.context.ok():       # publishing fails once the context is shut down
-            return
-        self._log.error(traceback.format_exc())
-        reason = f'unexpected {type(error).__name__}: {error}'
-        self.loop.fail(reason)
-        self._recording.end(error=reason)
-
-    def finish(self) -> None:
-        """End the process after the response that is being prepared."""
-        self._every('finish', LAST_ANSWERS_S,
-                    lambda: self.finished.done() or self.finished.set_result(None))
+                period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def stop(self) -> None:
         """End the motion and close the recording, whether the context is valid or not."""
@@ -178,35 +144,37 @@ class Simulator(Node):
             tell(summary)
 
     def _on_command(self, message: Float64MultiArray) -> None:
-        """Treat a command as a change of the parameters spin.l3 and spin.lz."""
-        if len(message.data) == len(SPIN):
-            reason = self.set_parameters_atomically([
-                Parameter(name, value=message.data[k]) for k, name in enumerate(SPIN)]).reason
-        else:
-            self.loop.rejected_commands += 1
-            reason = f'data has {len(message.data)} values: must be [L3, Lz]'
-        if reason:
-            self._log.warning(f'~/commands: refused: {reason}')
+        """Take over L3 and Lz, which the parameters show then."""
+        def command() -> None:
+            if len(message.data) != len(SPIN):
+                raise ValueError(f'data has {len(message.data)} values: must be [L3, Lz]')
+            self._command(parameters.checked_changes(dict(zip(SPIN, message.data, strict=True))))
+            self.show_spin()
+
+        self._obey('~/commands', command)
 
     def _on_velocity(self, message: Twist) -> None:
         """Drive the pivot; the axes are those of the world."""
         linear, angular = ([part.x, part.y, part.z] for part in (message.linear, message.angular))
-        try:
+
+        def drive() -> None:
             if any(angular):
                 raise ValueError(f'angular = {angular!r} rad/s: must be 0')
-            self.loop.drive(linear)
-        except ValueError as error:
+            self.loop.change('drive', partial(self.simulation.drive_details, linear))
+
+        self._obey('~/cmd_vel', drive)
+
+    def _obey(self, topic: str, act: Callable[[], None]) -> None:
+        """Do what a message asks for, or count and name why not."""
+        error, reason = self.outcome(act)
+        if error is not None:
             self.loop.rejected_commands += 1
-            self._log.warning(f'~/cmd_vel: refused: {error}')
+            self._log.warning(f'{topic}: refused: {reason}')
 
     def _on_set_parameters(self, given: list[Parameter]) -> SetParametersResult:
         """Apply all changes or none."""
-        for p in given:
-            if p.name == 'use_sim_time' and p.value != self.get_parameter(p.name).value:
-                return SetParametersResult(successful=False, reason=(
-                    f'{p.name} = {p.value!r}: cannot be changed while the node runs'))
         changes = {p.name: p.value for p in given if p.name in parameters.BY_NAME}
-        if not changes:
+        if changes.items() <= self._spin().items():     # nothing changes
             return SetParametersResult(successful=True)
         error, reason = self.outcome(lambda: self._change(changes))
         if error is not None and ros_parameters.is_command(changes):
@@ -235,15 +203,9 @@ class Simulator(Node):
             self.loop.set_parameters(values, {name: values[name] for name in rest})
             self._show_status(values)
             self._align_ticks()
-        for effect in (Effect.RESET, Effect.RECORDING):
-            names = [name for name in rest if parameters.BY_NAME[name].effect is effect
-                     and values[name] != self.values[name]]
-            if names:
-                self._log.info(f'{", ".join(names)}: {effect.value}')
         self.values = values
 
     def _command(self, command: Mapping[str, float]) -> None:
-        self.check_started()
         # The motion goes on with what is not commanded.
         self.loop.change('command', lambda: {
             name.removeprefix('spin.'): command.get(name, present)
@@ -253,7 +215,6 @@ class Simulator(Node):
         if self._follows and parameters.is_enabled('clock', values):
             raise ValueError('clock.enabled = True: must be false while this node follows another '
                              '/clock (use_sim_time)')
-        self._topics.check(values)
 
     def _show_status(self, values: Mapping[str, Any]) -> None:
         self._every('status', values['status_period'],
@@ -263,25 +224,17 @@ class Simulator(Node):
         """
         Return the error of an action, and its text.
 
-        An error other than ValueError, RuntimeError and OSError is unexpected: the motion stops.
+        An error other than ValueError, RuntimeError and OSError is unexpected, and raised.
         """
         try:
             return None, act() or ''
         except (ValueError, RuntimeError, OSError) as error:
             return error, str(error)
-        except Exception as error:
-            self.fail(error)
-            return error, f'{type(error).__name__}: {error}'
 
     def _serve(self, act: Callable[[Any], str], request: object, response: Any) -> object:
         error, response.message = self.outcome(lambda: act(request))
         response.success = error is None
         return response
-
-    def check_started(self) -> None:
-        """Raise RuntimeError before the first /clock that is followed."""
-        if self.loop.state is LoopState.WAITING:
-            raise RuntimeError('waiting for /clock (use_sim_time is set)')
 
     def _set_pause(self, request: SetBool.Request) -> str:
         if request.data:
@@ -301,7 +254,6 @@ class Simulator(Node):
         return round(self.values['step.dt'] * NANOSECONDS)
 
     def _step(self, _: Trigger.Request) -> str:
-        self.check_started()
         self.loop.step(self.values['step.count'] * self.step_ns)
         return self.loop.time_text
 
@@ -316,7 +268,6 @@ class Simulator(Node):
         Raises RuntimeError before the motion begins and after `duration`, and ValueError if no
         motion begins with the present parameters; nothing changes then.
         """
-        self.check_started()
         self.loop.reset(self.values, paused)
         self._align_ticks()
         self.show_spin()
@@ -327,12 +278,8 @@ class Simulator(Node):
 
     def show_spin(self) -> None:
         """Let the parameters show the present spin."""
-        self.remove_on_set_parameters_callback(self._on_set_parameters)
-        try:
-            self.set_parameters([
-                Parameter(name, value=value) for name, value in self._spin().items()])
-        finally:
-            self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.set_parameters_atomically([
+            Parameter(name, value=value) for name, value in self._spin().items()])
 
     def _record(self, request: SetBool.Request, response: SetBool.Response) -> Future:
         """Return the response, which is there when the log is open or closed."""
@@ -342,26 +289,15 @@ class Simulator(Node):
             response.success, response.message = success, message
             future.set_result(response)
 
-        def act() -> None:
-            if request.data:
-                self.check_started()
-                self._recording.start(self.values, answer)
-            else:
-                self._recording.end(answer)
-
-        error, reason = self.outcome(act)
-        if error is not None:
-            answer(False, reason)
+        if not request.data:
+            self._recording.end(answer)
+        elif self.loop.state is LoopState.WAITING:
+            answer(False, self.loop.state.value)
+        else:
+            self._recording.start(self.values, answer)
         return future
 
     def _publish_diagnostics(self) -> None:
-        waits = self.clock.is_missing()
-        if waits != self._report.waits_for_clock:
-            self._report.waits_for_clock = waits
-            self._log.warning('waiting for /clock (use_sim_time is set)' if waits else
-                              '/clock goes on')
-        if self._recording.warning:
-            self._log.warning(f'recording: {self._recording.warning}', throttle_duration_sec=10.0)
         self._diagnostics.publish(self._report.diagnostics(
             self.get_clock().now().to_msg(), self.get_fully_qualified_name().lstrip('/')))
         if self._report.overloaded:

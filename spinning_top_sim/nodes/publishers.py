@@ -3,7 +3,6 @@
 
 import importlib
 import os
-import re
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,21 +26,19 @@ def message_class(type_name: str) -> type:
     """
     Return a message class of an installed ROS package, of which publishers can be made.
 
-    Raises LookupError for any other name.
+    Raises ValueError for any other name.
     """
-    # REP-144 and the ROS 2 interface names.
-    match = re.fullmatch(r'([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9_]*)', type_name)
-    package, name = match.groups() if match else ('', '')
+    package, _, name = type_name.replace('/msg/', '/').partition('/')
     prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
-    # Other Python packages must not be imported because a log names them.
-    if not any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
-               for prefix in prefixes):
-        raise LookupError(f'{type_name} is not installed')
     try:
+        # Other Python packages must not be imported because a log names them.
+        if not any(Path(prefix, 'share/ament_index/resource_index/packages', package).is_file()
+                   for prefix in prefixes):
+            raise LookupError(package)
         kind: type = getattr(importlib.import_module(f'{package}.msg'), name)
         check_for_type_support(kind)
     except Exception as error:      # importing a broken package may raise anything
-        raise LookupError(f'{type_name} cannot be used: {error}') from error
+        raise ValueError(f'{type_name}: must be an installed type of messages') from error
     return kind
 
 
@@ -68,17 +65,12 @@ class ChannelPublishers:
         self._node, self._simulation = node, simulation
         self.by_topic: dict[str, Publisher] = {}
 
-    def check(self, values: Mapping[str, Any]) -> None:
-        """Raise ValueError for an enabled channel whose messages are not installed."""
-        for channel in self._simulation.channels:
-            if parameters.is_enabled(channel.name, values):
-                try:
-                    message_class(channel.type_name)
-                except LookupError as error:
-                    raise ValueError(f'{channel.name}.enabled: {error}') from error
-
     def open(self, values: Mapping[str, Any]) -> None:
-        """Create the publishers of enabled channels, and destroy those of disabled ones."""
+        """
+        Create the publishers of enabled channels, and destroy those of disabled ones.
+
+        Raises ValueError for a channel whose messages are not installed.
+        """
         for output in self._simulation.outputs:
             topic = output.channel.topic
             enabled = parameters.is_enabled(output.channel.name, values)

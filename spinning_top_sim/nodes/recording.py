@@ -42,12 +42,9 @@ class Recording:
 
     def start(self, values: Mapping[str, Any], answer: Answer = lambda *_: None) -> None:
         """Record from now on; `check` answers once the file is open."""
-        if (recorder := self._recorder) is None:
-            recorder, text = self._begin(values), 'recording to'
-        else:
-            text = 'recording already to'
+        recorder = self._recorder = self._recorder or self._begin(values)
         self._requests.append((recorder, ('opening',), lambda: answer(
-            recorder.error is None, recorder.error or f'{text} {recorder.path}')))
+            recorder.error is None, recorder.error or f'recording to {recorder.path}')))
 
     def _begin(self, values: Mapping[str, Any]) -> Recorder:
         from spinning_top_sim.recording.provenance import run_metadata  # noqa: PLC0415
@@ -55,13 +52,13 @@ class Recording:
         from spinning_top_sim.recording.rosbag2 import RecordedTopic  # noqa: PLC0415
         simulation = self._simulation
         channels = recorded(simulation.channels, values)
-        recorder = self._recorder = Recorder(
+        recorder = Recorder(
             values['record.uri'], [RecordedTopic(*topic) for topic in self._topics(channels)],
             partial(run_metadata, simulation.values, simulation.epoch_ns, simulation.now_ns,
                     (event.as_mapping() for event in tuple(simulation.history)), values),
             max_loss=values['record.max_loss'], compression=values['record.compression'],
             min_free_bytes=values['record.min_free_bytes'], **self._options)
-        self.error, self._events_index = None, len(channels)
+        self.error, self._recorder, self._events_index = None, recorder, len(channels)
         simulation.log_to(recorder.write, channels)
         self.write(Event('start', max(simulation.now_ns, 0), simulation.now_ns))
         return recorder
@@ -80,24 +77,22 @@ class Recording:
 
     def check(self) -> str | None:
         """Answer the requests that are done; return why a recording has stopped by itself."""
-        recorder, told = self._recorder, []
-        has_failed = recorder is not None and recorder.state == 'failed'
         for request in list(self._requests):
-            asked, states, tell = request
-            if asked.state not in states:
+            recorder, states, tell = request
+            if recorder.state not in states:
                 self._requests.remove(request)
-                told.append(asked)
                 tell()
-        if recorder is None or not has_failed:
+        stopped = self._recorder
+        if stopped is None or stopped.state != 'failed':
             return None
-        self.end(error=recorder.error)
-        return None if recorder in told else recorder.error
+        self.end(error=stopped.error)
+        return stopped.error
 
     def close(self) -> str | None:
         """Wait until all logs are closed; return a text for the user about the last one."""
         recorder = self._recorder
         self.end()
-        for one in dict.fromkeys(asked for asked, *_ in self._requests):    # each waits once
+        for one in {asked for asked, *_ in self._requests}:     # each waits once
             one.close()
         self.check()
         if recorder is None or recorder.path is None:

@@ -2,22 +2,16 @@
 """The node `replay`: publishes the messages of a log with their recorded spacing."""
 
 import argparse
-import contextlib
 import itertools
 import math
-import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from builtin_interfaces.msg import Time as Stamp
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -31,7 +25,6 @@ from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.streams.parameter import Range
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS
 
-LATE_NS = 10_000_000            # a message that is sent later than this is counted
 BUDGET_NS = 20_000_000          # services wait for messages that are due at most so long
 ROUND_GAP_NS = 10_000_000       # real time before the first message of a round, and after the last
 SHORTEST_WAIT_NS = 300_000      # denser messages are sent together: each wait takes 0.1 ms
@@ -47,7 +40,7 @@ class Replayer(Node):
 
     options : those that `replay_node.add_arguments` describes
     outputs : the publishers by the number of the channel
-    sent, late, failed : how many messages were sent, late, and could not be sent
+    sent, failed : how many messages were sent, and could not be sent
 
     Raises ValueError if nothing can be played.
     """
@@ -56,8 +49,10 @@ class Replayer(Node):
         super().__init__('replay', automatically_declare_parameters_from_overrides=True)
         overrides = ros_parameters.take_overrides(self)
         self.finished: Future = Future()    # completes with the exit code when all is played
-        self.sent = self.late = self.failed = 0
+        self.sent = self.failed = 0
         self._log, self._options = log, options
+        # Whoever follows /clock begins anew with each round.
+        self._clock_rate = options.clock or (40.0 if options.loop else 0.0)
         first = next(log.messages(start=1), None)       # a time of 0 says: no clock yet
         log_begin_ns = first.log_time if first else 0
         self._length_s = (log.span[1] - log_begin_ns) / NANOSECONDS
@@ -70,17 +65,15 @@ class Replayer(Node):
         self.outputs = self._open_publishers()
         for warning in ros_parameters.disobeyed_overrides(self, overrides):
             self.get_logger().warning(warning)
-        self._paused, self._round = options.start_paused, 0
-        self._later_ns = 0              # what the rounds before have played
+        self._paused = options.start_paused
         self._set_log_time(self._begin_ns)
         self._steps = self._play()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(0.02, self._step, clock=steady)
         self._clock_output: Publisher | None = None
-        if options.clock:
+        if self._clock_rate:
             self._clock_output = self.create_publisher(ClockMessage, '/clock', 10)
-            self.create_timer(1.0 / options.clock, self._publish_clock, clock=steady)
-        self.create_timer(1.0, lambda: tell(self._status()), clock=steady)
+            self.create_timer(1.0 / self._clock_rate, self._publish_clock, clock=steady)
         self.create_service(SetBool, '~/set_pause', self._set_pause)
 
     def _open_publishers(self) -> dict[int, Publisher]:
@@ -102,20 +95,17 @@ class Replayer(Node):
         return outputs
 
     def _publisher(self, topic: LogTopic) -> Publisher:
-        if topic.name == '/clock' and self._options.clock:
-            raise LookupError('--clock publishes another /clock')
+        if topic.name == '/clock' and self._clock_rate:
+            raise LookupError('--clock and --loop publish another /clock')
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
         profiles = topic.qos or (DEFAULT_QOS,)
         # It serves all subscribers that the recorded publishers have served together.
-        qos = {**profiles[0], **{key: min(one[key] for one in profiles)
-                                 for key in ('reliability', 'durability')},
-               'history': max(one['history'] for one in profiles),
-               'depth': min(sum(one['depth'] for one in profiles), 2 ** 31 - 1) or 10}
-        publisher = create_publisher(
-            self, message_class(topic.type_name), topic.name, QoSProfile(**{
-                key: Duration(seconds=value['sec'], nanoseconds=value['nsec'])
-                if isinstance(value, Mapping) else value for key, value in qos.items()}))
+        publisher = create_publisher(self, message_class(topic.type_name), topic.name, QoSProfile(
+            reliability=min(one['reliability'] for one in profiles),
+            durability=min(one['durability'] for one in profiles),
+            history=max(one['history'] for one in profiles),
+            depth=min(sum(one['depth'] for one in profiles), 2 ** 31 - 1) or 10))
         if any(one != profiles[0] for one in profiles):
             played = publisher.qos_profile
             self.get_logger().warning(
@@ -145,7 +135,8 @@ class Replayer(Node):
         self._log_ns, self._since_ns = self.now_ns, time.monotonic_ns()
         self._paused = request.data
         self._step_after(0.0)
-        response.success, response.message = True, self._status()
+        response.success = True
+        response.message = f'at {(self._log_ns - self._begin_ns) / NANOSECONDS:.2f} s'
         return response
 
     def start(self) -> None:
@@ -174,16 +165,17 @@ class Replayer(Node):
     def _play(self) -> Iterator[float]:
         """Play the log; yield how long to wait each time [ns]."""
         rounds = itertools.count() if self._options.loop else range(1)
-        for self._round in rounds:
+        for _ in rounds:
             self._set_log_time(self._begin_ns)
             self._publish_clock()       # before the messages, since it may go back
             yield ROUND_GAP_NS
             yield from self._play_round()
             yield ROUND_GAP_NS          # the last messages arrive before the clock goes back
-            self._later_ns += self._next_ns - self._begin_ns + ROUND_GAP_NS
         yield LAST_ANSWERS_NS
         wait_for_all_acked(self.outputs.values(), PATIENCE_S)
-        tell(f'played {self._counts()}')
+        tell(f'played {self.sent} messages' + (
+            f'; {self.failed} not published: a reader that keeps all has stalled'
+            if self.failed else ''))
         if self._log.left_out and not self._options.partial:
             self._fail(f'{self._log.path} is damaged inside: `recover` tells what is lost')
         else:
@@ -203,70 +195,24 @@ class Replayer(Node):
                 self.sent += 1
             except Exception:       # as with a reader that keeps all and has stopped reading
                 self.failed += 1
-            self.late += left_ns < -LATE_NS
 
-    def _messages(self) -> Iterator[tuple[int, Publisher, Any]]:
+    def _messages(self) -> Iterator[tuple[int, Publisher, bytes]]:
         """Yield log time [ns], publisher and message of the messages of a round."""
-        outputs, names = self.outputs, {
-            topic.name for topic in self._log.topics if topic.channel_id in self.outputs}
-        # Without a /clock that goes back, too, nobody takes stamps that go back.
-        goes_back = self._clock_output is not None or '/clock' in names
-        later_ns = 0 if goes_back else self._later_ns
+        names = {topic.name for topic in self._log.topics if topic.channel_id in self.outputs}
         for message in self._log.messages(names, self._begin_ns if self._options.start else 0):
-            if publisher := outputs.get(message.channel_id):    # of several with a topic
-                data = message.data
-                yield (max(message.log_time, self._begin_ns), publisher,
-                       stamped_later(data, publisher, later_ns) if later_ns else data)
+            if publisher := self.outputs.get(message.channel_id):   # of several with a topic
+                yield max(message.log_time, self._begin_ns), publisher, message.data
 
     def _publish_clock(self) -> None:
         if self._clock_output is not None:
             self._clock_output.publish(ClockMessage(clock=Time(
                 nanoseconds=min(self.now_ns, LAST_STAMP_NS)).to_msg()))
 
-    def _counts(self) -> str:
-        topics, left_out = {one.topic_name for one in self.outputs.values()}, self._log.left_out
-        return f'{self.sent} messages on {len(topics)} topics, {self.late} of them late' + (
-            f'; {self.failed} not published: a reader that keeps all has stalled'
-            if self.failed else '') + (
-            f'; {left_out} damaged chunks left out' if left_out else '')
-
-    def _status(self) -> str:
-        options = self._options
-        within_s = options.start + (self.now_ns - self._begin_ns) / NANOSECONDS
-        which = f' of round {self._round + 1}' if options.loop else ''
-        return (f'{within_s:.2f} of {self._length_s:.2f} s{which} | x{options.rate:g} | '
-                f'{"paused | " if self._paused else ""}{self._counts()}')
-
 
 def open_log(path: Path, partial: bool) -> LogReader:
     """Open a log.  Raises LogError, and without `partial` ValueError for a damaged log."""
     log = LogReader(path)
-    if not log.whole and (log.damage.torn or log.damage.lost_bytes):
-        if not partial:
-            raise ValueError(f'{path} is damaged: `recover` makes a whole log of it, --partial '
-                             'plays what is whole')
-        print(f'spinning-top replay: {path} is damaged, playing what is whole', file=sys.stderr)
+    if not partial and not log.whole and (log.damage.torn or log.damage.lost_bytes):
+        raise ValueError(f'{path} is damaged: `recover` makes a whole log of it, --partial plays '
+                         'what is whole')
     return log
-
-
-def stamped_later(data: bytes, publisher: Publisher, later_ns: int) -> Any:
-    """Return a message with later stamps, or the same bytes if it has none."""
-    with contextlib.suppress(Exception):    # recorded with another definition, or too late
-        message = deserialize_message(data, publisher.msg_type)
-        stamps = [*_stamps(message)]
-        for stamp in stamps:
-            stamp.sec, stamp.nanosec = divmod(
-                stamp.sec * NANOSECONDS + stamp.nanosec + later_ns, NANOSECONDS)
-        return message if stamps else data
-    return data
-
-
-def _stamps(message: Any) -> Iterator[Stamp]:
-    """Yield all stamps of a message, except those of 0, which is no time."""
-    for name in message.get_fields_and_field_types():
-        field = getattr(message, name)
-        for part in field if isinstance(field, list) else [field]:
-            if isinstance(part, Stamp) and (part.sec or part.nanosec):
-                yield part
-            elif hasattr(part, 'get_fields_and_field_types'):
-                yield from _stamps(part)

@@ -4,15 +4,10 @@
 import argparse
 import json
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 
-from spinning_top_sim.nodes.executable import (
-    RunnableNode,
-    node_name,
-    run_node,
-    split_ros_arguments,
-)
+from spinning_top_sim.nodes import executable
 
 DESCRIPTION = """\
 Simulate the heavy symmetric top in real time as a ROS 2 node.
@@ -25,20 +20,11 @@ Of several values for a parameter that of -p holds, before those of --params,
 
 exit code: 0 ended, also by a signal; 2 cannot start; 130 interrupted before
 """
-INTERFACE = """\
-~ is /spinning_top.  Subscribes to:
-  ~/commands (std_msgs/Float64MultiArray: [L3, Lz] in kg m^2/s)
-  ~/cmd_vel (geometry_msgs/Twist: velocity of the pivot in the world, m/s)
-Services:
-  ~/set_pause, ~/record (std_srvs/SetBool); ~/step, ~/reset (std_srvs/Trigger)
-  those of simulation_interfaces, where that package is installed
-Publishes, where enabled:
-  /diagnostics (diagnostic_msgs/DiagnosticArray), always"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node with these arguments, by default the program's; return its exit code."""
-    return run_node('node', argv, _prepare)
+    return executable.run_node('node', argv, _prepare)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,31 +32,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from spinning_top_sim.tools import scene_file  # noqa: PLC0415 - YAML takes 10 ms
     scene_file.add_parameters(parser)
     parser.add_argument('--namespace', metavar='NAME', help='of node, topics and frames')
-    parser.add_argument('--ros-args', metavar='...', nargs='*',
-                        help='arguments of ROS 2, such as -p NAME:=VALUE and --params-file FILE')
 
 
-def _interface() -> Iterator[str]:
-    from spinning_top_sim.streams import parameters  # noqa: PLC0415
-    from spinning_top_sim.tools import scene_file  # noqa: PLC0415
-    yield INTERFACE
-    for text in parameters.STREAMS.values():
-        yield textwrap.fill(text, 78, initial_indent='  ', subsequent_indent=6 * ' ')
-    yield textwrap.fill('Parameters used most (--help-parameters lists all): '
-                        + ', '.join(scene_file.MOST_USED), 78, subsequent_indent=2 * ' ')
-
-
-def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
-    words, for_ros = split_ros_arguments(argv)
+def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], executable.RunnableNode]]:
+    words, for_ros = executable.split_ros_arguments(argv)
     given: dict[str, object] = {}
     if words:
         from spinning_top_sim.tools import cli, scene_file  # noqa: PLC0415
-        parser = cli.Parser('node', DESCRIPTION, '\n'.join(_interface()))
+        parser = cli.Parser('node', DESCRIPTION, textwrap.fill(
+            f'Parameters used most (--help-parameters lists all): '
+            f'{", ".join(scene_file.MOST_USED)}', 78, subsequent_indent='  '))
         add_arguments(parser)
         arguments = parser.parse_args(words)
         if arguments.namespace:
             for_ros += ['-r', f'__ns:=/{arguments.namespace.strip("/")}']
-        name = node_name(for_ros)
+        name = executable.node_name(for_ros)
         given = scene_file.given(arguments, name)
         of_ros = scene_file.given(arguments, name, to_ros=True)
         for_ros = [*(word for name, value in of_ros.items()
@@ -78,7 +54,7 @@ def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
         argv = ['--ros-args', *for_ros]
     from spinning_top_sim.nodes.node import Simulator  # noqa: PLC0415
 
-    def make_node() -> RunnableNode:
+    def make_node() -> executable.RunnableNode:
         node = Simulator(given)
         if node.values['simulation_interfaces'] and find_spec('simulation_interfaces'):
             from spinning_top_sim.nodes import simulation_handlers  # noqa: PLC0415

@@ -29,6 +29,7 @@ from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
 
 Message = Any           # message packages have no types
+Columns = NDArray[np.float64]
 # Each service, and the values of SimulatorFeatures that announce it.
 FEATURES: Mapping[str, tuple[str, ...]] = {
     'GetSimulatorFeatures': (),
@@ -79,16 +80,15 @@ class SimulationHandlers:
         self._node, self._loop, self._simulation = node, node.loop, node.simulation
         self._messages, self._results = messages, messages.Result
         self._name = node.get_name()            # of the entity
-        self._quits = False
 
     def serve(self, name: str, request: Message, response: Message) -> Message:
         """Handle a request for the service of this type; return the response."""
         def handle() -> str | None:
-            if name in ON_A_MOTION:
-                self._check_runs()
+            if name in ON_A_MOTION and self._loop.state in (LoopState.WAITING, LoopState.ENDED):
+                raise RefusedError(self._results.RESULT_INCORRECT_STATE, self._loop.state.value)
             if getattr(request, 'entity', self._name) != self._name:
                 raise RefusedError(self._results.RESULT_NOT_FOUND,
-                                   f'entity = {request.entity!r}: there is {self._name!r} only')
+                                   f'entity = {request.entity!r}: must be {self._name!r}')
             text: str | None = getattr(self, f'_{service_name(name)}')(request, response)
             return text
 
@@ -99,13 +99,6 @@ class SimulationHandlers:
             # A request in YAML can hold text that UTF-8 cannot; sending it would raise an error.
             response.result.error_message = text.encode(errors='backslashreplace').decode()
         return response
-
-    def _check_runs(self) -> None:
-        """Raise RefusedError before the motion begins, and when the process ends."""
-        error, reason = self._node.outcome(self._node.check_started)
-        if error or self._state == 'QUITTING':
-            raise RefusedError(self._results.RESULT_INCORRECT_STATE,
-                               reason or 'the simulator is quitting')
 
     def _unsupported(self, reason: str) -> RefusedError:
         return RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED, reason)
@@ -120,10 +113,8 @@ class SimulationHandlers:
     def _state(self) -> str:
         """The state as SimulationState names it."""
         state = self._loop.state
-        if self._quits or state is LoopState.ENDED:
-            return 'QUITTING'
-        if state is LoopState.RUNNING:
-            return 'PLAYING'
+        if state in (LoopState.RUNNING, LoopState.ENDED):
+            return 'PLAYING' if state is LoopState.RUNNING else 'QUITTING'
         # A motion that has failed is PAUSED, too.
         return 'STOPPED' if self._simulation.now_ns < 0 and not self._loop.failure else 'PAUSED'
 
@@ -132,23 +123,19 @@ class SimulationHandlers:
         return self._loop.failure or ''
 
     def _set_simulation_state(self, request: Message, response: Message) -> None:
-        number, present = request.state.state, self._state
         changes: Mapping[str, Callable[[], None]] = {
             'STOPPED': partial(self._node.start_again, paused=True), 'PLAYING': self._node.resume,
-            'PAUSED': self._pause, 'QUITTING': self._quit}
-        names = {getattr(request.state, f'STATE_{name}'): name for name in changes}
-        if number not in names:
-            raise RefusedError(response.INCORRECT_TRANSITION, f'state = {number}: must be ' + (
-                ', '.join(f'{number} ({name})' for number, name in names.items())))
-        if names[number] == present:
-            raise RefusedError(response.ALREADY_IN_TARGET_STATE,
-                               f'the simulation is {present} already')
-        if present == 'QUITTING':
-            raise RefusedError(response.INCORRECT_TRANSITION, 'the simulator is quitting')
+            'PAUSED': self._pause, 'QUITTING': self._loop.end}
+        numbers = {getattr(request.state, f'STATE_{name}'): name for name in changes}
+        wanted, present = numbers.get(request.state.state), self._state
+        if wanted == present:
+            raise RefusedError(response.ALREADY_IN_TARGET_STATE, f'it is {present} already')
+        if wanted is None or present == 'QUITTING':
+            raise RefusedError(response.INCORRECT_TRANSITION, (
+                f'state = {request.state.state} from {present}: must be one of {numbers}, and '
+                'not after QUITTING'))
         try:
-            if names[number] != 'QUITTING':
-                self._node.check_started()
-            changes[names[number]]()
+            changes[wanted]()
         except (ValueError, RuntimeError) as error:
             raise RefusedError(response.STATE_TRANSITION_ERROR, error) from error
 
@@ -156,21 +143,15 @@ class SimulationHandlers:
         self._loop.pause()
         self._loop.step(0)          # the sample of t = 0 tells PAUSED from STOPPED
 
-    def _quit(self) -> None:
-        self._loop.pause()
-        self._quits = True
-        self._node.finish()
-
     def _step_simulation(self, request: Message, _: Message) -> None:
-        loop, steps = self._loop, request.steps
-        if steps < 1:
-            raise ValueError(f'steps = {steps}: must be >= 1')
+        loop, length_ns = self._loop, request.steps * self._node.step_ns
+        if request.steps < 1:
+            raise ValueError(f'steps = {request.steps}: must be >= 1')
         if self._state != 'PAUSED':
-            raise RuntimeError('the simulation is not paused: SetSimulationState must set '
-                               'STATE_PAUSED first')
-        target_ns = loop.now_ns + steps * self._node.step_ns
-        loop.step(target_ns - loop.now_ns)
-        if loop.now_ns < target_ns:
+            raise RuntimeError(f'the simulation is {self._state}: must be PAUSED')
+        end_ns = loop.now_ns + length_ns
+        loop.step(length_ns)
+        if loop.now_ns < end_ns:
             raise RuntimeError(f'{loop.time_text}: `duration` ends before the steps do')
 
     def _reset_simulation(self, request: Message, _: Message) -> None:
@@ -181,9 +162,8 @@ class SimulationHandlers:
             self._set_state(lambda _: parameters.start_state(values))
         else:
             raise self._unsupported(
-                f'scope = {request.scope}: must be {request.SCOPE_DEFAULT} or '
-                f'{request.SCOPE_ALL} (all), {request.SCOPE_STATE} (state) or {time_and_state} '
-                '(time and state): time goes back with the state only, and nothing is spawned')
+                f'scope = {request.scope}: must be {request.SCOPE_DEFAULT}, {request.SCOPE_ALL} '
+                f'or {time_and_state} (time and state), or {request.SCOPE_STATE} (state)')
 
     def _set_state(self, change: Callable[[States], State]) -> None:
         self._loop.change('state', lambda: asdict(change(self._simulation.state())))
@@ -234,46 +214,35 @@ class SimulationHandlers:
         frame, given = self._node.values['world_frame'], request.state.header.frame_id
         if given not in ('', frame):
             raise self._unsupported(f'header.frame_id = {given!r}: must be {frame!r} or empty')
-        self._set_state(partial(requested_state, request, response))
+        self._set_state(partial(self._requested, request, response))
+
+    def _requested(self, request: Message, response: Message, now: States) -> State:
+        """Return what a SetEntityState request asks for; the present state holds for the rest."""
+        def check_pivot(name: str, given: Message, present: Columns, code: int) -> None:
+            if not np.all(np.abs(_numbers(given) - present[:, 0]) <= NEAR):
+                raise RefusedError(code, (
+                    f'{name} = {_numbers(given).tolist()}: must be that of the pivot, '
+                    f'{present[:, 0].tolist()} (within {NEAR:g})'))
+
+        wanted, turned = request.state, now.rows_quaternion
+        rotation = np.concatenate(turned)
+        rates = np.concatenate(attitude.rotated(turned, now.rows_angular_velocity))
+        if getattr(request, 'set_pose', True):
+            rotation = _numbers(wanted.pose.orientation)
+            if not abs(float(np.linalg.norm(rotation)) - 1.0) <= LENGTH_ERROR:
+                raise RefusedError(response.INVALID_POSE, (
+                    f'pose.orientation = {rotation.tolist()}: must have the length 1 '
+                    f'(within {LENGTH_ERROR:g})'))
+            check_pivot('pose.position [m]', wanted.pose.position, now.pivot.position,
+                        response.INVALID_POSE)
+        if getattr(request, 'set_twist', True):
+            rates = _numbers(wanted.twist.angular)
+            if not np.all(np.isfinite(rates)):
+                raise ValueError(f'twist.angular = {rates.tolist()} rad/s: must be finite')
+            check_pivot('twist.linear [m/s]', wanted.twist.linear, now.pivot.velocity,
+                        self._results.RESULT_OPERATION_FAILED)
+        return state_of(now.top, rotation, rates)
 
 
-def requested_state(request: Message, response: Message, now: States) -> State:
-    """
-    Return the state that a SetEntityState request asks for.
-
-    response : has the codes of refusals
-    now : the present state (n = 1), which holds for what the request does not set, and for the
-        pivot
-
-    Raises RefusedError or ValueError, which name the value and what is allowed.
-    """
-    wanted, turned = request.state, now.rows_quaternion
-    rotation = np.concatenate(turned)
-    rates = np.concatenate(attitude.rotated(turned, now.rows_angular_velocity))
-    if getattr(request, 'set_pose', True):
-        rotation = _numbers(wanted.pose.orientation)
-        length = float(np.linalg.norm(rotation))
-        if not abs(length - 1.0) <= LENGTH_ERROR:
-            raise RefusedError(response.INVALID_POSE, f'pose.orientation = {rotation.tolist()} '
-                               f'has length {length!r}: must be 1 (within {LENGTH_ERROR:g})')
-        _check_near('pose.position', 'm', wanted.pose.position, now.pivot.position,
-                    response.INVALID_POSE)
-    if getattr(request, 'set_twist', True):
-        rates = _numbers(wanted.twist.angular)
-        if not np.all(np.isfinite(rates)):
-            raise ValueError(f'twist.angular = {rates.tolist()} rad/s: must be finite')
-        _check_near('twist.linear', 'm/s', wanted.twist.linear, now.pivot.velocity,
-                    response.result.RESULT_OPERATION_FAILED)
-    return state_of(now.top, rotation, rates)
-
-
-def _check_near(name: str, unit: str, message: Message, of_pivot: NDArray[np.float64],
-                code: int) -> None:
-    found, allowed = _numbers(message), of_pivot[:, 0]
-    if not np.all(np.abs(found - allowed) <= NEAR):
-        raise RefusedError(code, f'{name} = {found.tolist()} {unit}: must be that of the pivot, '
-                           f'{allowed.tolist()} (within {NEAR:g})')
-
-
-def _numbers(message: Message) -> NDArray[np.float64]:
+def _numbers(message: Message) -> Columns:
     return np.array([getattr(message, name) for name in 'xyzw' if hasattr(message, name)], float)

@@ -30,7 +30,6 @@ class NodeStatus:
         self._read_at, self._read_ns = time.monotonic(), 0
         self._told = 0, 0, 0            # failed, skipped, slipped: at the message before
         self.overloaded = False         # whether samples were skipped, or the clock has slipped
-        self.waits_for_clock = False            # whether /clock has not begun, or has stopped
 
     def diagnostics(self, stamp: Time, name: str) -> DiagnosticArray:
         """
@@ -45,8 +44,8 @@ class NodeStatus:
         new_failed = failed - self._told[0]
         self.overloaded, self._told = totals[1:] != self._told[1:], totals
         states = (      # whether it holds, its level, its message
-            (True, OK, 'paused' if loop.paused else 'running'),
-            (self.waits_for_clock, WARN, 'waiting for /clock'),
+            (True, OK, loop.state.value),
+            (loop.state is LoopState.WAITING, WARN, loop.state.value),
             (new_failed, WARN, f'{new_failed} messages could not be published'),
             (self.overloaded, WARN, 'this machine cannot keep up'),
             (recording.warning, WARN, f'recording: {recording.warning}'),
@@ -95,17 +94,12 @@ class NodeStatus:
     def status_line(self) -> str:
         """Return the line for the terminal, with the angle in degrees."""
         simulation, loop = self._simulation, self._loop
-        motion = simulation.trajectory
+        motion, state = simulation.trajectory, loop.state.name.lower()
         regime, (l3, lz) = motion.after(loop.now_ns).describe(), motion.momenta(loop.now_ns)
-        theta, sent = math.degrees(float(simulation.state().theta[0])), self._total('sent')
-        flag = (' FAILED' if loop.failure else ' waiting for /clock' if self.waits_for_clock
-                else ' paused' if loop.paused else '')
-        is_running = loop.state is LoopState.RUNNING and not math.isnan(self._speed)
+        theta = math.degrees(float(simulation.state().theta[0]))
         # The most important parts come first: a terminal shows as much as fits.
-        return ' | '.join(filter(None, (
-            f't {loop.now_ns / NANOSECONDS:9.2f} s{flag}', regime.name if regime else '',
-            f'theta {theta:6.2f} deg',
-            f'x{self._speed:.2f}' if is_running else '',
-            f'{sent} messages' if sent else 'no subscribers yet',
-            f'L3 {l3:.4g} Lz {lz:.4g}',
-            f'energy drift {self._energy_drift():+.0e}')))
+        return ' | '.join((
+            f't {loop.now_ns / NANOSECONDS:9.2f} s {state}', regime.name if regime else '-',
+            f'theta {theta:6.2f} deg', f'x{self._measure_speed(loop.now_ns):.2f}',
+            f'{self._total("sent")} messages',
+            f'L3 {l3:.4g} Lz {lz:.4g}', f'energy drift {self._energy_drift():+.0e}'))

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Helpers for tests of running nodes: a node in a process of its own, and a peer that talks to it.
+A node in a process of its own, and a peer that talks to it, in the domain of own_domain.
 
-Nodes and peer use the domain of own_domain.  A test waits for an event, at most PATIENCE_S: the
-speed of the machine decides nothing.
+A test waits for an event, at most PATIENCE_S: the speed of the machine decides nothing.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import json
 import os
@@ -29,14 +27,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 import helpers.own_domain  # noqa: F401, for programs without conftest.py
 import spinning_top_sim
 
 PATIENCE_S = 60.0           # for what takes a second on an idle machine
-LIFETIME_S = 300.0          # a node that is still there is killed
 
 
 def wait_for(what, condition):
@@ -46,10 +42,6 @@ def wait_for(what, condition):
         assert time.monotonic() < end, f'{PATIENCE_S:g} s and still not: {what}'
         time.sleep(0.005)
     return result
-
-
-# Nodes end with the test process, also if that is killed.
-DIE_WITH_PARENT = ['setpriv', '--pdeathsig', 'KILL'] if shutil.which('setpriv') else []
 
 
 class SimNode:
@@ -64,48 +56,53 @@ class SimNode:
 
     def __init__(self, folder, parameters=None, *, namespace=None, arguments=(), program=None,
                  executor='events'):
-        if namespace is None:
-            namespace = f'/top{next(self._number)}'     # tests share a domain, not names
+        namespace = namespace or f'/top{next(self._number)}'    # tests share a domain, not names
+        self.namespace = namespace.rstrip('/')
+        self.name = f'{self.namespace}/spinning_top'
         self.folder = Path(folder) / (namespace.strip('/') or 'root')
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.name = f'{namespace.rstrip("/")}/spinning_top'
-        self.namespace = namespace.rstrip('/')
-        self._path = []
         if executor == 'single':
-            self._path = [str(self.folder / 'hidden')]
-            (self.folder / 'hidden').mkdir()
-            (self.folder / 'hidden/sitecustomize.py').write_text(
+            (self.folder / 'sitecustomize.py').write_text(
                 "import sys; sys.modules['rclpy.experimental'] = None")
-        self.command = [
-            *DIE_WITH_PARENT, sys.executable,
-            *(program or ('-m', 'spinning_top_sim', 'node')),
-            '--ros-args', '-r', f'__ns:={namespace}', *options(parameters or {}), *arguments]
+        self.command = [        # it ends with the test process, also if that is killed
+            *(('setpriv', '--pdeathsig', 'KILL') if shutil.which('setpriv') else ()),
+            sys.executable, *(program or ('-m', 'spinning_top_sim', 'node')), '--ros-args', '-r',
+            f'__ns:={namespace}', *options(parameters or {}), *arguments]
 
     def __enter__(self):
-        source = str(Path(spinning_top_sim.__file__).parents[1])
-        paths = [*self._path, source, *filter(None, [os.environ.get('PYTHONPATH')])]
-        environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
+        source = Path(spinning_top_sim.__file__).parents[1]
+        environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
+            [f'{self.folder}', f'{source}', os.environ.get('PYTHONPATH', '')]).rstrip(os.pathsep)}
         if 'LD_LIBRARY_PATH' not in environment:        # then the wheels must start python anew
             environment.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None)
         with (self.folder / 'out').open('wb') as out, (self.folder / 'err').open('wb') as err:
             self.process = subprocess.Popen(
                 self.command, cwd=self.folder, env=environment, start_new_session=True,
                 stdin=subprocess.DEVNULL, stdout=out, stderr=err)
-        self._killer = threading.Timer(LIFETIME_S, self.kill)
-        self._killer.daemon = True
-        self._killer.start()
         return self
 
     def __exit__(self, *_):
         self.kill()
-        self._killer.cancel()
+
+    def signal(self, number):
+        """Signal the process group, if it is there."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, number)
 
     def kill(self):
-        """Kill the process group, if it is there."""
-        if self.process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self.process.pid, signal.SIGKILL)
+        if self.alive:
+            self.signal(signal.SIGKILL)
             self.process.wait()
+
+    def end(self, *numbers):
+        """Signal the process group, wait, and return the exit code."""
+        for number in numbers or (signal.SIGINT,):
+            self.signal(number)
+        return self.process.wait(PATIENCE_S)
+
+    @property
+    def alive(self):
+        return self.process.poll() is None
 
     @property
     def out(self):
@@ -115,30 +112,9 @@ class SimNode:
     def err(self):
         return (self.folder / 'err').read_text()
 
-    @property
-    def alive(self):
-        return self.process.poll() is None
-
-    def wait(self, timeout=PATIENCE_S):
-        """Wait until the node ends; return its exit code (-9: it had to be killed)."""
-        try:
-            return self.process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            return -signal.SIGKILL
-
-    def end(self, number=signal.SIGINT, times=1):
-        """Signal the process group, wait, and return the exit code."""
-        for _ in range(times):
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self.process.pid, number)
-        return self.wait(10.0)
-
     def topic(self, name):
         """Return the full name of a topic or service, `~` for the node's own."""
-        if name.startswith('~'):
-            return self.name + name[1:]
-        return name if name.startswith('/') else f'{self.namespace}/{name}'
+        return self.name + name[1:] if name.startswith('~') else f'{self.namespace}/{name}'
 
 
 def options(parameters):
@@ -170,36 +146,22 @@ class Topic:
         return self
 
     def wait_more(self, count):
-        """Wait until `count` more messages have arrived."""
         return self.wait(len(self.raw) + count)
 
-    def messages(self):
-        return [deserialize_message(data, self.kind) for data in self.raw]
+    def messages(self, first=0):
+        return [deserialize_message(data, self.kind) for data in self.raw[first:]]
 
     def last(self):
         return deserialize_message(self.raw[-1], self.kind)
 
 
-@functools.cache
-def _participant():
-    """
-    Return the context of all peers of this process, and a node that keeps it in DDS.
-
-    Without a node, the context's DDS participant would be destroyed with each peer: where others
-    come and go at the same time, that has ended in a segmentation fault in Fast DDS.
-    """
-    context = Context()
-    rclpy.init(context=context)
-    return context, Node('participant', context=context, enable_rosout=False,
-                         start_parameter_services=False)
-
-
 class Peer:
-    """A node in the test's process, with a thread that listens."""
+    """A node in the test's process, with a thread that listens, within the `with`."""
 
-    def __init__(self, name='peer'):
-        context, _ = _participant()
-        self.node = Node(name, context=context)
+    def __init__(self):
+        context = Context()
+        rclpy.init(context=context)
+        self.node = Node('peer', context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
         self._closed = False
@@ -213,18 +175,15 @@ class Peer:
             while not self._closed:
                 self._executor.spin_once(timeout_sec=0.5)
 
-    def close(self):
-        self._closed = True
-        self._thread.join(PATIENCE_S)
-        assert not self._thread.is_alive(), 'the peer still listens'
-        self._executor.shutdown()
-        self.node.destroy_node()
-
     def __enter__(self):
         return self
 
     def __exit__(self, *_):
-        self.close()
+        self._closed = True
+        self._thread.join()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.node.context)
 
     def listen(self, name, kind, reliability=ReliabilityPolicy.RELIABLE):
         """Subscribe with a queue that is long enough for any test."""
@@ -248,15 +207,14 @@ class Peer:
         assert client.wait_for_service(PATIENCE_S), f'no service {name}'
         # A server that has not discovered a new client drops its answer after 0.1 s
         # ("client will not receive response", rmw_fastrtps).
-        for patience in (PATIENCE_S / 10, PATIENCE_S) if new or again else (PATIENCE_S,):
-            done = threading.Event()
-            future = client.call_async(request)
-            future.add_done_callback(lambda _, done=done: done.set())
-            if done.wait(patience):
-                break
-        else:
-            raise AssertionError(f'no answer from {name}')
-        return future.result()
+        asked = []
+
+        def answered():
+            if not asked or ((new or again) and time.monotonic() > asked[-1][0] + PATIENCE_S / 10):
+                asked.append((time.monotonic(), client.call_async(request)))
+            return next((future for _, future in asked if future.done()), None)
+
+        return wait_for(f'an answer from {name}', answered).result()
 
     def trigger(self, node, name):
         return self.call(Trigger, node.topic(f'~/{name}'), Trigger.Request())
@@ -286,48 +244,16 @@ class Diagnostics:
         from diagnostic_msgs.msg import DiagnosticArray
         self._topic = peer.listen('/diagnostics', DiagnosticArray)
 
-    def _of(self, node):
-        return [status for message in self._topic.messages() for status in message.status
-                if status.name == node.name.lstrip('/')]
-
-    def wait_for(self, node, what, condition):
-        """Wait for a status for which the condition holds; return it."""
-        return wait_for(f'/diagnostics with {what}', lambda: next(
-            (one for one in self._of(node)[-1:] if condition(one)), None))
-
     def next(self, node):
         """Return the numbers of the next status but one, which is measured entirely after now."""
-        count = len(self._of(node))
-        wait_for('two /diagnostics', lambda: len(self._of(node)) >= count + 2)
-        return numbers(self._of(node)[-1])
+        first, name = len(self._topic.raw), node.name.lstrip('/')
 
-    def text(self, node, key):
-        """Return the newest value of this name."""
-        return numbers(self.wait_for(node, key, lambda _: True))[key]
+        def second():
+            return [status for message in self._topic.messages(first) for status in message.status
+                    if status.name == name][1:]
 
-
-class DrivenClock:
-    """A publisher of a clock [ns] on a topic."""
-
-    def __init__(self, peer, topic, now_ns):
-        self._peer, self.now_ns = peer, now_ns
-        self._publisher = peer.node.create_publisher(Clock, topic, 10)
-
-    def set(self, now_ns):
-        self.now_ns = now_ns
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = divmod(now_ns, 10 ** 9)
-        self._publisher.publish(message)
-
-    def drive(self, what, until, step_ns=5_000_000):
-        """Advance with each check of a condition."""
-        def goes_on():
-            self.set(self.now_ns + step_ns)
-            return until()
-        wait_for(what, goes_on)
-
-    def stop(self):
-        self._peer.node.destroy_publisher(self._publisher)
+        (status, *_) = wait_for('two /diagnostics', second)
+        return numbers(status)
 
 
 def numbers(status):

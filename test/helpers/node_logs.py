@@ -7,21 +7,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
-from nav_msgs.msg import Odometry
-from rosbags.highlevel import AnyReader
-from sensor_msgs.msg import Imu, JointState
 
 from spinning_top_sim.tools import inspect
 
 SECOND = 1_000_000_000
-KINDS = {'pose': PoseStamped, 'joint_states': JointState, 'imu/data_raw': Imu,
-         'ground_truth/imu': Imu, 'ground_truth/odom': Odometry, 'ground_truth/imu_bias': Imu}
-PERIODS_NS = {'pose': 10_000_000, 'joint_states': 10_000_000, 'imu/data_raw': 5_000_000,
-              'ground_truth/imu': 5_000_000, 'ground_truth/odom': 10_000_000,
-              'ground_truth/imu_bias': 5_000_000}
 TRACEBACK = 'Traceback (most recent call last)'
 
 
@@ -76,22 +66,6 @@ def assert_clean_end(node, code):
     assert code == 0, node.err
     assert TRACEBACK not in node.err, node.err
     assert TRACEBACK not in node.out, node.out
-
-
-def decoded(path):
-    """Return how many messages of each topic two readers of other people decode."""
-    counts = [{}, {}]
-    with AnyReader([Path(path)]) as reader:
-        for connection, _, data in reader.messages():
-            reader.deserialize(data, connection.msgtype)
-            counts[0][connection.topic] = counts[0].get(connection.topic, 0) + 1
-    with Path(path).open('rb') as file:
-        for _, channel, _, message in make_reader(
-                file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
-            assert message is not None
-            counts[1][channel.topic] = counts[1].get(channel.topic, 0) + 1
-    assert counts[0] == counts[1]
-    return counts[0]
 
 
 def assert_received_from(received, logged):

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A sim_node in this process: a test calls what the executor would call, or lets it spin."""
 
-import contextlib
 import gc
 import re
-import signal
 import sys
 from types import SimpleNamespace
 
@@ -117,29 +115,17 @@ def dotted(values):
     return {name.replace('__', '.'): value for name, value in values.items()}
 
 
-@contextlib.contextmanager
-def as_a_process():
-    """Restore what the `main` of a node changes for all of its process."""
-    handlers = {number: signal.getsignal(number) for number in (
-        signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)}
-    interval = sys.getswitchinterval()
-    try:
-        yield
-    finally:
-        rclpy.try_shutdown()
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        sys.setswitchinterval(interval)
-        gc.unfreeze()
-
-
 def run_main(main, capfd, *arguments):
     """Run the `main` of a node; return its exit code, and what it has printed."""
     capfd.readouterr()
-    with as_a_process():
-        try:
-            code = main([*map(str, arguments)])
-        except SystemExit as error:         # of argparse
-            code = error.code
+    interval = sys.getswitchinterval()
+    try:
+        code = main([*map(str, arguments)])
+    except SystemExit as error:         # of argparse
+        code = error.code
+    finally:                            # what `main` changes for all of its process
+        rclpy.try_shutdown()
+        sys.setswitchinterval(interval)
+        gc.unfreeze()
     printed = capfd.readouterr()
     return SimpleNamespace(code=code, out=printed.out, err=re.sub(r'\x1b\[\d*m', '', printed.err))

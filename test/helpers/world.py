@@ -105,8 +105,7 @@ class World:
             SimulatedClock(self._source if follows else self._date, self.told.append,
                            (lambda: 1 + (self._lag_ns is not None)) if follows else None,
                            self.read_clock_ns),
-            warn=self.told.append, error=self.told.append,
-            update_subscribers=self._update_subscribers)
+            error=self.told.append, update_subscribers=self._update_subscribers)
 
     def note(self, *what):
         self.journal.append((self.machine.now_ns, *what))
@@ -172,7 +171,7 @@ class World:
         self.loop.change('state', lambda: asdict(State(theta=theta, l3=l3, lz=lz)))
 
     def drive(self, *velocity):
-        self.loop.drive(velocity)
+        self.loop.change('drive', lambda: self.simulation.drive_details(velocity))
 
     def steer(self, *velocity):
         """Ask for a velocity at each tick from now on, or no more."""
@@ -276,8 +275,8 @@ class World:
                 self._tick()
 
     def _tick(self):
-        if self._steered:
-            self.loop.drive(self._steered)
+        if self._steered and self.loop.state is LoopState.RUNNING:
+            self.drive(*self._steered)
         self.loop.tick()
         self._check_time()
         self.recording.check()
