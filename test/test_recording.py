@@ -36,7 +36,7 @@ from spinning_top_sim.recording.errors import RecordingError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder, single
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, find_definition
-from spinning_top_sim.recording.writer import CHUNK_BYTES, McapWriter, log_head
+from spinning_top_sim.recording.writer import CHUNK_BYTES, McapWriter
 
 COMPRESSIONS = ('zstd', 'lz4', 'none')
 
@@ -179,7 +179,7 @@ def test_what_decides_the_last_bits_is_told(monkeypatch):
 
 def test_a_chunk_whose_writing_is_interrupted_is_there_once(tmp_path, monkeypatch):
     path, real = tmp_path / 'run.mcap', McapWriter._write
-    file = McapWriter(path, log_head(TOPICS, METADATA), compression='none')
+    file = McapWriter(path, TOPICS, METADATA, compression='none')
     file.add(*single(0, 5, bytes(99)))
 
     def interrupted(self, blocks):

@@ -23,15 +23,14 @@ class LogError(RuntimeError):
 class Damage:
     """What is wrong with a log."""
 
-    torn: bool                  # its summary is missing or wrong
+    torn: bool = False          # its summary is missing or wrong
     lost_bytes: int = 0         # that cannot be read; indexes do not count
-    lost_messages: int = 0      # that the summary counts and that are not there either
-    reasons: list[str] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)    # of losses
 
     def lines(self) -> list[str]:
-        """Return what is lost, and the first reasons."""
-        lost = {'bytes': self.lost_bytes, 'messages': self.lost_messages}
-        return [*(f'lost: {count} {what}' for what, count in lost.items() if count),
+        """Return what is wrong, but for the last reasons of many."""
+        return [*[f'lost: {self.lost_bytes} bytes'] * bool(self.lost_bytes),
+                *['found: the summary at the end is missing or wrong'] * self.torn,
                 *self.reasons[:MOST_REASONS]]
 
 

@@ -193,13 +193,12 @@ class Recorder:
     def _open(self) -> McapWriter:
         """Return the file that `uri` names; in a folder, under the first free name."""
         with needed('a recording', 'mcap'):
-            from spinning_top_sim.recording.writer import McapWriter, log_head  # noqa: PLC0415
+            from spinning_top_sim.recording.writer import McapWriter  # noqa: PLC0415
 
         metadata = {**self._metadata(), **environment()}
         if sum(map(len, metadata.values())) > MAX_BYTES // 2:   # it has keys and lengths, too
             raise RecordingError('too many events before the recording: a log could not be read; '
                                  '~/reset begins a run without any')
-        head = log_head(self._topics, metadata)
         folder = path = Path(self._uri).expanduser().absolute()
         if self._uri.endswith('/'):
             folder.mkdir(parents=True, exist_ok=True)
@@ -209,7 +208,7 @@ class Recorder:
             if not named:
                 path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
             try:
-                file = McapWriter(path, head, compression=self._compression,
+                file = McapWriter(path, self._topics, metadata, compression=self._compression,
                                   min_free_bytes=self._min_free_bytes)
                 self.path = path
                 return file

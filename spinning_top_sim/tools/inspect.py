@@ -110,7 +110,7 @@ def _as_json(found: Survey, comparison: Comparison | None) -> object:
     """Return the findings for JSON; docs/logs.md has the keys."""
     damage, run, (begin_ns, end_ns) = found.damage, found.run, found.span
     content: dict[str, object] = {
-        'file': str(found.path), 'whole': not damage.reasons,
+        'file': str(found.path), 'whole': found.whole,
         'damage': {'torn': damage.torn, 'lost_bytes': damage.lost_bytes, 'report': damage.lines()},
         'begin_ns': begin_ns, 'end_ns': end_ns, 'duration': (end_ns - begin_ns) / NANOSECONDS,
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},

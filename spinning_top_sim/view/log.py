@@ -32,8 +32,7 @@ class LogSource:
                 changes_ns = self._read(reader, recorded_run.read_run_description(reader))
             except recorded_run.ForeignLogError as error:
                 raise LogError(f'{path}: {error}') from error
-            note = (f'*{path.name} is truncated: shown as far as it goes*' if not reader.whole else
-                    f'*{path.name} is damaged: shown without some chunks*' * bool(reader.left_out))
+            note = '' if reader.whole else f'*{path.name} is damaged: what is whole is shown*'
         self._tops = [top for top in self._tops if len(top.rows)]
         if not self._tops:
             raise LogError(f'{path}: no attitude of the top in it ({", ".join(TOPICS)})')
@@ -56,12 +55,11 @@ class LogSource:
                     self._tops[-1].begin_ns = event.details['epoch_ns'] - run.epoch_ns
         found = defaultdict(list)
         name = next((name for name in TOPICS if name in run.topics), '')
-        for _, group in reader.groups([run.topics[name]] if name else []):
-            for message in group:
-                top = self.track_at(message.log_time - run.epoch_ns)
-                if len(message.data) == len(top.templates[name]) and (      # else it is none
-                        message.log_time <= recorded_run.LAST_LOG_TIME_NS):
-                    found[top].append(message)
+        for message in reader.messages([run.topics[name]] if name else []):
+            top = self.track_at(message.log_time - run.epoch_ns)
+            if len(message.data) == len(top.templates[name]) and (      # else it is none
+                    message.log_time <= recorded_run.LAST_LOG_TIME_NS):
+                found[top].append(message)
         for top, messages in found.items():
             top.add_messages(name, [one.data for one in messages],
                              [one.log_time for one in messages])

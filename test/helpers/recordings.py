@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, qos_profiles
-from spinning_top_sim.recording.writer import McapWriter, log_head
+from spinning_top_sim.recording.writer import McapWriter
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -39,9 +39,9 @@ def array_cdr(number: int) -> bytes:
     return struct.pack('<4sIII4xd', b'\x00\x01\x00\x00', 0, 0, 1, float(number))
 
 
-def write_rows(path, topics, rows, per_chunk=None, metadata=None):
+def write_rows(path, topics, rows, per_chunk=None, metadata=None, compression='none'):
     """Write a log of rows (number of a topic, stamp [ns], data), so many in a chunk."""
-    file = McapWriter(path, log_head(topics, metadata or {}), compression='none')
+    file = McapWriter(path, topics, metadata or {}, compression=compression)
     for number, row in enumerate(rows, start=1):
         file.add(*single(*row))
         if per_chunk and number % per_chunk == 0:
