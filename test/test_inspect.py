@@ -96,9 +96,8 @@ def test_errors_and_drifts_are_those_in_the_data(stepped, tmp_path, capsys):
     ([*range(5, 10), *range(20, 40)], [
         [1_000_000_000, 1_040_000_000], [1_100_000_000, 1_190_000_000],
         [1_400_000_000, 1_500_000_000]]),
-    ((), [[1_000_000_000, 1_300_000_000], [1_310_000_000, 1_500_000_000]])])
+    ((), [[1_000_000_000, 1_500_000_000]])])
 def test_missing_samples_are_told_where_they_are(short, tmp_path, capsys, kept, gaps):
-    """Of a topic without any, each part between two commands is a gap."""
     path = rewritten(short, tmp_path / 'gap.mcap', lambda topic, number, data: (
         None if topic == '/pose' and number not in kept else data))
     _, content = as_json(capsys, path)

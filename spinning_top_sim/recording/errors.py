@@ -27,6 +27,11 @@ class Damage:
     lost_bytes: int = 0         # that cannot be read; indexes do not count
     reasons: list[str] = field(default_factory=list)    # of losses
 
+    @property
+    def whole(self) -> bool:
+        """Whether nothing is wrong."""
+        return not (self.torn or self.reasons)
+
     def lines(self) -> list[str]:
         """Return what is wrong, but for the last reasons of many."""
         return [*[f'lost: {self.lost_bytes} bytes'] * bool(self.lost_bytes),

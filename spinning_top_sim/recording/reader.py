@@ -136,7 +136,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     @property
     def whole(self) -> bool:
-        return not (self.damage.torn or self.damage.reasons)
+        return self.damage.whole
 
     @property
     def topics(self) -> tuple[LogTopic, ...]:

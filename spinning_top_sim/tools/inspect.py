@@ -23,8 +23,11 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
+from spinning_top_sim.physics.states import joined, relative_drift
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.times import NANOSECONDS, stamp_text
@@ -34,6 +37,7 @@ from spinning_top_sim.tools.survey import MotionReport, Survey, survey
 from spinning_top_sim.tools.verify import Comparison, compare, objection
 
 DEGREES = math.degrees(1.0)
+FRAMES_PER_S, LONGEST_S, GIF_PIXELS = 20, 10.0, 640
 # Rows of the table of a motion: text, field of Description and Measured, factor.
 ROWS = (('nutation period [s]', 'nutation_period', 1.0),
         ('mean precession [rad/s]', 'mean_precession_rate', 1.0),
@@ -87,7 +91,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if reason and getattr(arguments, option):
             raise LogError(f'--{option}: {reason}')
     _draw(arguments, found)
-    passed = not found.damage.reasons and (comparison is None or comparison.identical)
+    passed = found.damage.whole and (comparison is None or comparison.identical)
     return cli.OK if passed else cli.FAILED
 
 
@@ -98,19 +102,28 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
     if not found.shown:
         raise LogError('nothing to draw: no attitude of a top in this log')
     with needed('a picture', 'plot'):
-        from spinning_top_sim.tools import log_pictures  # noqa: PLC0415
-    for path, draw in ((arguments.plot, log_pictures.draw_page),
-                       (arguments.animate, log_pictures.animate)):
-        if path is not None:
-            with new_file(path):
-                draw(found, path)
+        from matplotlib.animation import PillowWriter  # noqa: PLC0415
+
+        from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
+    if arguments.plot is not None:
+        # A motion is of one energy.
+        drift = np.concatenate([relative_drift(one.energy, one.energy[:1]) for one in found.shown])
+        figure = pictures.plot(joined(found.shown), drift, [one.t[0] for one in found.shown[1:]])
+        figure.suptitle(f'{found.path.name}: {len(found.shown)} of {len(found.motions)} motions')
+        with new_file(arguments.plot) as file:
+            figure.savefig(file.name, format=arguments.plot.suffix[1:] or 'png', dpi=120)
+    if arguments.animate is not None:
+        first = found.shown[0].until(LONGEST_S)
+        with new_file(arguments.animate) as file:
+            first.animate(FRAMES_PER_S).save(file.name, writer=PillowWriter(fps=FRAMES_PER_S),
+                                             dpi=GIF_PIXELS / 4.0)      # of 4 inches
 
 
 def _as_json(found: Survey, comparison: Comparison | None) -> object:
     """Return the findings for JSON; docs/logs.md has the keys."""
     damage, run, (begin_ns, end_ns) = found.damage, found.run, found.span
     content: dict[str, object] = {
-        'file': str(found.path), 'whole': found.whole,
+        'file': str(found.path), 'whole': damage.whole,
         'damage': {'torn': damage.torn, 'lost_bytes': damage.lost_bytes, 'report': damage.lines()},
         'begin_ns': begin_ns, 'end_ns': end_ns, 'duration': (end_ns - begin_ns) / NANOSECONDS,
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
@@ -130,7 +143,7 @@ def _as_json(found: Survey, comparison: Comparison | None) -> object:
         content['events'] = [{'event': event.kind, 'stamp_ns': stamp_ns, 't_ns': event.t_ns,
                               **event.details} for stamp_ns, event in run.events]
     if comparison is not None:
-        content['verify'] = {'identical': comparison.identical, 'whole': not damage.reasons,
+        content['verify'] = {'identical': comparison.identical, 'whole': damage.whole,
                              **asdict(comparison),
                              'first': comparison.first and comparison.first._asdict()}
     # Numbers that JSON does not have become null.
@@ -144,7 +157,7 @@ def _fields_of(source: object, *names: str) -> dict[str, object]:
 def _as_text(found: Survey, comparison: Comparison | None) -> Iterator[str]:
     """Yield the findings as lines of text."""
     damage, run, (begin_ns, end_ns) = found.damage, found.run, found.span
-    state = 'truncated' if damage.torn else 'damaged' if damage.reasons else 'whole'
+    state = 'truncated' if damage.torn else 'whole' if damage.whole else 'damaged'
     yield f'{found.path}: {state}, {(end_ns - begin_ns) / NANOSECONDS:.6g} s'
     yield from damage.lines()
     if run is None:

@@ -9,9 +9,11 @@ counts the samples of each topic, and measures each motion from the samples of o
 import itertools
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +26,10 @@ from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.imu import Imu
-from spinning_top_sim.streams.play import Block
+from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, Times, ns_array, stamp_text
 from spinning_top_sim.tools import analysis, recorded_run
-from spinning_top_sim.tools.analysis import Attitudes, Measured
+from spinning_top_sim.tools.analysis import Measured, SampledStates
 from spinning_top_sim.tools.recorded_run import LAST_LOG_TIME_NS, RunDescription
 
 MOST_GAPS = 10              # that are listed
@@ -35,7 +37,7 @@ MOST_EXACT = 1000           # motions that are compared with the exact one: 10 m
 # Streams that a motion can be measured from, the most accurate first.
 SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
 ENOUGH_SAMPLES = 12.0       # in a nutation; a higher rate adds no accuracy
-Rows = NDArray[np.float64]
+Due = defaultdict[str, list[Times]]     # by topic, when messages were due [ns]
 
 
 @dataclass
@@ -52,14 +54,19 @@ class TopicReport:
     gaps_ns: list[tuple[int, int]] = field(default_factory=list)
 
 
-@dataclass
-class Section:
-    """A part of a motion in which the rates stay the same: samples in (begin_ns, end_ns]."""
+class Section(NamedTuple):
+    """A part of a run in which all rates stay the same: samples after begin_ns."""
 
-    begin_ns: int                         # log times [ns]
-    end_ns: int
     epoch_ns: int                         # stamp of t = 0 [ns]
-    channels: dict[str, Channel]          # with their rates, by topic of the log
+    begin_ns: int                         # simulated time [ns]
+    channels: dict[str, Channel]          # of the log, by its topics
+    imu: Imu
+
+    @classmethod
+    def of(cls, simulation: Simulation, run: RunDescription) -> 'Section':
+        return cls(simulation.epoch_ns, simulation.now_ns, {
+            run.topics[channel.topic]: channel for channel in simulation.channels
+            if channel.topic in run.topics}, simulation.imu)
 
 
 @dataclass
@@ -67,22 +74,15 @@ class MotionReport:
     """A motion of the top, from its cause to the next one."""
 
     cause: str                            # start, command, state, drive or reset
+    begin_ns: int                         # log times [ns]
+    end_ns: int
+    section: Section                      # the first one
     piece: Piece                          # its constants and its exact solution
     exact: Description | None             # None if the closed form cannot represent it
     source: str | None                    # topic that it is measured from
-    imu: Imu
-    # Log times (n,) [ns] and `Attitudes.rows` of the source
-    samples: list[tuple[Times, Rows]] = field(default_factory=list)
-    sections: list[Section] = field(default_factory=list)
+    # Log times (n,) [ns] and samples (WIDTH, n) of the source
+    samples: list[tuple[Times, NDArray[np.float64]]] = field(default_factory=list)
     measured: Measured | None = None      # the numbers of `exact`, from the samples
-
-    @property
-    def begin_ns(self) -> int:
-        return self.sections[0].begin_ns
-
-    @property
-    def end_ns(self) -> int:
-        return self.sections[-1].end_ns
 
 
 @dataclass
@@ -101,8 +101,7 @@ class Survey:
     # not from 0, and the largest error of an attitude [rad]
     drifts: dict[str, dict[str, float]] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
-    # For pictures: the motions that are measured, and the samples of each
-    shown: list[tuple[MotionReport, Attitudes]] = field(default_factory=list)
+    shown: list[SampledStates] = field(default_factory=list)    # the motions, for pictures
     notes: list[str] = field(default_factory=list)
 
 
@@ -111,6 +110,7 @@ def survey(reader: LogReader) -> Survey:
     """Return the findings about a log.  Raises LogError."""
     found = Survey(reader.path, reader.damage, reader.span, reader.span[1], {
         topic.name: TopicReport(topic.type_name) for topic in reader.topics})
+    due = Due(list)
     try:
         run = found.run = recorded_run.read_run_description(reader)
     except recorded_run.ForeignLogError as error:
@@ -120,48 +120,57 @@ def survey(reader: LogReader) -> Survey:
                         for stamp_ns, reason in run.broken]
         for name, topic in run.topics.items():
             found.topics[topic].stream = name
-        _follow_run(found, run)
+        _follow_run(found, run, due)
     stamps_ns = _read_messages(found, reader)
-    sections = [section for motion in found.motions for section in motion.sections]
-    if sections:        # the last entry of the journal may be later than the last sample
-        last = sections[-1]
+    if found.motions:       # the last entry of the journal may be later than the last sample
+        last = found.motions[-1]
         found.end_ns = last.end_ns = max(last.begin_ns, 0, *(
-            int(stamps_ns[topic].max(initial=0)) for topic in last.channels))
+            int(stamps_ns[topic].max(initial=0)) for topic in last.section.channels))
     for topic, report in found.topics.items():
-        _count(found, report, stamps_ns[topic],
-               sections if report.stream is not None else [], topic)
+        _count(report, stamps_ns[topic], due[topic], found.end_ns)
     for motion in found.motions:
         _measure(found, motion)
     return found
 
 
-def _follow_run(found: Survey, run: RunDescription) -> None:
-    """Compute the motions of a run; add notes about what cannot be followed."""
-    motions = found.motions
+def _follow_run(found: Survey, run: RunDescription, due: Due) -> None:
+    """Compute the motions of a run, and when messages were due."""
+    motions, section = found.motions, None
     try:
         for simulation, done in recorded_run.rerun(run, found.span[1]):
             if isinstance(done, Block):
                 continue
             event = done.event
-            if motions:
-                last = motions[-1].sections[-1]
-                last.end_ns = last.epoch_ns + event.sent_ns
-            begin_ns = simulation.epoch_ns + simulation.now_ns
-            channels = {run.topics[channel.topic]: channel for channel in simulation.channels
-                        if channel.topic in run.topics}
+            if section is not None:
+                _expect(found, run, due, section, event.sent_ns)
+                motions[-1].end_ns = section.epoch_ns + event.sent_ns
+            section = Section.of(simulation, run)
             # The velocities of the pivot belong to one motion.
             if event.begins_report and not (
                     event.kind == 'drive' and motions and motions[-1].cause == 'drive'):
                 piece = simulation.trajectory.after(max(simulation.now_ns, 0))
                 exact = piece.describe() if len(motions) < MOST_EXACT else None
-                motions.append(MotionReport(event.kind, piece, exact,
-                                            _source(run, channels, exact), simulation.imu))
-            motions[-1].sections.append(
-                Section(begin_ns, begin_ns, simulation.epoch_ns, channels))
+                begin_ns = section.epoch_ns + section.begin_ns
+                motions.append(MotionReport(event.kind, begin_ns, begin_ns, section, piece, exact,
+                                            _source(run, section.channels, exact)))
     except MALFORMED as error:
         found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
+    if section is not None:
+        _expect(found, run, due, section, found.span[1] - section.epoch_ns)
     if len(motions) > MOST_EXACT:
         found.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact one')
+
+
+def _expect(found: Survey, run: RunDescription, due: Due, section: Section, end_ns: int) -> None:
+    """Note when the messages of a section up to a simulated time were due."""
+    for topic, channel in section.channels.items():
+        found.topics[topic].grid_rate = NANOSECONDS / channel.period_ns
+        times = channel.times(max(section.begin_ns, -1), end_ns)
+        if len(times) <= recorded_run.most_samples(run):
+            due[topic].append(section.epoch_ns + np.unique(channel.due(ns_array(times))))
+        else:
+            found.notes.append(f'{topic}: what is missing is not counted: the log lacks most of '
+                               f'{len(times)} samples')
 
 
 def _source(run: RunDescription, channels: Mapping[str, Channel],
@@ -185,81 +194,72 @@ def _read_messages(found: Survey, reader: LogReader) -> dict[str, Times]:
     return {topic: np.concatenate(parts) for topic, parts in blocks_ns.items()}
 
 
-def _stamps(samples: Sequence[LogMessage]) -> Times:
+def _stamps(samples: list[LogMessage]) -> Times:
     return np.array([min(sample.log_time, LAST_LOG_TIME_NS) for sample in samples], np.int64)
 
 
 def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogMessage]) -> None:
-    section, piece = motion.sections[0], motion.piece
+    """Compare messages with their motion, and keep those that it is measured from."""
+    section, piece = motion.section, motion.piece
     channel = section.channels[topic]
     fitting = [sample for sample in samples if len(sample.data) == len(channel.template)]
-    stamps_ns = _stamps(fitting)
-    fields = channel.template.decode(b''.join(sample.data for sample in fitting))
-    data = analysis.attitudes_of(channel.topic, motion.imu, stamps_ns, fields)
-    if data is None:
+    attitudes = analysis.attitudes_of(
+        channel.topic, section.imu, _stamps(fitting),
+        channel.template.decode(b''.join(sample.data for sample in fitting)))
+    if attitudes is None:
         return
     if topic == motion.source:
-        motion.samples.append((data.stamps_ns, data.rows))
+        motion.samples.append(attitudes)
     if not piece.rests:             # there are other constants in each of its pieces
         return
-    values = data.constants(piece.top)
-    if values is not None and channel.topic != 'imu/data':       # which is noisy
-        drifts = found.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})
-        for (name, largest), value in zip(drifts.items(), values, strict=True):
-            drift = relative_drift(value, getattr(piece, name))
-            drifts[name] = max(largest, _largest(drift))
     # Log times of the run; those of a log that was changed may lie anywhere.
-    times_ns = np.clip(data.stamps_ns - section.epoch_ns, piece.start_ns, LAST_STAMP_NS)
+    times_ns = np.clip(attitudes[0] - section.epoch_ns, piece.start_ns, LAST_STAMP_NS)
+    states = SampledStates(piece.top, times_ns / NANOSECONDS, attitudes[1])
+    if not np.isnan(states.l3).all() and channel.topic != 'imu/data':       # which is noisy
+        drifts = found.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})
+        for name, largest in drifts.items():
+            drift = relative_drift(getattr(states, name), getattr(piece, name))
+            drifts[name] = max(largest, _largest(drift))
     if motion.exact is not None and (truth := piece.truth(times_ns)) is not None:
-        error = _largest(angle_between(data.quaternion, truth.rows_quaternion))
+        error = _largest(angle_between(states.rows_quaternion, truth.rows_quaternion))
         found.errors[topic] = max(found.errors.get(topic, 0.0), error)
 
 
-def _largest(values: Rows) -> float:
+def _largest(values: NDArray[np.float64]) -> float:
     """Return the largest absolute value of those that are finite, 0 without any."""
     return float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
 
 
-def _count(found: Survey, report: TopicReport, stamps_ns: Times, sections: list[Section],
-           topic: str) -> None:
+def _count(report: TopicReport, stamps_ns: Times, due: list[Times], end_ns: int) -> None:
+    """Count the messages, and those that were due by a log time and are missing."""
     report.count = len(stamps_ns)
     if report.count > 1:
         duration_ns = int(stamps_ns[-1] - stamps_ns[0])
         report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
-    for section in sections:
-        end = int(np.searchsorted(stamps_ns, section.end_ns, 'right'))
-        channel = section.channels[topic]
-        times = channel.times(max(section.begin_ns - section.epoch_ns, -1),
-                              section.end_ns - section.epoch_ns)
-        report.grid_rate = NANOSECONDS / channel.period_ns
-        if found.run and len(times) > recorded_run.most_samples(found.run):
-            found.notes.append(f'{topic}: what is missing is not counted: the log lacks most of '
-                               f'{len(times)} samples')
-            return
-        _count_section(report, section, channel, times, stamps_ns[:end])
-        stamps_ns = stamps_ns[end:]
-
-
-def _count_section(report: TopicReport, section: Section, channel: Channel, times: range,
-                   stamps_ns: Times) -> None:
-    """Add the missing messages of a section: those that the run has sent and the log lacks."""
-    due_ns = section.epoch_ns + np.unique(channel.due(ns_array(times)))
-    missing = ~np.isin(due_ns, stamps_ns)
-    report.missing = (report.missing or 0) + int(np.sum(missing))
-    edges = np.flatnonzero(np.diff(missing, prepend=False, append=False))
-    report.gaps_ns += [(int(due_ns[begin]), int(due_ns[end - 1])) for begin, end in zip(
-        edges[::2], edges[1::2], strict=True)][:max(MOST_GAPS - len(report.gaps_ns), 0)]
+    if due:
+        due_ns = np.concatenate(due)
+        due_ns = due_ns[due_ns <= end_ns]
+        missing = ~np.isin(due_ns, stamps_ns)
+        report.missing = int(np.sum(missing))
+        edges = np.flatnonzero(np.diff(missing, prepend=False, append=False))
+        report.gaps_ns = [(int(due_ns[begin]), int(due_ns[end - 1])) for begin, end in zip(
+            edges[::2], edges[1::2], strict=True)][:MOST_GAPS]
 
 
 def _measure(found: Survey, motion: MotionReport) -> None:
-    samples, motion.samples = motion.samples, []
-    data = analysis.longest_run(samples) if samples else None
-    if data is None or len(data.stamps_ns) < 2:
+    """Measure a motion from the longest part of its samples that has one rate."""
+    stamps_ns = np.concatenate([np.empty(0, np.int64), *(one for one, _ in motion.samples)])
+    if len(stamps_ns) < 2:
         return
+    part = analysis.longest_run(stamps_ns)
+    rows = np.concatenate([rows for _, rows in motion.samples], axis=1)[:, part]
+    motion.samples = []
+    times = (stamps_ns[part] - found.span[0]) / NANOSECONDS
+    data = SampledStates(motion.piece.top, times, rows)
     try:
         motion.measured = analysis.measure(
             data, motion.exact.nutation_period if motion.exact else None)
     except MALFORMED as error:
         found.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
     else:
-        found.shown.append((motion, data))
+        found.shown.append(data)
