@@ -118,9 +118,6 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
     if torn:        # within the indexes of the last chunk
         os.truncate(path, max(end for opcode, _, end in records_of(path.read_bytes())
                               if opcode == Opcode.MESSAGE_INDEX) - 1)
-    # In a chunk of the file, the messages of a topic are together.
-    rows = [row for begin in range(0, 600, 50)
-            for row in sorted(rows[begin:begin + 50], key=lambda row: row[0])]
     wanted = sorted(rows, key=lambda row: row[1])
     stamps = [row[1] for row in rows]
     last = max(stamps[:50])     # of the first chunk

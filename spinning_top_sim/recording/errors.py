@@ -11,12 +11,8 @@ MOST_REASONS = 20           # of damage that are told
 MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
 
 
-class RecordingError(RuntimeError):
-    """A recording cannot start, or has stopped; the text names the path or type and the reason."""
-
-
 class LogError(RuntimeError):
-    """A log cannot be read or recovered; the text names the path and the reason."""
+    """A log cannot be read, written or recovered; the text names the path and the reason."""
 
 
 @dataclass

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import yaml
 
 from spinning_top_sim.installation import read_table
-from spinning_top_sim.recording.errors import RecordingError
 
 if TYPE_CHECKING:       # nodes need this module without mcap
     from mcap.records import Channel
@@ -64,26 +63,15 @@ class RecordedTopic(NamedTuple):
         return {**DEFAULT_QOS, **self.qos}
 
 
-def find_definition(type_name: str) -> tuple[str, str]:
-    """Return what `generated_definition` does, at once for the types of our streams."""
-    # docs/definitions.py writes the file: to load the types of rosbags takes 70 ms.
-    text, type_hash = read_table('recording/definitions.json').get(type_name) or (
-        generated_definition(type_name))
-    return text, type_hash
-
-
-def generated_definition(type_name: str) -> tuple[str, str]:
+def definition(type_name: str) -> tuple[str, str]:
     """
-    Return schema (`ros2msg`) and type hash (REP-2011) of a type of ROS 2 Jazzy.
+    Return schema (`ros2msg`) and type hash (REP-2011) of a type that a stream has.
 
     Other than rosbag2's, the schema, which is the definition followed by those it depends on, has
-    no comments.  Raises RecordingError for another type.
+    no comments.
     """
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-    types = get_typestore(Stores.ROS2_JAZZY)
-    if type_name not in types.fielddefs:
-        raise RecordingError(f'there is no message type {type_name} in ROS 2 Jazzy')
-    return types.generate_msgdef(type_name, ros_version=2)[0], types.hash_rihs01(type_name)
+    text, type_hash = read_table('recording/definitions.json')[type_name]
+    return text, type_hash
 
 
 def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
@@ -143,7 +131,7 @@ def bag_metadata(topics: Sequence[RecordedTopic], counts: Sequence[int], file_na
                 'offered_qos_profiles': [
                     {key: _POLICY_NAMES[key][value] if key in _POLICY_NAMES else value
                      for key, value in topic.offered.items()}],
-                'type_description_hash': find_definition(topic.type_name)[1]},
+                'type_description_hash': definition(topic.type_name)[1]},
              'message_count': count} for topic, count in zip(topics, counts, strict=True)],
         'compression_format': '',
         'compression_mode': '',

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording import rosbag2
-from spinning_top_sim.recording.errors import RecordingError, why_not_written
+from spinning_top_sim.recording.errors import LogError, why_not_written
 from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
 
 CHUNK_BYTES = 1_000_000     # of messages that make a chunk, about
@@ -55,8 +55,7 @@ class McapWriter:
     metadata : the `spinning_top_sim` record
     compression : of the chunks, 'zstd', 'lz4' or 'none'
 
-    Raises RecordingError naming the path or an unknown type, ValueError for a topic that is listed
-    twice.
+    Raises LogError naming the path, ValueError for a topic that is listed twice.
     """
 
     def __init__(self, path: Path, topics: Sequence[rosbag2.RecordedTopic],
@@ -86,7 +85,7 @@ class McapWriter:
                 path.unlink()
                 raise
         except (OSError, ValueError) as error:
-            raise RecordingError(f'cannot write {path}: {why_not_written(path, error)}') from error
+            raise LogError(f'cannot write {path}: {why_not_written(path, error)}') from error
 
     @property
     def size(self) -> int:
@@ -247,14 +246,14 @@ def _declarations(topics: Sequence[rosbag2.RecordedTopic]) -> list[records.McapR
             raise ValueError(f'topic {name!r} is listed twice: once is allowed')
     types = list(dict.fromkeys(topic.type_name for topic in topics))
     return [
-        *(records.Schema(number, rosbag2.find_definition(name)[0].encode(), 'ros2msg', name)
+        *(records.Schema(number, rosbag2.definition(name)[0].encode(), 'ros2msg', name)
           for number, name in enumerate(types, start=1)),
         *(records.Channel(
             id=number, topic=topic.name, message_encoding='cdr',
             schema_id=1 + types.index(topic.type_name),
             # In integers, as older releases of ROS read them, too.
             metadata={'offered_qos_profiles': rosbag2.as_yaml([topic.offered]),
-                      'topic_type_hash': rosbag2.find_definition(topic.type_name)[1]})
+                      'topic_type_hash': rosbag2.definition(topic.type_name)[1]})
           for number, topic in enumerate(topics, start=1))]
 
 

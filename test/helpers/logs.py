@@ -15,8 +15,10 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from rosbags.highlevel import AnyReader
 
-from helpers.recordings import METADATA, TOPICS, some_messages, write_rows
+from helpers.recordings import METADATA, TOPICS, some_messages
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.recorder import single
+from spinning_top_sim.recording.writer import McapWriter
 from spinning_top_sim.tools.recover import main
 
 CHUNKS, MESSAGES_PER_CHUNK = 3, 12
@@ -25,7 +27,13 @@ CHUNKS, MESSAGES_PER_CHUNK = 3, 12
 def small_log(path) -> SimpleNamespace:
     """Write a small log of ours; return bytes, messages, and (opcode, start, end) of chunks."""
     rows = some_messages(CHUNKS * MESSAGES_PER_CHUNK)
-    content = write_rows(path, TOPICS, rows, MESSAGES_PER_CHUNK, METADATA, 'zstd').read_bytes()
+    file = McapWriter(path, TOPICS, METADATA, compression='zstd')
+    for number, row in enumerate(rows, start=1):
+        file.add(*single(*row))
+        if number % MESSAGES_PER_CHUNK == 0:
+            file.flush()
+    file.finish()
+    content = path.read_bytes()
     chunks = [record for record in records_of(content) if record[0] == Opcode.CHUNK]
     assert len(chunks) == CHUNKS
     return SimpleNamespace(content=content, chunks=chunks, messages=[

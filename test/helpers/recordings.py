@@ -3,14 +3,15 @@
 
 import struct
 import time
+from collections import Counter
 
 import numpy as np
 from mcap.records import Channel as ChannelRecord
+from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic, qos_profiles
-from spinning_top_sim.recording.writer import McapWriter
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -39,14 +40,21 @@ def array_cdr(number: int) -> bytes:
     return struct.pack('<4sIII4xd', b'\x00\x01\x00\x00', 0, 0, 1, float(number))
 
 
-def write_rows(path, topics, rows, per_chunk=None, metadata=None, compression='none'):
-    """Write a log of rows (number of a topic, stamp [ns], data), so many in a chunk."""
-    file = McapWriter(path, topics, metadata or {}, compression=compression)
-    for number, row in enumerate(rows, start=1):
-        file.add(*single(*row))
-        if per_chunk and number % per_chunk == 0:
-            file.flush()
-    file.finish()
+def write_rows(path, topics, rows, per_chunk=None, metadata=None):
+    """Write rows (number of a topic, stamp [ns], data) by mcap's writer, so many in a chunk."""
+    with open(path, 'wb') as file:
+        writer, counts = Writer(file), Counter()
+        writer.start('ros2')
+        writer.add_metadata('spinning_top_sim', metadata or {})
+        channels = [writer.register_channel(topic.name, 'cdr', writer.register_schema(
+            topic.type_name, 'ros2msg', JAZZY.generate_msgdef(
+                topic.type_name, ros_version=2)[0].encode())) for topic in topics]
+        for number, (topic, stamp, data) in enumerate(rows, start=1):
+            writer.add_message(channels[topic], stamp, data, stamp, counts[topic])
+            counts[topic] += 1
+            if per_chunk and number % per_chunk == 0:
+                writer.flush()
+        writer.finish()
     return path
 
 
