@@ -21,7 +21,8 @@ from mcap.writer import Writer
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.tools import inspect, recover, simulate
-from spinning_top_sim.tools.survey import survey
+from spinning_top_sim.tools.recorded_run import read_run_description
+from spinning_top_sim.tools.survey import Survey
 
 # The tilt rests, or nearly: there is no nutation in the data.
 RESTING = {'sleeping', 'steady_fast', 'steady_slow'}
@@ -29,7 +30,7 @@ RESTING = {'sleeping', 'steady_fast', 'steady_slow'}
 
 def surveyed(path):
     with LogReader(path) as reader:
-        return survey(reader)
+        return Survey(reader, read_run_description(reader))
 
 
 @pytest.mark.parametrize(('scene', 'method'), [

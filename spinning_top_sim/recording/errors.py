@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can go wrong before a recording runs, and in reading and recovering logs."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 # What values raise that are not as this package writes them.
 MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 MOST_TEXT = 300             # of a reason
-MOST_REASONS = 20           # of damage that are told
 MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
 
 
@@ -21,18 +20,14 @@ class Damage:
 
     torn: bool = False          # its summary is missing or wrong
     lost_bytes: int = 0         # that cannot be read; indexes do not count
-    reasons: list[str] = field(default_factory=list)    # of losses
-
-    @property
-    def whole(self) -> bool:
-        """Whether nothing is wrong."""
-        return not (self.torn or self.reasons)
+    changed: bool = False       # what can be read has another checksum than was written
 
     def lines(self) -> list[str]:
-        """Return what is wrong, but for the last reasons of many."""
-        return [*[f'lost: {self.lost_bytes} bytes'] * bool(self.lost_bytes),
-                *['found: the summary at the end is missing or wrong'] * self.torn,
-                *self.reasons[:MOST_REASONS]]
+        """Return a line about each kind of damage."""
+        return [text for text, is_there in (
+            (f'lost: {self.lost_bytes} bytes', self.lost_bytes),
+            ('found: the summary at the end is missing or wrong', self.torn),
+            ('found: the checksum of the data section is wrong', self.changed)) if is_there]
 
 
 def text_of(error: BaseException) -> str:

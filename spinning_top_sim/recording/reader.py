@@ -19,7 +19,7 @@ from typing import BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader
@@ -136,7 +136,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     @property
     def whole(self) -> bool:
-        return self.damage.whole
+        return self.damage == Damage()
 
     @property
     def topics(self) -> tuple[LogTopic, ...]:
@@ -195,14 +195,14 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def _at(self, offset: int, end: int) -> bytes:
         """Return the bytes there.  Raises UNREADABLE if there are fewer, or too many."""
-        if end - offset > self._max_bytes and end <= self.size:
-            raise McapError(f'more than {self._max_bytes} bytes are not read')
+        if end > min(self.size, offset + self._max_bytes):
+            raise McapError
         try:
-            raw = os.pread(self._file.fileno(), end - offset, offset) if end <= self.size else b''
+            raw = os.pread(self._file.fileno(), end - offset, offset)
         except OSError as error:
             raise LogError(f'cannot read {self.path}: {error.strerror}') from error
-        if len(raw) < end - offset:
-            raise EndOfFile('no whole record')
+        if len(raw) < end - offset:     # it has become shorter
+            raise McapError
         return raw
 
     def _read_header(self) -> Header:
@@ -236,21 +236,17 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             try:
                 raw = self._at(offset, end)
                 self._note(raw, offset, end)
-            except UNREADABLE as error:
+            except UNREADABLE:
                 lost = min(end, self.size) - offset
                 # What follows the last chunk of a log tells nothing new.
                 if end <= self.size or lost > MOST_INDEX or opcode not in (
                         Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.DATA_END):
                     damage.lost_bytes += lost
-                    damage.reasons.append(f'found: {lost} bytes at byte {offset}: '
-                                          f'{str(error) or "a length in it is wrong"}')
                 continue
-            if opcode == Opcode.DATA_END and not damage.lost_bytes and (
-                    int.from_bytes(raw[9:13], 'little') not in (0, crc)):
-                damage.reasons.append('found: the checksum of the data section is wrong')
+            if opcode == Opcode.DATA_END and not damage.lost_bytes:
+                damage.changed = int.from_bytes(raw[HEAD.size:][:4], 'little') not in (0, crc)
             crc = zlib.crc32(raw, crc)
-        if opcode != Opcode.DATA_END or not self._ends_at(end):
-            damage.torn = True
+        damage.torn = opcode != Opcode.DATA_END or not self._ends_at(end)
 
     def _note(self, raw: bytes, offset: int, end: int) -> None:
         """Note what is declared in a record or chunk, and its messages; UNREADABLE."""
@@ -264,7 +260,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 self._declare(next(_records_in(HEAD.pack(opcode, len(record)) + record)),
                               (offset, end))
         if not channels <= self.channels.keys():
-            raise McapError('no whole record declares a channel of its messages')
+            raise McapError
         if times_ns:
             self._places.append(
                 Place(min(times_ns), offset, end, max(times_ns), frozenset(channels)))
@@ -315,7 +311,7 @@ def _records(raw: bytes, max_bytes: int) -> Iterator[tuple[int, bytes]]:
         begin = end + HEAD.size
         end = begin + length
         if end > len(plain):
-            raise McapError('a length in it is wrong')
+            raise McapError
         yield opcode, plain[begin:end]
 
 
@@ -324,22 +320,21 @@ def _unpacked(raw: bytes, max_bytes: int) -> bytes:
     chunk = next(_records_in(raw))
     assert isinstance(chunk, Chunk)
     if chunk.uncompressed_size > max_bytes:
-        raise McapError(f'it unpacks to more than {max_bytes} bytes')
+        raise McapError
     stream: BinaryIO = BytesIO(chunk.data)
     if chunk.compression == 'zstd':
         stream = zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True)
     elif chunk.compression == 'lz4':
         stream = lz4.frame.open(stream)
     elif chunk.compression:
-        raise McapError(f'its compression {chunk.compression[:20]!r} is none of zstd, lz4')
+        raise McapError
     try:
         plain = stream.read(chunk.uncompressed_size + 1)
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
-        raise McapError('it cannot be decompressed') from None
-    if len(plain) != chunk.uncompressed_size:
-        raise McapError('it has not the size that it says it has')
-    if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):
-        raise McapError('its checksum is wrong')
+        raise McapError from None
+    if len(plain) != chunk.uncompressed_size or (
+            chunk.uncompressed_crc not in (0, zlib.crc32(plain))):
+        raise McapError
     return plain
 
 

@@ -42,7 +42,7 @@ def _run(arguments: argparse.Namespace) -> int:
         messages = recover(reader, output)
     for line in reader.damage.lines():
         cli.print_line(line)
-    is_all = not reader.damage.reasons
+    is_all = not (reader.damage.lost_bytes or reader.damage.changed)
     cli.print_line(f'{"kept all" if is_all else "kept"}: {messages} messages, '
                    f'{output.stat().st_size} bytes in {output}')
     return cli.OK if is_all else SOME_LOST

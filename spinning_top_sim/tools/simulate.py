@@ -74,7 +74,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if objection := simulation.trajectory.top.objection:
         cli.print_line(f'spinning-top simulate: warning: {objection}', sys.stderr)
     log_exports.check(arguments.export, [
-        channel.topic for channel in recorded(simulation.channels, values)], values)
+        channel.topic for channel in recorded(simulation.channels, values)])
     cli.check_output(output, *(path for _, path in arguments.export))
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
