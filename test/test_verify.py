@@ -93,10 +93,6 @@ def test_a_missing_message_and_a_changed_journal_are_found(short, tmp_path, caps
         short, tmp_path / 'run.mcap', lambda topic, number, data: (
             data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
     assert not verdict['identical'] and verdict['different'] > 100
-    verdict = verified(capsys, rewritten(
-        short, tmp_path / 'cut.mcap', lambda topic, number, data: (
-            data.replace(b'"l3": 1.7', b'"l3"; 1.7') if topic.endswith('/events') else data)))
-    assert not verdict['identical'] and verdict['first']['topic'].endswith('/events')
 
 
 def test_each_change_that_takes_effect_at_once_is_replayed(short):
@@ -171,25 +167,23 @@ def test_what_a_sensor_delays_or_drops_is_no_gap_and_a_message_that_is_lost_is_o
     {'event': []}, {'event': 'state', 'l3': 1.0, 'lz': 1.0},
     {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18}])
 def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
-    """It is left out: the run is followed to its end all the same."""
     data = messages.string(json.dumps({'t_ns': 0, 'sent_ns': 300_000_000, **event}))
     path = rewritten(short, tmp_path / 'odd.mcap', lambda topic, number, old: (
         [old, data] if topic.endswith('/events') and number == 1 else old))
-    code, content = as_json(capsys, path, '--verify')
-    assert code == 1 and len(content['motions']) >= 2
-    assert any('entry at 1.300000000 s: ' in note or 'cannot be followed' in note
-               for note in content['notes'])
+    code, out, _ = told(capsys, path, '--verify')
+    assert code == 1 and '/pose' in out
+    assert 'journal cannot be used' in out or 'cannot be followed' in out
 
 
 def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
         short, tmp_path, capsys, monkeypatch):
     """A stamp of the year 2096: neither 10^12 samples nor 10^12 steps."""
+    monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
+    monkeypatch.setattr(recorded_run, 'LEAST_STEPS', 5_000)
     path = rewritten(short, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
         4 * 10 ** 18 if (topic, number) == ('/pose', 50) else stamp_ns))
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1 and 'lacks most samples of this run' in out
-    monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
-    monkeypatch.setattr(recorded_run, 'LEAST_STEPS', 5_000)
     t_ns = 3_999_999_998_000_000_000
     far = Event('command', t_ns, t_ns, {'l3': 1.7, 'lz': 1.4}).entries()[0][1]
     path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (

@@ -184,6 +184,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
                 yield topic, list(group)
 
+    def in_file_order(self) -> Iterator[LogMessage]:
+        """Iterate over all messages."""
+        for place in sorted(self._places, key=attrgetter('offset')):
+            yield from self._messages_in(place)
+
     def attached(self) -> Iterator[Metadata | Attachment]:
         """Iterate over metadata and attachments, in file order."""
         for offset, end in self._attached:

@@ -9,7 +9,6 @@ more, and closes the file.  It may hang as a disk does; `possible_loss` tells wh
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import threading
 import time
@@ -84,9 +83,7 @@ class Recorder:
         # (time, bytes): what had left the queue by that time is on the disk.
         self._on_disk = clock(), 0
         self._wake, self._taken = threads.Event(), threads.Event()
-        # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
-        # exit handler runs before daemons are stopped and closes the file properly.
-        atexit.register(self.close)
+        # A daemon, so that a disk that hangs cannot hold up the end of the interpreter.
         self._thread = threads.Thread(target=self._run, name='recorder', daemon=True)
         self._thread.start()
 
@@ -184,7 +181,6 @@ class Recorder:
             with contextlib.suppress(Exception):
                 if self._file is not None:
                     self._file.finish()
-        atexit.unregister(self.close)
 
     def _open(self) -> McapWriter:
         """Return the file that `uri` names; in a folder, under the first free name."""

@@ -18,7 +18,7 @@ def recover(reader: LogReader, output: Path) -> int:
 
     output : must not exist; is removed again where the recovery fails
 
-    Messages are in the order of their log times; chunks, indexes and summary are made anew.
+    Chunks, indexes and summary are made anew.
     Raises LogError or OSError, also if a torn file holds no whole message.
     """
     count = 0
@@ -37,7 +37,7 @@ def recover(reader: LogReader, output: Path) -> int:
             else:
                 writer.add_attachment(record.create_time, record.log_time, record.name,
                                       record.media_type, record.data)
-        for message in reader.messages():
+        for message in reader.in_file_order():
             writer.add_message(channels[message.channel_id], message.log_time, message.data,
                                message.publish_time, message.sequence)
             count += 1

@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages for the tests of the recorder, and what readers find of them."""
+"""Messages for the tests of recordings, and logs of other programs with any messages."""
 
 import struct
-import time
 from collections import Counter
 
 import numpy as np
-from mcap.records import Channel as ChannelRecord
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from spinning_top_sim.recording.recorder import single
-from spinning_top_sim.recording.rosbag2 import RecordedTopic, qos_profiles
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -58,27 +55,10 @@ def write_rows(path, topics, rows, per_chunk=None, metadata=None):
     return path
 
 
-def opened(recorder):
-    """Wait until a recorder has opened its file, or failed."""
-    deadline = time.monotonic() + 20.0
-    while recorder.state == 'opening':
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
-    return recorder
-
-
-def write(recorder, topic_index, log_time_ns, data):
-    recorder.write([single(topic_index, log_time_ns, data)])
-
-
 def some_messages(count: int) -> list[tuple[int, int, bytes]]:
     """Messages of the first two topics in turn, 1 ms apart."""
     makers = (pose_cdr, array_cdr)
     return [(n % 2, EPOCH_NS + n * 1_000_000, makers[n % 2](n)) for n in range(count)]
-
-
-def parsed_qos(text):
-    return qos_profiles(ChannelRecord(1, '/a', 'cdr', {'offered_qos_profiles': text}, 1))
 
 
 def rows_of(begin: int, end: int):

@@ -7,7 +7,6 @@ commands, subscribers that come, go and stall, faults of the disk, a kill, a pow
 `simulate` computes the history again, and all that was sent or promised is compared with it.
 """
 
-import atexit
 import contextlib
 import functools
 import random
@@ -236,8 +235,6 @@ class World:
         with self.disk, mock.patch.object(recorder_module, 'QUEUE_BYTES', QUEUE_BYTES):
             self.machine.run(self._live)
         self.was_killed = not self.is_over
-        for log in self.logs:
-            atexit.unregister(log.recorder.close)
 
     def _live(self):
         self.loop.start()
