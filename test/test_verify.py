@@ -46,7 +46,7 @@ def test_a_log_whose_library_is_missing_is_read_and_only_not_computed_again(
 
 @pytest.mark.parametrize('name', ['stepped', 'columns'])
 def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
-        name, tmp_path, capsys, request):
+        name, tmp_path, capsys, monkeypatch, request):
     path = request.getfixturevalue(name)
     verdict = verified(capsys, path)
     assert verdict['identical'] and verdict['warnings'] == []
@@ -60,12 +60,14 @@ def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
     rng = np.random.default_rng(5)
     places = {topic: (int(rng.integers(4, sizes[topic])), int(rng.integers(8)))
               for topic in counts}
+    here = provenance.environment()
+    monkeypatch.setattr(provenance, 'environment', lambda: {**here, 'platform': 'abacus'})
     verdict = verified(capsys, rewritten(
         path, tmp_path / 'changed.mcap', lambda topic, number, data: (
             flipped(data, *places[topic])
             if topic in places and number == min(1, counts[topic] - 1) else data)))
-    first = verdict['first']
-    assert verdict['different'] == len(counts)
+    first, (warning,) = verdict['first'], verdict['warnings']
+    assert verdict['different'] == len(counts) and 'abacus' in warning
     assert not (verdict['missing'] or verdict['unexpected'])
     assert first['byte'] == places[first['topic']][0]
     assert first['logged'] != first['computed']
@@ -82,12 +84,14 @@ def test_a_difference_names_field_stamp_and_both_values(short, tmp_path, capsys)
     assert 0.0 < abs(logged - computed) < 3e-16
 
 
-def test_a_missing_message_and_a_changed_journal_are_found(short, tmp_path, capsys):
+def test_a_missing_an_added_and_a_shorter_message_and_a_changed_journal_are_found(
+        short, tmp_path, capsys):
     """A digit of a commanded momentum: the motion after it is another."""
+    changes = {10: lambda data: None, 20: lambda data: [data, data], 30: lambda data: data[:-8]}
     verdict = verified(capsys, rewritten(
-        short, tmp_path / 'fewer.mcap', lambda topic, number, data: (
-            None if (topic, number) == ('/pose', 10) else data)))
-    assert (verdict['missing'], verdict['unexpected'], verdict['different']) == (1, 0, 0)
+        short, tmp_path / 'other.mcap', lambda topic, number, data: changes.get(
+            number if topic == '/pose' else -1, lambda data: data)(data)))
+    assert (verdict['missing'], verdict['unexpected'], verdict['different']) == (1, 1, 1)
     assert verdict['first']['stamp_ns'] == 1_100_000_000
     verdict = verified(capsys, rewritten(
         short, tmp_path / 'run.mcap', lambda topic, number, data: (
@@ -106,14 +110,6 @@ def test_each_change_that_takes_effect_at_once_is_replayed(short):
         assert (event in done) is (parameter.effect is Effect.NOW), parameter.name
 
 
-def test_another_machine_is_warned_of(short, capsys, monkeypatch):
-    here = provenance.environment()
-    monkeypatch.setattr(provenance, 'environment', lambda: {**here, 'platform': 'abacus'})
-    verdict = verified(capsys, short)
-    assert verdict['identical']
-    assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
-
-
 def test_a_log_of_1_is_read_and_verified_by_1(capsys):
     """Its history has lists of numbers: a command, a rate, a velocity of the pivot, a state."""
     path = ROOT / 'test/data/log_of_1.mcap'
@@ -129,23 +125,19 @@ def test_a_log_of_1_is_read_and_verified_by_1(capsys):
     assert max(drift for drifts in content['drifts'].values() for drift in drifts.values()) < 1e-14
     assert all(topic['missing'] == 0 for topic in content['topics'].values() if topic['stream'])
     code, _, err = told(capsys, path, '--verify')
-    assert code == 1 and err == (
-        'spinning-top inspect: --verify: it was recorded by spinning_top_sim 1.0.0, which '
-        'draws other noise and computes other last bits: verify it with that version\n')
+    assert code == 1 and err.endswith(
+        'it was recorded by spinning_top_sim 1.0.0, which draws other noise and computes other '
+        'last bits: verify it with that version\n')
 
 
-@pytest.fixture(scope='module')
-def receiver(tmp_path_factory):
+def test_what_a_sensor_delays_or_drops_is_no_gap_and_a_message_that_is_lost_is_one(
+        tmp_path, capsys):
     """A late receiver on a moving pivot, with an outage longer than a block; an IMU with drops."""
     pytest.importorskip('pymap3d')
     values = {'gnss.enabled': 'true', 'gnss.latency': 0.12, 'gnss.outages': '[2.8, 5.0]',
               'pivot.waypoints': '[0.0, 0.0, 0.0, 4.0, 2.0, 5.0]', 'imu.drop_rate': 0.05}
-    return log_of(tmp_path_factory.mktemp('log') / 'gnss.mcap', '--duration', 5, *(
+    receiver = log_of(tmp_path / 'gnss.mcap', '--duration', 5, *(
         part for name, value in values.items() for part in ('-p', f'{name}:={value}')))
-
-
-def test_what_a_sensor_delays_or_drops_is_no_gap_and_a_message_that_is_lost_is_one(
-        receiver, tmp_path, capsys):
     assert verified(capsys, receiver)['identical']
     lossy = rewritten(receiver, tmp_path / 'lossy.mcap', lambda topic, number, data: (
         None if number == 10 else data))

@@ -14,7 +14,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -157,8 +158,8 @@ class Recorder:
         self.end()
         self._thread.join(timeout)
         if self._thread.is_alive():
-            late = f'{self.path or self._uri} could not be closed within {timeout:g} s'
-            return replace(self.counters, error=self.error or late)
+            self.error = self.error or (
+                f'{self.path or self._uri} could not be closed within {timeout:g} s')
         return self.counters
 
     # ----------------------------------------------------------------- in the recorder's thread
@@ -168,7 +169,7 @@ class Recorder:
             self._file = self._open()
             self.state = 'recording'
             self._record(self._file)
-            self.state = 'closed'
+            self.state, self.error = 'closed', None
         except Exception as error:  # whatever it is, the simulation goes on without a log
             self._accepting = False
             self.error = text_of(error) if self.path is None else (
@@ -183,7 +184,7 @@ class Recorder:
                     self._file.finish()
 
     def _open(self) -> McapWriter:
-        """Return the file that `uri` names; in a folder, under the first free name."""
+        """Return the file that `uri` names."""
         with needed('a recording', 'mcap'):
             from spinning_top_sim.recording.writer import McapWriter  # noqa: PLC0415
 
@@ -191,24 +192,15 @@ class Recorder:
         if sum(map(len, metadata.values())) > MAX_BYTES // 2:   # it has keys and lengths, too
             raise LogError('too many events before the recording: a log could not be read; '
                            '~/reset begins a run without any')
-        folder = path = Path(self._uri).expanduser().absolute()
+        path = Path(self._uri).expanduser().absolute()
         if self._uri.endswith('/'):
-            folder.mkdir(parents=True, exist_ok=True)
-        named = self._uri and not path.is_dir()
-        stem, number = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S'), 1
-        while True:
-            if not named:
-                path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
-            try:
-                file = McapWriter(path, self._topics, metadata, compression=self._compression,
-                                  min_free_bytes=self._min_free_bytes)
-                self.path = path
-                return file
-            except LogError as error:
-                # Another node may take a name at any time: only opening shows whether it is free.
-                if named or not isinstance(error.__cause__, FileExistsError):
-                    raise
-            number += 1
+            path.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():       # microseconds, since several nodes may begin at once
+            path /= f'{datetime.now():spinning_top_%Y-%m-%d_%H-%M-%S_%f}.mcap'
+        file = McapWriter(path, self._topics, metadata, compression=self._compression,
+                          min_free_bytes=self._min_free_bytes)
+        self.path = path
+        return file
 
     def _record(self, file: McapWriter) -> None:
         interval = self._max_loss / 2.0
