@@ -192,25 +192,21 @@ def test_a_strangers_file_is_read_and_recovered_and_what_stands_before_a_tear(
         tmp_path, kind, no_sync):
     path, output = tmp_path / 'stranger.mcap', tmp_path / 'whole.mcap'
     messages = write_stranger(path, STRANGERS[kind])
-    with LogReader(path) as reader:
-        assert reader.whole
-        assert [topic[:3] for topic in reader.topics] == [
+    assert run(path, '-o', output)[0] == ALL_KEPT
+    assert seen_by_us(path) == seen_by_mcap(output) == messages
+    with LogReader(output) as ours, open(output, 'rb') as file:
+        assert ours.whole and [topic[:3] for topic in ours.topics] == [
             ('/json', 'thing', 'json'), ('/raw', '', 'octets')]
-    code, out, err = run(path, '-o', output)
-    assert code == ALL_KEPT, (out, err)
-    assert seen_by_us(path) == seen_by_us(output) == seen_by_mcap(output) == messages
-    with open(output, 'rb') as file:
         reader = make_reader(file)
         assert reader.get_header() == Header(profile='', library='a stranger')
-        assert [(record.name, record.metadata) for record in reader.iter_metadata()] == [
-            ('note', {'a': 'ä', 'b': ''})]
-        (attachment,) = reader.iter_attachments()
+        (note,), (attachment,) = reader.iter_metadata(), reader.iter_attachments()
+        assert (note.name, note.metadata) == ('note', {'a': 'ä', 'b': ''})
+        assert (attachment.name, attachment.media_type, attachment.data) == (
+            'calibration.bin', 'x/y', b'\x06' * 3000)
         read = [*reader.iter_messages()]
         assert read[0][1].metadata == {'unit': 'm'} and read[0][0].data == b'{"type": "object"}'
         assert [message.publish_time for *_, message in read] == [
             stamp + 1000 for _, stamp, _ in messages]
-    assert (attachment.name, attachment.media_type, attachment.data) == (
-        'calibration.bin', 'x/y', b'\x06' * 3000)
     content = path.read_bytes()
     ends = [end for opcode, _, end in records_of(content) if opcode in (
         Opcode.MESSAGE, Opcode.CHUNK)]

@@ -74,7 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     cli.check_output(arguments.plot, arguments.animate, *(path for _, path in arguments.export))
     with LogReader(arguments.log) as reader:
-        run, foreign, verdict, exported = None, '', None, []
+        run, foreign, verdict = None, '', None
+        exported: list[str] = []
         try:
             run = read_run_description(reader)
         except ForeignLogError as error:

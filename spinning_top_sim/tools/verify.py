@@ -134,9 +134,8 @@ def _difference(key: tuple[int, str], channel: Channel | None, logged: bytes,
                 computed: bytes) -> Difference:
     sizes = len(logged), len(computed)
     if sizes[0] != sizes[1]:
-        return Difference(*key, 'size', *(f'{size} bytes' for size in sizes), min(sizes))
+        return Difference(*key, 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes))
     at = next(at for at in range(sizes[0]) if logged[at] != computed[at])
-    what, values = f'byte {at}', [f'0x{one[at]:02x}' for one in (logged, computed)]
-    if channel is not None:
-        what, values = channel.template.shown_at(at, logged, computed)
-    return Difference(*key, what, *values, at)
+    what, (one, two) = channel.template.shown_at(at, logged, computed) if channel else (
+        f'byte {at}', (f'0x{logged[at]:02x}', f'0x{computed[at]:02x}'))
+    return Difference(*key, what, one, two, at)

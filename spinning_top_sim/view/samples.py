@@ -79,7 +79,7 @@ class SampledTrack(Track):
         found = attitudes_of(topic, self._imu, stamps, fields)
         assert found is not None
         known_ns, samples = found
-        place = np.full((len(stamps_ns), 3), np.nan)
+        place = np.full((len(known_ns), 3), np.nan)
         if topic in ('pose', 'ground_truth/odom'):
             place = fields[0][np.isin(stamps, known_ns)]
         self.add(known_ns, np.column_stack((samples[MOTION].T, place)))
