@@ -211,7 +211,8 @@ def _motion(number: int, motion: Content, begin_ns: int) -> Iterator[str]:
     for text, key, factor in ROWS:
         expected, seen = (None if one.get(key) is None else one[key] * factor
                           for one in (exact, measured))
-        rows.append((text, _number(expected, 12), _number(seen, 12), _difference(expected, seen)))
+        rows.append((text, _number(expected, 12), _number(seen, 12), _number(
+            None if expected is None or seen is None else seen - expected, 2)))
     yield from cli.table_lines(
         f'motion {number} ({motion["cause"]}), {begin:.6g} to {end:.6g} s: {name}',
         ('', 'exact', 'measured', 'difference'), rows)
@@ -241,15 +242,6 @@ def _verdict(verdict: Content) -> Iterator[str]:
 
 def _number(value: float | None, digits: int = 6) -> str:
     return '' if value is None else f'{value:.{digits}g}'
-
-
-def _difference(expected: float | None, seen: float | None) -> str:
-    if expected is None or seen is None:
-        return ''
-    difference = seen - expected
-    if abs(difference) > abs(expected):         # also where that is 0
-        return f'{difference:.1e} absolute'
-    return f'{difference / abs(expected):.1e}' if difference else '0'
 
 
 main = partial(cli.run, 'inspect', __doc__, add_arguments, _run)
