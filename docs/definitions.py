@@ -5,7 +5,8 @@
 import json
 from pathlib import Path
 
-from spinning_top_sim.recording.rosbag2 import generated_definition
+from rosbags.typesys import Stores, get_typestore
+
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.tools.recorded_run import channels_of
 
@@ -14,8 +15,10 @@ FILE = Path(__file__).parent.parent / 'spinning_top_sim/recording/definitions.js
 
 def definitions() -> str:
     """Return schema and type hash of every type that a stream or an event has."""
-    types = {channel.type_name for channel in channels_of(parameters.checked({}))}
-    return json.dumps({name: generated_definition(name) for name in sorted(
+    types, store = {channel.type_name for channel in channels_of(parameters.checked({}))}, (
+        get_typestore(Stores.ROS2_JAZZY))
+    return json.dumps({name: (store.generate_msgdef(name, ros_version=2)[0],
+                              store.hash_rihs01(name)) for name in sorted(
         types | set(events.TOPICS.values()))}, indent=1) + '\n'
 
 

@@ -13,41 +13,32 @@ import zlib
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
+from helpers.inspected import told
 from helpers.logs import (
-    ALL_KEPT,
-    FAILED,
     MESSAGES_PER_CHUNK,
-    POINT,
-    SOME_LOST,
     STRANGERS,
-    TOPICS,
     flipped,
     records_of,
     run,
     seen_by_mcap,
     seen_by_rosbags,
     seen_by_us,
-    write_anew,
     write_bag,
-    write_log,
     write_stranger,
 )
-from helpers.mutations import repair
-from helpers.recordings import METADATA, write_rows
+from helpers.recordings import METADATA, POSE, TOPICS, write_rows
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, Message
 from mcap.records import Metadata as MetadataRecord
 from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.rosbag2 import compression_of
 from spinning_top_sim.recording.writer import record_bytes
 
-CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8      # bytes before the records in an uncompressed chunk
+ALL_KEPT, FAILED, SOME_LOST = 0, 1, 3
 
 
 def check_with_all_readers(path, messages) -> None:
@@ -55,93 +46,67 @@ def check_with_all_readers(path, messages) -> None:
     assert seen_by_us(path) == seen_by_mcap(path) == seen_by_rosbags(path) == messages
     with open(path, 'rb') as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        values = [message.x if schema.name == POINT else message.data
+        values = [message.pose.position.z if schema.name == POSE else message.data[0]
                   for schema, _, _, message in reader.iter_decoded_messages()]
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     assert values == [float(number) for number in range(len(messages))]
     assert metadata['spinning_top_sim'] == METADATA
-    assert f'message_count: {len(messages)}\n' in metadata['rosbag2']['serialized_metadata']
     with LogReader(path) as reader:
         assert reader.whole and reader.damage.lines() == []
-        assert reader.metadata == metadata
         assert [topic.name for topic in reader.topics] == [topic.name for topic in TOPICS]
-
-
-def cuts(log):
-    """Return for sizes of a torn log its whole chunks, and whether the cut is within a chunk."""
-    edges = [0, *(place for chunk in log.chunks for place in chunk[1:]), len(log.content)]
-    sizes = {cut for edge in edges for cut in range(edge - 10, edge + 11)
-             if 0 <= cut <= len(log.content)}.union(range(0, len(log.content), 97))
-    for size in sorted(sizes, reverse=True):
-        yield (size, sum(end <= size for _, _, end in log.chunks),
-               any(start < size < end for _, start, end in log.chunks))
 
 
 def test_every_cut_keeps_every_whole_chunk(tmp_path, log, no_sync):
     """The exit code says whether a message was in what is gone."""
-    torn, output = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap'
-    seen = {}
+    torn, output, seen = tmp_path / 'torn.mcap', tmp_path / 'whole.mcap', {}
+    edges = [0, *(place for chunk in log.chunks for place in chunk[1:]), len(log.content)]
+    sizes = {cut for edge in edges for cut in range(edge - 10, edge + 11)
+             if 0 <= cut <= len(log.content)}.union(range(0, len(log.content), 97))
     torn.write_bytes(log.content)
-    for size, whole_chunks, in_chunk in cuts(log):
+    for size in sorted(sizes, reverse=True):
         os.truncate(torn, size)
+        whole_chunks = sum(end <= size for _, _, end in log.chunks)
+        is_in_chunk = any(start < size < end for _, start, end in log.chunks)
         code, out, err = run(torn, '-o', output)
         if whole_chunks == 0:
             assert code == FAILED and not output.exists() and err.count('\n') == 1, (size, err)
             continue
         assert ('lost: ' in out) == (code == SOME_LOST) and err == '', (size, out)
-        assert code == (SOME_LOST if in_chunk else ALL_KEPT), (size, out)
+        assert code == (SOME_LOST if is_in_chunk else ALL_KEPT), (size, out)
         with LogReader(torn) as reader:
             assert reader.damage.torn == (not reader.whole) == (size < len(log.content))
-        seen.setdefault(whole_chunks, set()).add(output.read_bytes())
+        seen[output.read_bytes()] = whole_chunks
         output.unlink()
-    assert [len(seen[chunks]) for chunks in (1, 2, 3)] == [1, 1, 1]
-    for whole_chunks, (content,) in seen.items():
-        write_anew(output, content)
+    assert set(seen.values()) == {1, 2, 3}
+    for content, whole_chunks in seen.items():
+        output.write_bytes(content)
         check_with_all_readers(output, log.messages[:whole_chunks * MESSAGES_PER_CHUNK])
 
 
 def test_a_damaged_chunk_is_left_out_and_zeros_end_the_log(tmp_path, log):
     """A file system may leave zeros behind the tear after a power loss."""
-    output = tmp_path / 'whole.mcap'
+    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
     _, start, end = log.chunks[1]
-    path = write_anew(tmp_path / 'a.mcap', flipped(log.content, end - 6))
+    path.write_bytes(flipped(log.content, end - 6))
     kept = log.messages[:MESSAGES_PER_CHUNK] + log.messages[2 * MESSAGES_PER_CHUNK:]
     code, out, _ = run(path, '-o', output)
     assert code == SOME_LOST and f'lost: {end - start} bytes\n' in out
     assert seen_by_us(path) == seen_by_mcap(output) == seen_by_rosbags(output) == kept
     with LogReader(path) as reader:
-        for _ in range(2):
-            assert len([*reader.messages()]) == len(kept)
-        assert reader.whole and reader.left_out == 1
+        assert not reader.whole and not reader.damage.torn
     output.unlink()
-    write_anew(path, log.content[:start] + bytes(3_000_000))
+    path.write_bytes(log.content[:start] + bytes(3_000_000))
     code, out, _ = run(path, '-o', output)
-    assert code == SOME_LOST and 'lost: 3000000 bytes\n' in out and out.count('found: ') == 2
+    assert code == SOME_LOST and 'lost: 3000000 bytes\n' in out
     check_with_all_readers(output, log.messages[:MESSAGES_PER_CHUNK])
 
 
-def test_a_summary_that_does_not_describe_the_file_is_damage(tmp_path):
-    """Also where every checksum is right: a message became a record of some application."""
-    path, output = tmp_path / 'a.mcap', tmp_path / 'whole.mcap'
-    messages = write_log(path, compression='none')
-    content = bytearray(path.read_bytes())
-    number, (_, start, end) = next(
-        (k, one) for k, one in enumerate(records_of(content)) if one[0] == Opcode.CHUNK)
-    content[start + CHUNK_HEAD] = 0x80
-    struct.pack_into('<I', content, start + 33, zlib.crc32(content[start + CHUNK_HEAD:end]))
-    repair(content)
-    write_anew(path, content)
-    code, out, _ = run(path, '-o', output)
-    assert code == SOME_LOST and out.startswith('lost: 1 messages\nfound: 35 messages, where ')
-    assert sorted([*seen_by_mcap(output), messages[1]]) == sorted(messages)
-    # The chunk behind its index.
-    write_log(tmp_path / 'b.mcap')
-    content = bytearray((tmp_path / 'b.mcap').read_bytes())
-    (_, start, middle), (_, _, end) = records_of(content)[number:number + 2]
-    content[start:end] = content[middle:end] + content[start:middle]
-    repair(content)
-    with LogReader(write_anew(path, content)) as reader:
-        assert not reader.whole and sorted(seen_by_us(path)) == sorted(messages)
+def test_a_chunk_that_has_become_another_record_is_a_loss(tmp_path, log):
+    """All lengths are right; the checksum of the data section is not."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(flipped(log.content, log.chunks[1][1]))
+    code, out, _ = run(path)
+    assert code == SOME_LOST and 'found: the checksum of the data section is wrong' in out
 
 
 @pytest.mark.parametrize('torn', [False, True])
@@ -151,12 +116,8 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
     rows = [(number % 2, order.randrange(200), struct.pack('<I', number)) for number in range(600)]
     path = write_rows(tmp_path / 'run.mcap', TOPICS, rows, 50)
     if torn:        # within the indexes of the last chunk
-        content = path.read_bytes()
-        path.write_bytes(content[:max(end for opcode, _, end in records_of(content)
-                                      if opcode == Opcode.MESSAGE_INDEX) - 1])
-    # In a chunk of the file, the messages of a topic are together.
-    rows = [row for begin in range(0, 600, 50)
-            for row in sorted(rows[begin:begin + 50], key=lambda row: row[0])]
+        os.truncate(path, max(end for opcode, _, end in records_of(path.read_bytes())
+                              if opcode == Opcode.MESSAGE_INDEX) - 1)
     wanted = sorted(rows, key=lambda row: row[1])
     stamps = [row[1] for row in rows]
     last = max(stamps[:50])     # of the first chunk
@@ -164,7 +125,7 @@ def test_messages_come_in_the_order_of_their_log_times(tmp_path, torn):
         assert reader.whole == (not torn) and reader.span == (min(stamps), max(stamps))
         for given, chosen in (
                 ({}, lambda topic, stamp, data: True),
-                ({'topics': ['/top/number'], 'start': 70, 'end': 130},
+                ({'topics': [TOPICS[1].name], 'start': 70, 'end': 130},
                  lambda topic, stamp, data: topic and 70 <= stamp < 130),
                 ({'start': last, 'end': last + 1}, lambda topic, stamp, data: stamp == last),
                 ({'topics': []}, lambda *_: False)):
@@ -185,12 +146,12 @@ def message(log_time: int, data: bytes, channel: int = 1) -> bytes:
                                 sequence=0, data=data))
 
 
-def chunk_of(plain: bytes, time: int = 5, compression: str = '', data: bytes | None = None,
+def chunk_of(plain: bytes, compression: str = '', data: bytes | None = None,
              **changed: int) -> bytes:
     return record_bytes(Chunk(**{
         'compression': compression, 'data': plain if data is None else data,
         'uncompressed_size': len(plain), 'uncompressed_crc': zlib.crc32(plain),
-        'message_start_time': time, 'message_end_time': time} | changed))
+        'message_start_time': 5, 'message_end_time': 5} | changed))
 
 
 def padded(record: bytes, extra: bytes) -> bytes:
@@ -201,35 +162,29 @@ def padded(record: bytes, extra: bytes) -> bytes:
 def closed(folder, *records: bytes):
     """Write a file without summary, with the checksum of its data section."""
     content = MCAP0_MAGIC + HEADER + CHANNEL + b''.join(records)
-    return write_anew(folder / 'a.mcap', b''.join([
+    path = folder / 'a.mcap'
+    path.write_bytes(b''.join([
         content, record_bytes(DataEnd(zlib.crc32(content))),
         record_bytes(Footer(summary_start=0, summary_offset_start=0, summary_crc=0)),
         MCAP0_MAGIC]))
-
-
-def data_in(path) -> list[bytes]:
-    return [data for _, _, data in seen_by_us(path)]
+    return path
 
 
 def test_extra_fields_and_unknown_kinds_are_no_damage_and_the_order_is_kept(tmp_path):
     """The specification lets records grow, and gives 0x80 and above to applications."""
+    no_schema = Channel(id=2, topic='/b', message_encoding='x', metadata={}, schema_id=9)
     path = closed(
         tmp_path, padded(struct.pack('<BQ', 0x80, 0), b'of an application'), message(5, b'1'),
         padded(chunk_of(message(5, b'2') + message(5, b'3')), b'\x00' * 20),
         padded(record_bytes(MetadataRecord('note', {'a': 'b'})), b'\x06'), message(5, b'4'),
-        padded(record_bytes(Attachment(1, 2, 'name', 'x/y', b'data')), b'behind'))
+        padded(record_bytes(Attachment(1, 2, 'name', 'x/y', b'data')), b'behind'),
+        record_bytes(no_schema), message(5, b'5', channel=2))
     with LogReader(path) as reader:
         assert reader.whole and not reader.damage.lines()
         assert reader.metadata == {'note': {'a': 'b'}}
     assert run(path, '-o', tmp_path / 'b.mcap')[0] == ALL_KEPT
-    assert data_in(path) == data_in(tmp_path / 'b.mcap') == [b'1', b'2', b'3', b'4']
-
-
-def test_a_channel_whose_schema_is_gone_is_recovered_without(tmp_path):
-    channel = Channel(id=2, topic='/b', message_encoding='x', metadata={}, schema_id=9)
-    path = closed(tmp_path, record_bytes(channel), message(5, b'1', channel=2))
-    assert run(path, '-o', tmp_path / 'b.mcap')[0] == ALL_KEPT
-    assert seen_by_mcap(tmp_path / 'b.mcap') == [('/b', 5, b'1')]
+    assert seen_by_us(path) == seen_by_mcap(tmp_path / 'b.mcap') == [
+        *(('/a', 5, b'%d' % number) for number in range(1, 5)), ('/b', 5, b'5')]
 
 
 @pytest.mark.parametrize('kind', STRANGERS)
@@ -237,66 +192,46 @@ def test_a_strangers_file_is_read_and_recovered_and_what_stands_before_a_tear(
         tmp_path, kind, no_sync):
     path, output = tmp_path / 'stranger.mcap', tmp_path / 'whole.mcap'
     messages = write_stranger(path, STRANGERS[kind])
-    with LogReader(path) as reader:
-        assert reader.whole and reader.damage.lines() == []
-        assert [topic[:3] for topic in reader.topics] == [
+    assert run(path, '-o', output)[0] == ALL_KEPT
+    assert seen_by_us(path) == seen_by_mcap(output) == messages
+    with LogReader(output) as ours, open(output, 'rb') as file:
+        assert ours.whole and [topic[:3] for topic in ours.topics] == [
             ('/json', 'thing', 'json'), ('/raw', '', 'octets')]
-        assert reader.compression == ('', '')
-    code, out, err = run(path, '-o', output)
-    assert code == ALL_KEPT, (out, err)
-    assert seen_by_us(path) == seen_by_us(output) == seen_by_mcap(output) == messages
-    with open(output, 'rb') as file:
         reader = make_reader(file)
         assert reader.get_header() == Header(profile='', library='a stranger')
-        assert [(record.name, record.metadata) for record in reader.iter_metadata()] == [
-            ('note', {'a': 'ä', 'b': ''})]
-        (attachment,) = reader.iter_attachments()
+        (note,), (attachment,) = reader.iter_metadata(), reader.iter_attachments()
+        assert (note.name, note.metadata) == ('note', {'a': 'ä', 'b': ''})
+        assert (attachment.name, attachment.media_type, attachment.data) == (
+            'calibration.bin', 'x/y', b'\x06' * 3000)
         read = [*reader.iter_messages()]
         assert read[0][1].metadata == {'unit': 'm'} and read[0][0].data == b'{"type": "object"}'
         assert [message.publish_time for *_, message in read] == [
             stamp + 1000 for _, stamp, _ in messages]
-    assert (attachment.name, attachment.media_type, attachment.data) == (
-        'calibration.bin', 'x/y', b'\x06' * 3000)
     content = path.read_bytes()
     ends = [end for opcode, _, end in records_of(content) if opcode in (
         Opcode.MESSAGE, Opcode.CHUNK)]
-    for size in range(ends[0], len(content), 1501):
-        write_anew(path, content[:size])
+    for size in range(ends[0], len(content), 2501):
+        path.write_bytes(content[:size])
         output.unlink()
         assert run(path, '-o', output)[0] != FAILED
         kept = seen_by_mcap(output)
         assert kept == messages[:len(kept)] and len(kept) >= sum(end <= size for end in ends)
 
 
-@pytest.mark.parametrize(('form', 'told_by'), [('zstd', 'record'), ('lz4', 'metadata.yaml')])
-def test_messages_that_rosbag2_compressed_are_decompressed_and_recover_keeps_the_mode(
-        tmp_path, form, told_by):
-    compress = {'zstd': zstandard.compress, 'lz4': lz4.frame.compress}[form]
-    messages = write_bag(tmp_path / 'bag', 'MESSAGE', form, compress, record=told_by == 'record')
-    (tmp_path / 'new').mkdir()
-    output = tmp_path / 'new' / 'new.mcap'
-    assert run(tmp_path / 'bag', '-o', output)[0] == ALL_KEPT
-    for place in (tmp_path / 'bag', output):
-        with LogReader(place) as reader:
-            assert reader.compression == ('MESSAGE', form)
-            assert [one.data for one in reader.messages()] == messages
-    if form == 'zstd':      # rosbags knows no other
-        text = reader.metadata['rosbag2']['serialized_metadata'].replace('\n', '\n  ')
-        (tmp_path / 'new' / 'metadata.yaml').write_text(f'rosbag2_bagfile_information:\n  {text}')
-        with AnyReader([tmp_path / 'new']) as bag:
-            assert [bytes(data) for _, _, data in bag.messages()] == messages
-    write_bag(tmp_path / 'plain', 'MESSAGE', form, bytes)       # they are not what it says
-    with LogReader(tmp_path / 'plain') as reader, pytest.raises(
-            LogError, match=r'plain_0\.mcap: a message of /said: .*cannot be decompressed'):
-        list(reader.messages())
-
-
-def test_what_stands_beside_a_log_and_cannot_be_read_is_named(tmp_path):
-    write_bag(tmp_path / 'bag', record=False)
-    (tmp_path / 'bag/metadata.yaml').unlink()
-    (tmp_path / 'bag/metadata.yaml').symlink_to('/proc/self/mem')   # reading it at 0 fails
-    with LogReader(tmp_path / 'bag') as reader, pytest.raises(LogError, match=r'\.yaml: '):
-        list(reader.messages())
+@pytest.mark.parametrize('record', [True, False])
+def test_messages_that_rosbag2_has_compressed_are_refused_and_recover_keeps_them(
+        tmp_path, capsys, record):
+    """The mode is told by a record in the file, or by metadata.yaml beside it."""
+    write_bag(tmp_path / 'bag', 'MESSAGE', record=record)
+    path = tmp_path / 'bag/bag_0.mcap'
+    reason = (f'cannot read {path}: rosbag2 has compressed its messages one by one; `ros2 bag '
+              'convert` makes a bag without that')
+    for option in ((), ('--verify',)):
+        assert told(capsys, path, *option) == (1, '', f'spinning-top inspect: {reason}\n')
+    output = tmp_path / 'bag/new.mcap'
+    assert run(path, '-o', output)[0] == ALL_KEPT
+    assert seen_by_mcap(output) == seen_by_mcap(path)
+    assert told(capsys, output)[2].endswith('makes a bag without that\n')
 
 
 @pytest.mark.parametrize(('form', 'compress', 'split', 'reason'), [
@@ -311,34 +246,27 @@ def test_a_file_that_is_compressed_and_a_split_bag_are_refused(
     assert str(caught.value).endswith(reason)
 
 
-def test_a_long_record_about_a_bag_is_searched_line_by_line():
-    """Not from each of its empty lines to its end, which takes hours for this one."""
-    assert compression_of('\n' * 4_000_000 + 'compression_mode: FILE') == ('FILE', '')
-
-
 # ----------------------------------------------------------------------------------- hostile
 
 FIRST, SECOND = message(5, b'first'), message(5, b'second' * 50)
 
 
 @pytest.mark.parametrize('bad', [
-    chunk_of(FIRST, data=zstandard.compress(FIRST + SECOND), compression='zstd',
-             uncompressed_crc=0),                           # holds more than it says
-    chunk_of(b'', data=lz4.frame.compress(bytes(1 << 26)), compression='lz4',
-             uncompressed_size=1 << 40),                    # says that it unpacks to much
-    chunk_of(FIRST, uncompressed_crc=7), chunk_of(message(5, b'', channel=7)),
+    chunk_of(FIRST, 'zstd', zstandard.compress(FIRST + SECOND), uncompressed_crc=0),   # too much
+    chunk_of(b'', 'lz4', lz4.frame.compress(bytes(1 << 26)), uncompressed_size=1 << 40),
+    chunk_of(FIRST, uncompressed_crc=7), chunk_of(FIRST, 'zstd', b'noise'),
+    chunk_of(message(5, b'', channel=7)), chunk_of(FIRST, 'brotli'), chunk_of(FIRST[:-1]),
     chunk_of(message(5, bytes(5000))), record_bytes(MetadataRecord('big', {'k': 'v' * 5000}))])
 def test_what_is_damaged_or_too_large_is_left_out_alone(tmp_path, bad):
-    path = closed(tmp_path, chunk_of(message(4, b'a'), 4), bad, chunk_of(message(6, b'c'), 6))
+    path = closed(tmp_path, chunk_of(message(4, b'a')), bad, chunk_of(message(6, b'c')))
     with LogReader(path, max_bytes=4000) as reader:
         assert [one.data for one in reader.messages()] == [b'a', b'c']
-        assert reader.damage.lost_bytes == len(bad) and reader.damage.reasons[0]
+        assert reader.damage.lost_bytes == len(bad)
 
 
 def test_a_small_file_whose_chunks_unpack_to_all_memory_is_refused(tmp_path):
     bomb = message(5, b'') + message(9, bytes(1 << 16))
-    path = closed(tmp_path, *(chunk_of(bomb, 5, 'zstd', zstandard.compress(bomb),
-                                       message_end_time=9) for _ in range(9)))
+    path = closed(tmp_path, *[chunk_of(bomb, 'zstd', zstandard.compress(bomb))] * 9)
     with LogReader(path, max_bytes=1 << 20) as reader:
         assert len([*reader.messages()]) == 18
     with LogReader(path, max_bytes=1 << 18) as reader, pytest.raises(
@@ -347,8 +275,7 @@ def test_a_small_file_whose_chunks_unpack_to_all_memory_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize('content', [
-    b'', MCAP0_MAGIC[:5], b'SQLite format 3\x00' + bytes(100), MCAP0_MAGIC + bytes(100), None,
-    os.mkdir, os.mkfifo])
+    b'', b'SQLite format 3\x00' + bytes(100), MCAP0_MAGIC + bytes(100), None, os.mkdir, os.mkfifo])
 def test_what_is_no_log_is_refused(tmp_path, content):
     path = tmp_path / 'file.mcap'
     if content is not None:
@@ -360,15 +287,15 @@ def test_what_is_no_log_is_refused(tmp_path, content):
 
 
 def test_what_cannot_be_written_is_named_and_nothing_is_overwritten(tmp_path, log):
-    path = write_anew(tmp_path / 'run.mcap', log.content)
-    head = write_anew(tmp_path / 'head.mcap', log.content[:log.chunks[0][1]])
-    (tmp_path / 'link.mcap').symlink_to(tmp_path / 'nowhere')
+    path, head = tmp_path / 'run.mcap', tmp_path / 'head.mcap'
+    path.write_bytes(log.content)
+    head.write_bytes(log.content[:log.chunks[0][1]])
     none = tmp_path / 'none'
-    for output in (path, head, tmp_path / 'link.mcap', none / 'whole.mcap'):
+    for output in (path, head, none / 'whole.mcap'):
         reason = (f'there is no directory {none}' if output.parent == none
                   else 'it exists, and nothing is overwritten')
         assert run(path, '-o', output) == (
             FAILED, '', f'spinning-top recover: cannot write {output}: {reason}\n')
     assert run(head) == (FAILED, '', f'spinning-top recover: nothing to save in {head}: there is '
                          'no whole message in it\n')
-    assert path.read_bytes() == log.content and len(list(tmp_path.iterdir())) == 3
+    assert path.read_bytes() == log.content and len(list(tmp_path.iterdir())) == 2

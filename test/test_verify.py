@@ -46,7 +46,7 @@ def test_a_log_whose_library_is_missing_is_read_and_only_not_computed_again(
 
 @pytest.mark.parametrize('name', ['stepped', 'columns'])
 def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
-        name, tmp_path, capsys, request):
+        name, tmp_path, capsys, monkeypatch, request):
     path = request.getfixturevalue(name)
     verdict = verified(capsys, path)
     assert verdict['identical'] and verdict['warnings'] == []
@@ -60,12 +60,14 @@ def test_offline_logs_verify_and_a_changed_bit_is_found_wherever_it_is(
     rng = np.random.default_rng(5)
     places = {topic: (int(rng.integers(4, sizes[topic])), int(rng.integers(8)))
               for topic in counts}
+    here = provenance.environment()
+    monkeypatch.setattr(provenance, 'environment', lambda: {**here, 'platform': 'abacus'})
     verdict = verified(capsys, rewritten(
         path, tmp_path / 'changed.mcap', lambda topic, number, data: (
             flipped(data, *places[topic])
             if topic in places and number == min(1, counts[topic] - 1) else data)))
-    first = verdict['first']
-    assert verdict['different'] == len(counts)
+    first, (warning,) = verdict['first'], verdict['warnings']
+    assert verdict['different'] == len(counts) and 'abacus' in warning
     assert not (verdict['missing'] or verdict['unexpected'])
     assert first['byte'] == places[first['topic']][0]
     assert first['logged'] != first['computed']
@@ -82,21 +84,19 @@ def test_a_difference_names_field_stamp_and_both_values(short, tmp_path, capsys)
     assert 0.0 < abs(logged - computed) < 3e-16
 
 
-def test_a_missing_message_and_a_changed_journal_are_found(short, tmp_path, capsys):
+def test_a_missing_an_added_and_a_shorter_message_and_a_changed_journal_are_found(
+        short, tmp_path, capsys):
     """A digit of a commanded momentum: the motion after it is another."""
+    changes = {10: lambda data: None, 20: lambda data: [data, data], 30: lambda data: data[:-8]}
     verdict = verified(capsys, rewritten(
-        short, tmp_path / 'fewer.mcap', lambda topic, number, data: (
-            None if (topic, number) == ('/pose', 10) else data)))
-    assert (verdict['missing'], verdict['unexpected'], verdict['different']) == (1, 0, 0)
+        short, tmp_path / 'other.mcap', lambda topic, number, data: changes.get(
+            number if topic == '/pose' else -1, lambda data: data)(data)))
+    assert (verdict['missing'], verdict['unexpected'], verdict['different']) == (1, 1, 1)
     assert verdict['first']['stamp_ns'] == 1_100_000_000
     verdict = verified(capsys, rewritten(
         short, tmp_path / 'run.mcap', lambda topic, number, data: (
             data.replace(b'"l3": 1.7', b'"l3": 1.8') if topic.endswith('/events') else data)))
     assert not verdict['identical'] and verdict['different'] > 100
-    verdict = verified(capsys, rewritten(
-        short, tmp_path / 'cut.mcap', lambda topic, number, data: (
-            data.replace(b'"l3": 1.7', b'"l3"; 1.7') if topic.endswith('/events') else data)))
-    assert not verdict['identical'] and verdict['first']['topic'].endswith('/events')
 
 
 def test_each_change_that_takes_effect_at_once_is_replayed(short):
@@ -108,14 +108,6 @@ def test_each_change_that_takes_effect_at_once_is_replayed(short):
         done = [done for _, done in recorded_run.rerun(
             dataclasses.replace(run, events=[event]), run.epoch_ns + 2)]
         assert (event in done) is (parameter.effect is Effect.NOW), parameter.name
-
-
-def test_another_machine_is_warned_of(short, capsys, monkeypatch):
-    here = provenance.environment()
-    monkeypatch.setattr(provenance, 'environment', lambda: {**here, 'platform': 'abacus'})
-    verdict = verified(capsys, short)
-    assert verdict['identical']
-    assert len(verdict['warnings']) == 1 and 'abacus' in verdict['warnings'][0]
 
 
 def test_a_log_of_1_is_read_and_verified_by_1(capsys):
@@ -133,23 +125,19 @@ def test_a_log_of_1_is_read_and_verified_by_1(capsys):
     assert max(drift for drifts in content['drifts'].values() for drift in drifts.values()) < 1e-14
     assert all(topic['missing'] == 0 for topic in content['topics'].values() if topic['stream'])
     code, _, err = told(capsys, path, '--verify')
-    assert code == 1 and err == (
-        'spinning-top inspect: --verify: it was recorded by spinning_top_sim 1.0.0, which '
-        'draws other noise and computes other last bits: verify it with that version\n')
+    assert code == 1 and err.endswith(
+        'it was recorded by spinning_top_sim 1.0.0, which draws other noise and computes other '
+        'last bits: verify it with that version\n')
 
 
-@pytest.fixture(scope='module')
-def receiver(tmp_path_factory):
+def test_what_a_sensor_delays_or_drops_is_no_gap_and_a_message_that_is_lost_is_one(
+        tmp_path, capsys):
     """A late receiver on a moving pivot, with an outage longer than a block; an IMU with drops."""
     pytest.importorskip('pymap3d')
     values = {'gnss.enabled': 'true', 'gnss.latency': 0.12, 'gnss.outages': '[2.8, 5.0]',
               'pivot.waypoints': '[0.0, 0.0, 0.0, 4.0, 2.0, 5.0]', 'imu.drop_rate': 0.05}
-    return log_of(tmp_path_factory.mktemp('log') / 'gnss.mcap', '--duration', 5, *(
+    receiver = log_of(tmp_path / 'gnss.mcap', '--duration', 5, *(
         part for name, value in values.items() for part in ('-p', f'{name}:={value}')))
-
-
-def test_what_a_sensor_delays_or_drops_is_no_gap_and_a_message_that_is_lost_is_one(
-        receiver, tmp_path, capsys):
     assert verified(capsys, receiver)['identical']
     lossy = rewritten(receiver, tmp_path / 'lossy.mcap', lambda topic, number, data: (
         None if number == 10 else data))
@@ -171,25 +159,23 @@ def test_what_a_sensor_delays_or_drops_is_no_gap_and_a_message_that_is_lost_is_o
     {'event': []}, {'event': 'state', 'l3': 1.0, 'lz': 1.0},
     {'event': 'reset', 'parameters': {}, 'epoch_ns': 10 ** 18}])
 def test_an_odd_entry_of_the_journal_is_told(short, tmp_path, capsys, event):
-    """It is left out: the run is followed to its end all the same."""
     data = messages.string(json.dumps({'t_ns': 0, 'sent_ns': 300_000_000, **event}))
     path = rewritten(short, tmp_path / 'odd.mcap', lambda topic, number, old: (
         [old, data] if topic.endswith('/events') and number == 1 else old))
-    code, content = as_json(capsys, path, '--verify')
-    assert code == 1 and len(content['motions']) >= 2
-    assert any('entry at 1.300000000 s: ' in note or 'cannot be followed' in note
-               for note in content['notes'])
+    code, out, _ = told(capsys, path, '--verify')
+    assert code == 1 and '/pose' in out
+    assert 'journal cannot be used' in out or 'cannot be followed' in out
 
 
 def test_a_run_that_no_log_of_its_size_holds_is_not_computed(
         short, tmp_path, capsys, monkeypatch):
     """A stamp of the year 2096: neither 10^12 samples nor 10^12 steps."""
+    monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
+    monkeypatch.setattr(recorded_run, 'LEAST_STEPS', 5_000)
     path = rewritten(short, tmp_path / 'late.mcap', stamp=lambda topic, number, stamp_ns: (
         4 * 10 ** 18 if (topic, number) == ('/pose', 50) else stamp_ns))
     code, out, _ = told(capsys, path, '--verify')
     assert code == 1 and 'lacks most samples of this run' in out
-    monkeypatch.setattr(recorded_run, 'STEPS_A_BYTE', 0)        # they would take a minute
-    monkeypatch.setattr(recorded_run, 'LEAST_STEPS', 5_000)
     t_ns = 3_999_999_998_000_000_000
     far = Event('command', t_ns, t_ns, {'l3': 1.7, 'lz': 1.4}).entries()[0][1]
     path = rewritten(short, tmp_path / 'far.mcap', lambda topic, number, data: (

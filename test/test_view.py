@@ -193,7 +193,7 @@ def test_a_log_is_shown_as_far_as_it_can_be_read(log, shown, tmp_path, capsys):
     torn = tmp_path / 'torn.mcap'
     torn.write_bytes(log.read_bytes()[:-60_000])
     part = LogSource(torn, Desk)
-    assert part.page.message.content == '*torn.mcap is truncated: shown as far as it goes*'
+    assert part.page.message.content == '*torn.mcap is damaged: what is whole is shown*'
     assert shown.span[0] == part.track.span[0] < part.track.span[1] <= shown.span[1]
 
     decode = shown.templates['ground_truth/odom'].decode

@@ -37,13 +37,11 @@ def read_log(path: Path, wanted: Sequence[str] = ()) -> Recorded:
             end_ns = next((one.stamp_ns for one in recorded.run.events
                            if one.event.kind != 'start'), end_ns)
         if not reader.whole:
-            recorded.notes.append('the log is truncated: read as far as it goes')
+            recorded.notes.append('the log is damaged: what is whole is read')
         types = {topic.name: topic.type_name for topic in reader.topics}
         for one in samples(reader, {name: kind for name, kind in types.items() if kind in PLACES},
                            end_ns):
             found[one.kind][one.source].append(one)
-        if reader.left_out:
-            recorded.notes.append('damaged chunks of the log are left out')
     try:
         _choose(recorded, found, wanted)
         recorded.check()

@@ -28,7 +28,7 @@ while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'
 
 exit code: 0 played (also in part: topics left out, ended by a signal),
-2 cannot be played, or is damaged inside
+2 cannot be played, or is damaged
 """
 
 

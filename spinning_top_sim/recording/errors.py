@@ -1,38 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can go wrong before a recording runs, and in reading and recovering logs."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 # What values raise that are not as this package writes them.
 MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 MOST_TEXT = 300             # of a reason
-MOST_REASONS = 20           # of damage that are told
 MAX_BYTES = 128 << 20       # of one record or one uncompressed chunk in memory
 
 
-class RecordingError(RuntimeError):
-    """A recording cannot start, or has stopped; the text names the path or type and the reason."""
-
-
 class LogError(RuntimeError):
-    """A log cannot be read or recovered; the text names the path and the reason."""
+    """A log cannot be read, written or recovered; the text names the path and the reason."""
 
 
 @dataclass
 class Damage:
     """What is wrong with a log."""
 
-    torn: bool                  # its summary is missing or wrong
+    torn: bool = False          # its summary is missing or wrong
     lost_bytes: int = 0         # that cannot be read; indexes do not count
-    lost_messages: int = 0      # that the summary counts and that are not there either
-    reasons: list[str] = field(default_factory=list)
+    changed: bool = False       # what can be read has another checksum than was written
 
     def lines(self) -> list[str]:
-        """Return what is lost, and the first reasons."""
-        lost = {'bytes': self.lost_bytes, 'messages': self.lost_messages}
-        return [*(f'lost: {count} {what}' for what, count in lost.items() if count),
-                *self.reasons[:MOST_REASONS]]
+        """Return a line about each kind of damage."""
+        return [text for text, is_there in (
+            (f'lost: {self.lost_bytes} bytes', self.lost_bytes),
+            ('found: the summary at the end is missing or wrong', self.torn),
+            ('found: the checksum of the data section is wrong', self.changed)) if is_there]
 
 
 def text_of(error: BaseException) -> str:

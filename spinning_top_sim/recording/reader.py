@@ -6,43 +6,34 @@ Lengths lead from record to record, so that no index is needed.
 """
 
 import contextlib
-import heapq
 import itertools
 import os
 import struct
 import zlib
-from collections.abc import Collection, Iterable, Iterator
-from functools import cached_property
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator
+from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
-from mcap import records
-from mcap.exceptions import EndOfFile, McapError
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import FOOTER_SIZE
-from mcap.records import Channel, Footer, Header, McapRecord, Schema
-from mcap.stream_reader import MAGIC_SIZE
+from mcap.records import Attachment, Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema
+from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from spinning_top_sim.recording import rosbag2
 from spinning_top_sim.recording.errors import MAX_BYTES, Damage, LogError
-from spinning_top_sim.recording.parsing import (
-    HEAD,
-    UNREADABLE,
-    decompress,
-    message_layout,
-    records_in,
-    unpacked,
-)
 
-MOST_INDEX = 1 << 20        # bytes behind the last chunk that may be torn without a loss
+HEAD = struct.Struct('<BQ')         # of every record: opcode, length of what follows
+MESSAGE = struct.Struct('<HIQQ')    # channel, sequence, log and publish time, before the data
+UNREADABLE = (McapError, ValueError, OverflowError, struct.error)
 MESSAGE_BYTES = 300         # of memory that a message takes besides its data
+MOST_INDEX = 1 << 20        # bytes behind the last chunk that may be torn without a loss
 BLOCK = 16384               # messages that are grouped together
-NOTED = Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT
-# Where log times stand: the earliest and the latest in a chunk, and that of a message
-TIMES: dict[int, struct.Struct] = {
-    Opcode.CHUNK: struct.Struct('<9xQQ'), Opcode.MESSAGE: struct.Struct('<15xQ')}
 COMPRESSED = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}     # as a whole
 
 
@@ -67,11 +58,21 @@ class LogTopic(NamedTuple):
     channel_id: int
 
 
+class Place(NamedTuple):
+    """Where messages are: a chunk, or a message that is in none."""
+
+    begin_ns: int               # earliest log time
+    offset: int                 # in the file
+    end: int
+    end_ns: int                 # latest log time
+    channels: frozenset[int]
+
+
 class LogReader(contextlib.AbstractContextManager['LogReader']):
     """
-    An MCAP file, open for reading; a context manager.  Raises LogError if it is none.
+    An MCAP file, open for reading; a context manager.
 
-    What is damaged is left out.  A file that was not closed is read through at once.
+    Opening reads it through once.  What is damaged is left out from then on.
 
     Parameters
     ----------
@@ -80,25 +81,31 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     max_bytes : int
         Of the largest record, and the largest uncompressed chunk, that is read; and of the
         messages of other chunks that `messages` holds while it reads one.
+    compressed : bool
+        Read a log whose messages rosbag2 has compressed one by one, and leave them so.
+
+    Raises
+    ------
+    LogError
+        If it is no MCAP file, or its messages are compressed.
 
     Notes
     -----
     Attributes are `path` and `size` [bytes] of the file when it was opened; `profile` and
-    `library`, which its header names; `whole`, whether it was closed, and its summary, if any,
-    describes it; `metadata`, the last of each name; `schemas` and `channels`, mcap's records by
-    id; `span`, the earliest and the latest log time [ns], both 0 without messages; `left_out`,
-    the number of damaged chunks that `messages` has skipped so far.
+    `library`, which its header names; `damage`; `whole`, whether there is none; `metadata`, the
+    last of each name; `schemas` and `channels`, mcap's records by id; `span`, the earliest and the
+    latest log time [ns], both 0 without messages.
     """
 
-    def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES, *,
+                 compressed: bool = False) -> None:
         self.path, self._max_bytes = _file_of(Path(path)), max_bytes
-        self._left_out: set[int] = set()        # offsets of chunks
         self.metadata: dict[str, dict[str, str]] = {}
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        # By the summary: channels in the chunk at an offset, and the number of messages
-        self._channels_in: dict[int, Collection[int]] = {}
-        self._counted: int | None = None
+        self.damage = Damage()
+        self._places: list[Place] = []
+        self._attached: list[tuple[int, int]] = []      # begin and end of records
         try:
             if self.path.exists() and not self.path.is_file():     # opening a pipe would block
                 raise LogError(f'cannot read {self.path}: it is no regular file')
@@ -109,21 +116,16 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             self.size = os.fstat(self._file.fileno()).st_size
             header = self._read_header()
             self.profile, self.library = header.profile, header.library
-            try:
-                self._read_summary()
-                closed = True
-            except UNREADABLE:
-                closed = False
-            self._places = sorted(self._find_places())
-            self.whole = closed and self._channels_in.keys() <= {
-                offset for _, offset, _, _ in self._places}
-            self.span = (self._places[0][0] if self._places else 0,
-                         max((end_ns for _, _, end_ns, _ in self._places), default=0))
-            if not self.whole or not self.channels:
-                _ = self.damage     # notes what is declared in chunks
+            self._read_through()
+            if not compressed and rosbag2.has_compressed_messages(self.path, self.metadata):
+                raise LogError(f'cannot read {self.path}: rosbag2 has compressed its messages one '
+                               'by one; `ros2 bag convert` makes a bag without that')
         except BaseException:
             self.close()
             raise
+        self._places.sort()
+        self.span = (min((place.begin_ns for place in self._places), default=0),
+                     max((place.end_ns for place in self._places), default=0))
 
     def close(self) -> None:
         """Close the file; nothing can be read any more."""
@@ -131,6 +133,10 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    @property
+    def whole(self) -> bool:
+        return self.damage == Damage()
 
     @property
     def topics(self) -> tuple[LogTopic, ...]:
@@ -141,161 +147,81 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             for number, channel in sorted(self.channels.items())
             for schema in [self.schemas.get(channel.schema_id)])
 
-    @property
-    def left_out(self) -> int:
-        return len(self._left_out)
-
-    @cached_property
-    def compression(self) -> tuple[str, str]:
-        """Mode, as 'MESSAGE', and format of compression, if rosbag2 has compressed; LogError."""
-        text = self.metadata.get(rosbag2.BAG_METADATA, {}).get('serialized_metadata', '')
-        beside = self.path.with_name('metadata.yaml')
-        try:
-            if not text and beside.is_file():
-                text = beside.read_text(errors='replace')
-        except OSError as error:
-            raise LogError(f'cannot read {beside}: {error.strerror}') from error
-        return rosbag2.compression_of(text)
-
-    @cached_property
-    def damage(self) -> Damage:
-        """What is wrong with the file; reads all of it."""
-        for _ in self.parts():
-            pass
-        return self.damage
-
-    def messages(self, topics: Iterable[str] | None = None, start: int | None = None,
-                 end: int | None = None) -> Iterator[LogMessage]:
+    def messages(self, topics: Iterable[str] | None = None, start: int = 0,
+                 end: int = 1 << 64) -> Iterator[LogMessage]:
         """
         Iterate over the messages in the order of their log times, equal ones in file order.
 
-        Parameters
-        ----------
-        topics : iterable of str, optional
-            Names; default: all.
-        start, end : int, optional
-            Log times [ns]; `end` is exclusive.
+        topics : names; default: all
+        start, end : log times [ns]; `end` is exclusive
 
-        Yields
-        ------
-        LogMessage
-            Decompressed, where rosbag2 has compressed messages one by one.
-
-        Raises
-        ------
-        LogError
-            For a message that cannot be decompressed, and for too many chunks of one time.
+        Raises LogError for too many chunks of one time.
         """
         names = None if topics is None else frozenset(topics)
         wanted = {number for number, channel in self.channels.items()
                   if names is None or channel.topic in names}
-        times = range(start or 0, 1 << 64 if end is None else end)
-        # Of each chunk that is read and not yet passed: log time of its next message, place,
-        # that message, those after it, and the bytes of memory of all
-        held: list[tuple[int, int, LogMessage, Iterator[LogMessage], int]] = []
-        held_bytes = 0
-        mode, form = self.compression
-        for start_ns, offset, end_ns, its_end in [*self._places, (1 << 64, 0, 0, 0)]:
-            while held and held[0] < (start_ns, offset):
-                _, place, message, others, size = held[0]
-                if (following := next(others, None)) is None:
-                    heapq.heappop(held)
-                    held_bytes -= size
-                else:
-                    heapq.heapreplace(held, (following.log_time, place, following, others, size))
-                yield self._decompressed(message, form) if mode == 'MESSAGE' else message
-            if end_ns < times.start or start_ns >= times.stop or wanted.isdisjoint(
-                    self._channels_in.get(offset) or wanted):
+        # Of the chunks that are read: log time, place in the file, and in the chunk; message
+        waiting: list[tuple[int, int, int, LogMessage]] = []
+        for place in [*self._places, Place(1 << 64, 0, 0, 1 << 64, frozenset())]:
+            passed = bisect_left(waiting, place[:2])
+            yield from (one[-1] for one in waiting[:passed])
+            del waiting[:passed]
+            if place.end_ns < start or place.begin_ns >= end or wanted.isdisjoint(place.channels):
                 continue
-            if held_bytes > self._max_bytes:
+            if sum(MESSAGE_BYTES + len(one[-1].data) for one in waiting) > self._max_bytes:
                 raise LogError(f'cannot read {self.path}: its chunks overlap in time, and '
                                f'more than {self._max_bytes} bytes of them are not held')
-            try:
-                messages, _ = self._records(self._at(offset, its_end))
-            except UNREADABLE:
-                self._left_out.add(offset)
-                continue
-            chosen = sorted((one for one in messages if one.channel_id in wanted
-                             and one.log_time in times), key=attrgetter('log_time'))
-            if chosen:
-                size = sum(MESSAGE_BYTES + len(one.data) for one in chosen)
-                held_bytes += size
-                first, *later = chosen
-                heapq.heappush(held, (first.log_time, offset, first, iter(later), size))
-
-    def _decompressed(self, message: LogMessage, form: str) -> LogMessage:
-        try:
-            return message._replace(
-                data=decompress(message.data, form or 'unknown', self._max_bytes))
-        except McapError as error:
-            raise LogError(f'cannot read {self.path}: a message of {message.topic}: '
-                           f'{error}') from None
+            waiting += [(one.log_time, place.offset, number, one)
+                        for number, one in enumerate(self._messages_in(place))
+                        if one.channel_id in wanted and start <= one.log_time < end]
+            waiting.sort()
 
     def groups(self, topics: Iterable[str] | None = None,
                ) -> Iterator[tuple[str, list[LogMessage]]]:
-        """
-        Iterate over the messages of topics as `messages` does, some of one topic at a time.
-
-        Yields
-        ------
-        (str, list of LogMessage)
-            A topic, and messages in the order of `messages`.
-        """
+        """Iterate over messages as `messages` does, some of one topic at a time, and its name."""
         messages = self.messages(topics)
         while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
                 yield topic, list(group)
 
-    def parts(self) -> Iterator[tuple[int, list[LogMessage], list[McapRecord]]]:
-        """
-        Iterate over what can be read, in file order; then `damage` tells what cannot.
+    def in_file_order(self) -> Iterator[LogMessage]:
+        """Iterate over all messages."""
+        for place in sorted(self._places, key=attrgetter('offset')):
+            yield from self._messages_in(place)
 
-        Yields
-        ------
-        (int, list of LogMessage, list of McapRecord)
-            The offset of a record or chunk, its messages, and what it declares or attaches.
-        """
-        damage = Damage(not self.whole)
-        damage.reasons += ['found: the summary at the end is missing or wrong'] * damage.torn
-        crc, count = zlib.crc32(MCAP0_MAGIC), 0
-        for opcode, offset, end in self._heads():
-            # What follows the last chunk is made anew.
-            if damage.torn and end > self.size < offset + MOST_INDEX and opcode in (
-                    Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.DATA_END):
-                break
-            try:
-                raw = self._at(offset, end)
-                messages, others = self._records(raw)
-            except UNREADABLE as error:
-                lost = min(end, self.size) - offset
-                damage.lost_bytes += lost
-                damage.reasons.append(f'found: {lost} bytes at byte {offset}: '
-                                      f'{str(error) or "a length in it is wrong"}')
-                continue
-            if opcode == Opcode.DATA_END and not damage.lost_bytes and (
-                    int.from_bytes(raw[9:13], 'little') not in (0, crc)):
-                damage.reasons.append('found: the checksum of the data section is wrong')
-            crc = zlib.crc32(raw, crc)
-            count += len(messages)
-            yield offset, messages, others
-        if self._counted not in (None, count) and not damage.lost_bytes:
-            damage.lost_messages = max(self._counted - count, 0)
-            damage.reasons.append(f'found: {count} messages, where the summary counts '
-                                  f'{self._counted}')
-        self.damage = damage
+    def attached(self) -> Iterator[Metadata | Attachment]:
+        """Iterate over metadata and attachments, in file order."""
+        for offset, end in self._attached:
+            record = next(_records_in(self._at(offset, end)))
+            if isinstance(record, Metadata | Attachment):
+                yield record
 
     # -------------------------------------------------------------------------------- the bytes
 
     def _at(self, offset: int, end: int) -> bytes:
         """Return the bytes there.  Raises UNREADABLE if there are fewer, or too many."""
-        if not 0 <= offset <= end <= self.size:
-            raise EndOfFile('no whole record')
-        if end - offset > self._max_bytes:
-            raise McapError(f'more than {self._max_bytes} bytes are not read')
+        if end > min(self.size, offset + self._max_bytes):
+            raise McapError
         try:
-            return os.pread(self._file.fileno(), end - offset, offset)
+            raw = os.pread(self._file.fileno(), end - offset, offset)
         except OSError as error:
             raise LogError(f'cannot read {self.path}: {error.strerror}') from error
+        if len(raw) < end - offset:     # it has become shorter
+            raise McapError
+        return raw
+
+    def _read_header(self) -> Header:
+        """Return the header.  Raises LogError for no MCAP file."""
+        magic = self._at(0, min(MAGIC_SIZE, self.size))
+        with contextlib.suppress(*UNREADABLE):
+            _, offset, end = next(self._heads(), (0, 0, 0))
+            header = next(_records_in(self._at(offset, end)))
+            if magic == MCAP0_MAGIC and isinstance(header, Header):
+                return header
+        reason = 'it is no MCAP file' if magic else 'it is empty'
+        if form := COMPRESSED.get(magic[:4]):
+            reason = f'it is compressed as a whole, unpack it by {form} -d'
+        raise LogError(f'cannot read {self.path}: {reason}')
 
     def _heads(self) -> Iterator[tuple[int, int, int]]:
         """Yield opcode, begin and end of records, of which the last may end behind the file."""
@@ -308,90 +234,113 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
             end = offset + HEAD.size + length if opcode else self.size + 1
             yield opcode, offset, end
 
-    def _records(self, raw: bytes) -> tuple[list[LogMessage], list[McapRecord]]:
-        """Return the messages, and after noting them the others, in a record; UNREADABLE."""
-        plain = unpacked(raw, self._max_bytes) if raw[0] == Opcode.CHUNK else raw
-        messages: list[LogMessage] = []
-        others: list[McapRecord] = []
-        at = 0
-        while at < len(plain):
-            opcode, length = HEAD.unpack_from(plain, at)
-            end = at + HEAD.size + length
-            if end > len(plain):
-                raise McapError('a length in it is wrong')
+    def _read_through(self) -> None:
+        """Note what is declared and where, and what is damaged."""
+        damage, crc, opcode = self.damage, zlib.crc32(MCAP0_MAGIC), 0
+        for opcode, offset, end in self._heads():
+            try:
+                raw = self._at(offset, end)
+                self._note(raw, offset, end)
+            except UNREADABLE:
+                lost = min(end, self.size) - offset
+                # What follows the last chunk of a log tells nothing new.
+                if end <= self.size or lost > MOST_INDEX or opcode not in (
+                        Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.DATA_END):
+                    damage.lost_bytes += lost
+                continue
+            if opcode == Opcode.DATA_END and not damage.lost_bytes:
+                damage.changed = int.from_bytes(raw[HEAD.size:][:4], 'little') not in (0, crc)
+            crc = zlib.crc32(raw, crc)
+        damage.torn = opcode != Opcode.DATA_END or not self._ends_at(end)
+
+    def _note(self, raw: bytes, offset: int, end: int) -> None:
+        """Note what is declared in a record or chunk, and its messages; UNREADABLE."""
+        times_ns, channels = [], set()
+        for opcode, record in _records(raw, self._max_bytes):
             if opcode == Opcode.MESSAGE:
-                end = self._add_messages(messages, plain, at, message_layout(length))
-            elif opcode in NOTED:
-                others.append(next(records_in(plain[at:end])))
-                self._declare(others[-1])
-            at = end
-        return messages, others
+                channel, _, log_time, _ = MESSAGE.unpack_from(record)
+                times_ns.append(log_time)
+                channels.add(channel)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT):
+                self._declare(next(_records_in(HEAD.pack(opcode, len(record)) + record)),
+                              (offset, end))
+        if not channels <= self.channels.keys():
+            raise McapError
+        if times_ns:
+            self._places.append(
+                Place(min(times_ns), offset, end, max(times_ns), frozenset(channels)))
 
-    def _add_messages(self, found: list[LogMessage], plain: bytes, at: int,
-                      layout: struct.Struct) -> int:
-        """Add the messages of this layout that begin there; return where they end; UNREADABLE."""
-        # Those of a topic, which follow one another in our chunks, are unpacked together.
-        last = len(plain) - (len(plain) - at) % layout.size
-        length = layout.size - HEAD.size
-        try:
-            for opcode, its_length, channel, sequence, log_time, publish_time, data in (
-                    layout.iter_unpack(memoryview(plain)[at:last])):
-                if opcode != Opcode.MESSAGE or its_length != length:
-                    break
-                found.append(LogMessage(self.channels[channel].topic, log_time, publish_time,
-                                        sequence, data, channel))
-                at += layout.size
-        except KeyError:
-            raise McapError('no whole record declares a channel of its messages') from None
-        return at
-
-    def _declare(self, record: McapRecord) -> None:
+    def _declare(self, record: McapRecord, place: tuple[int, int]) -> None:
         """Note a schema, a channel or metadata; of several with an id, the first counts."""
-        if isinstance(record, records.Metadata):
-            self.metadata[record.name] = record.metadata
-        elif isinstance(record, Schema):
+        if isinstance(record, Schema):
             self.schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
             self.channels.setdefault(record.id, record)
-        elif isinstance(record, records.ChunkIndex):
-            self._channels_in[record.chunk_start_offset] = record.message_index_offsets
-        elif isinstance(record, records.Statistics):
-            self._counted = record.message_count
+        else:
+            self._attached.append(place)
+            if isinstance(record, Metadata):
+                self.metadata[record.name] = record.metadata
 
-    def _find_places(self) -> Iterator[tuple[int, int, int, int]]:
-        """Yield (first time, offset, last time, end) of chunks and messages; note the others."""
-        for opcode, offset, end in self._heads():
-            with contextlib.suppress(*UNREADABLE):
-                if opcode in TIMES and end <= self.size:
-                    times = TIMES[opcode].unpack(self._at(offset, offset + TIMES[opcode].size))
-                    yield times[0], offset, times[-1], end
-                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
-                    self._records(self._at(offset, end))
-
-    def _read_summary(self) -> None:
-        """Note what the summary declares.  UNREADABLE if it is damaged or the file is torn."""
-        footer_at = self.size - FOOTER_SIZE - MAGIC_SIZE
-        footer = next(records_in(self._at(footer_at, self.size)))
-        if not isinstance(footer, Footer):
-            raise McapError
-        summary = self._at(footer.summary_start or footer_at, self.size)
-        if footer.summary_crc not in (0, zlib.crc32(summary[:-MAGIC_SIZE - 4])):
-            raise McapError
-        for record in records_in(summary):     # to the footer, and the magic behind it
-            self._declare(record)
-
-    def _read_header(self) -> Header:
-        """Return the header.  Raises LogError for no MCAP file."""
-        magic = self._at(0, min(MAGIC_SIZE, self.size))
+    def _ends_at(self, offset: int) -> bool:
+        """Return whether a summary with the right checksum, and the end of the file are there."""
         with contextlib.suppress(*UNREADABLE):
-            _, offset, end = next(self._heads(), (0, 0, 0))
-            header = next(records_in(self._at(offset, end)))
-            if magic == MCAP0_MAGIC and isinstance(header, Header):
-                return header
-        reason = 'it is no MCAP file' if magic else 'it is empty'
-        if form := COMPRESSED.get(magic[:4]):
-            reason = f'it is compressed as a whole, unpack it by {form} -d'
-        raise LogError(f'cannot read {self.path}: {reason}')
+            rest = self._at(offset, self.size)
+            *_, footer = _records_in(rest)
+            return isinstance(footer, Footer) and (
+                footer.summary_crc in (0, zlib.crc32(rest[:-MAGIC_SIZE - 4])))
+        return False
+
+    def _messages_in(self, place: Place) -> Iterator[LogMessage]:
+        try:
+            for opcode, record in _records(self._at(place.offset, place.end), self._max_bytes):
+                if opcode == Opcode.MESSAGE:
+                    channel, sequence, log_time, publish_time = MESSAGE.unpack_from(record)
+                    yield LogMessage(self.channels[channel].topic, log_time, publish_time,
+                                     sequence, record[MESSAGE.size:], channel)
+        except UNREADABLE as error:
+            raise LogError(f'cannot read {self.path}: it has changed meanwhile') from error
+
+
+def _records_in(raw: bytes) -> Iterator[McapRecord]:
+    """Iterate over the records in bytes as mcap reads them; UNREADABLE."""
+    return StreamReader(BytesIO(raw), skip_magic=True, emit_chunks=True).records
+
+
+def _records(raw: bytes, max_bytes: int) -> Iterator[tuple[int, bytes]]:
+    """Yield opcode and content of a record, or of each in it if it is a chunk; UNREADABLE."""
+    # Objects of mcap for all messages would take twice the time of `inspect`.
+    plain = _unpacked(raw, max_bytes) if raw[0] == Opcode.CHUNK else raw
+    end = 0
+    while end < len(plain):
+        opcode, length = HEAD.unpack_from(plain, end)
+        begin = end + HEAD.size
+        end = begin + length
+        if end > len(plain):
+            raise McapError
+        yield opcode, plain[begin:end]
+
+
+def _unpacked(raw: bytes, max_bytes: int) -> bytes:
+    """Return the records in a chunk, which mcap would unpack to any size; UNREADABLE."""
+    chunk = next(_records_in(raw))
+    assert isinstance(chunk, Chunk)
+    if chunk.uncompressed_size > max_bytes:
+        raise McapError
+    stream: BinaryIO = BytesIO(chunk.data)
+    if chunk.compression == 'zstd':
+        stream = zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True)
+    elif chunk.compression == 'lz4':
+        stream = lz4.frame.open(stream)
+    elif chunk.compression:
+        raise McapError
+    try:
+        plain = stream.read(chunk.uncompressed_size + 1)
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
+        raise McapError from None
+    if len(plain) != chunk.uncompressed_size or (
+            chunk.uncompressed_crc not in (0, zlib.crc32(plain))):
+        raise McapError
+    return plain
 
 
 def _file_of(path: Path) -> Path:

@@ -3,26 +3,26 @@
 Recording while the simulation runs: bounded loss, bounded memory, and no waiting for a disk.
 
 The caller only appends to a queue.  The recorder's thread opens the file, writes chunks at least
-every half `max_loss`, so that a SIGKILL takes no more, and closes the file.  Another thread, which
-may hang as a disk does, brings them to the disk; `possible_loss` tells what a power loss takes.
+every half `max_loss`, brings them to the disk, so that neither a SIGKILL nor a power loss takes
+more, and closes the file.  It may hang as a disk does; `possible_loss` tells what would be lost.
 """
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.recording.errors import MAX_BYTES, RecordingError, text_of, why_not_written
+from spinning_top_sim.recording.errors import MAX_BYTES, LogError, text_of, why_not_written
 from spinning_top_sim.recording.provenance import environment
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 
@@ -83,12 +83,8 @@ class Recorder:
         self._accepting = True
         # (time, bytes): what had left the queue by that time is on the disk.
         self._on_disk = clock(), 0
-        self._sync_error: Exception | None = None
-        self._syncing: threading.Thread | None = None
         self._wake, self._taken = threads.Event(), threads.Event()
-        # A daemon, so that a forgotten recording cannot hold up the end of the interpreter; the
-        # exit handler runs before daemons are stopped and closes the file properly.
-        atexit.register(self.close)
+        # A daemon, so that a disk that hangs cannot hold up the end of the interpreter.
         self._thread = threads.Thread(target=self._run, name='recorder', daemon=True)
         self._thread.start()
 
@@ -162,8 +158,8 @@ class Recorder:
         self.end()
         self._thread.join(timeout)
         if self._thread.is_alive():
-            late = f'{self.path or self._uri} could not be closed within {timeout:g} s'
-            return replace(self.counters, error=self.error or late)
+            self.error = self.error or (
+                f'{self.path or self._uri} could not be closed within {timeout:g} s')
         return self.counters
 
     # ----------------------------------------------------------------- in the recorder's thread
@@ -173,7 +169,7 @@ class Recorder:
             self._file = self._open()
             self.state = 'recording'
             self._record(self._file)
-            self.state = 'closed'
+            self.state, self.error = 'closed', None
         except Exception as error:  # whatever it is, the simulation goes on without a log
             self._accepting = False
             self.error = text_of(error) if self.path is None else (
@@ -184,40 +180,27 @@ class Recorder:
             self._taken.set()
             # Cutting off the truncated chunk may have freed enough space for the summary.
             with contextlib.suppress(Exception):
-                if self._syncing is not None:
-                    self._syncing.join()
                 if self._file is not None:
                     self._file.finish()
-        atexit.unregister(self.close)
 
     def _open(self) -> McapWriter:
-        """Return the file that `uri` names; in a folder, under the first free name."""
+        """Return the file that `uri` names."""
         with needed('a recording', 'mcap'):
-            from spinning_top_sim.recording.writer import McapWriter, log_head  # noqa: PLC0415
+            from spinning_top_sim.recording.writer import McapWriter  # noqa: PLC0415
 
         metadata = {**self._metadata(), **environment()}
         if sum(map(len, metadata.values())) > MAX_BYTES // 2:   # it has keys and lengths, too
-            raise RecordingError('too many events before the recording: a log could not be read; '
-                                 '~/reset begins a run without any')
-        head = log_head(self._topics, metadata)
-        folder = path = Path(self._uri).expanduser().absolute()
+            raise LogError('too many events before the recording: a log could not be read; '
+                           '~/reset begins a run without any')
+        path = Path(self._uri).expanduser().absolute()
         if self._uri.endswith('/'):
-            folder.mkdir(parents=True, exist_ok=True)
-        named = self._uri and not path.is_dir()
-        stem, number = time.strftime('spinning_top_%Y-%m-%d_%H-%M-%S'), 1
-        while True:
-            if not named:
-                path = folder / f'{stem}{f"_{number}" if number > 1 else ""}.mcap'
-            try:
-                file = McapWriter(path, head, compression=self._compression,
-                                  min_free_bytes=self._min_free_bytes)
-                self.path = path
-                return file
-            except RecordingError as error:
-                # Another node may take a name at any time: only opening shows whether it is free.
-                if named or not isinstance(error.__cause__, FileExistsError):
-                    raise
-            number += 1
+            path.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():       # microseconds, since several nodes may begin at once
+            path /= f'{datetime.now():spinning_top_%Y-%m-%d_%H-%M-%S_%f}.mcap'
+        file = McapWriter(path, self._topics, metadata, compression=self._compression,
+                          min_free_bytes=self._min_free_bytes)
+        self.path = path
+        return file
 
     def _record(self, file: McapWriter) -> None:
         interval = self._max_loss / 2.0
@@ -237,36 +220,14 @@ class Recorder:
             if closing or now >= next_flush:
                 next_flush = now + interval
                 file.flush()
-                if closing and self._syncing is not None:
-                    self._syncing.join()
-                if self._sync_error is not None:
-                    raise self._sync_error
                 file.check_disk(self._min_free_bytes)
                 if closing:
                     file.finish()
                     return
-                self._begin_sync(file, now)
+                if self._bytes_out != self._on_disk[1]:
+                    file.sync()
+                self._on_disk = now, self._bytes_out
             self._wake.wait(max(0.0, next_flush - self._clock()))
-
-    def _begin_sync(self, file: McapWriter, now: float) -> None:
-        if self._syncing is not None and self._syncing.is_alive():
-            return
-        written = now, self._bytes_out
-        if self._bytes_out == self._on_disk[1]:
-            self._on_disk = written
-        else:
-            self._syncing = self._threads.Thread(
-                target=self._sync, args=(file, written), name='recorder sync', daemon=True)
-            self._syncing.start()
-
-    def _sync(self, file: McapWriter, written: tuple[float, int]) -> None:
-        try:
-            file.sync()
-        except Exception as error:
-            self._sync_error = error
-            self._wake.set()
-        else:
-            self._on_disk = written
 
 
 def single(topic_index: int, log_time_ns: int, data: bytes) -> Rows:

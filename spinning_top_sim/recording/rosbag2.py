@@ -11,13 +11,13 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 
 from spinning_top_sim.installation import read_table
-from spinning_top_sim.recording.errors import RecordingError
 
 if TYPE_CHECKING:       # nodes need this module without mcap
     from mcap.records import Channel
@@ -58,27 +58,20 @@ class RecordedTopic(NamedTuple):
     type_name: str          # 'package/msg/Type'
     qos: Qos = MappingProxyType({})     # offered; what is left out is as in DEFAULT_QOS
 
-
-def find_definition(type_name: str) -> tuple[str, str]:
-    """Return what `generated_definition` does, at once for the types of our streams."""
-    # docs/definitions.py writes the file: to load the types of rosbags takes 70 ms.
-    text, type_hash = read_table('recording/definitions.json').get(type_name) or (
-        generated_definition(type_name))
-    return text, type_hash
+    @property
+    def offered(self) -> Qos:
+        return {**DEFAULT_QOS, **self.qos}
 
 
-def generated_definition(type_name: str) -> tuple[str, str]:
+def definition(type_name: str) -> tuple[str, str]:
     """
-    Return schema (`ros2msg`) and type hash (REP-2011) of a type of ROS 2 Jazzy.
+    Return schema (`ros2msg`) and type hash (REP-2011) of a type that a stream has.
 
     Other than rosbag2's, the schema, which is the definition followed by those it depends on, has
-    no comments.  Raises RecordingError for another type.
+    no comments.
     """
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-    types = get_typestore(Stores.ROS2_JAZZY)
-    if type_name not in types.fielddefs:
-        raise RecordingError(f'there is no message type {type_name} in ROS 2 Jazzy')
-    return types.generate_msgdef(type_name, ros_version=2)[0], types.hash_rihs01(type_name)
+    text, type_hash = read_table('recording/definitions.json')[type_name]
+    return text, type_hash
 
 
 def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
@@ -110,43 +103,38 @@ def _understood(value: Any, default: Any, names: Sequence[str] = ()) -> Any:
     return number
 
 
-def compression_of(text: str) -> tuple[str, str]:
-    """
-    Return how rosbag2 has compressed a bag beyond MCAP's chunks: mode and format.
-
-    text : of a `rosbag2` record, or of a bag's metadata.yaml
-    """
-    mode, form = (re.search(rf'^[ \t]*compression_{key}:[ \t]*["\']?([\w.-]*)', text, re.MULTILINE)
-                  for key in ('mode', 'format'))
-    if not mode or mode[1].upper() in ('', 'NONE'):
-        return '', ''
-    return mode[1].upper(), form[1] if form else ''
+def has_compressed_messages(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> bool:
+    """Return whether rosbag2 has compressed the messages of a log one by one."""
+    text = metadata.get(BAG_METADATA, {}).get('serialized_metadata', '')
+    beside = path.with_name('metadata.yaml')
+    if not text and beside.is_file():
+        text = beside.read_text(errors='replace')
+    return bool(re.search(r'^[ \t]*compression_mode:[ \t]*["\']?message', text, re.M | re.I))
 
 
-def bag_metadata(topics: Sequence[tuple[Channel, str, int]], file_name: str, start_ns: int,
-                 end_ns: int, compression: tuple[str, str] = ('', '')) -> dict[str, str]:
-    """Return the `rosbag2` record; `topics` are channels, types and message counts."""
+def bag_metadata(topics: Sequence[RecordedTopic], counts: Sequence[int], file_name: str,
+                 start_ns: int, end_ns: int) -> dict[str, str]:
+    """Return the `rosbag2` record; `counts` are numbers of messages by topic."""
     # A file name may hold bytes that are no text: they must not spoil the closing of a log.
     file_name = file_name.encode(errors='replace').decode()
     numbers = {'starting_time': {'nanoseconds_since_epoch': start_ns},
-               'duration': {'nanoseconds': end_ns - start_ns},
-               'message_count': sum(messages for _, _, messages in topics)}
+               'duration': {'nanoseconds': end_ns - start_ns}, 'message_count': sum(counts)}
     return {'serialized_metadata': as_yaml({
         'version': 9,   # of rosbag2_storage::BagMetadata in jazzy
         'storage_identifier': 'mcap',
         **numbers,
         'topics_with_message_count': [
             {'topic_metadata': {
-                'name': channel.topic,
-                'type': type_name,
-                'serialization_format': channel.message_encoding,
+                'name': topic.name,
+                'type': topic.type_name,
+                'serialization_format': 'cdr',
                 'offered_qos_profiles': [
                     {key: _POLICY_NAMES[key][value] if key in _POLICY_NAMES else value
-                     for key, value in qos.items()} for qos in qos_profiles(channel)],
-                'type_description_hash': channel.metadata.get('topic_type_hash', '')},
-             'message_count': messages} for channel, type_name, messages in topics],
-        'compression_format': compression[1],
-        'compression_mode': compression[0],
+                     for key, value in topic.offered.items()}],
+                'type_description_hash': definition(topic.type_name)[1]},
+             'message_count': count} for topic, count in zip(topics, counts, strict=True)],
+        'compression_format': '',
+        'compression_mode': '',
         'relative_file_paths': [file_name],
         'files': [{'path': file_name, **numbers}],
         'custom_data': None,

@@ -4,7 +4,7 @@ Writes MCAP files that end after a whole record at any time, whatever happens to
 
 mcap.Writer reports success after a failed write and cannot truncate.
 
-Layout: header, metadata of the run, schemas, channels | chunk, its message indexes | ... |
+Layout: header, schemas, channels, metadata of the run | chunk, its message indexes | ... |
 `rosbag2` metadata, data end | summary, footer.
 """
 
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording import rosbag2
-from spinning_top_sim.recording.errors import RecordingError, why_not_written
+from spinning_top_sim.recording.errors import LogError, why_not_written
 from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
 
 CHUNK_BYTES = 1_000_000     # of messages that make a chunk, about
@@ -51,59 +51,45 @@ class McapWriter:
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 
     path : must not exist
-    head : what stands before the first chunk, so that a truncated file tells it in any case
+    topics : the channel of a topic is its index + 1
+    metadata : the `spinning_top_sim` record
     compression : of the chunks, 'zstd', 'lz4' or 'none'
 
-    Raises RecordingError naming the path.
+    Raises LogError naming the path, ValueError for a topic that is listed twice.
     """
 
-    def __init__(self, path: Path, head: Iterable[records.McapRecord], *, compression: str,
+    def __init__(self, path: Path, topics: Sequence[rosbag2.RecordedTopic],
+                 metadata: Mapping[str, str], *, compression: str,
                  min_free_bytes: int = 0) -> None:
-        self._path, self._compression = path, '' if compression == 'none' else compression
+        self._path, self._topics = path, topics
+        self._compression = '' if compression == 'none' else compression
         self._rows: list[Rows] = []                 # of the next chunk,
         self._chunk_bytes = 0                       # and its size
-        self._types: dict[int, str] = {}            # names of the schemas in the file
-        self._channels: list[records.Channel] = []
         self.message_counts = Counter[int]()        # messages in the file by channel
         self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         # Records of the summary.  Serialized: thousands of objects would take memory.
-        self._summary: list[bytes] = []
+        self._summary = [*map(record_bytes, _declarations(topics))]
+        header = record_bytes(records.Header(profile='ros2', library=OUR_LIBRARY + version()))
         try:
             self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
             try:
                 self.check_disk(min_free_bytes)
-                self._end = self._write([MCAP0_MAGIC])
-                for record in head:
-                    self.write(record)
+                self._end = self._write([MCAP0_MAGIC, header, *self._summary])
+                # In the head, so that a truncated file tells it in any case.
+                self._write_metadata(METADATA_NAME, metadata)
                 self.sync()
                 _sync_directory(path.parent)
             except BaseException:
-                self.discard()
+                self._file.close()
+                path.unlink()
                 raise
         except (OSError, ValueError) as error:
-            raise RecordingError(f'cannot write {path}: {why_not_written(path, error)}') from error
+            raise LogError(f'cannot write {path}: {why_not_written(path, error)}') from error
 
     @property
     def size(self) -> int:
         return self._end[0]
-
-    def write(self, record: records.McapRecord) -> None:
-        """Write a record that is neither a message nor a chunk."""
-        offset, raw = self.size, record_bytes(record)
-        self._end = self._write([raw])
-        if isinstance(record, records.Schema):
-            self._types[record.id] = record.name
-        elif isinstance(record, records.Channel):
-            self._channels.append(record)
-        elif isinstance(record, records.Metadata):
-            raw = record_bytes(records.MetadataIndex(offset, len(raw), record.name))
-        elif isinstance(record, records.Attachment):
-            raw = record_bytes(records.AttachmentIndex(
-                offset, len(raw), record.log_time, record.create_time, len(record.data),
-                record.name, record.media_type))
-        if not isinstance(record, records.Header):
-            self._summary.append(raw)
 
     def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
             rows: NDArray[np.uint8]) -> None:
@@ -113,14 +99,14 @@ class McapWriter:
         log_times_ns : log and publish times (n,), n >= 1, in any order
         rows : serialized messages (n, size)
         """
-        if topic_index >= len(self._channels):
+        if topic_index >= len(self._topics):
             raise IndexError(f'there is no topic {topic_index}')
         self._rows.append((topic_index, log_times_ns, rows))
         self._chunk_bytes += len(rows) * _message_type(rows.shape[1]).itemsize
 
     def flush(self, if_full: bool = False) -> None:
         """
-        Write the chunk in memory; or only if it is full.
+        Write the chunk in memory, and its message indexes; or only if it is full.
 
         Call it where no topic lags behind another: a file that is torn there has no holes.
         An exception loses the chunk, so that the file can be finished; an interrupt does not.
@@ -128,13 +114,13 @@ class McapWriter:
         if self._chunk_bytes < (CHUNK_BYTES if if_full else 1):
             return
         try:
-            self.write_chunk(*self._chunk())
+            self._write_chunk(*self._chunk())
         except Exception:
             self._rows, self._chunk_bytes = [], 0
             raise
 
     def _chunk(self) -> tuple[bytearray, dict[int, NDArray[np.uint64]]]:
-        """Return what `write_chunk` takes of the rows in memory."""
+        """Return the messages in memory, and by channel log times and offsets in them (n, 2)."""
         plain, offset, counts = bytearray(self._chunk_bytes), 0, self.message_counts.copy()
         index: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
         for (topic, size), alike in itertools.groupby(
@@ -153,14 +139,7 @@ class McapWriter:
             offset += messages.nbytes
         return plain, {channel: np.concatenate(parts) for channel, parts in index.items()}
 
-    def write_chunk(self, plain: bytes | bytearray,
-                    index: Mapping[int, NDArray[np.uint64]]) -> None:
-        """
-        Write a chunk, and its message indexes.
-
-        plain : its message records
-        index : by channel, log times [ns] and offsets in `plain`, (n, 2) with n >= 1
-        """
+    def _write_chunk(self, plain: bytearray, index: Mapping[int, NDArray[np.uint64]]) -> None:
         times_ns = np.concatenate([entries[:, 0] for entries in index.values()])
         span = {'message_start_time': int(times_ns.min()), 'message_end_time': int(times_ns.max())}
         # A tenth of the time of `simulate` is all of this: not worth a thread.
@@ -203,32 +182,19 @@ class McapWriter:
             raise OSError(f'{free} bytes are free on the disk, fewer than min_free_bytes = '
                           f'{min_free_bytes}')
 
-    def discard(self) -> None:
-        """Close and remove the file."""
-        self._file.close()
-        self._path.unlink(missing_ok=True)
-
-    def finish(self, *, bag: bool = True, compression: tuple[str, str] = ('', '')) -> None:
-        """
-        Write the chunk in memory and the summary, bring all to the disk, close the file.
-
-        bag : write the `rosbag2` record, too, with this `compression` of messages
-        """
+    def finish(self) -> None:
+        """Write the chunk in memory and the summary, bring all to the disk, close the file."""
         try:
             self.flush()
             start_ns, end_ns = min(self._times_ns, default=0), max(self._times_ns, default=0)
-            if bag:
-                self.write(records.Metadata(rosbag2.BAG_METADATA, rosbag2.bag_metadata(
-                    [(channel, self._types.get(channel.schema_id, ''),
-                      self.message_counts[channel.id]) for channel in self._channels],
-                    self._path.name, start_ns, end_ns, compression)))
+            counts = {channel: self.message_counts[channel]
+                      for channel, _ in enumerate(self._topics, start=1)}
+            self._write_metadata(rosbag2.BAG_METADATA, rosbag2.bag_metadata(
+                self._topics, [*counts.values()], self._path.name, start_ns, end_ns))
             self._end = self._write([record_bytes(records.DataEnd(self._end[1]))])
             kinds = Counter(raw[0] for raw in self._summary)
             statistics = record_bytes(records.Statistics(
-                attachment_count=kinds[Opcode.ATTACHMENT_INDEX],
-                channel_count=kinds[Opcode.CHANNEL],
-                channel_message_counts={
-                    channel.id: self.message_counts[channel.id] for channel in self._channels},
+                attachment_count=0, channel_count=len(counts), channel_message_counts=counts,
                 chunk_count=kinds[Opcode.CHUNK_INDEX], message_count=self.message_counts.total(),
                 message_end_time=end_ns, message_start_time=start_ns,
                 metadata_count=kinds[Opcode.METADATA_INDEX], schema_count=kinds[Opcode.SCHEMA]))
@@ -245,6 +211,12 @@ class McapWriter:
         finally:
             with contextlib.suppress(OSError):      # all is on the disk, or another error is told
                 self._file.close()
+
+    def _write_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
+        raw = record_bytes(records.Metadata(name, dict(metadata)))
+        index = record_bytes(records.MetadataIndex(self.size, len(raw), name))
+        self._end = self._write([raw])
+        self._summary.append(index)
 
     def _write(self, blocks: Iterable[bytes]) -> tuple[int, int]:
         """Write whole records that come in blocks, or none of them; return size and checksum."""
@@ -267,33 +239,22 @@ class McapWriter:
         return offset, crc
 
 
-def log_head(topics: Sequence[rosbag2.RecordedTopic],
-             metadata: Mapping[str, str]) -> list[records.McapRecord]:
-    """
-    Return the head of a log of this package; the channel of a topic is its index + 1.
-
-    metadata : the `spinning_top_sim` record
-
-    Raises ValueError for a topic that is listed twice, RecordingError for an unknown type.
-    """
+def _declarations(topics: Sequence[rosbag2.RecordedTopic]) -> list[records.McapRecord]:
+    """Return schemas and channels; see `McapWriter`."""
     for name, number in Counter(topic.name for topic in topics).items():
         if number > 1:
             raise ValueError(f'topic {name!r} is listed twice: once is allowed')
     types = list(dict.fromkeys(topic.type_name for topic in topics))
-    definitions = {name: rosbag2.find_definition(name) for name in types}
     return [
-        records.Header(profile='ros2', library=OUR_LIBRARY + version()),
-        *(records.Schema(number, definitions[name][0].encode(), 'ros2msg', name)
+        *(records.Schema(number, rosbag2.definition(name)[0].encode(), 'ros2msg', name)
           for number, name in enumerate(types, start=1)),
         *(records.Channel(
             id=number, topic=topic.name, message_encoding='cdr',
             schema_id=1 + types.index(topic.type_name),
             # In integers, as older releases of ROS read them, too.
-            metadata={'offered_qos_profiles': rosbag2.as_yaml(
-                          [{**rosbag2.DEFAULT_QOS, **topic.qos}]),
-                      'topic_type_hash': definitions[topic.type_name][1]})
-          for number, topic in enumerate(topics, start=1)),
-        records.Metadata(METADATA_NAME, dict(metadata))]
+            metadata={'offered_qos_profiles': rosbag2.as_yaml([topic.offered]),
+                      'topic_type_hash': rosbag2.definition(topic.type_name)[1]})
+          for number, topic in enumerate(topics, start=1))]
 
 
 def record_bytes(record: records.McapRecord) -> bytes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures a motion from samples of the attitude alone; `survey` selects them from a log."""
+"""Samples of a motion as states, and what is measured from their attitude alone."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column
-from spinning_top_sim.physics.top import Top
+from spinning_top_sim.physics.states import States
+from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.streams.imu import Imu
+from spinning_top_sim.times import Times
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
@@ -24,93 +26,71 @@ DEGREE, WINDOW = 15, 64
 LEAST_SAMPLES = 9.0         # in a nutation, for a spline as good as the data
 RESTS = 1e-9                # a tilt that changes less does not nutate: rounding decides [rad]
 LARGEST_STEP = 2.5          # between two samples of an angle that can be unwrapped [rad]
-RATES, TURNS = slice(4, 7), slice(7, 10)        # of the rows of Attitudes
+# Of samples: q(world <- body) as x, y, z, w; angular velocity in the body frame [rad/s]; phi and
+# psi, which count turns [rad].  NaN: not known.
+QUATERNION, RATES, TURNS, WIDTH = slice(0, 4), slice(4, 7), slice(7, 9), 9
 
 
-class Attitudes:
+class SampledStates(States):
     """
-    Samples of the attitude of the body in the order of time, and what follows from each.
+    States by samples, without forces; what follows from a rate that is not known is NaN.
 
-    stamps_ns : (n,) log times [ns]
-    rows : (4, n) q(world <- body) as x, y, z, w; then, if the log has them, (3, n) angular
-        velocity in the body frame [rad/s]; then, if the log has them, phi and psi, which count
-        turns, and phi'
-    cos2, sin2 : (n,) squares of the cosine and sine of theta/2; near a pole the smaller one has
-        more digits
-    tip, body_tip : (n,) sin(theta) exp(i phi) and sin(theta) exp(i psi)
+    t : (n,) times [s]
+    rows : (WIDTH, n) samples
     """
 
-    def __init__(self, stamps_ns: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
-        self.stamps_ns, self.rows = stamps_ns, rows
-        self.time = (stamps_ns - stamps_ns[:1]) * 1e-9
-        self.period = float(np.max(self.time, initial=0.0)) / max(len(stamps_ns) - 1, 1)
-        x, y, z, w = self.quaternion = tuple(rows[:4])
-        self.cos2, self.sin2 = w * w + z * z, x * x + y * y
-        tip_x, tip_y, self.height = attitude.axis_in_world(self.quaternion)
-        up_1, up_2, _ = self.up = attitude.vertical_in_body(self.quaternion)
-        self.tip, self.body_tip = tip_x + 1j * tip_y, -up_1 + 1j * up_2
-        self.omega = tuple(rows[RATES]) or None
-        self.phi_dot = None
-        if self.omega is not None:
-            one, two, _ = self.omega
-            with np.errstate(invalid='ignore'):     # NaN at a pole
-                self.phi_dot = (one * up_1 + two * up_2) / (up_1 ** 2 + up_2 ** 2)
-        self.counts_turns = len(rows) == TURNS.stop
-        if self.counts_turns:
-            self.phi, self.psi, self.phi_dot = rows[TURNS]
-        else:
-            self.phi, self.psi = (np.unwrap(np.angle(tip)) for tip in (self.tip, self.body_tip))
+    method = 'samples'
 
-    def first(self, count: int) -> Attitudes:
-        return Attitudes(self.stamps_ns[:count], self.rows[:, :count])
+    def __init__(self, top: Top, t: Column, rows: NDArray[np.float64]) -> None:
+        super().__init__(top, State(theta=0.0, l3=0.0, lz=0.0), len(t))
+        (x, y, z, w), (w1, w2, w3), self.turns = rows[QUATERNION], rows[RATES], rows[TURNS]
+        self.t, self.rows_quaternion, self.transverse_velocity = t, (x, y, z, w), (w1, w2)
+        self._l3 = self.l3 = top.lambda3 * w3
+        up_1, up_2, height = self.rows_vertical
+        across = w1 * up_1 + w2 * up_2
+        self.lz = top.lambda1 * across + self._l3 * height
+        with np.errstate(divide='ignore', invalid='ignore'):        # at a pole
+            self.phi_dot = across / (up_1 ** 2 + up_2 ** 2)
+        self._rows = rows
 
-    def constants(self, top: Top) -> tuple[Column, Column, Column] | None:
-        """Return E [J], L3 and Lz [kg m^2/s] of each sample (n,); None without rates."""
-        if self.omega is None:
-            return None
-        (one, two, spin), (up_1, up_2, height) = self.omega, self.up
-        l3 = top.lambda3 * spin
-        return (0.5 * top.lambda1 * (one ** 2 + two ** 2) + 0.5 * l3 * spin
-                + top.gravity_torque * height,
-                l3, top.lambda1 * (one * up_1 + two * up_2) + l3 * height)
+    def until(self, seconds: float) -> SampledStates:
+        """Return the states of so many seconds from the first one on."""
+        count = int(np.searchsorted(self.t, self.t[0] + seconds, 'right'))
+        return SampledStates(self.top, self.t[:count], self._rows[:, :count])
 
 
-def attitudes_of(name: str, imu: Imu, stamps_ns: NDArray[np.int64],
-                 fields: tuple[NDArray[np.float64], ...]) -> Attitudes | None:
-    """Return the attitudes in the decoded fields of a stream, None if it has none."""
-    rows = [field.T for field in fields]
+def attitudes_of(name: str, imu: Imu, stamps_ns: Times, fields: tuple[NDArray[np.float64], ...],
+                 ) -> tuple[Times, NDArray[np.float64]] | None:
+    """Return stamps (n,) and samples (WIDTH, n) in the decoded fields of a stream, if it has."""
+    parts = [field.T for field in fields]
+    rows = np.full((WIDTH, len(stamps_ns)), np.nan)
     if name in ('ground_truth/imu', 'imu/data'):
-        rows = list(map(np.vstack, imu.mounting.to_body(tuple(rows[0]), tuple(rows[1]))))
-        if imu.takes_means:         # the rates are not those at the stamps
-            del rows[1]
+        rows[QUATERNION], rates = imu.mounting.to_body(tuple(parts[0]), tuple(parts[1]))
+        if not imu.takes_means:         # else the rates are not those at the stamps
+            rows[RATES] = rates
     elif name == 'joint_states':
-        (phi, theta, psi), (phi_dot, theta_dot, psi_dot) = rows
-        across = phi_dot * np.sin(theta)
-        rows = [np.stack((
-            *attitude.quaternion_of_angles(phi, theta, psi),
-            theta_dot * np.sin(psi) - across * np.cos(psi),
-            theta_dot * np.cos(psi) + across * np.sin(psi), psi_dot + phi_dot * np.cos(theta),
-            phi, psi, phi_dot))]
+        (phi, theta, psi), (phi_dot, theta_dot, psi_dot) = parts
+        rows[QUATERNION] = attitude.quaternion_of_angles(phi, theta, psi)
+        rows[RATES] = (*attitude.transverse(theta_dot, phi_dot * np.sin(theta), np.cos(psi),
+                                            np.sin(psi)), psi_dot + phi_dot * np.cos(theta))
+        rows[TURNS] = phi, psi
     elif name in ('pose', 'ground_truth/odom'):     # position, attitude, velocity, rates
-        rows = rows[1::2]
+        rows[QUATERNION] = parts[1]
+        rows[RATES] = parts[3] if len(parts) > 2 else np.nan
     else:
         return None
-    columns = np.vstack(rows)
-    norm = np.linalg.norm(columns[:4], axis=0)
+    norm = np.linalg.norm(rows[QUATERNION], axis=0)
     valid = np.isfinite(norm) & (norm > 0.0)
-    columns[:4, valid] /= norm[valid]
-    return Attitudes(stamps_ns[valid], columns[:, valid])
+    rows[QUATERNION] /= np.where(valid, norm, 1.0)
+    return stamps_ns[valid], rows[:, valid]
 
 
-def longest_run(blocks: list[tuple[NDArray[np.int64], NDArray[np.float64]]]) -> Attitudes:
-    """Return the longest part of these blocks of stamps and rows that has one rate and no gap."""
-    stamps_ns = np.concatenate([stamps_ns for stamps_ns, _ in blocks])
-    rows = np.concatenate([rows for _, rows in blocks], axis=1)
+def longest_run(stamps_ns: Times) -> slice:
+    """Return where the longest part is that has one rate and no gap."""
     steps = np.diff(stamps_ns)
     cuts = np.array([0, *(np.flatnonzero(np.diff(steps)) + 1), len(steps)])
     longest = int(np.argmax(np.diff(cuts)))
-    part = slice(cuts[longest], cuts[longest + 1] + 1)
-    return Attitudes(stamps_ns[part], rows[:, part])
+    return slice(cuts[longest], cuts[longest + 1] + 1)
 
 
 @dataclass(frozen=True)
@@ -125,7 +105,7 @@ class Measured:
     missing: tuple[str, ...]              # why numbers are None
 
 
-def measure(data: Attitudes, expected: float | None = None) -> Measured:
+def measure(data: SampledStates, expected: float | None = None) -> Measured:
     """
     Measure a motion from two or more samples at one rate.
 
@@ -134,18 +114,20 @@ def measure(data: Attitudes, expected: float | None = None) -> Measured:
     A nutation lasts from one rise of the tip through its middle height to the next.  The tip is
     fastest there, and far from the poles, where phi may jump.
     """
-    count = len(data.stamps_ns)
+    count, step = len(data), float(data.t[-1] - data.t[0]) / (len(data) - 1)
     nutations, period, begin, end, reason = 0, None, 0.0, count - 1.0, ''
-    if np.ptp(2.0 * np.arctan2(np.sqrt(data.sin2), np.sqrt(data.cos2))) >= RESTS:
-        nutations, begin, end = _crossings(data)
-        period = (end - begin) / nutations * data.period if nutations else None
-        in_one = min(period or math.inf, expected or math.inf) / data.period
+    if np.ptp(data.theta_folded) >= RESTS:
+        nutations, begin, end = _crossings(*data.half_angle_squares)
+        period = (end - begin) / nutations * step if nutations else None
+        in_one = min(period or math.inf, expected or math.inf) / step
         if in_one < LEAST_SAMPLES:
             reason = f'{in_one:.1f} samples in a nutation are too few'
         elif period is None:
             reason = 'not one whole nutation'
-    precession, spin = (None if reason else _mean_rate(data, angle, tip, begin, end)
-                        for angle, tip in ((data.phi, data.tip), (data.psi, data.body_tip)))
+    (x, y, _), (up_1, up_2, _) = data.rows_axis, data.rows_vertical
+    precession, spin = (None if reason else _mean_rate(turns, tip, begin, end, step)
+                        for turns, tip in zip(data.turns, (x + 1j * y, -up_1 + 1j * up_2),
+                                              strict=True))
     if not reason and None in (precession, spin):
         reason = 'phi or psi cannot be unwrapped: a pole, or too few samples in a turn'
     return Measured(count, nutations, None if reason else period, precession, spin,
@@ -162,12 +144,12 @@ def _spline(values: NDArray[np.generic], index: float) -> BSpline:
                               k=min(DEGREE, len(part) - 1))
 
 
-def _crossings(data: Attitudes) -> tuple[int, float, float]:
+def _crossings(cos2: Column, sin2: Column) -> tuple[int, float, float]:
     """Return the number of whole nutations, and the indices at which they begin and end."""
     from scipy.optimize import brentq  # noqa: PLC0415
 
     # Both rise with the axis; the smaller one has the digits of a small angle.
-    values = -data.sin2 if np.mean(data.sin2) < 0.5 else data.cos2
+    values = -sin2 if np.mean(sin2) < 0.5 else cos2
     values = values - 0.5 * (float(np.min(values)) + float(np.max(values)))
     rising = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
     if len(rising) < 2:
@@ -177,12 +159,14 @@ def _crossings(data: Attitudes) -> tuple[int, float, float]:
     return len(rising) - 1, begin, end
 
 
-def _mean_rate(data: Attitudes, angle: Column, tip: NDArray[np.complex128], begin: float,
-               end: float) -> float | None:
+def _mean_rate(turns: Column, tip: NDArray[np.complex128], begin: float, end: float,
+               step: float) -> float | None:
     """Return the mean rate of phi or psi [rad/s] between two indices, None if unknown."""
-    if not data.counts_turns and (
-            not tip.all() or np.max(np.abs(np.diff(angle))) > LARGEST_STEP):
-        return None
+    angle = turns
+    if np.isnan(turns).any():
+        angle = np.unwrap(np.angle(tip))
+        if not tip.all() or np.max(np.abs(np.diff(angle))) > LARGEST_STEP:
+            return None
     # The tip is smooth where the angle jumps at a pole, and slow without its mean rate.
     rate = (angle[-1] - angle[0]) / (len(angle) - 1)
     slow = tip * np.exp(-1j * rate * np.arange(len(angle)))
@@ -190,4 +174,4 @@ def _mean_rate(data: Attitudes, angle: Column, tip: NDArray[np.complex128], begi
     here = np.rint(at).astype(int)
     ends = np.array([_spline(slow, index)(index) for index in at])
     turned = angle[here] + rate * (at - here) + np.angle(ends * np.conj(slow[here]))
-    return float((turned[1] - turned[0]) / ((end - begin) * data.period))
+    return float((turned[1] - turned[0]) / ((end - begin) * step))

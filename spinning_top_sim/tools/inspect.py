@@ -18,22 +18,31 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import needed
+from spinning_top_sim.physics.states import joined, relative_drift
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.times import NANOSECONDS, stamp_text
 from spinning_top_sim.tools import cli, log_exports
-from spinning_top_sim.tools.recorded_run import RunDescription
-from spinning_top_sim.tools.survey import MotionReport, Survey, survey
-from spinning_top_sim.tools.verify import Comparison, compare, objection
+from spinning_top_sim.tools.recorded_run import (
+    ForeignLogError,
+    RunDescription,
+    read_run_description,
+)
+from spinning_top_sim.tools.survey import Survey
+from spinning_top_sim.tools.verify import compare, objection
 
 DEGREES = math.degrees(1.0)
+FRAMES_PER_S, LONGEST_S, GIF_PIXELS = 20, 10.0, 640
 # Rows of the table of a motion: text, field of Description and Measured, factor.
 ROWS = (('nutation period [s]', 'nutation_period', 1.0),
         ('mean precession [rad/s]', 'mean_precession_rate', 1.0),
@@ -44,6 +53,7 @@ ROWS = (('nutation period [s]', 'nutation_period', 1.0),
         ('greatest precession [rad/s]', 'precession_max', 1.0),
         ('1 - m (separatrix: 0)', 'separatrix_distance', 1.0),
         ('L3^2/(4 lambda1 |P|) (sleeps: > 1)', 'gyroscopic_ratio', 1.0))
+Content = Mapping[str, Any]     # as of --json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,31 +74,62 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     cli.check_output(arguments.plot, arguments.animate, *(path for _, path in arguments.export))
     with LogReader(arguments.log) as reader:
-        found, comparison = survey(reader), None
+        run, foreign, verdict = None, '', None
         exported: list[str] = []
-        refused = found.foreign_reason if found.run is None else objection(found.run)
-        if found.run is not None:
+        try:
+            run = read_run_description(reader)
+        except ForeignLogError as error:
+            foreign = str(error)
+        found = Survey(reader, run)
+        refused = foreign if run is None else objection(run)
+        if run is not None:
             if arguments.verify and not refused:
-                begin_ns, end_ns = found.span[0], found.end_ns
-                with cli.progress('verified', (end_ns - begin_ns) / NANOSECONDS, 's',
+                with cli.progress('verified', (found.end_ns - found.begin_ns) / NANOSECONDS, 's',
                                   quiet=arguments.json) as show:
-                    comparison = compare(found.run, reader, end_ns, lambda stamp_ns: show(
-                        (stamp_ns - begin_ns) / NANOSECONDS))
-            exported += log_exports.write(reader, found.run, arguments.export)
+                    verdict = compare(run, reader, found.end_ns, lambda stamp_ns: show(
+                        (stamp_ns - found.begin_ns) / NANOSECONDS)).as_json()
+            exported += log_exports.write(reader, run, arguments.export)
+        content = {**_content(reader, found, run), 'ours': run is not None,
+                   'why_not_ours': foreign or None, 'verify': verdict}
     if arguments.json:
         with cli.reader_may_end():
-            print(json.dumps(_as_json(found, comparison), indent=2, allow_nan=False))
+            # Numbers that JSON does not have become null.
+            print(json.dumps(json.loads(json.dumps(content), parse_constant=lambda name: None),
+                             indent=2))
     else:
-        for line in _as_text(found, comparison):
+        for line in _as_text(content):
             cli.print_line(line)
     for line in exported:
         cli.print_line(line, sys.stderr if arguments.json else None)
-    for option, reason in (('verify', refused), ('export', found.foreign_reason)):
+    for option, reason in (('verify', refused), ('export', foreign)):
         if reason and getattr(arguments, option):
             raise LogError(f'--{option}: {reason}')
     _draw(arguments, found)
-    passed = not found.damage.reasons and (comparison is None or comparison.identical)
+    passed = reader.whole and (verdict is None or verdict['identical'])
     return cli.OK if passed else cli.FAILED
+
+
+def _content(reader: LogReader, found: Survey, run: RunDescription | None) -> dict[str, Any]:
+    """Return the findings for JSON; docs/logs.md has the keys."""
+    damage, (begin_ns, end_ns) = reader.damage, reader.span
+    return {
+        'file': str(reader.path), 'whole': reader.whole,
+        'damage': {'torn': damage.torn, 'lost_bytes': damage.lost_bytes, 'report': damage.lines()},
+        'begin_ns': begin_ns, 'end_ns': end_ns, 'duration': (end_ns - begin_ns) / NANOSECONDS,
+        'topics': {name: asdict(topic) for name, topic in found.topics.items()},
+        'notes': found.notes,
+        'run': run and {'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
+                        'epoch_ns': run.epoch_ns, 'begun_ns': run.begun_ns, **run.environment},
+        'events': [{'event': event.kind, 'stamp_ns': stamp_ns, 't_ns': event.t_ns,
+                    **event.details} for stamp_ns, event in (run.events if run else ())],
+        'motions': [{
+            'cause': motion.cause, 'begin_ns': motion.begin_ns, 'end_ns': motion.end_ns,
+            'source': motion.source, 'regime': motion.exact and motion.exact.name,
+            **{name: getattr(motion.piece, name) for name in ('l3', 'lz', 'energy')},
+            'exact': motion.exact and asdict(motion.exact),
+            'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
+        'drifts': found.drifts,
+        'orientation_error': {topic: {'max': error} for topic, error in found.errors.items()}}
 
 
 def _draw(arguments: argparse.Namespace, found: Survey) -> None:
@@ -98,155 +139,109 @@ def _draw(arguments: argparse.Namespace, found: Survey) -> None:
     if not found.shown:
         raise LogError('nothing to draw: no attitude of a top in this log')
     with needed('a picture', 'plot'):
-        from spinning_top_sim.tools import log_pictures  # noqa: PLC0415
-    for path, draw in ((arguments.plot, log_pictures.draw_page),
-                       (arguments.animate, log_pictures.animate)):
-        if path is not None:
-            with new_file(path):
-                draw(found, path)
+        from matplotlib.animation import PillowWriter  # noqa: PLC0415
+
+        from spinning_top_sim import pictures  # noqa: PLC0415 - matplotlib is slow
+    if arguments.plot is not None:
+        # A motion is of one energy.
+        drift = np.concatenate([relative_drift(one.energy, one.energy[:1]) for one in found.shown])
+        figure = pictures.plot(joined(found.shown), drift, [one.t[0] for one in found.shown[1:]])
+        figure.suptitle(f'{arguments.log.name}: {len(found.shown)} of {len(found.motions)} '
+                        'motions')
+        with new_file(arguments.plot) as file:
+            figure.savefig(file.name, format=arguments.plot.suffix[1:] or 'png', dpi=120)
+    if arguments.animate is not None:
+        with new_file(arguments.animate) as file:
+            pictures.animate(found.shown[0].until(LONGEST_S), FRAMES_PER_S).save(
+                file.name, writer=PillowWriter(fps=FRAMES_PER_S), dpi=GIF_PIXELS / 4.0)  # 4 inches
 
 
-def _as_json(found: Survey, comparison: Comparison | None) -> object:
-    """Return the findings for JSON; docs/logs.md has the keys."""
-    damage, run, (begin_ns, end_ns) = found.damage, found.run, found.span
-    content: dict[str, object] = {
-        'file': str(found.path), 'whole': not damage.reasons,
-        'damage': {'torn': damage.torn, 'lost_bytes': damage.lost_bytes, 'report': damage.lines()},
-        'begin_ns': begin_ns, 'end_ns': end_ns, 'duration': (end_ns - begin_ns) / NANOSECONDS,
-        'topics': {name: asdict(topic) for name, topic in found.topics.items()},
-        'ours': run is not None, 'why_not_ours': found.foreign_reason or None,
-        'notes': found.notes, 'run': None, 'events': [], 'verify': None,
-        'motions': [{
-            **_fields_of(motion, 'cause', 'begin_ns', 'end_ns', 'source'),
-            'regime': motion.exact and motion.exact.name,
-            **_fields_of(motion.piece, 'l3', 'lz', 'energy'),
-            'exact': motion.exact and asdict(motion.exact),
-            'measured': motion.measured and asdict(motion.measured)} for motion in found.motions],
-        'drifts': found.drifts,
-        'orientation_error': {topic: {'max': error} for topic, error in found.errors.items()}}
-    if run is not None:
-        content['run'] = {'parameters': run.values_at_start, 'seed': run.values_at_start['seed'],
-                          **_fields_of(run, 'epoch_ns', 'begun_ns'), **run.environment}
-        content['events'] = [{'event': event.kind, 'stamp_ns': stamp_ns, 't_ns': event.t_ns,
-                              **event.details} for stamp_ns, event in run.events]
-    if comparison is not None:
-        content['verify'] = {'identical': comparison.identical, 'whole': not damage.reasons,
-                             **asdict(comparison),
-                             'first': comparison.first and comparison.first._asdict()}
-    # Numbers that JSON does not have become null.
-    return json.loads(json.dumps(content), parse_constant=lambda name: None)
-
-
-def _fields_of(source: object, *names: str) -> dict[str, object]:
-    return {name: getattr(source, name) for name in names}
-
-
-def _as_text(found: Survey, comparison: Comparison | None) -> Iterator[str]:
+def _as_text(content: Content) -> Iterator[str]:
     """Yield the findings as lines of text."""
-    damage, run, (begin_ns, end_ns) = found.damage, found.run, found.span
-    state = 'truncated' if damage.torn else 'damaged' if damage.reasons else 'whole'
-    yield f'{found.path}: {state}, {(end_ns - begin_ns) / NANOSECONDS:.6g} s'
-    yield from damage.lines()
+    damage, run = content['damage'], content['run']
+    state = ('truncated' if damage['torn'] else 'whole' if content['whole'] else 'damaged')
+    yield f'{content["file"]}: {state}, {content["duration"]:.6g} s'
+    yield from damage['report']
     if run is None:
-        yield found.foreign_reason
-        yield from _topics(found)
+        yield content['why_not_ours']
+        yield from _topics(content['topics'])
         return
-    values = run.values_at_start
+    values = run['parameters']
     solver = values['solver.method']
     if solver != 'exact':
         solver += f" ({values['solver.equations']}, rtol {values['solver.rtol']:g})"
-    yield f'spinning_top_sim {run.environment["version"]}, {solver}, seed {values["seed"]}'
-    yield from _topics(found)
-    yield _journal(run)
-    yield from found.notes
-    for number, motion in enumerate(found.motions, start=1):
-        yield from _motion(number, motion, begin_ns)
-    if found.errors or found.drifts:
+    yield f'spinning_top_sim {run["version"]}, {solver}, seed {run["seed"]}'
+    yield from _topics(content['topics'])
+    counts = Counter(event['event'] for event in content['events'])
+    yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
+           f'{counts["parameters"]} changes of parameters, {counts["state"]} states set, '
+           f'{counts["drive"]} velocities of the pivot')
+    yield from content['notes']
+    for number, motion in enumerate(content['motions'], start=1):
+        yield from _motion(number, motion, content['begin_ns'])
+    drifts, errors = content['drifts'], content['orientation_error']
+    if drifts or errors:
         yield from cli.table_lines(
             'largest relative drifts in a motion, orientation error against the exact solution '
             '[rad]', ('from', 'E', 'L3', 'Lz', 'error'),
-            [(topic, *(_number(found.drifts.get(topic, {}).get(name), 2)
-                       for name in ('energy', 'l3', 'lz')), _number(found.errors.get(topic), 3))
-             for topic in found.topics if topic in {**found.drifts, **found.errors}])
-    if comparison is not None:
-        yield from _about_comparison(comparison)
+            [(topic, *(_number(drifts.get(topic, {}).get(name), 2)
+                       for name in ('energy', 'l3', 'lz')),
+              _number(errors.get(topic, {}).get('max'), 3))
+             for topic in content['topics'] if topic in {**drifts, **errors}])
+    if content['verify'] is not None:
+        yield from _verdict(content['verify'])
 
 
-def _journal(run: RunDescription) -> str:
-    if run.events_topic is None:
-        return 'no journal: commands and resets are unknown'
-    counts = Counter(logged.event.kind for logged in run.events)
-    return (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
-            f'{counts["parameters"]} changes of parameters'
-            + (f', {counts["state"]} states set' if counts['state'] else '')
-            + (f', {counts["drive"]} velocities of the pivot' if counts['drive'] else ''))
-
-
-def _topics(found: Survey) -> Iterator[str]:
+def _topics(topics: Content) -> Iterator[str]:
     head = 'topic', 'type', 'messages', 'rate [Hz]', 'grid [Hz]', 'missing'
     yield from cli.table_lines('topics', head, [
-        (name, topic.type, str(topic.count), _number(topic.rate), _number(topic.grid_rate),
-         _number(topic.missing, 15)) for name, topic in found.topics.items()])
-    for name, topic in found.topics.items():
-        for begin, end in topic.gaps_ns:
+        (name, topic['type'], str(topic['count']), _number(topic['rate']),
+         _number(topic['grid_rate']), _number(topic['missing'], 15))
+        for name, topic in topics.items()])
+    for name, topic in topics.items():
+        for begin, end in topic['gaps_ns']:
             yield f'gap: {name} from {stamp_text(begin)} s to {stamp_text(end)} s'
 
 
-def _motion(number: int, motion: MotionReport, begin_ns: int) -> Iterator[str]:
-    exact, measured = motion.exact, motion.measured
-    begin, end = (max(at_ns - begin_ns, 0) / NANOSECONDS
-                  for at_ns in (motion.begin_ns, motion.end_ns))
-    name = (exact.name if exact is not None else 'the pivot moves' if not motion.piece.rests
-            else 'beyond the closed form')
-    title = f'motion {number} ({motion.cause}), {begin:.6g} to {end:.6g} s: {name}'
+def _motion(number: int, motion: Content, begin_ns: int) -> Iterator[str]:
+    exact, measured = motion['exact'] or {}, motion['measured'] or {}
+    begin, end = (max(motion[at] - begin_ns, 0) / NANOSECONDS for at in ('begin_ns', 'end_ns'))
+    name = motion['regime'] or 'no closed form'
     rows = []
     for text, key, factor in ROWS:
-        expected, seen = (None if value is None else value * factor for value in (
-            getattr(exact, key, None), getattr(measured, key, None)))
-        rows.append((text, _number(expected, 12), _number(seen, 12), _difference(expected, seen)))
-    yield from cli.table_lines(title, ('', 'exact', 'measured', 'difference'), rows)
-    if measured is not None:
-        yield f'measured from {motion.source}: {measured.nutations} whole nutations'
-        yield from (f'not measured: {reason}' for reason in measured.missing)
+        expected, seen = (None if one.get(key) is None else one[key] * factor
+                          for one in (exact, measured))
+        rows.append((text, _number(expected, 12), _number(seen, 12), _number(
+            None if expected is None or seen is None else seen - expected, 2)))
+    yield from cli.table_lines(
+        f'motion {number} ({motion["cause"]}), {begin:.6g} to {end:.6g} s: {name}',
+        ('', 'exact', 'measured', 'difference'), rows)
+    if measured:
+        yield f'measured from {motion["source"]}: {measured["nutations"]} whole nutations'
+        yield from (f'not measured: {reason}' for reason in measured['missing'])
     else:
         yield 'not measured: no topic with enough attitudes (joint_states, pose, ground_truth/...)'
-    if not motion.piece.rests:
-        yield ('the pivot moves: no constants and no closed form of the whole motion to compare '
-               'with; --verify compares each message')
 
 
-def _about_comparison(comparison: Comparison) -> Iterator[str]:
-    for warning in comparison.warnings:
+def _verdict(verdict: Content) -> Iterator[str]:
+    for warning in verdict['warnings']:
         yield f'verify: {warning}: the last bits may differ for that'
-    compared = sum(comparison.compared.values())
-    if comparison.stopped:
-        yield f'verify: the run cannot be computed again: {comparison.stopped}'
-    if comparison.identical:
+    compared = sum(verdict['compared'].values())
+    if verdict['stopped']:
+        yield f'verify: the run cannot be computed again: {verdict["stopped"]}'
+    if verdict['identical']:
         yield f'verify: identical, all {compared} messages byte for byte'
-    elif not (comparison.different or comparison.unexpected or comparison.stopped):
-        yield (f'verify: incomplete, {comparison.missing} messages missing; '
-               f'the other {compared} are identical byte for byte')
     else:
-        yield (f'verify: DIFFERENT: {comparison.different} of {compared} messages differ, '
-               f'{comparison.missing} are missing, {comparison.unexpected} should not be there')
-    first = comparison.first
-    if first is not None:
-        place = '' if first.byte is None else f', byte {first.byte}'
-        yield (f'verify: first: {first.topic} at {stamp_text(first.stamp_ns)} s{place}, '
-               f'{first.field}: in the log {first.logged}, computed {first.computed}')
+        yield (f'verify: DIFFERENT: {verdict["different"]} of {compared} messages differ, '
+               f'{verdict["missing"]} are missing, {verdict["unexpected"]} should not be there')
+    if first := verdict['first']:
+        place = '' if first['byte'] is None else f', byte {first["byte"]}'
+        yield (f'verify: first: {first["topic"]} at {stamp_text(first["stamp_ns"])} s{place}, '
+               f'{first["field"]}: in the log {first["logged"]}, computed {first["computed"]}')
 
 
 def _number(value: float | None, digits: int = 6) -> str:
     return '' if value is None else f'{value:.{digits}g}'
-
-
-def _difference(expected: float | None, seen: float | None) -> str:
-    if expected is None or seen is None:
-        return ''
-    difference = seen - expected
-    if abs(difference) > abs(expected):         # also where that is 0
-        return f'{difference:.1e} absolute'
-    return f'{difference / abs(expected):.1e}' if difference else '0'
 
 
 main = partial(cli.run, 'inspect', __doc__, add_arguments, _run)

@@ -4,38 +4,29 @@ Writes files for other tools from a log.
 
 TUM: "timestamp tx ty tz qx qy qz qw", in s and m (vision.in.tum.de, RGB-D dataset, file formats).
 EuRoC: state_groundtruth_estimate0/data.csv and imu0/data.csv (M. Burri et al., "The EuRoC micro
-aerial vehicle datasets", IJRR 35, 2016).  kalibr: imu.yaml (github.com/ethz-asl/kalibr, wiki "Yaml
-formats").
+aerial vehicle datasets", IJRR 35, 2016).
 """
 
 import argparse
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from spinning_top_sim.files import new_file
 from spinning_top_sim.physics import attitude
 from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.times import stamp_text
+from spinning_top_sim.times import Times, stamp_text
 from spinning_top_sim.tools.recorded_run import RunDescription, channels_of
 
 RAW, BIAS, ODOMETRY = 'imu/data_raw', 'ground_truth/imu_bias', 'ground_truth/imu_odom'
-KALIBR_NEEDS = tuple(f'imu.{kind}_{name}' for kind in ('accelerometer', 'gyroscope')
-                     for name in ('noise_density', 'random_walk'))
 EUROC_HEAD = ('#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],'
               'q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1],'
               'b_w_RS_S_x [rad s^-1],b_w_RS_S_y [rad s^-1],b_w_RS_S_z [rad s^-1],'
               'b_a_RS_S_x [m s^-2],b_a_RS_S_y [m s^-2],b_a_RS_S_z [m s^-2]\n')
 EUROC_IMU_HEAD = ('#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
                   'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n')
-FIX, VELOCITY = 'gnss/fix', 'gnss/velocity'
-FIX_HEAD = '#timestamp [ns],latitude [deg],longitude [deg],altitude [m]\n'
-VELOCITY_HEAD = '#timestamp [ns],v_east [m s^-1],v_north [m s^-1],v_up [m s^-1]\n'
 
 
 def add_argument(parser: argparse.ArgumentParser) -> None:
@@ -43,9 +34,7 @@ def add_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--export', type=_parse, metavar='KIND:FILE', action='append', default=[],
         help='write a file for other tools: tum or euroc, the true trajectory of the IMU; '
-        'euroc_imu, its readings (CSV); kalibr, its parameters (imu.yaml); gnss_fix and '
-        'gnss_velocity, what a receiver measures (CSV; nan: no fix); may be repeated; an existing '
-        'file is never overwritten')
+        'euroc_imu, its readings (CSV); may be repeated; an existing file is never overwritten')
 
 
 def _parse(text: str) -> tuple[str, Path]:
@@ -56,29 +45,21 @@ def _parse(text: str) -> tuple[str, Path]:
     return kind, Path(name)
 
 
-def check(exports: Sequence[tuple[str, Path]], topics: Collection[str],
-          values: Mapping[str, Any]) -> None:
-    """Raise ValueError if files cannot be made of a run with these parameters."""
+def check(exports: Sequence[tuple[str, Path]], topics: Collection[str]) -> None:
+    """Raise ValueError if files cannot be made of a log with these topics of streams."""
     for kind, _ in exports:
         for topic in KINDS[kind][0]:
             if topic not in topics:
                 raise ValueError(f'--export {kind}: the log has no {topic}')
-        for name in KALIBR_NEEDS:
-            if kind == 'kalibr' and not values[name] > 0.0:
-                raise ValueError(f'--export kalibr: {name} = {values[name]!r}: kalibr reads only '
-                                  'what is > 0')
 
 
 def write(reader: LogReader, run: RunDescription,
           exports: Sequence[tuple[str, Path]]) -> Iterator[str]:
     """Write the files; yield a line about each.  Raises ValueError or OSError."""
-    check(exports, run.topics, run.values_in_effect)
+    check(exports, run.topics)
     for kind, path in exports:
-        lines = KINDS[kind][1](reader, run)
-        first = next(lines, '')         # a run that is refused leaves no file
         with new_file(path) as file:
-            file.write(first)
-            file.writelines(lines)
+            file.writelines(KINDS[kind][1](reader, run))
         yield f'{path}: {kind}'
 
 
@@ -88,10 +69,10 @@ def _tum(reader: LogReader, run: RunDescription) -> Iterator[str]:
 
 
 def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
-    biases = [block for block in _blocks(reader, run, BIAS) if len(block[0])]
-    if not biases:
+    biases = [*_blocks(reader, run, BIAS)]
+    bias_ns = np.concatenate([np.empty(0, np.int64), *(stamps_ns for stamps_ns, _ in biases)])
+    if not len(bias_ns):
         raise ValueError(f'--export euroc: the log has no sample of {BIAS}')
-    bias_ns = np.concatenate([stamps_ns for stamps_ns, _ in biases])
     bias = np.concatenate([np.hstack(fields) for _, fields in biases])
     yield EUROC_HEAD
     for stamps_ns, (position, orientation, velocity, _) in _blocks(reader, run, ODOMETRY):
@@ -102,12 +83,10 @@ def _euroc(reader: LogReader, run: RunDescription) -> Iterator[str]:
                         np.column_stack(world), bias[newest])
 
 
-def _csv(topic: str, head: str, chosen: slice, reader: LogReader,
-         run: RunDescription) -> Iterator[str]:
-    """Yield the lines of a table of a topic, with these fields of its messages."""
-    yield head
-    for stamps_ns, fields in _blocks(reader, run, topic):
-        yield from _rows(',', stamps_ns, *fields[chosen])
+def _euroc_imu(reader: LogReader, run: RunDescription) -> Iterator[str]:
+    yield EUROC_IMU_HEAD
+    for stamps_ns, (rates, accelerations) in _blocks(reader, run, RAW):
+        yield from _rows(',', stamps_ns, rates, accelerations)
 
 
 def _rows(separator: str, stamps: Iterable[object],
@@ -116,15 +95,8 @@ def _rows(separator: str, stamps: Iterable[object],
         yield f'{stamp}{separator}{separator.join(map(repr, row))}\n'
 
 
-def _kalibr(_: LogReader, run: RunDescription) -> Iterator[str]:
-    values = run.values_in_effect
-    content = {'rostopic': run.topics[RAW], 'update_rate': values['imu.rate'],
-               **{name.removeprefix('imu.'): values[name] for name in KALIBR_NEEDS}}
-    yield yaml.safe_dump(content, sort_keys=True, default_flow_style=None)
-
-
 def _blocks(reader: LogReader, run: RunDescription, topic: str,
-            ) -> Iterator[tuple[NDArray[np.int64], tuple[NDArray[np.float64], ...]]]:
+            ) -> Iterator[tuple[Times, tuple[NDArray[np.float64], ...]]]:
     """Yield stamps (n,) [ns] and fields of the messages of a stream, block by block."""
     template = next(channel.template for channel in channels_of(run.values_in_effect)
                     if channel.topic == topic)
@@ -136,7 +108,4 @@ def _blocks(reader: LogReader, run: RunDescription, topic: str,
 # Of each kind: the topics that it needs, and the generator of its text.
 KINDS: dict[str, tuple[Sequence[str], Callable[..., Iterator[str]]]] = {
     'tum': ((ODOMETRY,), _tum), 'euroc': ((ODOMETRY, BIAS), _euroc),
-    'euroc_imu': ((RAW,), partial(_csv, RAW, EUROC_IMU_HEAD, slice(2))),
-    'kalibr': ((RAW,), _kalibr),
-    'gnss_fix': ((FIX,), partial(_csv, FIX, FIX_HEAD, slice(1, 2))),
-    'gnss_velocity': ((VELOCITY,), partial(_csv, VELOCITY, VELOCITY_HEAD, slice(1)))}
+    'euroc_imu': ((RAW,), _euroc_imu)}

@@ -57,7 +57,6 @@ class RunDescription:
     commands_topic: str | None            # None where the log has none
     events_topic: str | None
     events: Sequence[Logged]              # what was applied later
-    broken: Sequence[tuple[int, str]]     # stamp [ns] of each damaged entry, and the reason
     log_bytes: int                        # size of the log
 
     @property
@@ -84,17 +83,17 @@ def read_run_description(reader: LogReader) -> RunDescription:
                 LAST_LOG_TIME_NS, reader.span[1] or LAST_LOG_TIME_NS):
             raise ValueError('times are out of order or too late')
         environment = {key: metadata[key] for key in ('version', 'platform', 'libraries')}
-        log_format = metadata['format']
         topics = _topics(reader.topics, at_recording)
+        commands_topic = topics.pop(events.COMMANDS, None)
+        events_topic = topics.pop(events.EVENTS, None)
+        return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history,
+                              metadata['format'], environment, topics, commands_topic,
+                              events_topic, [*_events(reader, events_topic, epoch_ns)],
+                              reader.size)
     except MALFORMED as error:
         raise ForeignLogError(
-            f'its metadata {METADATA_NAME!r} cannot be used: {reason_of(error)}') from error
-    commands_topic = topics.pop(events.COMMANDS, None)
-    events_topic = topics.pop(events.EVENTS, None)
-    found, broken = _events(reader, events_topic, epoch_ns)
-    return RunDescription(at_start, at_recording, epoch_ns, begun_ns, history,
-                          log_format, environment, topics, commands_topic, events_topic,
-                          found, broken, reader.size)
+            f'its metadata {METADATA_NAME!r} or journal cannot be used: {reason_of(error)}',
+        ) from error
 
 
 def channels_of(values: Mapping[str, Any]) -> list[Channel]:
@@ -102,25 +101,20 @@ def channels_of(values: Mapping[str, Any]) -> list[Channel]:
     return all_channels(values, Imu(values, period_ns(values['imu.rate'])))
 
 
-def _events(reader: LogReader, topic: str | None, epoch_ns: int,
-            ) -> tuple[list[Logged], list[tuple[int, str]]]:
-    """Return the events in a topic, and stamp [ns] and reason of each that cannot be one."""
-    found, broken, reached_ns = [], [], epoch_ns - 1
+def _events(reader: LogReader, topic: str | None, epoch_ns: int) -> Iterator[Logged]:
+    """Yield the events in a topic.  Raises one of MALFORMED for what is none."""
+    reached_ns = epoch_ns - 1
     for message in reader.messages(topics=[] if topic is None else [topic]):
-        try:
-            event = Event.decoded(message.data)
-            sent_ns = epoch_ns + event.sent_ns
-            new_epoch_ns = event.details.get('epoch_ns', epoch_ns)
-            if not reached_ns <= sent_ns <= message.log_time <= LAST_LOG_TIME_NS or not (
-                    0 <= new_epoch_ns <= message.log_time):
-                raise ValueError(f'sent_ns = {event.sent_ns} is out of order or too late')
-            reached_ns = max(sent_ns, new_epoch_ns - 1) if event.kind == 'reset' else (
-                new_epoch_ns + event.sent_ns)
-            epoch_ns = new_epoch_ns
-            found.append(Logged(message.log_time, event))
-        except MALFORMED as error:
-            broken.append((message.log_time, reason_of(error)))
-    return found, broken
+        event = Event.decoded(message.data)
+        sent_ns = epoch_ns + event.sent_ns
+        new_epoch_ns = event.details.get('epoch_ns', epoch_ns)
+        if not reached_ns <= sent_ns <= message.log_time <= LAST_LOG_TIME_NS or not (
+                0 <= new_epoch_ns <= message.log_time):
+            raise ValueError(f'sent_ns = {event.sent_ns} is out of order or too late')
+        reached_ns = max(sent_ns, new_epoch_ns - 1) if event.kind == 'reset' else (
+            new_epoch_ns + event.sent_ns)
+        epoch_ns = new_epoch_ns
+        yield Logged(message.log_time, event)
 
 
 def _event_before(entry: Mapping[str, Any] | Sequence[Any]) -> Event:

@@ -35,18 +35,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    log: Path = arguments.log
-    with LogReader(log) as reader, cli.progress('recovered', reader.size, 'bytes') as show:
-        log = reader.path
-        output: Path = arguments.output or log.parent / f'{log.stem}_recovered.mcap'
-        messages = recover(reader, output, show)
-        damage = reader.damage
-    for line in damage.lines():
+    with LogReader(arguments.log, compressed=True) as reader:
+        output: Path = arguments.output or reader.path.with_name(
+            f'{reader.path.stem}_recovered.mcap')
+        cli.check_output(output)
+        messages = recover(reader, output)
+    for line in reader.damage.lines():
         cli.print_line(line)
-    lost = damage.lost_bytes or damage.lost_messages
-    kept = 'kept' if lost else 'kept all'
-    cli.print_line(f'{kept}: {messages} messages, {output.stat().st_size} bytes in {output}')
-    return SOME_LOST if lost else cli.OK
+    is_all = not (reader.damage.lost_bytes or reader.damage.changed)
+    cli.print_line(f'{"kept all" if is_all else "kept"}: {messages} messages, '
+                   f'{output.stat().st_size} bytes in {output}')
+    return cli.OK if is_all else SOME_LOST
 
 
 main = partial(cli.run, 'recover', __doc__, add_arguments, _run)

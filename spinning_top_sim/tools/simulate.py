@@ -21,7 +21,7 @@ from spinning_top_sim.recording.provenance import environment, run_metadata
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import McapWriter, log_head
+from spinning_top_sim.recording.writer import McapWriter
 from spinning_top_sim.solvers.dormand_prince import IntegrationError
 from spinning_top_sim.streams import events, parameters
 from spinning_top_sim.streams.channel import Channel
@@ -74,7 +74,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if objection := simulation.trajectory.top.objection:
         cli.print_line(f'spinning-top simulate: warning: {objection}', sys.stderr)
     log_exports.check(arguments.export, [
-        channel.topic for channel in recorded(simulation.channels, values)], values)
+        channel.topic for channel in recorded(simulation.channels, values)])
     cli.check_output(output, *(path for _, path in arguments.export))
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
@@ -168,10 +168,10 @@ def write_log(path: Path, simulation: Simulation, stops: Sequence[Stop],
     channels = recorded(simulation.channels, values)
     types = {channel.topic: channel.type_name for channel in channels} | events.TOPICS
     topics = list(types)
-    file = McapWriter(path, log_head(
-        [RecordedTopic(resolve_topic(name, namespace), type_name)
-         for name, type_name in types.items()],
-        {**run_metadata(values, epoch_ns, -1, (), values), **environment()}),
+    file = McapWriter(
+        path, [RecordedTopic(resolve_topic(name, namespace), type_name)
+               for name, type_name in types.items()],
+        {**run_metadata(values, epoch_ns, -1, (), values), **environment()},
         compression=values['record.compression'])
 
     def add(event: Event) -> None:

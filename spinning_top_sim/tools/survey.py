@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Finds out what is in a log, and how accurate that is.
-
-`survey` computes the motions of the run, compares each message with the motion that it belongs to,
-counts the samples of each topic, and measures each motion from the samples of one topic.
-"""
+"""Finds out what is in a log, and how accurate that is."""
 
 import itertools
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +14,15 @@ from numpy.typing import NDArray
 from spinning_top_sim.physics.attitude import angle_between
 from spinning_top_sim.physics.regimes import Description
 from spinning_top_sim.physics.states import relative_drift
-from spinning_top_sim.recording.errors import MALFORMED, Damage, reason_of
+from spinning_top_sim.recording.errors import MALFORMED, reason_of
 from spinning_top_sim.recording.reader import LogMessage, LogReader
 from spinning_top_sim.solvers.handover import Piece
 from spinning_top_sim.streams.channel import Channel
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.play import Block
-from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, Times, ns_array, stamp_text
+from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, Times, ns_array
 from spinning_top_sim.tools import analysis, recorded_run
-from spinning_top_sim.tools.analysis import Attitudes, Measured
+from spinning_top_sim.tools.analysis import Measured, SampledStates
 from spinning_top_sim.tools.recorded_run import LAST_LOG_TIME_NS, RunDescription
 
 MOST_GAPS = 10              # that are listed
@@ -35,232 +30,206 @@ MOST_EXACT = 1000           # motions that are compared with the exact one: 10 m
 # Streams that a motion can be measured from, the most accurate first.
 SOURCES = ('joint_states', 'ground_truth/imu', 'ground_truth/odom', 'imu/data', 'pose')
 ENOUGH_SAMPLES = 12.0       # in a nutation; a higher rate adds no accuracy
-Rows = NDArray[np.float64]
 
 
 @dataclass
-class TopicReport:
+class Topic:
     """The findings about a topic, with the keys of docs/logs.md."""
 
     type: str
-    stream: str | None = None             # topic of the stream of this package
+    stream: str | None = None
     count: int = 0
-    rate: float | None = None             # mean [Hz]
-    grid_rate: float | None = None        # by the parameters [Hz]
-    missing: int | None = None            # samples of the grid that are not in the log
-    # The first gaps: log times of the first and the last missing sample [ns]
+    rate: float | None = None             # [Hz]
+    grid_rate: float | None = None
+    missing: int | None = None
     gaps_ns: list[tuple[int, int]] = field(default_factory=list)
 
 
-@dataclass
-class Section:
-    """A part of a motion in which the rates stay the same: samples in (begin_ns, end_ns]."""
+class Section(NamedTuple):
+    """A part of a run in which all rates stay the same."""
 
-    begin_ns: int                         # log times [ns]
-    end_ns: int
     epoch_ns: int                         # stamp of t = 0 [ns]
-    channels: dict[str, Channel]          # with their rates, by topic of the log
+    after_ns: int                         # simulated time before the first samples [ns]
+    channels: dict[str, Channel]          # by topic of the log
+    imu: Imu
 
 
 @dataclass
-class MotionReport:
+class Motion:
     """A motion of the top, from its cause to the next one."""
 
     cause: str                            # start, command, state, drive or reset
+    begin_ns: int                         # log times [ns]
+    end_ns: int
+    section: Section                      # the first one
     piece: Piece                          # its constants and its exact solution
     exact: Description | None             # None if the closed form cannot represent it
     source: str | None                    # topic that it is measured from
-    imu: Imu
-    # Log times (n,) [ns] and `Attitudes.rows` of the source
-    samples: list[tuple[Times, Rows]] = field(default_factory=list)
-    sections: list[Section] = field(default_factory=list)
+    # Log times (n,) [ns] and samples (WIDTH, n) of the source
+    samples: list[tuple[Times, NDArray[np.float64]]] = field(default_factory=list)
     measured: Measured | None = None      # the numbers of `exact`, from the samples
 
-    @property
-    def begin_ns(self) -> int:
-        return self.sections[0].begin_ns
 
-    @property
-    def end_ns(self) -> int:
-        return self.sections[-1].end_ns
-
-
-@dataclass
 class Survey:
-    """All findings about a log."""
+    """
+    The findings about a log, and about its run if it has one.  Raises LogError.
 
-    path: Path                            # of the log
-    damage: Damage
-    span: tuple[int, int]                 # log times of the first and the last message [ns]
-    end_ns: int                           # log time up to which samples were recorded [ns]
-    topics: dict[str, TopicReport]
-    run: RunDescription | None = None     # None for a log that this package did not record
-    foreign_reason: str = ''              # why it is None
-    motions: list[MotionReport] = field(default_factory=list)
-    # By topic, the largest drifts of energy, l3 and lz since the begin of the motion, relative if
-    # not from 0, and the largest error of an attitude [rad]
-    drifts: dict[str, dict[str, float]] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-    # For pictures: the motions that are measured, and the samples of each
-    shown: list[tuple[MotionReport, Attitudes]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    end_ns : log time up to which samples were recorded [ns]
+    topics, motions : in the order of the log
+    drifts : by topic, the largest drifts of energy, l3 and lz since the begin of the motion,
+        relative if not from 0
+    errors : by topic, the largest error of an attitude [rad]
+    shown : samples of the motions that were measured
+    notes : what could not be done
+    """
 
+    def __init__(self, reader: LogReader, run: RunDescription | None) -> None:
+        self.begin_ns, self.end_ns = reader.span
+        self.topics = {topic.name: Topic(topic.type_name) for topic in reader.topics}
+        self.motions: list[Motion] = []
+        self.drifts: dict[str, dict[str, float]] = {}
+        self.errors: dict[str, float] = {}
+        self.shown: list[SampledStates] = []
+        self.notes: list[str] = []
+        self._due: defaultdict[str, list[Times]] = defaultdict(list)    # log times [ns]
+        with np.errstate(all='ignore'):         # a log may hold any numbers
+            if run is not None:
+                self._follow(run)
+            stamps_ns = self._read(reader)
+            if self.motions:        # the last event may be later than the last sample
+                last = self.motions[-1]
+                self.end_ns = last.end_ns = max(last.begin_ns, 0, *(
+                    int(stamps_ns[topic].max(initial=0)) for topic in last.section.channels))
+            for name, topic in self.topics.items():
+                self._count(topic, stamps_ns[name], self._due[name])
+            for motion in self.motions:
+                self._measure(motion)
 
-@np.errstate(all='ignore')                  # a log may hold any numbers
-def survey(reader: LogReader) -> Survey:
-    """Return the findings about a log.  Raises LogError."""
-    found = Survey(reader.path, reader.damage, reader.span, reader.span[1], {
-        topic.name: TopicReport(topic.type_name) for topic in reader.topics})
-    try:
-        run = found.run = recorded_run.read_run_description(reader)
-    except recorded_run.ForeignLogError as error:
-        found.foreign_reason = str(error)
-    else:
-        found.notes += [f'journal, entry at {stamp_text(stamp_ns)} s: {reason}'
-                        for stamp_ns, reason in run.broken]
+    def _follow(self, run: RunDescription) -> None:
+        """Compute the motions of a run, and when messages were due."""
         for name, topic in run.topics.items():
-            found.topics[topic].stream = name
-        _follow_run(found, run)
-    stamps_ns = _read_messages(found, reader)
-    sections = [section for motion in found.motions for section in motion.sections]
-    if sections:        # the last entry of the journal may be later than the last sample
-        last = sections[-1]
-        found.end_ns = last.end_ns = max(last.begin_ns, 0, *(
-            int(stamps_ns[topic].max(initial=0)) for topic in last.channels))
-    for topic, report in found.topics.items():
-        _count(found, report, stamps_ns[topic],
-               sections if report.stream is not None else [], topic)
-    for motion in found.motions:
-        _measure(found, motion)
-    return found
+            self.topics[topic].stream = name
+        motions, section = self.motions, None
+        try:
+            for simulation, done in recorded_run.rerun(run, self.end_ns):
+                if isinstance(done, Block):
+                    continue
+                event = done.event
+                if section is not None:
+                    motions[-1].end_ns = section.epoch_ns + event.sent_ns
+                    self._expect(run, section, event.sent_ns)
+                section = Section(simulation.epoch_ns, simulation.now_ns, {
+                    run.topics[channel.topic]: channel for channel in simulation.channels
+                    if channel.topic in run.topics}, simulation.imu)
+                # The velocities of the pivot belong to one motion.
+                if event.begins_report and not (
+                        event.kind == 'drive' and motions and motions[-1].cause == 'drive'):
+                    begin_ns = section.epoch_ns + section.after_ns
+                    piece = simulation.trajectory.after(max(simulation.now_ns, 0))
+                    exact = piece.describe() if len(motions) < MOST_EXACT else None
+                    motions.append(Motion(event.kind, begin_ns, begin_ns, section, piece, exact,
+                                          _source(run, section, exact)))
+        except MALFORMED as error:
+            self.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
+        if section is not None:
+            self._expect(run, section, self.end_ns - section.epoch_ns)
+        if len(motions) > MOST_EXACT:
+            self.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact '
+                              'one')
+
+    def _expect(self, run: RunDescription, section: Section, end_ns: int) -> None:
+        """Note when the messages of a section up to a simulated time were due."""
+        for name, channel in section.channels.items():
+            self.topics[name].grid_rate = NANOSECONDS / channel.period_ns
+            times = channel.times(max(section.after_ns, -1), end_ns)
+            if len(times) <= recorded_run.most_samples(run):
+                self._due[name].append(section.epoch_ns + np.unique(channel.due(ns_array(times))))
+            else:
+                self.notes.append(f'{name}: what is missing is not counted: the log lacks most of '
+                                  f'{len(times)} samples')
+
+    def _read(self, reader: LogReader) -> dict[str, Times]:
+        """Compare all messages with their motions; return the log times of each topic [ns]."""
+        ends_ns = [motion.end_ns for motion in self.motions[:-1]]
+        blocks_ns = {topic: [np.empty(0, np.int64)] for topic in self.topics}
+        for topic, messages in reader.groups():
+            blocks_ns[topic].append(_stamps(messages))
+            if self.motions and self.topics[topic].stream is not None:
+                for number, part in itertools.groupby(
+                        messages, lambda message: bisect_left(ends_ns, message.log_time)):
+                    self._compare(self.motions[number], topic, list(part))
+        return {topic: np.concatenate(parts) for topic, parts in blocks_ns.items()}
+
+    def _compare(self, motion: Motion, topic: str, messages: list[LogMessage]) -> None:
+        """Compare messages with their motion, and keep those that it is measured from."""
+        section, piece = motion.section, motion.piece
+        channel = section.channels[topic]
+        fitting = [one for one in messages if len(one.data) == len(channel.template)]
+        attitudes = analysis.attitudes_of(
+            channel.topic, section.imu, _stamps(fitting),
+            channel.template.decode(b''.join(one.data for one in fitting)))
+        if attitudes is None:
+            return
+        if topic == motion.source:
+            motion.samples.append(attitudes)
+        if not piece.rests:         # there are other constants in each of its pieces
+            return
+        # Log times of the run; those of a log that was changed may lie anywhere.
+        times_ns = np.clip(attitudes[0] - section.epoch_ns, piece.start_ns, LAST_STAMP_NS)
+        states = SampledStates(piece.top, times_ns / NANOSECONDS, attitudes[1])
+        if not np.isnan(states.l3).all() and channel.topic != 'imu/data':       # which is noisy
+            drifts = self.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})
+            for name, largest in drifts.items():
+                drifts[name] = max(largest, _largest(
+                    relative_drift(getattr(states, name), getattr(piece, name))))
+        if motion.exact is not None and piece.exact:
+            truth = piece.exact.states(times_ns)
+            error = _largest(angle_between(states.rows_quaternion, truth.rows_quaternion))
+            self.errors[topic] = max(self.errors.get(topic, 0.0), error)
+
+    def _count(self, topic: Topic, stamps_ns: Times, due: list[Times]) -> None:
+        """Count messages, and those that were due and are missing."""
+        topic.count = len(stamps_ns)
+        if topic.count > 1 and (duration_ns := int(stamps_ns[-1] - stamps_ns[0])):
+            topic.rate = (topic.count - 1) / duration_ns * NANOSECONDS
+        if due:
+            due_ns = np.concatenate(due)
+            due_ns = due_ns[due_ns <= self.end_ns]
+            missing = ~np.isin(due_ns, stamps_ns)
+            topic.missing = int(np.sum(missing))
+            edges = np.flatnonzero(np.diff(missing, prepend=False, append=False))
+            topic.gaps_ns = [(int(due_ns[begin]), int(due_ns[end - 1])) for begin, end in zip(
+                edges[::2], edges[1::2], strict=True)][:MOST_GAPS]
+
+    def _measure(self, motion: Motion) -> None:
+        """Measure a motion from the longest part of its samples that has one rate."""
+        if sum(len(stamps_ns) for stamps_ns, _ in motion.samples) < 2:
+            return
+        stamps_ns, rows = (np.concatenate(parts, axis=-1)
+                           for parts in zip(*motion.samples, strict=True))
+        motion.samples, part = [], analysis.longest_run(stamps_ns)
+        states = SampledStates(motion.piece.top, (stamps_ns[part] - self.begin_ns) / NANOSECONDS,
+                               rows[:, part])
+        try:
+            motion.measured = analysis.measure(
+                states, motion.exact.nutation_period if motion.exact else None)
+        except MALFORMED as error:
+            self.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
+        else:
+            self.shown.append(states)
 
 
-def _follow_run(found: Survey, run: RunDescription) -> None:
-    """Compute the motions of a run; add notes about what cannot be followed."""
-    motions = found.motions
-    try:
-        for simulation, done in recorded_run.rerun(run, found.span[1]):
-            if isinstance(done, Block):
-                continue
-            event = done.event
-            if motions:
-                last = motions[-1].sections[-1]
-                last.end_ns = last.epoch_ns + event.sent_ns
-            begin_ns = simulation.epoch_ns + simulation.now_ns
-            channels = {run.topics[channel.topic]: channel for channel in simulation.channels
-                        if channel.topic in run.topics}
-            # The velocities of the pivot belong to one motion.
-            if event.begins_report and not (
-                    event.kind == 'drive' and motions and motions[-1].cause == 'drive'):
-                piece = simulation.trajectory.after(max(simulation.now_ns, 0))
-                exact = piece.describe() if len(motions) < MOST_EXACT else None
-                motions.append(MotionReport(event.kind, piece, exact,
-                                            _source(run, channels, exact), simulation.imu))
-            motions[-1].sections.append(
-                Section(begin_ns, begin_ns, simulation.epoch_ns, channels))
-    except MALFORMED as error:
-        found.notes.append(f'the run cannot be followed beyond here: {reason_of(error)}')
-    if len(motions) > MOST_EXACT:
-        found.notes.append(f'only the first {MOST_EXACT} motions are compared with the exact one')
-
-
-def _source(run: RunDescription, channels: Mapping[str, Channel],
-            exact: Description | None) -> str | None:
+def _source(run: RunDescription, section: Section, exact: Description | None) -> str | None:
     """Return the topic that a motion is measured from, as docs/logs.md says."""
     period_ns = ((exact and exact.nutation_period) or math.inf) * NANOSECONDS
     return max((run.topics[name] for name in SOURCES if name in run.topics), default=None,
-               key=lambda name: min(period_ns / channels[name].period_ns, ENOUGH_SAMPLES))
+               key=lambda name: min(period_ns / section.channels[name].period_ns, ENOUGH_SAMPLES))
 
 
-def _read_messages(found: Survey, reader: LogReader) -> dict[str, Times]:
-    """Compare all messages with their motions; return the log times of each topic [ns]."""
-    ends_ns = [motion.end_ns for motion in found.motions[:-1]]
-    blocks_ns = {topic: [np.empty(0, np.int64)] for topic in found.topics}
-    for topic, samples in reader.groups():
-        blocks_ns[topic].append(_stamps(samples))
-        if found.motions and found.topics[topic].stream is not None:
-            for number, part in itertools.groupby(
-                    samples, lambda sample: bisect_left(ends_ns, sample.log_time)):
-                _analyse(found, found.motions[number], topic, list(part))
-    return {topic: np.concatenate(parts) for topic, parts in blocks_ns.items()}
+def _stamps(messages: list[LogMessage]) -> Times:
+    return np.array([min(one.log_time, LAST_LOG_TIME_NS) for one in messages], np.int64)
 
 
-def _stamps(samples: Sequence[LogMessage]) -> Times:
-    return np.array([min(sample.log_time, LAST_LOG_TIME_NS) for sample in samples], np.int64)
-
-
-def _analyse(found: Survey, motion: MotionReport, topic: str, samples: list[LogMessage]) -> None:
-    section, piece = motion.sections[0], motion.piece
-    channel = section.channels[topic]
-    fitting = [sample for sample in samples if len(sample.data) == len(channel.template)]
-    stamps_ns = _stamps(fitting)
-    fields = channel.template.decode(b''.join(sample.data for sample in fitting))
-    data = analysis.attitudes_of(channel.topic, motion.imu, stamps_ns, fields)
-    if data is None:
-        return
-    if topic == motion.source:
-        motion.samples.append((data.stamps_ns, data.rows))
-    if not piece.rests:             # there are other constants in each of its pieces
-        return
-    values = data.constants(piece.top)
-    if values is not None and channel.topic != 'imu/data':       # which is noisy
-        drifts = found.drifts.setdefault(topic, {'energy': 0.0, 'l3': 0.0, 'lz': 0.0})
-        for (name, largest), value in zip(drifts.items(), values, strict=True):
-            drift = relative_drift(value, getattr(piece, name))
-            drifts[name] = max(largest, _largest(drift))
-    # Log times of the run; those of a log that was changed may lie anywhere.
-    times_ns = np.clip(data.stamps_ns - section.epoch_ns, piece.start_ns, LAST_STAMP_NS)
-    if motion.exact is not None and piece.exact:
-        error = _largest(angle_between(
-            data.quaternion, piece.exact.states(times_ns).rows_quaternion))
-        found.errors[topic] = max(found.errors.get(topic, 0.0), error)
-
-
-def _largest(values: Rows) -> float:
+def _largest(values: NDArray[np.float64]) -> float:
     """Return the largest absolute value of those that are finite, 0 without any."""
     return float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
-
-
-def _count(found: Survey, report: TopicReport, stamps_ns: Times, sections: list[Section],
-           topic: str) -> None:
-    report.count = len(stamps_ns)
-    if report.count > 1:
-        duration_ns = int(stamps_ns[-1] - stamps_ns[0])
-        report.rate = (report.count - 1) / duration_ns * 1e9 if duration_ns else None
-    for section in sections:
-        end = int(np.searchsorted(stamps_ns, section.end_ns, 'right'))
-        channel = section.channels[topic]
-        times = channel.times(max(section.begin_ns - section.epoch_ns, -1),
-                              section.end_ns - section.epoch_ns)
-        report.grid_rate = NANOSECONDS / channel.period_ns
-        if found.run and len(times) > recorded_run.most_samples(found.run):
-            found.notes.append(f'{topic}: what is missing is not counted: the log lacks most of '
-                               f'{len(times)} samples')
-            return
-        _count_section(report, section, channel, times, stamps_ns[:end])
-        stamps_ns = stamps_ns[end:]
-
-
-def _count_section(report: TopicReport, section: Section, channel: Channel, times: range,
-                   stamps_ns: Times) -> None:
-    """Add the missing messages of a section: those that the run has sent and the log lacks."""
-    due_ns = section.epoch_ns + np.unique(channel.due(ns_array(times)))
-    missing = ~np.isin(due_ns, stamps_ns)
-    report.missing = (report.missing or 0) + int(np.sum(missing))
-    edges = np.flatnonzero(np.diff(missing, prepend=False, append=False))
-    report.gaps_ns += [(int(due_ns[begin]), int(due_ns[end - 1])) for begin, end in zip(
-        edges[::2], edges[1::2], strict=True)][:max(MOST_GAPS - len(report.gaps_ns), 0)]
-
-
-def _measure(found: Survey, motion: MotionReport) -> None:
-    samples, motion.samples = motion.samples, []
-    data = analysis.longest_run(samples) if samples else None
-    if data is None or len(data.stamps_ns) < 2:
-        return
-    try:
-        motion.measured = analysis.measure(
-            data, motion.exact.nutation_period if motion.exact else None)
-    except MALFORMED as error:
-        found.notes.append(f'{motion.source} cannot be measured: {reason_of(error)}')
-    else:
-        found.shown.append((motion, data))

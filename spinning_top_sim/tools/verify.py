@@ -5,8 +5,8 @@ import math
 import operator
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple
 
 from spinning_top_sim.recording import provenance
 from spinning_top_sim.recording.errors import MALFORMED, reason_of
@@ -48,6 +48,10 @@ class Comparison:
         """Whether the messages in the log are those computed."""
         return not (self.different or self.missing or self.unexpected or self.stopped)
 
+    def as_json(self) -> dict[str, Any]:
+        return {'identical': self.identical, **asdict(self),
+                'first': self.first and self.first._asdict()}
+
     def note(self, this: Difference) -> None:
         self.first = min(self.first or this, this, key=operator.attrgetter('stamp_ns'))
 
@@ -71,9 +75,6 @@ def compare(run: RunDescription, reader: LogReader, end_ns: int,
     comparison = Comparison(dict.fromkeys(filter(None, topics), 0), warnings=[
         f'{what} was {run.environment[what]}, is {here}'
         for what, here in provenance.environment().items() if run.environment[what] != here])
-    for stamp_ns, reason in run.broken:
-        comparison.different += 1
-        comparison.note(Difference(stamp_ns, run.events_topic or '', 'entry', reason, 'an entry'))
     # What has not been met in the log.
     computed: _Computed = defaultdict(deque)
     progress, before_ns = _compute(run, end_ns, computed, comparison, show), -math.inf
@@ -135,8 +136,6 @@ def _difference(key: tuple[int, str], channel: Channel | None, logged: bytes,
     if sizes[0] != sizes[1]:
         return Difference(*key, 'size', f'{sizes[0]} bytes', f'{sizes[1]} bytes', min(sizes))
     at = next(at for at in range(sizes[0]) if logged[at] != computed[at])
-    if channel is not None:
-        what, (one, two) = channel.template.shown_at(at, logged, computed)
-    else:
-        what, one, two = f'byte {at}', f'0x{logged[at]:02x}', f'0x{computed[at]:02x}'
+    what, (one, two) = channel.template.shown_at(at, logged, computed) if channel else (
+        f'byte {at}', (f'0x{logged[at]:02x}', f'0x{computed[at]:02x}'))
     return Difference(*key, what, one, two, at)

@@ -30,8 +30,7 @@ class LogSource:
             self.track = SampledTrack(run.values_in_effect, run.epoch_ns)
             last_ns = _end_of_top(run)
             self._read(reader, run, last_ns or recorded_run.LAST_LOG_TIME_NS)
-            notes = {'is truncated: shown as far as it goes': not reader.whole,
-                     'is damaged: shown without some chunks': reader.whole and reader.left_out,
+            notes = {'is damaged: what is whole is shown': not reader.whole,
                      'is shown up to the reset to another top': last_ns}
         if not len(self.track.rows):
             raise LogError(f'{path}: no attitude of the top in it ({", ".join(TOPICS)})')

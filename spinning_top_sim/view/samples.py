@@ -7,38 +7,16 @@ from typing import Any
 import numpy as np
 
 from spinning_top_sim.physics.pivot import Kinematics
-from spinning_top_sim.physics.states import States
-from spinning_top_sim.physics.top import State, Top
 from spinning_top_sim.streams.imu import Imu
 from spinning_top_sim.streams.topics import all_channels
 from spinning_top_sim.times import NANOSECONDS, Times, period_ns
-from spinning_top_sim.tools.analysis import RATES, attitudes_of
+from spinning_top_sim.tools.analysis import SampledStates, attitudes_of
 from spinning_top_sim.view.source import Reals, Track
 
 # The topics that tell the attitude, the one that tells most first.
 TOPICS = ('ground_truth/odom', 'joint_states', 'pose', 'ground_truth/imu')
-# Columns of a sample: q(world <- body) as x, y, z, w, the angular velocity in the body, the place
-# of the pivot.  NaN: not known.
-QUATERNION, OMEGA, PLACE, WIDTH = slice(0, 4), slice(4, 7), slice(7, 10), 10
-
-
-class SampledStates(States):
-    """States by samples, without forces.  What follows from a rate that is not known is NaN."""
-
-    method = 'samples'
-
-    def __init__(self, top: Top, t: Reals, rows: Reals) -> None:
-        super().__init__(top, State(theta=0.0, l3=0.0, lz=0.0), len(t))
-        (x, y, z, w), (w1, w2, w3) = rows[:, QUATERNION].T, rows[:, OMEGA].T
-        self.t, self.rows_quaternion, self.transverse_velocity = t, (x, y, z, w), (w1, w2)
-        self._l3 = self.l3 = top.lambda3 * w3
-        place = np.nan_to_num(rows[:, PLACE].T)
-        self.pivot = Kinematics(place, 0.0 * place, 0.0 * place)
-        up_1, up_2, height = self.rows_vertical
-        across = w1 * up_1 + w2 * up_2
-        self.lz = top.lambda1 * across + self._l3 * height
-        with np.errstate(divide='ignore', invalid='ignore'):        # at a pole
-            self.phi_dot = across / (up_1 ** 2 + up_2 ** 2)
+# Columns of a sample: attitude and rates, as in `analysis`; place of the pivot.  NaN: not known.
+MOTION, PLACE, WIDTH = slice(0, 7), slice(7, 10), 10
 
 
 class SampledTrack(Track):
@@ -66,8 +44,11 @@ class SampledTrack(Track):
         return bool(np.diff(places, axis=0).any())
 
     def at(self, times: Times) -> SampledStates:
-        return SampledStates(self.top, times / NANOSECONDS, self.rows[
-            np.searchsorted(self.stamps_ns, times + self.epoch_ns)])
+        rows = self.rows[np.searchsorted(self.stamps_ns, times + self.epoch_ns)].T
+        states = SampledStates(self.top, times / NANOSECONDS, rows[MOTION])
+        place = np.nan_to_num(rows[PLACE])
+        states.pivot = Kinematics(place, 0.0 * place, 0.0 * place)
+        return states
 
     @property
     def span(self) -> tuple[int, int]:
@@ -92,13 +73,11 @@ class SampledTrack(Track):
         fields = template.decode(data)
         found = attitudes_of(topic, self._imu, stamps, fields)
         assert found is not None
-        rows = np.full((len(found.stamps_ns), WIDTH), np.nan)
-        rows[:, QUATERNION] = found.rows[:4].T
-        if found.omega is not None:
-            rows[:, OMEGA] = found.rows[RATES].T
+        known_ns, samples = found
+        place = np.full((len(known_ns), 3), np.nan)
         if topic in ('pose', 'ground_truth/odom'):
-            rows[:, PLACE] = fields[0][np.isin(stamps, found.stamps_ns)]
-        self.add(found.stamps_ns, rows)
+            place = fields[0][np.isin(stamps, known_ns)]
+        self.add(known_ns, np.column_stack((samples[MOTION].T, place)))
 
     def drop_before(self, stamp_ns: int) -> None:
         """Drop the samples before a stamp [ns]."""

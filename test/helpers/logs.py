@@ -2,80 +2,42 @@
 """Logs for the tests of `recover` and of the readers, and what three readers see in them."""
 
 import contextlib
-import functools
 import io
-import os
 import random
 import struct
 from pathlib import Path
 from types import SimpleNamespace
 
-import yaml  # type: ignore[import-untyped]
 import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 
-from helpers.recordings import METADATA
+from helpers.recordings import METADATA, TOPICS, some_messages
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import single
-from spinning_top_sim.recording.rosbag2 import RecordedTopic
-from spinning_top_sim.recording.writer import McapWriter, log_head
+from spinning_top_sim.recording.writer import McapWriter
 from spinning_top_sim.tools.recover import main
 
-JAZZY = get_typestore(Stores.ROS2_JAZZY)
-POINT = 'geometry_msgs/msg/Point'
-NUMBER = 'std_msgs/msg/Float64'
-TOPICS = (
-    RecordedTopic('/top/point', POINT),
-    RecordedTopic('/top/number', NUMBER, {'depth': 3, 'reliability': 2}),
-)
-EPOCH_NS = 1_700_000_000_000_000_000
-CHUNKS = 3
-MESSAGES_PER_CHUNK = 12
-ALL_KEPT, FAILED, SOME_LOST = 0, 1, 3
-
-
-def cdr(number: int) -> tuple[int, bytes]:
-    """Return a topic and a message for it."""
-    if number % 3:
-        return 0, bytes(JAZZY.serialize_cdr(JAZZY.types[POINT](float(number), -2.0, 1 / 3), POINT))
-    return 1, bytes(JAZZY.serialize_cdr(JAZZY.types[NUMBER](float(number)), NUMBER))
-
-
-def write_log(path, compression='zstd'):
-    """Write a log by our writer, chunk borders where they are wanted; return its messages."""
-    file = McapWriter(path, log_head(TOPICS, METADATA), compression=compression)
-    messages = []
-    for number in range(CHUNKS * MESSAGES_PER_CHUNK):
-        index, data = cdr(number)
-        stamp = EPOCH_NS + number * 1_234_567
-        file.add(*single(index, stamp, data))
-        messages.append((TOPICS[index].name, stamp, data))
-        if (number + 1) % MESSAGES_PER_CHUNK == 0:
-            file.flush()
-    file.finish()
-    return messages
+CHUNKS, MESSAGES_PER_CHUNK = 3, 12
 
 
 def small_log(path) -> SimpleNamespace:
-    """Write a small log of ours; return bytes, messages, and (opcode, start, end) of records."""
-    messages = write_log(path)
+    """Write a small log of ours; return bytes, messages, and (opcode, start, end) of chunks."""
+    rows = some_messages(CHUNKS * MESSAGES_PER_CHUNK)
+    file = McapWriter(path, TOPICS, METADATA, compression='zstd')
+    for number, row in enumerate(rows, start=1):
+        file.add(*single(*row))
+        if number % MESSAGES_PER_CHUNK == 0:
+            file.flush()
+    file.finish()
     content = path.read_bytes()
-    records = records_of(content)
-    chunks = [record for record in records if record[0] == Opcode.CHUNK]
+    chunks = [record for record in records_of(content) if record[0] == Opcode.CHUNK]
     assert len(chunks) == CHUNKS
-    return SimpleNamespace(content=content, messages=messages, records=records, chunks=chunks)
-
-
-def write_anew(path, content):
-    """Write a file, not over the one before: that would wait for the disk."""
-    path.unlink(missing_ok=True)
-    path.write_bytes(content)
-    return path
+    return SimpleNamespace(content=content, chunks=chunks, messages=[
+        (TOPICS[index].name, stamp, data) for index, stamp, data in rows])
 
 
 def flipped(content: bytes, position: int, bit: int = 0) -> bytes:
@@ -131,10 +93,8 @@ def seen_by_rosbags(path) -> list[tuple[str, int, bytes]]:
 
 
 STRANGERS = {
-    'plain': {},
     'unchunked': {'use_chunking': False},
     'lz4': {'compression': CompressionType.LZ4},
-    'no message index': {'index_types': IndexType.ALL & ~IndexType.MESSAGE},
     'nothing but messages': {
         'use_chunking': False, 'use_statistics': False, 'use_summary_offsets': False,
         'repeat_channels': False, 'repeat_schemas': False, 'index_types': IndexType.NONE,
@@ -142,12 +102,12 @@ STRANGERS = {
 }
 
 
-def write_stranger(path, options, profile='', count=300):
+def write_stranger(path, options, count=300):
     """Write JSON and schemaless messages by mcap's own writer, with an attachment."""
     messages = []
     with open(path, 'wb') as file:
         writer = Writer(file, chunk_size=1000, **options)
-        writer.start(profile=profile, library='a stranger')
+        writer.start(library='a stranger')
         writer.add_metadata('note', {'a': 'ä', 'b': ''})
         schema = writer.register_schema('thing', 'jsonschema', b'{"type": "object"}')
         channels = {
@@ -165,11 +125,10 @@ def write_stranger(path, options, profile='', count=300):
     return messages
 
 
-def write_bag(folder, mode='', form='', compress=zstandard.compress, split=1, *,
+def write_bag(folder, mode='', form='zstd', compress=zstandard.compress, split=1, *,
               record=True):
-    """Write what matters of a bag as rosbag2 does, with ten strings; return these."""
+    """Write what matters of a bag as rosbag2 does, with ten strings."""
     folder.mkdir()
-    messages = [b'\0\1\0\0\x06\0\0\0text%d\0' % number for number in range(10)]
     about = f"compression_format: {form}\ncompression_mode: '{mode}'\n"
     for part in range(split):
         path = folder / f'{folder.name}_{part}.mcap'
@@ -178,7 +137,8 @@ def write_bag(folder, mode='', form='', compress=zstandard.compress, split=1, *,
             writer.start('ros2', 'libmcap')
             channel = writer.register_channel('/said', 'cdr', writer.register_schema(
                 'std_msgs/msg/String', 'ros2msg', b'string data\n'))
-            for number, data in enumerate(messages):
+            for number in range(10):
+                data = b'\0\1\0\0\x06\0\0\0text%d\0' % number
                 writer.add_message(channel, number, compress(data) if mode == 'MESSAGE' else data,
                                    number)
             if record:
@@ -189,19 +149,3 @@ def write_bag(folder, mode='', form='', compress=zstandard.compress, split=1, *,
             path.unlink()
     (folder / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  ' + about.replace(
         '\n', '\n  '))
-    return messages
-
-
-def without_sync(monkeypatch) -> None:
-    """For thousands of recoveries that nobody pulls the plug on; of one YAML, parsed once."""
-    dumped, dump = {}, yaml.dump
-
-    def dump_once(value, **options):
-        key = repr((value, sorted(options)))
-        if key not in dumped:
-            dumped[key] = dump(value, **options)
-        return dumped[key]
-
-    monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
-    monkeypatch.setattr(yaml, 'dump', dump_once)
-    monkeypatch.setattr(yaml, 'safe_load', functools.cache(yaml.safe_load))

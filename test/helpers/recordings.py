@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages for the tests of the recorder, and what readers find of them."""
+"""Messages for the tests of recordings, and logs of other programs with any messages."""
 
 import struct
-import time
+from collections import Counter
 
 import numpy as np
-from mcap.records import Channel as ChannelRecord
+from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from spinning_top_sim.recording.recorder import single
-from spinning_top_sim.recording.rosbag2 import RecordedTopic, qos_profiles
-from spinning_top_sim.recording.writer import McapWriter, log_head
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -40,37 +38,27 @@ def array_cdr(number: int) -> bytes:
 
 
 def write_rows(path, topics, rows, per_chunk=None, metadata=None):
-    """Write a log of rows (number of a topic, stamp [ns], data), so many in a chunk."""
-    file = McapWriter(path, log_head(topics, metadata or {}), compression='none')
-    for number, row in enumerate(rows, start=1):
-        file.add(*single(*row))
-        if per_chunk and number % per_chunk == 0:
-            file.flush()
-    file.finish()
+    """Write rows (number of a topic, stamp [ns], data) by mcap's writer, so many in a chunk."""
+    with open(path, 'wb') as file:
+        writer, counts = Writer(file), Counter()
+        writer.start('ros2')
+        writer.add_metadata('spinning_top_sim', metadata or {})
+        channels = [writer.register_channel(topic.name, 'cdr', writer.register_schema(
+            topic.type_name, 'ros2msg', JAZZY.generate_msgdef(
+                topic.type_name, ros_version=2)[0].encode())) for topic in topics]
+        for number, (topic, stamp, data) in enumerate(rows, start=1):
+            writer.add_message(channels[topic], stamp, data, stamp, counts[topic])
+            counts[topic] += 1
+            if per_chunk and number % per_chunk == 0:
+                writer.flush()
+        writer.finish()
     return path
-
-
-def opened(recorder):
-    """Wait until a recorder has opened its file, or failed."""
-    deadline = time.monotonic() + 20.0
-    while recorder.state == 'opening':
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
-    return recorder
-
-
-def write(recorder, topic_index, log_time_ns, data):
-    recorder.write([single(topic_index, log_time_ns, data)])
 
 
 def some_messages(count: int) -> list[tuple[int, int, bytes]]:
     """Messages of the first two topics in turn, 1 ms apart."""
     makers = (pose_cdr, array_cdr)
     return [(n % 2, EPOCH_NS + n * 1_000_000, makers[n % 2](n)) for n in range(count)]
-
-
-def parsed_qos(text):
-    return qos_profiles(ChannelRecord(1, '/a', 'cdr', {'offered_qos_profiles': text}, 1))
 
 
 def rows_of(begin: int, end: int):
