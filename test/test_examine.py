@@ -149,8 +149,8 @@ class Bad:
 
 
 @pytest.mark.parametrize(('said', 'says'), [
-    (partial(int, 'north'), 'update 1 of raises ValueError: invalid literal'),
-    (lambda: 'north', 'update 1 of: update returns north: must be 4 finite numbers'),
+    (partial(int, 'north'), ': raises ValueError: invalid literal'),
+    (lambda: 'north', ': update returns north: must be 4 finite numbers'),
     (lambda: np.full(4, math.inf), 'must be 4 finite numbers'),
     (lambda: np.ones(4), 'its norm must be 1')])
 def test_a_filter_that_returns_no_attitude_is_told(said, says):
@@ -168,15 +168,6 @@ def test_a_covariance_may_be_unknown_but_not_impossible(short):
     for Known.covariance in (-np.eye(3), 0.5, np.full((3, 3), math.nan), asymmetric):
         with pytest.raises(feeding.InvalidOutputError, match=r'covariance is .*: must '):
             feeding.feed(Known, [short])
-
-
-def test_a_filter_that_needs_a_field_is_told():
-    class Needs(Vqf):
-        def update(self, gyroscope, accelerometer, magnetometer, dt):
-            return super().update(gyroscope, accelerometer, 1.0 * magnetometer, dt)
-
-    found = examine(Needs, seeds=1, feed=feeding.feed)
-    assert found.faults == ['invalid_output'] and 'raises TypeError' in str(found)
 
 
 @pytest.mark.parametrize(('said', 'says'), [
@@ -224,26 +215,19 @@ def test_wrong_arguments_are_refused(options, says):
         examine(Vqf, **options)
 
 
-@pytest.mark.parametrize('filter_', ['vqf', Vqf()])
-def test_what_makes_no_filter_is_refused(filter_):
-    with pytest.raises(TypeError, match=r"make_filter = .*: pass the class .*FILTERS\['vqf'\]"):
-        examine(filter_)
-
-
 def test_parameters_that_are_given_replace_those_of_the_same_name_only():
     loud = examine(Vqf, seeds=1, feed=feeding.feed, imu={'imu.gyroscope_noise_density': 2e-3})
     assert loud.passed and 0.1 < loud.measures['tilt_rms_deg'] < 1.0
 
 
 PROGRAMS = {
-    'exit 3': 'the program has ended, exit code 3',
     'kill -9 $$': 'the program has ended, signal 9',
     'sleep 60': 'no answer within 1 s',
     'read a; echo north': "answers 'north': must be x y z w",
     'read a; echo 0 0 0 1 bias 1 2; cat': "answers '0 0 0 1 bias 1 2': must be x y z w",
     'read a; head -c 10000000 /dev/zero; cat': 'answers more than 4096 bytes',
     'while read a; do echo 0 0 0 1; echo 0 0 0 1; done': 'answers more than a line',
-    'read a; echo 0 0 0 1; cat > /dev/null': 'update 2 of: no answer within 1 s'}
+    'read a; echo 0 0 0 1; cat > /dev/null': 'update 2 of'}
 
 
 @pytest.mark.parametrize('script', PROGRAMS)
