@@ -17,7 +17,7 @@ from spinning_top_sim.exam import measures
 from spinning_top_sim.exam.feeding import Outcome
 from spinning_top_sim.exam.measures import NEES_OFF, degrees
 from spinning_top_sim.exam.motions import RATE, Reals
-from spinning_top_sim.exam.runs import BIAS, BIAS_S, FIELD_TURN, LARGE, LED_BACK, STILL, Exam
+from spinning_top_sim.exam.runs import ANSWER, BIAS, BIAS_S, FIELD_TURN, LARGE, STILL, Exam
 from spinning_top_sim.tools import conventions
 from spinning_top_sim.tools.conventions import errors_of
 from spinning_top_sim.tools.identify import AXES, rms
@@ -26,7 +26,7 @@ from spinning_top_sim.tools.report import Mark
 # Without noise a right filter has no error; what is left is its own rounding and settling [deg].
 CLEAN_DEG = 0.3
 GAIN_OFF = 0.02         # of turns: less than sensors differ in scale
-EXPLAINED = 0.25        # of an effect: what a matrix may leave of it, if the matrix is wrong
+EXPLAINED = 0.25        # of an effect: what its cause may leave of it
 TURNS_OFF = 0.003       # of large turns; a step of first order is 0.0075 off
 DELAY = 0.25            # samples: half of what a mean of two steps is late
 UNEVEN = 0.8            # 1 - ratio of gains about two axes: those of right filters differ less
@@ -150,12 +150,12 @@ def tilt_answer(exam: Exam) -> Measured:
     for moved in exam.outcomes('tilts'):
         last = len(moved.run.dt) - 1
         first, later = (np.cross(*measures.up(np.stack((moved.estimates[k], still.estimates[k]))))
-                        for k in (last + 1 - LED_BACK, last))
+                        for k in (last + 1 - 4 * ANSWER, last))
         back.append(1.0 - float(first @ later) / float(first @ first))
     share = np.array(back[::2]) / np.maximum(back[1::2], measures.ROUNDING)
     return Measured(1.0 - float(np.min(share)), 'gravity leads a tilt about x, y and z back by '
                     f'{", ".join(f"{one:.2g}" for one in back[::2])} of it within '
-                    f'{LED_BACK / RATE:g} s, across by '
+                    f'{4.0 * ANSWER / RATE:g} s, across by '
                     f'{", ".join(f"{one:.2g}" for one in back[1::2])}')
 
 

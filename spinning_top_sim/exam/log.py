@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from spinning_top_sim.exam.checks import EXPLAINED
 from spinning_top_sim.exam.feeding import Outcome, invalid
 from spinning_top_sim.exam.measures import NEES_OFF, degrees, nees_of, turns
 from spinning_top_sim.exam.motions import Reals, Run
@@ -32,7 +33,6 @@ TRUTH = 'ground_truth/imu'
 LONGEST_GAP_S = 0.1             # of the truth, across which it is interpolated
 # Steps by which stamps may be late, or early, because a node may predict the next attitude.
 LATE, EARLY = 0.75, -1.5
-EXPLAINED = 0.25                # most of an error that its cause leaves
 FEWEST = 100                    # attitudes that can be judged, and that show a convention
 
 

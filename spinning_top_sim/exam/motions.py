@@ -156,8 +156,7 @@ def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: 
     values = parameters.checked({'mag.field': FIELD, **imu, 'seed': seed})
     period_ns = round(1e9 / RATE)
     times = period_ns * np.arange(1, len(run.dt) + 1)
-    # North is magnetic north.
-    east, north, up = values['mag.field']
+    east, north, up = values['mag.field']       # north is magnetic north
     field: Any = Rotation.from_quat(run.truth).inv().apply((0.0, math.hypot(east, north), up))
     true: Any = tuple(run.gyroscope.T), tuple(run.accelerometer.T)
     device, magnetometer = Imu(values, period_ns), Magnetometer(values, period_ns)
