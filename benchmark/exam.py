@@ -26,6 +26,7 @@ from helpers.wrong_filters import TABLE
 
 from spinning_top_sim.exam import examine
 from spinning_top_sim.exam.adapters import FILTERS, Vqf
+from spinning_top_sim.exam.feeding import feed
 
 PACKAGES = ('numpy', 'scipy', 'vqf', 'ahrs', 'imufusion')
 SEEDS = 3                       # of an exam
@@ -58,7 +59,7 @@ def main() -> None:
     arguments = parser.parse_args()
     examine(Vqf, seeds=1)           # imports
     quick_s = statistics.median(timeit.repeat(
-        lambda: examine(Vqf, isolated=False), number=1, repeat=7))
+        lambda: examine(Vqf, feed=feed), number=1, repeat=7))
     jobs = [(name, number) for name in TABLE for number in range(arguments.exams)]
     with ProcessPoolExecutor(arguments.workers) as pool:
         marks = [row for row in pool.map(marks_of, FILTERS) if row is not None]

@@ -15,7 +15,6 @@ from helpers.reference import ROOT
 
 from spinning_top_sim.exam import feeding, motions
 from spinning_top_sim.exam.adapters import Vqf
-from spinning_top_sim.exam.command import main
 
 pytest.importorskip('rclpy')
 pytest.importorskip('vqf')
@@ -64,18 +63,14 @@ def test_a_node_says_what_its_filter_says_in_every_run(run):
             assert np.isnan(outcome.covariances).all()
 
 
-def test_a_best_effort_node_is_examined_and_a_lost_message_is_no_fault(run, plain):
+def test_a_best_effort_node_is_examined_and_a_lost_message_is_no_fault(run, plain, monkeypatch):
     with live.NodeExam(plain(), 'imu/data') as node:
         (outcome,) = feeding.feed(node.start, [run])
         assert len(outcome.estimates) == len(run.dt)
-
-
-def test_the_exam_ends_with_a_line_if_a_message_is_lost(
-        run, plain, monkeypatch):
     monkeypatch.setattr(live, 'ANSWER_S', 0.3)
     with (live.NodeExam(plain(left_out=(30,)), 'imu/data') as node,
           pytest.raises(feeding.NodeError,
-                        match=r's is lost between exam and node: make imu/data_raw')):
+                        match=r'or a message is lost; make imu/data_raw')):
         feeding.feed(node.start, [run])
 
 
@@ -104,15 +99,14 @@ def children(pid):
     return [int(one) for one in said]
 
 
-@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT])
-def test_the_node_ends_with_the_exam(number):
+def test_the_node_ends_with_the_exam():
     exam = subprocess.Popen([sys.executable, '-m', 'spinning_top_sim', 'examine', '--node', NODE,
                              '--topic', 'imu/data'], stderr=subprocess.PIPE, cwd=ROOT, text=True,
                             env={**os.environ, 'PYTHONPATH': str(ROOT)})
     try:
         wait_for('the node to start', lambda: children(exam.pid))
         node = children(exam.pid)
-        exam.send_signal(number)
+        exam.send_signal(signal.SIGTERM)
         _, said = exam.communicate(timeout=30.0)    # its end is that of the node, too
         assert exam.returncode == 130 and 'interrupted' in said
         wait_for('the node to end', lambda: not any(os.path.exists(f'/proc/{one}')
@@ -134,12 +128,3 @@ def test_a_node_that_does_not_start_or_answer_is_told(run, plain, monkeypatch):
     with (live.NodeExam(f'{sys.executable} -c "import time; time.sleep(9)"', 'imu/data') as node,
           pytest.raises(feeding.InvalidOutputError, match='no node reads imu/data_raw and')):
         feeding.feed(node.start, [run])
-
-
-@pytest.mark.parametrize(('arguments', 'says'), [
-    (['--node', 'x', '--topic', 'a b'], 'a b'),
-    (['--topic', 'a', '--node', "a 'b"], 'No closing quotation')])
-def test_what_is_no_topic_or_command_is_told_in_one_line(arguments, says, capfd):
-    assert main(arguments) == 2
-    said = capfd.readouterr().err
-    assert says in said and said.count('\n') == 1

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
 from spinning_top_sim.grade import Start, grade
-from spinning_top_sim.grade.pytest_plugin import pass_grade  # noqa: F401, a fixture
 from spinning_top_sim.grade.scenes import SCENES, WHEEL, Scene
 
 SENSOR = replace(WHEEL, gyroscope_noise_density=1.7e-4, accelerometer_noise_density=1.2e-3)
@@ -184,13 +183,6 @@ def test_a_report_is_readable_and_json():
     assert said['passed'] is False
     assert said['found'][0]['name'] == 'late'
     assert said['marks']['l3_drift: pole']['limit'] is None
-
-
-def test_the_fixture_for_pytest_fails_a_test_of_a_simulator_with_faults(pass_grade):  # noqa: F811
-    assert pass_grade(Imu(), scenes=SHORT[:1]).passed
-    with pytest.raises(pytest.fail.Exception, match='readings belong to the motion of 1 steps'):
-        pass_grade(Imu(defect='late'), scenes=SHORT[:1])
-    pass_grade(Imu(defect='late'), scenes=SHORT[:1], known=['late'])
 
 
 def test_another_motion_in_the_same_run_is_told():

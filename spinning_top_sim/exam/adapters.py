@@ -23,7 +23,7 @@ FROM_NWU = Rotation.from_euler('z', 90.0, degrees=True)
 
 
 class Vqf:
-    """VQF (Laidig and Seel 2023), package vqf.  Its period is fixed: it repeats lost samples."""
+    """VQF (Laidig and Seel 2023), package vqf.  Its period is fixed, turns are not."""
 
     def __init__(self, magnetic: bool = True, **options: float) -> None:
         from vqf import VQF  # noqa: PLC0415
@@ -35,8 +35,8 @@ class Vqf:
         if not self._period:
             self._filter, self._period = self._make(dt), dt
         uses_field = self._magnetic and magnetometer is not None
-        for _ in range(max(1, round(dt / self._period))):
-            self._filter.update(gyroscope, accelerometer, *([magnetometer] * uses_field))
+        self._filter.update(gyroscope * (dt / self._period), accelerometer,
+                            *([magnetometer] * uses_field))
         said = self._filter.getQuat9D() if uses_field else self._filter.getQuat6D()
         return np.asarray(said)[W_LAST]
 

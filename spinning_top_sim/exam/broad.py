@@ -31,16 +31,7 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     The filter gets each trial from its first sample on.  The measures are the root mean squares
     of the errors in motion, of each trial and their means.
 
-    Parameters
-    ----------
-    make_filter : callable
-        As of `examine`.
-    folder : path
-        With the trials.
-    subject : str, optional
-        As of `examine`.
-    feed, show : callable, optional
-        As of `examine`.
+    folder : with the trials; the other arguments are those of `examine`
 
     Raises
     ------

@@ -29,8 +29,8 @@ from pathlib import Path
 from typing import Any
 
 from spinning_top_sim.exam.adapters import FILTERS
-from spinning_top_sim.exam.broad import examine_data, trials_in
-from spinning_top_sim.exam.examiner import SEEDS, checked_imu, examine
+from spinning_top_sim.exam.broad import examine_data
+from spinning_top_sim.exam.examiner import SEEDS, examine
 from spinning_top_sim.exam.feeding import INTERRUPTED, Filter, feed, feed_apart
 from spinning_top_sim.exam.programs import Program
 from spinning_top_sim.files import new_file
@@ -38,7 +38,7 @@ from spinning_top_sim.installation import needed
 from spinning_top_sim.tools import cli, scene_file
 from spinning_top_sim.tools.report import Report, printed
 
-# What is examined, and the options that it takes; log and node need the first one.
+# What is examined, and the options that it takes.
 OF_FILTER = 'level', 'imu', 'seeds', 'data'
 KINDS = {'log': ('topic', 'truth', 'heading'), 'node': ('topic', 'level', 'imu', 'seeds'),
          'filter': OF_FILTER, 'command': OF_FILTER}
@@ -46,7 +46,7 @@ KINDS = {'log': ('topic', 'truth', 'heading'), 'node': ('topic', 'level', 'imu',
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    add = parser.add_argument
+    add = parser.add_mutually_exclusive_group(required=True).add_argument
     add('log', type=Path, nargs='?', help='an MCAP file with the attitudes and the truth')
     add('--filter', metavar='NAME', help='examine the class with a method `update` in a file '
         f'(FILE.py:CLASS), or a published filter: {", ".join(FILTERS)}')
@@ -54,10 +54,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'of readings for each update and answers with a line; each run starts it anew')
     add('--node', metavar='COMMAND', help='command that starts a ROS node that reads imu/data_raw '
         'and imu/mag; each run starts it anew, and waits for its answer to each sample')
+    add = parser.add_argument
     add('--topic', help='topic of the attitudes in a log, or of the node')
-    add('--truth', help='topic of the truth; default: ground_truth/imu, ground_truth/odom or pose')
-    add('--heading', choices=('true', 'magnetic'), help='the heading in the log must be right, '
-        'from true or magnetic north; default: it must be steady')
+    add('--truth', help='topic of the true attitudes of the same axes; default: ground_truth/imu')
+    add('--heading', choices=('true',), help='the heading in the log must be right, from true '
+        'north; default: it must be steady')
     add('--data', type=Path, metavar='FOLDER', help='examine with the trials of BROAD in this '
         'folder: readings of a real IMU beside an optical truth (.mat)')
     add('--level', choices=SEEDS, help='level of the exam; default: quick; field: scenes of a '
@@ -70,13 +71,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    kind, options = _options(arguments)
+    kind = next(kind for kind in KINDS if getattr(arguments, kind) is not None)
+    options = _options(arguments, kind)
     cli.check_output(arguments.page)
     if arguments.page is not None:
         with needed('a page', 'plot'):
             from spinning_top_sim.exam.page import draw_page  # noqa: PLC0415
     judge = _judge(kind, getattr(arguments, kind))
-    with _interruptible(), cli.progress('examined', 100.0, '%') as bar:
+    with _interruptible(raises=kind != 'node'), cli.progress('examined', 100.0, '%') as bar:
         if kind != 'log':
             options['show'] = lambda done, total: bar(100.0 * done / total)
         report = judge(**options)
@@ -87,24 +89,14 @@ def _run(arguments: argparse.Namespace) -> int:
     return code
 
 
-def _options(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
-    """Return what is examined, a key of KINDS, and its options.  Raises ValueError."""
-    kinds = [kind for kind in KINDS if getattr(arguments, kind) is not None]
-    if not kinds and arguments.data is not None:
-        raise ValueError('--data needs a filter: add --filter FILE.py:CLASS or --command COMMAND')
-    if not kinds:
-        raise ValueError('nothing to examine: type --filter FILE.py:CLASS, --command COMMAND, '
-                         '--node COMMAND --topic TOPIC, or a log and --topic TOPIC')
-    if len(kinds) > 1:
-        raise ValueError(f'{" and ".join(kinds)} are given: must be one of a log, --filter, '
-                         '--command and --node')
-    (kind,) = kinds
+def _options(arguments: argparse.Namespace, kind: str) -> dict[str, Any]:
+    """Return the options of what is examined.  Raises ValueError for those that it has not."""
     options = {name: value for name in dict.fromkeys(sum(KINDS.values(), ()))
                if (value := getattr(arguments, name)) is not None}
     shown, taken = kind if kind == 'log' else f'--{kind}', KINDS[kind]
     if 'topic' in taken and 'topic' not in options:
         raise ValueError(f'{shown} needs --topic')
-    if 'data' in options and taken is OF_FILTER:
+    if 'data' in options and 'data' in taken:
         shown, taken = '--data', ('data',)
     for name in options:
         if name not in taken:
@@ -112,19 +104,14 @@ def _options(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
                              f'{", ".join(f"--{one}" for one in taken)}')
     if 'imu' in options:
         options['imu'] = scene_file.file_of('imu', options['imu'])
-        checked_imu(options['imu'], options.get('level', 'quick'))
-    if 'data' in options:
-        trials_in(options['data'])
-    return kind, options
+    return options
 
 
 def _judge(kind: str, subject: Any) -> Callable[..., Report]:
     """Return what examines the subject with its options; it has imported what it needs."""
     if kind == 'log':
-        with needed('it'):
-            from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
-        return lambda topic, truth=None, heading=None: examine_log(
-            subject, topic, truth, heading)
+        from spinning_top_sim.exam.log import examine_log  # noqa: PLC0415 - not always needed
+        return partial(examine_log, subject)
     if kind == 'node':
         with needed('the exam of a node', 'ros'):
             from spinning_top_sim.exam.live import examine_node  # noqa: PLC0415
@@ -145,17 +132,15 @@ def _judge(kind: str, subject: Any) -> Callable[..., Report]:
 
 
 @contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
+def _interruptible(raises: bool) -> Iterator[None]:
     """End the exam, and what it has started, at SIGTERM as at SIGINT."""
     def interrupt(*_: object) -> None:
+        if raises:
+            raise KeyboardInterrupt
         INTERRUPTED.set()
-        raise KeyboardInterrupt
 
-    try:
-        with cli.handling(interrupt):
-            yield
-    finally:
-        INTERRUPTED.clear()
+    with cli.handling(interrupt):
+        yield
 
 
 def _own_filter(given: str) -> Callable[[], Filter]:

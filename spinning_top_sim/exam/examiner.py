@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exam of a filter: the loop over the checks."""
 
-import operator
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 from spinning_top_sim.exam import motions, scenes
 from spinning_top_sim.exam.checks import CHECKS
 from spinning_top_sim.exam.feeding import Feed, InvalidOutputError, MakeFilter, feed_apart
-from spinning_top_sim.exam.feeding import feed as feed_here
 from spinning_top_sim.exam.runs import Exam
 from spinning_top_sim.exam.scored import report_of
 from spinning_top_sim.streams import parameters
@@ -18,15 +16,14 @@ from spinning_top_sim.tools.cli import one_line
 from spinning_top_sim.tools.report import Finding, Mark, Report
 from spinning_top_sim.tools.scene_file import read_scene
 
-SEEDS = {'quick': 3, 'full': 10, 'field': 1}        # of the noisy runs, or of the scenes
+SEEDS = {'quick': 3, 'field': 1}     # of the noisy runs, of the scenes
 
 
 def examine(make_filter: MakeFilter, level: str = 'quick',
             imu: Mapping[str, Any] | str | Path | None = None,
             seeds: int | Iterable[int] | None = None, *, subject: str | None = None,
-            isolated: bool = True, feed: Feed | None = None,
-            show: Callable[[float, float], object] | None = None,
-            ) -> Report:
+            feed: Feed = feed_apart,
+            show: Callable[[float, float], object] = lambda done, total: None) -> Report:
     """
     Examine an attitude filter.
 
@@ -41,20 +38,20 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
     ----------
     make_filter : callable
         Returns a new filter for every run: its class, a function, or one of `adapters.FILTERS`.
-    level : {'quick', 'full', 'field'}
-        'field' are scenes of a sensor in a hand instead of the checks; 'full' is both.
+    level : {'quick', 'field'}
+        'field' are scenes of a sensor in a hand instead of the checks.
     imu : mapping or path, optional
         Parameters imu.* and mag.* that replace those of the noisy runs and of the scenes, or the
         path of a parameter file such as those in config/imu.
     seeds : int or iterable of int, optional
-        Seeds of the noisy runs, or their number; default: 3, of 'full' 10 and one of the
-        scenes, of 'field' 1.
+        Seeds of the noisy runs, or their number; default: 3, of 'field' 1.
     subject : str, optional
         Name in the report; default: that of the filter's class.
-    isolated : bool, optional
-        If False, the filter runs in this process, where a debugger can reach it.
-    feed, show : callable, optional
-        What feeds a filter, as `feeding.feed`; what takes the number of parts done and to do.
+    feed : callable, optional
+        What feeds the filter; `feeding.feed` does it in this process, where a debugger can reach
+        it.
+    show : callable, optional
+        What takes the number of parts done and to do.
 
     Returns
     -------
@@ -74,65 +71,43 @@ def examine(make_filter: MakeFilter, level: str = 'quick',
                         "spinning_top_sim.exam.adapters.FILTERS, such as FILTERS['vqf']")
     if level not in SEEDS:
         raise ValueError(f'level = {level!r}: must be one of {", ".join(SEEDS)}')
-    values = checked_imu(imu, level)
-    numbers = _seed_numbers(SEEDS[level] if seeds is None else seeds)
-    feed = feed or (feed_apart if isolated else feed_here)
-    show = show or (lambda done, total: None)
+    taken = motions.TAKEN + motions.OF_SCENES * (level == 'field')
+    values = {} if imu is None else _checked(imu, level, taken)
+    seeds = SEEDS[level] if seeds is None else seeds
+    numbers = list(seeds if isinstance(seeds, Iterable) else range(seeds))
+    if not numbers or min(numbers) < 0:
+        raise ValueError(f'seeds = {seeds!r}: must be a positive number, or integers >= 0')
     subject = one_line(subject or getattr(make_filter, '__name__', 'filter'))
-    reports = []
-    if level != 'field':
-        of_noise = {name: value for name, value in values.items()
-                    if name.startswith(motions.TAKEN)}
-        reports.append(_sit(Exam(make_filter, feed, {**motions.CALIBRATED, **of_noise}, numbers),
-                            subject, show))
-    if level != 'quick':
-        runs = [partial(scenes.record, scene, seed, values)
-                for seed in (numbers if level == 'field' else numbers[:1])
-                for scene in scenes.SCENES]
-        reports.append(report_of(make_filter, runs, 'field', subject, feed, show))
-    return reports[0].plus(*reports[1:])
+    if level == 'quick':
+        return _sit(Exam(partial(feed, make_filter), {**motions.CALIBRATED, **values}, numbers),
+                    subject, show)
+    runs = [partial(scenes.record, scene, seed, values)
+            for seed in numbers for scene in scenes.SCENES]
+    return report_of(make_filter, runs, 'field', subject, feed, show)
 
 
-def checked_imu(imu: Mapping[str, Any] | str | Path | None, level: str) -> Mapping[str, Any]:
+def _checked(imu: Mapping[str, Any] | str | Path, level: str,
+             taken: tuple[str, ...]) -> dict[str, Any]:
     """Return the parameters that are given.  Raises ValueError for what the level has not."""
-    if imu is None:
-        return {}
     given = imu if isinstance(imu, Mapping) else read_scene(imu)
     checked, source = parameters.checked(given), 'imu' if imu is given else imu
-    taken = motions.TAKEN + motions.OF_SCENES * (level != 'quick')
     for name, value in given.items():
-        if not name.startswith(('imu.', 'mag.')):
-            raise ValueError(f'{source} has {name}: must have parameters imu.* and mag.* only')
         default = parameters.BY_NAME[name].default
         if not name.startswith(taken) and checked[name] != default:
             raise ValueError(f'{source} has {name} = {value!r}: must be {default!r}, because '
                              f'nothing in level {level} has it')
-    if not any(checked['mag.field'][:2]):
-        raise ValueError(f'{source} has mag.field = {given["mag.field"]!r}: must have a '
-                         'horizontal part, which shows north')
     return {name: checked[name] for name in given if name.startswith(taken)}
-
-
-def _seed_numbers(seeds: int | Iterable[int]) -> list[int]:
-    try:
-        numbers = list(map(operator.index, seeds if isinstance(seeds, Iterable) else range(seeds)))
-    except TypeError:
-        numbers = []
-    if not numbers or min(numbers) < 0:
-        raise ValueError(f'seeds = {seeds!r}: must be a positive number, or integers >= 0')
-    return numbers
 
 
 def _sit(exam: Exam, subject: str, show: Callable[[float, float], object]) -> Report:
     """Do all checks but those that a fault hides."""
     found: list[Finding] = []
     marks: dict[str, Mark] = {}
-    hides: dict[str, list[str]] = {}
+    left_out = []
     for k, check in enumerate(CHECKS):
         show(k, len(CHECKS))
-        names = [finding.name for finding in found]
-        if hidden := [name for name in check.needs if name in names]:
-            hides.setdefault(', '.join(hidden), []).append(check.mark)
+        if any(finding.name in check.needs for finding in found):
+            left_out.append(check.mark)
             continue
         try:
             measured = check.measure(exam)
@@ -147,9 +122,9 @@ def _sit(exam: Exam, subject: str, show: Callable[[float, float], object]) -> Re
             found.append(Finding(measured.name or check.fault, measured.evidence,
                                  measured.value))
     show(len(CHECKS), len(CHECKS))
-    notes = [f'not judged because of {names}: {", ".join(left_out)}'
-             for names, left_out in hides.items()]
-    absolute = 'field turned' not in exam.done or exam.heading
+    notes = [f'not judged because of this: {", ".join(left_out)}'] if left_out else []
+    noise = exam.told.get('noise', ())[:-1]
+    absolute = 'no field' not in exam.told or exam.heading
     if not absolute:
         notes.append('the magnetometer changes nothing: tilt and steady heading are judged')
-    return Report(subject, found, marks, notes, exam.done.get('noise', ()), absolute)
+    return Report(subject, found, marks, notes, list(map(exam.ours, noise)), absolute)

@@ -95,13 +95,10 @@ def _feed(make_filter: MakeFilter, run: Run) -> Outcome:
                     rows[k - 1] = _numbers(f'{name} is', said, rows.shape[1:])
     except NodeError:
         raise
-    except InvalidOutputError as error:
-        where = f', update {k} of {n}' if k else ''
-        raise InvalidOutputError(f'{run.name}{where}: {error}') from error
     except (Exception, SystemExit) as error:
-        where = f'update {k} of {n}' if k else 'making the filter'
-        raise InvalidOutputError(f'{run.name}, {where} raises {type(error).__name__}: '
-                                 f'{one_line(error)}') from error
+        what = error if isinstance(error, InvalidOutputError) else (
+            f'raises {type(error).__name__}: {one_line(error)}')
+        raise InvalidOutputError(f'{run.name}, update {k} of {n}: {what}') from error
     finally:
         if callable(close := getattr(filter_, 'close', None)):
             close()
@@ -138,9 +135,8 @@ def feed_apart(make_filter: MakeFilter, runs: Sequence[Run]) -> list[Outcome]:
                 raise output
             return output
         process.join()
-        code = process.exitcode or 0
-        how = signal.strsignal(-code) if code < 0 else f'exit code {code}'
-        raise InvalidOutputError(f'{runs[0].name}: the filter ends the process: {how}')
+        raise InvalidOutputError(f'{runs[0].name}: the filter ends the process, exit code '
+                                 f'{process.exitcode}')
     finally:
         process.kill()
         process.join()

@@ -7,8 +7,7 @@ import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,16 +21,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, MagneticField
 
 from spinning_top_sim.exam.examiner import examine
-from spinning_top_sim.exam.feeding import (
-    ANSWER_S,
-    INTERRUPTED,
-    READ_EVERY,
-    NodeError,
-    feed,
-)
+from spinning_top_sim.exam.feeding import ANSWER_S, INTERRUPTED, READ_EVERY, NodeError, feed
 from spinning_top_sim.exam.motions import Reals
 from spinning_top_sim.times import NANOSECONDS, stamp_text
-from spinning_top_sim.tools import cli
 from spinning_top_sim.tools.foreign_messages import NO_ORIENTATION
 from spinning_top_sim.tools.report import Report
 
@@ -48,10 +40,7 @@ START_NS = NANOSECONDS          # in ROS a stamp of 0 means "no time"
 NAME, FRAME = 'examine', 'imu_link'
 
 
-def examine_node(command: str, topic: str, level: str = 'quick',
-                 imu: Mapping[str, Any] | str | Path | None = None,
-                 seeds: int | Iterable[int] | None = None,
-                 show: Callable[[float, float], object] | None = None) -> Report:
+def examine_node(command: str, topic: str, **options: Any) -> Report:
     """
     Examine a ROS node that `command` starts for each run, without a shell.
 
@@ -61,14 +50,8 @@ def examine_node(command: str, topic: str, level: str = 'quick',
         Starts the node.
     topic : str
         That of its attitudes, sensor_msgs/Imu, each with the stamp of its sample.
-    level : {'quick', 'full', 'field'}
-        As of `examine`.
-    imu : mapping or path, optional
-        As of `examine`.
-    seeds : int or iterable of int, optional
-        As of `examine`.
-    show : callable, optional
-        As of `examine`.
+    **options
+        Of `examine`.
 
     Raises
     ------
@@ -76,7 +59,7 @@ def examine_node(command: str, topic: str, level: str = 'quick',
         If other nodes publish on its topics, or messages are lost.
     """
     with NodeExam(command, topic) as node:
-        return examine(node.start, level, imu, seeds, subject=command, feed=feed, show=show)
+        return examine(node.start, subject=command, feed=feed, **options)
 
 
 class NodeExam(contextlib.AbstractContextManager['NodeExam']):
@@ -111,12 +94,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         """Start the node anew; return it as a filter."""
         self._end_process()
         try:
-            # A signal within `Popen` would leave a process that nobody knows.
-            late: list[int] = []
-            with cli.handling(lambda number, _: late.append(number)):
-                self._process = subprocess.Popen(self._command, start_new_session=True)
-            for number in late:
-                signal.raise_signal(number)
+            self._process = subprocess.Popen(self._command, start_new_session=True)
         except OSError as error:
             raise NodeError(f'cannot start {self._command[0]}: {error.strerror}') from error
         if not self._wait(self.is_there, PATIENCE_S):
@@ -124,25 +102,15 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
                 f'no node reads {IMU_TOPIC} and publishes {self._topic} within {PATIENCE_S:g} s: '
                 f'check its ROS_DOMAIN_ID ({os.environ.get("ROS_DOMAIN_ID", "0")} here), '
                 'namespace and remappings')
-        self._subscribe()
-        self._now_ns = START_NS
-        self._answered = 0
+        # The attitudes are read with the reliability that they are offered with.
+        self._subscription = self._subscription or self._node.create_subscription(
+            Imu, self._topic, self._take,
+            QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_AVAILABLE))
+        self._now_ns, self._answered = START_NS, 0
         self._check_alone()
         self._answers.clear()
         self.covariance = None
         return self
-
-    def _subscribe(self) -> None:
-        """Read the attitudes with the reliability that they are offered with."""
-        read, told = (self._node.resolve_topic_name(name) for name in (IMU_TOPIC, self._topic))
-        offered, asked = ([one.qos_profile.reliability for one in infos(name)] for infos, name in (
-            (self._node.get_publishers_info_by_topic, told),
-            (self._node.get_subscriptions_info_by_topic, read)))
-        best_effort = ReliabilityPolicy.BEST_EFFORT
-        self._reliable = best_effort not in (*offered, *asked)
-        self._subscription = self._subscription or self._node.create_subscription(
-            Imu, self._topic, self._take,
-            QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_AVAILABLE))
 
     def _check_alone(self) -> None:
         """Raise NodeError if another node publishes on a topic of the exam."""
@@ -168,12 +136,9 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             self._check_alone()
             if not self._answered:
                 raise RuntimeError(f'it answers none of {AGAIN} samples')
-            if not self._reliable:
-                raise NodeError(f'the message of {stamp_text(self._now_ns)} s is lost between '
-                                f'exam and node: make {IMU_TOPIC} and {self._topic} reliable '
-                                'there')
-            raise RuntimeError(f'no attitude has the stamp {stamp_text(self._now_ns)} s of its '
-                               f'sample within {ANSWER_S:g} s')
+            raise NodeError(f'no attitude has the stamp {stamp_text(self._now_ns)} s of its '
+                            f'sample within {ANSWER_S:g} s: the node hangs, or a message is lost; '
+                            f'make {IMU_TOPIC} and {self._topic} reliable there')
         message = self._answers.pop(self._now_ns)
         self._answers.clear()
         self._answered += 1
@@ -213,7 +178,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
         end = time.monotonic() + seconds
         while not condition():
             if INTERRUPTED.is_set():
-                INTERRUPTED.clear()
+                INTERRUPTED.clear()         # so that the end of the node is waited for
                 raise KeyboardInterrupt
             if time.monotonic() > end:
                 return False
@@ -234,7 +199,7 @@ class NodeExam(contextlib.AbstractContextManager['NodeExam']):
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, number)
             with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(5.0)
+                process.wait(ANSWER_S)
                 break
         # Wait until its endpoints leave the graph, so that they are not taken for the next node's.
         self._wait(lambda: not self._imu.get_subscription_count()

@@ -3,19 +3,17 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim.exam.feeding import Outcome
-from spinning_top_sim.exam.motions import ROUNDING, Reals
+from spinning_top_sim.exam.motions import Reals
 from spinning_top_sim.tools.conventions import errors_of
-from spinning_top_sim.tools.identify import autocorrelation_time, rms
+from spinning_top_sim.tools.identify import rms
 
-# Of the band of a squared error: standard deviations; factors by which a covariance may be too
-# small and, to be on the safe side, too large.
-SIGMAS, SMALL, LARGE = 4.0, 2.0, 10.0
+ROUNDING = float(np.finfo(np.float32).eps)      # of filters in single precision, relative
+NEES_OFF = 4.0, 20.0    # factors by which a covariance may be too small, and on the safe side
 
 
 def rmse(estimates: Reals, truth: Reals) -> Reals:
@@ -52,6 +50,12 @@ def largest_turn(one: Reals, other: Reals) -> float:
     return float(np.max(np.linalg.norm(turns(one, other), axis=1)))
 
 
+def settled(quaternions: Reals, most: float) -> bool:
+    """Return whether the second half of attitudes (n, 4) turns by less [rad]."""
+    later = quaternions[len(quaternions) // 2:]
+    return largest_turn(later[:1], later) < most
+
+
 def differ(one: Reals, other: Reals) -> bool:
     """Return whether attitudes (n, 4) are others than these, beyond rounding."""
     return bool(np.max(np.abs(one - other)) > ROUNDING)
@@ -62,58 +66,26 @@ def degrees(angle: float) -> str:
     return f'{math.degrees(angle):.3g} deg'
 
 
-class Nees(NamedTuple):
-    """Mean squared error of the tilt over its covariance, 1 if consistent, and its band."""
-
-    ratio: float
-    low: float
-    high: float
-
-    @property
-    def band(self) -> str:
-        """The band in words."""
-        return f'consistent are {self.low:.3g} to {self.high:.3g}'
-
-    def __str__(self) -> str:
-        return (f'the squared error of the tilt is {self.ratio:.3g} times what the covariance '
-                f'says; {self.band}')
-
-
-def nees_of(outcomes: Sequence[Outcome]) -> Nees | None:
+def nees_of(outcomes: Sequence[Outcome]) -> float | None:
     """
     Return the normalised squared error of the tilt (Bar-Shalom et al. 2001, 5.4.2).
 
-    The covariance may refer to the axes of the sensor or of the world: the assumption with the
-    greater likelihood counts.  One error of each autocorrelation time is independent.  None: there
-    is no covariance, or it has no inverse.  The first quarter of each outcome does not count.
+    It is 1 if the covariance is consistent.  The covariance may refer to the axes of the sensor or
+    of the world: the better one counts.  None: there is no covariance.
     """
-    last = [one.part(slice(len(one.run.dt) // 4, None)) for one in outcomes]
-    known = [one.part(np.flatnonzero(np.isfinite(one.covariances[:, 0, 0]))) for one in last]
-    found = []
-    for in_sensor in (True, False):
-        pairs = [_squares(one, in_sensor) for one in known if len(one.run.dt)]
-        if not pairs or not np.all(np.isfinite(np.concatenate([size for _, size in pairs]))):
-            continue
-        mean = max(float(np.mean(np.concatenate([squares for squares, _ in pairs]))), 1e-300)
-        count = sum(len(one) / autocorrelation_time(one) for one, _ in pairs)
-        spread = math.exp(SIGMAS / math.sqrt(count))
-        # Negative log-likelihood for the best common factor of the covariances.
-        unlikely = 2.0 * math.log(mean) + float(np.mean([np.mean(size) for _, size in pairs]))
-        found.append((unlikely, Nees(0.5 * mean, 1.0 / (LARGE * spread), SMALL * spread)))
-    return min(found)[1] if found else None
-
-
-def _squares(outcome: Outcome, in_sensor: bool) -> tuple[Reals, Reals]:
-    """Return e^T P^-1 e of the tilts e (n,), and the logarithms of det P, NaN if not positive."""
-    estimated, p = Rotation.from_quat(outcome.estimates), outcome.covariances
-    if in_sensor:
-        turn = estimated.as_matrix()
-        p = turn @ p @ turn.transpose(0, 2, 1)
-    x, y, _ = (estimated * Rotation.from_quat(outcome.run.truth).inv()).apply((0.0, 0.0, 1.0)).T
-    (a, b), (_, c) = p[:, :2, :2].transpose(1, 2, 0)
-    with np.errstate(all='ignore'):
-        determinant = a * c - b * b
-        return (c * y * y + 2.0 * b * x * y + a * x * x) / determinant, np.log(determinant)
+    squares: list[list[float]] = [[], []]
+    for outcome in outcomes:
+        one = outcome.part(np.flatnonzero(np.isfinite(outcome.covariances[:, 0, 0])))
+        if not len(one.run.dt):
+            return None
+        tilt = turns(one.estimates, one.run.truth)[:, :2, np.newaxis]
+        turn = Rotation.from_quat(one.estimates).as_matrix()
+        for found, p in zip(squares, (one.covariances, turn @ one.covariances @ turn.transpose(
+                0, 2, 1)), strict=True):
+            inverse = np.linalg.pinv(p[:, :2, :2], hermitian=True)
+            found.extend(0.5 * np.squeeze(tilt.transpose(0, 2, 1) @ inverse @ tilt, (1, 2)))
+    return min((max(float(np.mean(one)), ROUNDING) for one in squares),
+               key=lambda ratio: abs(math.log(ratio)))
 
 
 def from_two_vectors(up: Reals, magnetometer: Reals | None) -> Reals:

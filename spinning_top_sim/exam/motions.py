@@ -39,21 +39,20 @@ OF_SCENES = 'imu.bandwidth', 'imu.vibration.', 'mag.disturbance.'
 # slow precession and large nutation.
 WHEEL = Top(lambda1=0.123, lambda3=0.15, mass=2.0, com_distance=0.02, gravity=GRAVITY)
 START = {'theta': 0.7, 'theta_dot': 0.0, 'l3': 0.6, 'lz': 0.6 * math.cos(0.7)}
+TOP_S = 12.0                    # some nutations
 # Yaw, pitch and roll [deg]: near the identity, where many filters start, so that slow ones settle
-# soon; and with another axis of the sensor level.
-NEAR, X_UP = (4.0, 3.0, -2.5), (20.0, -80.0, 10.0)
-TURN_RATE = 2.6         # [rad/s]: a turn of the sensor that every filter follows
-# Turns about an axis of the sensor [deg] at a rate [rad/s], each followed by a rest: those that
-# any filter sees, two as fast as a hand turns, and one so slow that a threshold would drop it.
-TURNS = (*(('turn', axis, angle, TURN_RATE) for axis, angle in (
-    (0, 80.0), (1, -70.0), (2, 100.0), (0, -110.0), (1, 85.0), (2, -75.0), (0, 95.0), (1, 110.0),
-    (2, -120.0))), ('fast', 0, 220.0, 12.0), ('fast', 1, -200.0, 12.0), ('slow', 1, 60.0, 0.15))
-RIPPLE = 0.3            # of the slow turn: some filters take a steady one for their bias
-REST_S, TOP_S = 2.5, 12.0       # a time constant of fast filters; some nutations
-STILL = math.radians(0.05)      # an attitude that moves by less is at rest [rad]
-ROUNDING = float(np.finfo(np.float32).eps)      # of filters in single precision, relative
-NEVER_ZERO = 1e-6       # [rad/s]; some filters take no step while the rates are zero
+# soon; and two more to start from.
+NEAR, STARTS = (4.0, 3.0, -2.5), ((60.0, -35.0, 20.0), (-110.0, 15.0, -50.0))
+# Turns about an axis of the sensor [deg] at a rate [rad/s], each after a rest: those that any
+# filter follows, two as fast as a hand turns, and one so slow that a threshold would drop it.
+# Each axis of the sensor is near the vertical in some rests, upwards and downwards.
+TURNS = (*(('turns', axis, angle, 2.6) for axis, angle in (
+    (0, -115.0), (1, -85.0), (2, -70.0), (0, -85.0), (1, -115.0), (2, 100.0), (0, -100.0),
+    (1, -110.0), (2, -90.0))), ('fast turns', 0, 220.0, 12.0), ('fast turns', 1, -200.0, 12.0),
+    ('slow turns', 1, 60.0, 0.15))
+REST_S = 2.5                    # time for answers, and for gravity to lead a tilt back
 STEPS = 0.0025, 0.005, 0.015, 0.0025, 0.0125, 0.005, 0.0025, 0.0075     # uneven ones [s]
+NEVER_ZERO = 1e-6       # [rad/s]; some filters take no step while the rates are zero
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class Run:
 
 
 class Part(NamedTuple):
-    """Samples of a motion: 'rest', 'turn', 'fast', 'slow' or 'top'."""
+    """Samples of a motion: 'rests', 'turns', 'fast turns', 'slow turns', 'top', 'uneven steps'."""
 
     kind: str
     begin: int
@@ -90,41 +89,37 @@ class Part(NamedTuple):
 
 
 class Motion:
-    """A motion that is put together from rests and turns, sampled at RATE."""
+    """A motion that is put together from rests and turns, from an attitude [deg] on."""
 
-    def __init__(self, start: Rotation) -> None:
-        self._attitudes: list[Any] = [start.as_quat()[np.newaxis]]
+    def __init__(self, start: Sequence[float]) -> None:
+        self._attitudes = [Rotation.from_euler('ZYX', [start], degrees=True)]
+        self._dt: list[Reals] = []
         self.parts: list[Part] = []
 
     def of(self, kind: str) -> list[Part]:
         """Return the parts of a kind."""
         return [part for part in self.parts if part.kind == kind]
 
-    def _add(self, kind: str, attitudes: Rotation) -> 'Motion':
+    def add(self, kind: str, attitudes: Rotation,
+            steps: Sequence[float] = (1.0 / RATE,)) -> 'Motion':
+        """Add attitudes at the ends of steps of these lengths, again and again."""
         begin = self.parts[-1].end if self.parts else 0
         self.parts.append(Part(kind, begin, begin + len(attitudes)))
-        self._attitudes.append(attitudes.as_quat())
+        self._attitudes.append(attitudes)
+        self._dt.append(np.resize(steps, len(attitudes)))
         return self
 
-    @property
-    def _now(self) -> Rotation:
-        return Rotation.from_quat(self._attitudes[-1][-1])
-
-    def rest(self, seconds: float) -> 'Motion':
+    def rest(self, seconds: float, kind: str = 'rests',
+             steps: Sequence[float] = (1.0 / RATE,)) -> 'Motion':
         """Add a rest."""
-        n = round(seconds * RATE)
-        return self._add('rest', Rotation.from_quat(np.tile(self._now.as_quat(), (n, 1))))
+        return self.add(kind, self._attitudes[-1][[-1] * round(seconds / np.mean(steps))], steps)
 
-    def turn(self, goal: Rotation | tuple[int, float], rate: float = TURN_RATE,
-             kind: str = 'turn') -> 'Motion':
-        """Add a turn to an attitude, or about an axis of the sensor by an angle [deg]."""
-        vector = (self._now.inv() * goal).as_rotvec() if isinstance(goal, Rotation) else (
-            math.radians(goal[1]) * np.eye(3)[goal[0]])
+    def turn(self, vector: Sequence[float] | Reals, rate: float = 2.6,
+             kind: str = 'turns') -> 'Motion':
+        """Add a turn by a rotation vector about axes of the sensor [rad]."""
         n = max(2, math.ceil(float(np.linalg.norm(vector)) / rate * RATE))
-        share = np.arange(1.0, n + 1.0)
-        share[:-1:2] += RIPPLE * (kind == 'slow')
-        return self._add(kind, self._now * Rotation.from_rotvec(
-            share[:, np.newaxis] / n * vector))
+        return self.add(kind, self._attitudes[-1][-1] * Rotation.from_rotvec(
+            np.arange(1.0, n + 1.0)[:, np.newaxis] / n * vector))
 
     def top(self, seconds: float, seed: int = 0) -> 'Motion':
         """Add a turn to the start of the wheel's motion, and the motion; `seed` varies it."""
@@ -132,47 +127,23 @@ class Motion:
         t = np.arange(1.0, round(seconds * RATE) + 1.0) / RATE
         turns = Rotation.from_quat(solve(WHEEL, State(**START, phi=phi, psi=psi), t,
                                          method='exact').quaternion)
-        return self.turn(turns[0])._add('top', turns)
+        return self.turn((self._attitudes[-1][-1].inv() * turns[0]).as_rotvec()).add('top', turns)
 
     def run(self, name: str) -> Run:
-        """Return what a perfect IMU reads."""
-        attitudes = Rotation.from_quat(np.concatenate(self._attitudes))
-        return perfect(name, attitudes, np.full(self.parts[-1].end, 1.0 / RATE))
-
-
-def euler(angles: Sequence[float]) -> Rotation:
-    """Return the attitude of yaw, pitch and roll [deg]."""
-    return Rotation.from_euler('ZYX', angles, degrees=True)
-
-
-def perfect(name: str, attitudes: Rotation, dt: Reals) -> Run:
-    """Return the readings along attitudes (n + 1), between which the sensor turns steadily."""
-    rates = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() / dt[:, np.newaxis]
-    to_sensor = attitudes[1:].inv()
-    return Run(name, dt, attitudes[1:].as_quat(), rates + NEVER_ZERO,
-               to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(FIELD))
+        """Return what a perfect IMU reads, which turns steadily in a step."""
+        attitudes, dt = Rotation.concatenate(self._attitudes), np.concatenate(self._dt)
+        rates = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() / dt[:, np.newaxis]
+        to_sensor = attitudes[1:].inv()
+        return Run(name, dt, attitudes[1:].as_quat(), rates + NEVER_ZERO,
+                   to_sensor.apply((0.0, 0.0, GRAVITY)), to_sensor.apply(FIELD))
 
 
 def excitation(lead_s: float) -> Motion:
-    """Return turns about each axis between rests, and the motion of a top."""
-    motion = Motion(euler(NEAR)).rest(lead_s)
+    """Return turns about each axis between rests, the motion of a top, and uneven steps."""
+    motion = Motion(NEAR).rest(lead_s)
     for kind, axis, angle, rate in TURNS:
-        motion.rest(REST_S).turn((axis, angle), rate, kind)
-    return motion.top(TOP_S).rest(REST_S)
-
-
-def attitudes(lead_s: float) -> Motion:
-    """Return a rest, and short rests in many attitudes."""
-    motion = Motion(euler(NEAR)).rest(lead_s)
-    for turn in Rotation.random(6, random_state=4):
-        motion.turn(turn).rest(4.0)
-    return motion
-
-
-def uneven(count: int) -> Run:
-    """Return a rest in so many steps of different lengths."""
-    turns = Rotation.from_quat(np.tile(euler(NEAR).as_quat(), (count + 1, 1)))
-    return perfect('uneven steps', turns, np.resize(STEPS, count))
+        motion.rest(REST_S).turn(np.radians(angle) * np.eye(3)[axis], rate, kind)
+    return motion.rest(REST_S).top(TOP_S).rest(REST_S).rest(REST_S, 'uneven steps', STEPS)
 
 
 def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: float) -> Run:
@@ -181,12 +152,11 @@ def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: 
 
     Raises ValueError for parameters that are not allowed.
     """
-    run = Motion(euler(NEAR)).rest(lead_s).top(seconds, seed).run(name)
+    run = Motion(NEAR).rest(lead_s).top(seconds, seed).run(name)
     values = parameters.checked({'mag.field': FIELD, **imu, 'seed': seed})
     period_ns = round(1e9 / RATE)
     times = period_ns * np.arange(1, len(run.dt) + 1)
-    # North is magnetic north.
-    east, north, up = values['mag.field']
+    east, north, up = values['mag.field']       # north is magnetic north
     field: Any = Rotation.from_quat(run.truth).inv().apply((0.0, math.hypot(east, north), up))
     true: Any = tuple(run.gyroscope.T), tuple(run.accelerometer.T)
     device, magnetometer = Imu(values, period_ns), Magnetometer(values, period_ns)
@@ -194,14 +164,3 @@ def noisy(name: str, imu: Mapping[str, Any], seed: int, lead_s: float, seconds: 
         *device.read(true, device.errors(times)),
         magnetometer.read(tuple(field.T), magnetometer.errors(times))))
     return replace(run, gyroscope=rates, accelerometer=force, magnetometer=field)
-
-
-def with_arm(motion: Motion, run: Run, arm: Sequence[float]) -> Run:
-    """Return the run with the IMU at a point [m] in the motion of a top."""
-    (part,) = motion.of('top')
-    rows = slice(part.begin, part.end)
-    turns, force = Rotation.from_quat(run.truth[rows]), run.accelerometer.copy()
-    acceleration = np.gradient(np.gradient(turns.apply(arm), 1.0 / RATE, axis=0), 1.0 / RATE,
-                               axis=0)
-    force[rows] += turns.inv().apply(acceleration)
-    return replace(run, name='lever arm', accelerometer=force)

@@ -4,7 +4,7 @@
 import contextlib
 import os
 import re
-import selectors
+import select
 import shlex
 import subprocess
 import time
@@ -38,8 +38,6 @@ class Program:
             raise InvalidOutputError(f'cannot start {command}: {error.strerror}') from error
         assert self._process.stdin and self._process.stdout
         self._to, self._from = self._process.stdin, self._process.stdout
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(self._from, selectors.EVENT_READ)
         self._text = b''
         self.bias: Reals | None = None
         self.covariance: Reals | None = None
@@ -47,9 +45,8 @@ class Program:
     def update(self, gyroscope: Reals, accelerometer: Reals, magnetometer: Reals | None,
                dt: float) -> Reals:
         """Send the readings, and wait for the attitude."""
-        if self._text or self._selector.select(0.0):
-            self._text = self._text or self._read()
-            text = self._text[:80].decode(errors='replace')
+        if self._text or self._answers(0.0):
+            text = (self._text or self._read())[:80].decode(errors='replace')
             raise InvalidOutputError(f'answers more than a line: {one_line(text)!r}')
         field = np.full(3, np.nan) if magnetometer is None else magnetometer
         numbers = (*gyroscope.tolist(), *accelerometer.tolist(), *field.tolist(), dt)
@@ -59,13 +56,16 @@ class Program:
             self._fail()
         end = time.monotonic() + ANSWER_S
         while b'\n' not in self._text:
-            if not self._selector.select(max(0.0, end - time.monotonic())):
+            if not self._answers(max(0.0, end - time.monotonic())):
                 raise InvalidOutputError(f'no answer within {ANSWER_S:g} s')
             self._text += self._read()
             if len(self._text) > LONGEST_LINE:
                 raise InvalidOutputError(f'answers more than {LONGEST_LINE} bytes')
         line, _, self._text = self._text.partition(b'\n')
         return self._parsed(line.decode(errors='replace'))
+
+    def _answers(self, within_s: float) -> bool:
+        return bool(select.select([self._from], [], [], within_s)[0])
 
     def _read(self) -> bytes:
         return os.read(self._from.fileno(), LONGEST_LINE) or self._fail()
@@ -93,7 +93,6 @@ class Program:
 
     def close(self) -> None:
         """End the process."""
-        self._selector.close()
         self._process.kill()
         self._process.wait()
         self._from.close()

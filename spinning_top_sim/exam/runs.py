@@ -1,5 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The runs of one exam: what the filter is fed with, and what it answers."""
+"""
+The runs of one exam: what the filter is fed with, and what it answers.
+
+A kick is a turn that the gyroscope alone reads, in one step of a rest.  The difference of the
+attitudes with and without it is the filter's answer.  Without a field, nothing but the gyroscope
+shows a kick about the vertical: the answer is its use of the rates.  After other kicks, gravity
+leads the attitude back.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -11,17 +18,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import answers, bias, measures, motions
-from spinning_top_sim.exam.feeding import Feed, MakeFilter, Outcome
-from spinning_top_sim.exam.motions import NEAR, RATE, STILL, Motion, Run
+from spinning_top_sim.exam import measures, motions
+from spinning_top_sim.exam.feeding import Outcome
+from spinning_top_sim.exam.motions import NEAR, RATE, Motion, Reals, Run
 from spinning_top_sim.tools.conventions import Convention, Errors, errors_of
 
-# A filter is settled if it is STILL in the second half of a rest at the start; slow ones get
+# A filter is settled if it is STILL in the second half of rests at the start; slow ones get
 # longer ones.
-LEADS_S = 10.0, 40.0, 160.0
-ARM = 0.1, 0.0, 0.0                         # of the IMU [m]
-STARTS = NEAR, (60.0, -35.0, 20.0), (-110.0, 15.0, -50.0)      # yaw, pitch, roll [deg]
-FIELD_TURN = math.radians(3.0)              # of the field about the vertical
+LEADS_S, STILL = (10.0, 30.0, 120.0), math.radians(0.05)
+ARM = 0.1, 0.0, 0.0                         # of the IMU off the axis [m]
+FIELD_TURN = math.radians(6.0)              # of the field about the vertical
+SMALL, LARGE = 0.05, 0.3        # kicks [rad], of first order; that a step of first order misses
+# Samples for an answer, a late one, too; gravity has four times that to lead a kick back.
+ANSWER = 50
+# Of the gyroscope [rad/s], 0.7 deg/s in all: so large are those of consumer devices at power-on;
+# and how long it lasts in each of two rests [s], so that a slow filter shows where it tends to.
+BIAS, BIAS_S = np.array((0.006, -0.0055, 0.009)), 80.0
 NOISE_LEAD_S, NOISE_S = 6.0, 20.0           # rest and motion of the noisy runs
 
 
@@ -29,79 +41,51 @@ class Exam:
     """
     The runs of one exam, each fed when a check asks for it.
 
-    convention : of the attitudes; it is undone in all outcomes
-    done : outcomes by the name of their runs in RUNS
+    convention : of the attitudes
+    told : outcomes by the name of their runs in RUNS, as they are told
     """
 
-    def __init__(self, make_filter: MakeFilter, feed: Feed, imu: Mapping[str, Any],
+    def __init__(self, feed: Callable[[Sequence[Run]], list[Outcome]], imu: Mapping[str, Any],
                  seeds: Sequence[int]) -> None:
-        self._make_filter, self._feed = make_filter, feed
-        self.imu, self.seeds = imu, seeds
+        self._feed, self.imu, self.seeds = feed, imu, seeds
         self.convention = Convention()
-        self.done: dict[str, list[Outcome]] = {}
+        self.told: dict[str, list[Outcome]] = {}
 
     def outcomes(self, name: str) -> list[Outcome]:
         """Return the outcomes of a run by its name in RUNS, in our convention."""
-        if name not in self.done:
-            self.done[name] = self.fed(RUNS[name](self))
-        return self.done[name]
+        if name not in self.told:
+            self.told[name] = self._feed(RUNS[name](self))
+        return list(map(self.ours, self.told[name]))
+
+    def ours(self, told: Outcome) -> Outcome:
+        """Return an outcome in our convention."""
+        return replace(told, estimates=self.convention.undo(told.estimates)
+                       ) if self.convention.parts else told
 
     @cached_property
-    def ends(self) -> NDArray[np.intp]:
-        """The ends of the rests in many attitudes."""
-        return np.array([part.end for part in self.attitudes.of('rest')[1:]])
+    def starts(self) -> list[Outcome]:
+        """New filters at rest, until they are settled or the patience ends, as they are told."""
+        for seconds in LEADS_S:
+            outcomes = self._feed([Motion(start).rest(seconds).run('start')
+                                   for start in (NEAR, *motions.STARTS)])
+            if all(measures.settled(one.estimates, STILL) for one in outcomes):
+                break
+        return outcomes
+
+    @property
+    def settled(self) -> list[Outcome]:
+        """Those of the new filters that have settled, in our convention."""
+        return [self.ours(one) for one in self.starts if measures.settled(one.estimates, STILL)]
 
     @cached_property
-    def level(self) -> list[Outcome]:
-        """Return 'attitudes' up to the rests with x, y and z most level: three, or none."""
-        (whole,) = self.outcomes('attitudes')
-        ups, true = (measures.up(rows[self.ends + answers.LONG - 1])
-                     for rows in (whole.estimates, whole.run.truth))
-        # Gravity leads away a filter that is upside down.
-        least = np.where(np.sum(ups * true, axis=1) > 0.0, np.abs(ups).T, np.inf)
-        return [whole.part(slice(self.ends[np.argmin(row)])) for row in least if min(row) < np.inf]
-
-    def fed(self, runs: Sequence[Run]) -> list[Outcome]:
-        """Return the outcomes of other runs, in our convention."""
-        told = self._feed(self._make_filter, runs)
-        return [replace(one, estimates=self.convention.undo(one.estimates)) for one in told
-                ] if self.convention.parts else told
-
-    def read_in(self, convention: Convention) -> None:
-        """
-        Read the attitudes of all runs in another convention than before.
-
-        The kicks of 'turns' are about the vertical of the old one: they are fed anew.
-        """
-        self.done = {name: [replace(one, estimates=convention.undo(
-            self.convention.tell(one.estimates))) for one in outcomes]
-            for name, outcomes in self.done.items() if name != 'turns'}
-        self.convention = convention
-
-    @cached_property
-    def lead_s(self) -> float:
-        """How long the filter rests at the start until it is settled [s]."""
-        return next((one for one in LEADS_S[:-1] if self._settles_in(one)), LEADS_S[-1])
-
-    @cached_property
-    def settles(self) -> bool:
-        """Whether the filter settles at all: one that is unstable, or very slow, does not."""
-        return self.lead_s < LEADS_S[-1] or self._settles_in(LEADS_S[-1])
-
-    def _settles_in(self, seconds: float) -> bool:
-        (outcome,) = self.fed([Motion(motions.euler(NEAR)).rest(seconds).run('rest')])
-        later = outcome.estimates[len(outcome.estimates) // 2:]
-        return measures.largest_turn(later[:1], later) < STILL
+    def lead(self) -> int:
+        """Samples of the rest at the start, until the filter is settled."""
+        return len(self.starts[0].run.dt)
 
     @cached_property
     def motion(self) -> Motion:
         """The excitation."""
-        return motions.excitation(self.lead_s)
-
-    @cached_property
-    def attitudes(self) -> Motion:
-        """Rests in many attitudes, in which a filter is kicked when it has settled."""
-        return motions.attitudes(self.lead_s)
+        return motions.excitation(self.lead / RATE)
 
     @cached_property
     def run(self) -> Run:
@@ -109,41 +93,67 @@ class Exam:
         return self.motion.run('excitation')
 
     @cached_property
+    def ends(self) -> NDArray[np.intp]:
+        """The ends of the rests."""
+        return np.array([part.end for part in self.motion.of('rests')])
+
+    @cached_property
+    def uneven(self) -> NDArray[np.intp]:
+        """Uneven steps: each of STEPS once, far apart."""
+        (part,) = self.motion.of('uneven steps')
+        kinds = len(motions.STEPS)
+        return part.begin + (3 * kinds + 1) * np.arange(1, kinds + 1)
+
+    @cached_property
     def heading(self) -> bool:
         """Whether the field changes attitudes: only then the heading is judged against north."""
         return measures.differ(*(self.outcomes(name)[0].estimates
-                                 for name in ('excitation', 'field turned')))
+                                 for name in ('excitation', 'no field')))
 
-    @cached_property
-    def bias(self) -> bias.Effects:
-        """The effects of a bias."""
-        return bias.effects(self.fed)
+    def errors(self, name: str) -> Errors:
+        """Return the errors in the excitation once settled; without north, about their mean."""
+        (outcome,) = self.outcomes(name)
+        errors = errors_of(outcome.estimates[self.lead:], self.run.truth[self.lead:])
+        return errors if self.heading else errors.about_mean()
 
-    def errors(self, name: str = 'excitation') -> Errors:
-        """Return the errors in the excitation; without north, the heading from when settled on."""
-        errors = errors_of(self.outcomes(name)[0].estimates, self.run.truth)
-        if not self.heading:
-            turned = errors.heading - errors.heading[round(self.lead_s * RATE)]
-            errors = errors._replace(heading=(turned + math.pi) % math.tau - math.pi)
-        return errors
+    def answers(self, name: str) -> tuple[Reals, Reals]:
+        """Return kicks of a run (n, 3), and by how much they move attitudes (n, ANSWER, 3)."""
+        (still,), (moved,) = self.outcomes('no field'), self.outcomes(name)
+        turns = (moved.run.gyroscope - still.run.gyroscope) * still.run.dt[:, np.newaxis]
+        apart = measures.increments(moved.estimates) - measures.increments(still.estimates)
+        steps = np.flatnonzero(np.any(turns, axis=1))
+        return turns[steps], np.cumsum(apart[steps[:, np.newaxis] + np.arange(ANSWER)], axis=1)
 
-    @cached_property
-    def clean(self) -> Errors:
-        """The errors in the excitation; filters may read force and field at the begin of steps."""
-        errors, settled = self.errors(), slice(round(self.lead_s * RATE), None)
-        if np.max(errors.whole[settled]) < STILL:
-            return errors
-        return min(errors, self.errors('force of the begin'),
-                   key=lambda one: float(np.max(one.whole[settled])))
+    def kicked(self, steps: NDArray[np.intp], turns: Reals) -> Run:
+        """Return the run without field, with turns of the gyroscope alone (n, 3) [rad]."""
+        run = self.run.without_field()
+        gyroscope = run.gyroscope.copy()
+        gyroscope[steps] += turns / run.dt[steps, np.newaxis]
+        return replace(run, name='kicks', gyroscope=gyroscope)
+
+    def turned(self, steps: NDArray[np.intp], sizes: Reals | float) -> Run:
+        """Return the run without field, with kicks about the vertical of so many rad (n,)."""
+        (still,) = self.outcomes('no field')
+        return self.kicked(steps, np.reshape(sizes, (-1, 1)) * measures.up(
+            still.estimates[steps - 1]))
+
+
+def _tilts(exam: Exam) -> list[Run]:
+    """Return runs with a kick each: about x, y and z where they are most level, and across."""
+    up = measures.up(exam.run.truth[exam.ends - 1])
+    runs = []
+    for axis, k in zip(np.eye(3), np.argmin(np.abs(up), axis=0), strict=True):
+        across, end = np.cross(up[k], axis), exam.ends[k]
+        runs += [exam.kicked(np.array([end - 4 * ANSWER]), SMALL * kick[np.newaxis]).part(
+            slice(end)) for kick in (np.cross(across, up[k]), across)]
+    return runs
 
 
 def _field_turned(exam: Exam) -> list[Run]:
-    """Turn the field about the vertical, to one side and then to the other."""
-    middle = len(exam.run.dt) // 2
-    turns = Rotation.from_quat(exam.run.truth)
-    west = np.where(np.arange(len(turns)) < middle, FIELD_TURN, -FIELD_TURN)
-    field = turns.inv().apply(Rotation.from_euler('z', west[:, np.newaxis]).apply(
-        turns.apply(exam.run.magnetometer)))
+    """Turn the field about the vertical, from the middle on."""
+    turns, middle = Rotation.from_quat(exam.run.truth), len(exam.run.dt) // 2
+    field = turns.inv().apply(Rotation.from_euler('z', FIELD_TURN).apply(motions.FIELD))
+    field[:middle] = exam.run.magnetometer[:middle]
     return [replace(exam.run, name='field turned', magnetometer=field)]
 
 
@@ -154,49 +164,33 @@ def _begin(exam: Exam) -> list[Run]:
     return [replace(exam.run, name='force of the begin', accelerometer=force, magnetometer=field)]
 
 
-def _uneven_turns(exam: Exam) -> list[Run]:
-    """Return the run of uneven steps with a kick in a step of each length."""
-    (still,) = exam.outcomes('uneven')
-    settled = 4 * len(still.run.dt) // 5
-    lengths, first = np.unique(still.run.dt[settled:].round(6), return_index=True)
-    # In the third period after the one before; as fast in each length.
-    steps = settled + first + 3 * len(motions.STEPS) * np.arange(len(first))
-    return [answers.kicked(still.run, steps, answers.SMALL * RATE * lengths[:, np.newaxis]
-                           * measures.up(still.estimates[steps - 1]))]
+def _arm(exam: Exam) -> list[Run]:
+    """Move the IMU off the axis of the top."""
+    (part,) = exam.motion.of('top')
+    rows, force = slice(part.begin, part.end), exam.run.accelerometer.copy()
+    turns = Rotation.from_quat(exam.run.truth[rows])
+    velocity = np.gradient(turns.apply(ARM), 1.0 / RATE, axis=0)
+    force[rows] += turns.inv().apply(np.gradient(velocity, 1.0 / RATE, axis=0))
+    return [replace(exam.run, name='lever arm', accelerometer=force)]
 
 
-def _turns(exam: Exam, size: float) -> list[Run]:
-    """Return the run with a kick about the vertical in each attitude: nothing leads it back."""
-    ((still,), steps) = exam.outcomes('attitudes'), exam.ends + answers.SHORT
-    sizes = np.resize((size, -size), (len(steps), 1))
-    return [answers.kicked(still.run, steps, sizes * measures.up(still.estimates[steps - 1]))]
-
-
-def _tilts(exam: Exam) -> list[Run]:
-    """Return runs with one kick each: about x, y and z as far as level, and across them."""
-    runs = []
-    for axis, still in zip(np.eye(3), exam.level, strict=True):
-        up = measures.up(still.estimates[answers.LONG - 1])
-        across = np.cross(up, axis) * answers.SMALL / np.linalg.norm(np.cross(up, axis))
-        runs += [answers.kicked(still.run, [answers.LONG], kick)
-                 for kick in (np.cross(across, up), across)]
-    return runs
+def _bias(exam: Exam) -> list[Run]:
+    """Add a bias in a rest, and in one about other axes."""
+    run = Motion(NEAR).rest(BIAS_S).turn((0.0, -1.4, 0.0)).rest(BIAS_S).run('bias')
+    return [replace(run, gyroscope=run.gyroscope + BIAS)]
 
 
 RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
-    'twice': lambda exam: 2 * [motions.noisy('twice', motions.CALIBRATED, 0, 1.0, 1.0)],
-    'excitation': lambda exam: [exam.run],
-    'force of the begin': _begin,
-    'field turned': _field_turned,
-    'uneven': lambda exam: [motions.uneven(1000).without_field()],
-    'uneven turns': _uneven_turns,
-    'attitudes': lambda exam: [exam.attitudes.run('attitudes').without_field()],
-    'turns': lambda exam: _turns(exam, answers.SMALL),
-    'large turns': lambda exam: _turns(exam, answers.LARGE),
-    'starts': lambda exam: [Motion(motions.euler(one)).rest(exam.lead_s).run('start')
-                            for one in STARTS],
-    'starts, no field': lambda exam: [one.run.without_field() for one in exam.outcomes('starts')],
-    'tilts': _tilts,
-    'arm': lambda exam: [motions.with_arm(exam.motion, exam.run, ARM)],
+    # The first seed twice: a filter says the same of the same.
     'noise': lambda exam: [motions.noisy(f'noise, seed {seed}', exam.imu, seed, NOISE_LEAD_S,
-                                         NOISE_S) for seed in exam.seeds]}
+                                         NOISE_S) for seed in (*exam.seeds, exam.seeds[0])],
+    'excitation': lambda exam: [exam.run],
+    'no field': lambda exam: [exam.run.without_field()],
+    'starts, no field': lambda exam: [one.run.without_field() for one in exam.starts],
+    'force of the begin': _begin, 'field turned': _field_turned,
+    'turns': lambda exam: [exam.turned(exam.ends - ANSWER, SMALL)],
+    'large turns': lambda exam: [exam.turned(exam.ends - ANSWER, LARGE)],
+    # As fast as those of equal steps.
+    'uneven turns': lambda exam: [exam.turned(
+        exam.uneven, SMALL * RATE * exam.run.dt[exam.uneven])],
+    'tilts': _tilts, 'bias': _bias, 'arm': _arm}

@@ -22,8 +22,8 @@ from spinning_top_sim.streams.felt import Vibration
 from spinning_top_sim.streams.imu import Imu, Magnetometer
 
 # The motion is computed every half step.
-PERIOD_NS, HALF_NS = 7_000_000, 3_500_000
-HALF = 1e-9 * HALF_NS
+PERIOD_NS = 7_000_000
+HALF_NS, HALF = PERIOD_NS // 2, 0.5e-9 * PERIOD_NS
 # Begin and end of each motion [s]; the sensor rests before it.  A motion sets in within RAMP.
 ONE, BREAKS = ((30.0, 90.0),), ((30.0, 52.0), (60.0, 80.0), (88.0, 106.0))
 RAMP = 1.0

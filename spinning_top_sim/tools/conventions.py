@@ -64,16 +64,8 @@ class Convention:
                        * Rotation.from_quat(self.sensor).inv()).as_quat()
         return ours
 
-    def tell(self, ours: Reals) -> Reals:
-        """Return attitudes (n, 4) as they are told; the inverse of `undo`."""
-        q = Rotation.from_quat(self.world) * Rotation.from_quat(ours) * Rotation.from_quat(
-            self.sensor)
-        told: Reals = (q.inv() if self.conjugate else q).as_quat()
-        return told[:, [3, 0, 1, 2]] if self.w_first else told
 
-
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """The best convention, and the rms errors [rad] of the attitudes read in ours and in it."""
 
     convention: Convention
@@ -107,29 +99,24 @@ def axes(matrix: Any) -> str:
                      for row in matrix)
 
 
-def best(told: Reals, truth: Reals, heading: str = 'absolute') -> Found:
+def best(told: Reals, truth: Reals, steady: bool = False) -> Found:
     """
     Return the convention in which attitudes agree best with the truth.
 
     told : attitudes as they are told (n, 4)
     truth : the same in our convention (n, 4)
-    heading : 'absolute', 'steady' (a constant turn about the vertical is no error) or 'any'
+    steady : whether a constant turn about the vertical is no error
 
     Some dozen attitudes that differ from each other by large turns suffice.
     """
-    found = [(error_of(one.undo(told), truth, heading), one) for one in group()]
+    found = []
+    for one in group():
+        errors = errors_of(one.undo(told), truth)
+        found.append((rms((errors.about_mean() if steady else errors).whole), one))
     least = min(error for error, _ in found)
     # The first has the fewest parts.
     error, chosen = next(pair for pair in found if pair[0] <= max(AS_GOOD * least, SAME))
     return Found(chosen, found[0][0], error)
-
-
-def error_of(ours: Reals, truth: Reals, heading: str = 'absolute') -> float:
-    """Return the rms error [rad] of attitudes (n, 4); `heading` as for `best`."""
-    errors = errors_of(ours, truth)
-    if heading == 'steady':
-        errors = errors.about_mean()
-    return rms(errors.tilt if heading == 'any' else errors.whole)
 
 
 class Errors(NamedTuple):

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 Reals = NDArray[np.float64]
 
 AXES = 'xyz'
-WINDOW = 3.0            # autocorrelation times over which correlations are summed (Sokal 1997)
 MOST_CAUSES = 3
 # Further causes are looked for while more than these shares of the discrepancy and of the noise
 # remain.
@@ -60,25 +59,6 @@ class Cause(NamedTuple):
 def rms(values: Reals) -> float:
     """Return the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def autocorrelation_time(values: Reals) -> float:
-    """
-    Return the integrated autocorrelation time of values (n,) [samples], at least 1.
-
-    The sum ends at the first lag of at least WINDOW times its present value (Sokal 1997, sect. 3).
-    """
-    centred = values - np.mean(values)
-    largest = float(np.max(np.abs(centred)))
-    if not largest > 0.0:
-        return 1.0
-    n = len(values)
-    # Zero padding makes the circular correlation of the transform a linear one.
-    power = np.abs(np.fft.rfft(centred / largest, 2 * n)) ** 2      # no overflow
-    correlations = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
-    times = 2.0 * np.cumsum(correlations / correlations[0]) - 1.0
-    ends = np.flatnonzero(np.arange(n) >= WINDOW * times)
-    return max(float(times[ends[0] if len(ends) else -1]), 1.0)
 
 
 def instead(name: str, evidence: str) -> Judge:

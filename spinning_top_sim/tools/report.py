@@ -3,7 +3,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -102,11 +102,11 @@ class Report:
         lines = [f'{self.subject}: {"passed" if self.passed else ", ".join(self.faults)}',
                  *(f'  {finding.name}: {finding.evidence}' for finding in self.found),
                  *(f'  {note}' for note in self.notes)]
-        return '\n'.join([*lines, *(f'  {line}' for line in self.mark_lines())])
+        return '\n'.join([*lines, *self.mark_lines()])
 
-    def mark_lines(self) -> list[str]:
+    def mark_lines(self) -> Iterator[str]:
         """
-        Return the marks as a table, without those that could not be measured.
+        Yield the marks as a table, without those that could not be measured.
 
         Those that are called 'MARK: SCENE' are a table of their own, scene by mark.
         """
@@ -117,44 +117,33 @@ class Report:
                 what, _, scene = name.partition(': ')
                 scenes.setdefault(scene, {})[what] = mark
         limits = {what: mark.limit for marks in scenes.values() for what, mark in marks.items()}
-        by_scene = [('scene', *limits), *((scene, *(
-            f'{marks[what].value:.4g}' if what in marks else '' for what in limits))
-            for scene, marks in scenes.items()), ('limit', *map(_limit, limits.values()))]
-        others = [('measure', 'value', 'limit', ''), *(
-            (name, f'{mark.value:.4g}', _limit(mark.limit), f'  {mark.meaning}')
-            for name, mark in known.items() if ': ' not in name)]
-        return [*(_aligned(by_scene) if scenes else ()),
-                *(_aligned(others) if len(others) > 1 else ())]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report as JSON can hold it; None: NaN or infinity."""
-        return {'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
-                'found': [{'name': finding.name, 'evidence': finding.evidence,
-                           'number': number(finding.number)} for finding in self.found],
-                'marks': {name: {'value': number(mark.value), 'limit': number(mark.limit)}
-                          for name, mark in self.marks.items()},
-                'notes': list(self.notes)}
+        if scenes:
+            yield from cli.table_lines('Scenes', ('scene', *limits), [*((scene, *(
+                _number(marks[what].value) if what in marks else '' for what in limits))
+                for scene, marks in scenes.items()), ('limit', *map(_number, limits.values()))])
+        others = {name: mark for name, mark in known.items() if ': ' not in name}
+        if others:
+            width = max(len(mark.meaning) for mark in others.values())
+            yield from cli.table_lines('Measures', ('measure', 'value', 'limit', ''), [
+                (name, _number(mark.value), _number(mark.limit), mark.meaning.ljust(width))
+                for name, mark in others.items()])
 
     def as_json(self) -> str:
-        """Return `as_dict` as JSON."""
-        return json.dumps(self.as_dict(), indent=2)
+        """Return the report as JSON; null: NaN or infinity."""
+        def finite(value: float) -> float | None:
+            return value if math.isfinite(value) else None
+
+        return json.dumps({
+            'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
+            'found': [{'name': finding.name, 'evidence': finding.evidence,
+                       'number': finite(finding.number)} for finding in self.found],
+            'marks': {name: {'value': finite(mark.value), 'limit': finite(mark.limit)}
+                      for name, mark in self.marks.items()},
+            'notes': list(self.notes)}, indent=2)
 
 
-def _limit(value: float) -> str:
+def _number(value: float) -> str:
     return '' if math.isnan(value) else f'{value:.4g}'
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows as lines: names to the left, numbers to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [''.join(cell if cell.startswith(' ') else f'{cell:<{width}}' if k == 0 else
-                    f'  {cell:>{max(width, 9)}}' for k, (cell, width) in enumerate(
-                        zip(row, widths, strict=True))).rstrip() for row in rows]
-
-
-def number(value: float) -> float | None:
-    """Return what JSON can hold: None for NaN and infinity."""
-    return value if math.isfinite(value) else None
 
 
 def printed(report: Report, as_json: bool) -> int:
@@ -166,16 +155,3 @@ def printed(report: Report, as_json: bool) -> int:
         for line in str(report).splitlines():
             cli.print_line(line)
     return cli.OK if report.passed else cli.FAILED
-
-
-def passing(judge: Callable[..., Report]) -> Callable[..., Report]:
-    """Return `judge` as a function that fails a test in pytest, but for faults `known`."""
-    import pytest  # noqa: PLC0415 - for tests only
-
-    def judged(*arguments: Any, known: Iterable[str] = (), **options: Any) -> Report:
-        __tracebackhide__ = True
-        report = judge(*arguments, **options)
-        if not set(report.faults) <= set(known):
-            pytest.fail(str(report), pytrace=False)
-        return report
-    return judged

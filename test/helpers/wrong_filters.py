@@ -106,15 +106,6 @@ class Mahony:
         return self._q.copy()
 
 
-class UpsideDown(Mahony):
-    """Starts upside down if there is no field; its estimate of the bias has to come back."""
-
-    def update(self, w, a, m, dt):
-        if self._q is None and m is None:
-            self._q = world(from_two_vectors(a, None), np.array((math.pi, 0.0, 0.0)))
-        return super().update(w, a, m, dt)
-
-
 def axes(*rows):
     """Return what reads other axes: numbers from 1 on, negative where the sign is changed."""
     chosen, signs = np.abs(rows) - 1, np.sign(rows)
@@ -144,7 +135,6 @@ RIGHT = {
     'mahony, float32': partial(Mahony, number=np.float32),
     'mahony, from the identity': partial(Mahony, triad=False),
     'mahony, slow from the identity': partial(Mahony, 0.1, 0.1, 0.01, triad=False),
-    'mahony, upside down': partial(UpsideDown, 0.5, 0.5, 0.05),
     'mahony, corrects first': partial(Mahony, 1.0, 0.5, 0.1, first=True)}
 # Each with the faults that may be named.
 WRONG = {
@@ -178,7 +168,7 @@ WRONG = {
     'attitude late': (partial(Part, late=(0, 0, 0, 5)), 'timing'),
     'one step late': (partial(Part, late=(0, 0, 0, 1)), 'timing'),
     'dt of 100 Hz': (partial(Part, Mahony, step=lambda dt: 0.01), 'timing'),
-    'wrong side': (partial(Mahony, advance=world), 'gyroscope'),
+    'wrong side': (partial(Mahony, advance=world), 'accuracy'),
     'first order': (partial(Mahony, advance=first_order), 'integration'),
     'follows forces': (partial(Vqf, tauAcc=0.1), 'lever_arm'),
     'no bias': (partial(Mahony, learns=0.0), 'bias'),

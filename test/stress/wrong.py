@@ -4,6 +4,7 @@
 from helpers.wrong_filters import TABLE
 
 from spinning_top_sim.exam import examine
+from spinning_top_sim.exam.feeding import feed
 
 PATIENCE_S = 1800.0
 MEMORY_MB = 4000
@@ -13,6 +14,6 @@ def check(seed, folder):
     del folder
     name = list(TABLE)[seed % len(TABLE)]
     make, fault = TABLE[name]
-    report = examine(make, seeds=[seed // len(TABLE)], isolated=False, subject=name)
+    report = examine(make, seeds=[seed // len(TABLE)], feed=feed, subject=name)
     assert ', '.join(report.faults) == fault, str(report)
     return 'named' if fault else 'right'
