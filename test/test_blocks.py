@@ -125,11 +125,8 @@ def live(dice, published):
 
 
 def assert_same(found, expected):
-    assert {topic: len(messages) for topic, messages in found.items()} == {
-        topic: len(messages) for topic, messages in expected.items()}
-    for topic, messages in expected.items():
-        for one, two in zip(found[topic], messages, strict=True):
-            assert one == two, (topic, two[0])
+    topics = found.keys() | expected.keys()
+    assert [topic for topic in topics if found.get(topic) != expected.get(topic)] == []
 
 
 @pytest.mark.parametrize('name', RUNS)

@@ -53,7 +53,8 @@ class Output:
     sent: int = 0
     skipped: int = 0
     failed: int = 0
-    # Times [ns] and messages of which the first ones are sent, and how many.
+    # Log times [ns], as an array and as a list, and messages; so many of them are sent.
+    _stamps: Times = field(default_factory=lambda: np.empty(0, np.int64))
     _times: list[int] = field(default_factory=list)
     _rows: Rows = field(default_factory=lambda: np.empty((0, 0), np.uint8))
     _taken: int = 0
@@ -64,17 +65,18 @@ class Output:
         """Whether anybody takes the messages: else they are not computed."""
         return self.publish is not None or self.log_index is not None
 
-    def add(self, t_ns: Times, rows: Rows) -> None:
+    def add(self, stamps: Times, rows: Rows) -> None:
         """Put messages behind those that wait."""
-        waiting = self._times[self._taken:]
-        if waiting:
+        if self._taken < len(self._times):
+            stamps = np.concatenate((self._stamps[self._taken:], stamps))
             rows = np.concatenate((self._rows[self._taken:], rows))
-        self._times, self._rows, self._taken = waiting + t_ns.tolist(), rows, 0
+        self._stamps, self._times, self._rows, self._taken = stamps, stamps.tolist(), rows, 0
 
-    def take(self, until_ns: int) -> tuple[list[int], Rows]:
-        """Return what waits up to a time [ns], which waits no longer."""
-        begin, self._taken = self._taken, bisect_right(self._times, until_ns, self._taken)
-        return self._times[begin:self._taken], self._rows[begin:self._taken]
+    def take(self, until_ns: int) -> tuple[Times, list[int], Rows]:
+        """Return what waits up to a log time [ns], which waits no longer."""
+        begin, end = self._taken, bisect_right(self._times, until_ns, self._taken)
+        self._taken = end
+        return self._stamps[begin:end], self._times[begin:end], self._rows[begin:end]
 
     def send(self, message: bytes) -> None:
         """Publish a message; what the middleware refuses is counted."""
@@ -200,7 +202,7 @@ class LiveSimulation(Simulation):
             if group is self._motion:
                 goal_ns = self.reach(group.computed_ns, goal_ns)
             for channel, t_ns, rows in self.messages(group.outputs, group.computed_ns, goal_ns):
-                group.outputs[channel].add(t_ns, rows)
+                group.outputs[channel].add(self.epoch_ns + t_ns, rows)
             done_ns, called = goal_ns - group.computed_ns, now
             group.computed_ns, now = goal_ns, self._clock()
             # Where it took too long, the next piece is a half of it, else up to twice as long.
@@ -212,11 +214,11 @@ class LiveSimulation(Simulation):
         logged: list[LogRows] = []
         due: list[tuple[int, int, NDArray[np.uint8]]] = []
         for number, output in self._used:
-            times, rows = output.take(until_ns)
+            stamps, times, rows = output.take(self.epoch_ns + until_ns)
             if times and output.log_index is not None:
-                logged.append((output.log_index, self.epoch_ns + np.array(times), rows))
+                logged.append((output.log_index, stamps, rows))
             if output.publish is not None:
-                late = bisect_left(times, publish_from_ns)
+                late = bisect_left(times, self.epoch_ns + publish_from_ns)
                 output.skipped += late
                 due += zip(times[late:], repeat(number), rows[late:])
         if logged:

@@ -35,16 +35,6 @@ def record(simulation, *topics):
     return taken
 
 
-def publish(simulation, *topics):
-    """Subscribe to these topics: [(topic, bytes)]."""
-    taken = []
-    for topic in topics:
-        output(simulation, topic).publish = (
-            lambda message, topic=topic: taken.append((topic, message)))
-    simulation.refresh()
-    return taken
-
-
 def play(simulation, until_ns, *topics):
     """Return what is sent offline, in the order of blocks: [(topic, stamp_ns, bytes)]."""
     channels = [one for one in simulation.channels if not topics or one.topic in topics]
