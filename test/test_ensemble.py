@@ -163,20 +163,6 @@ def test_failed_runs_are_told_with_their_reason(
         assert 'ValueError: no motion from State(theta=' in why['1'] and 'spin.lz = ' in why['1']
 
 
-def test_a_receiver_without_reception_is_no_failure_and_has_no_fix():
-    """Outages that begin and end within a run, and last for all of it."""
-    specification = ensemble_spec.parse({
-        'runs': 2, 'duration': 1.0, 'streams': ['gnss'], 'sample': {
-            'gnss.outages': {'values': [[0.25, 0.75], [0.0, 9.0]]}}}, 'test')
-    for run, out in ((0, slice(3, 8)), (1, slice(0, 11))):
-        columns, lost = table_of_run(specification, run).to_pydict(), np.zeros(11, bool)
-        lost[out] = True
-        assert columns['gnss/fix.status.status'] == np.where(lost, -1.0, 0.0).tolist()
-        assert np.array_equal(np.isnan(columns['gnss/fix.position.latitude']), lost)
-        velocity = columns['gnss/velocity.twist.twist.linear.x']
-        assert [value is None for value in velocity] == lost.tolist()
-
-
 def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names():
     given = {'runs': 2030, 'duration': 1.0, 'seed': 3}
     lists = {'initial.theta': {'values': [0.1, 0.2]}}
@@ -202,19 +188,26 @@ def test_what_is_drawn_has_the_distributions_and_does_not_depend_on_other_names(
 
 
 def test_all_runs_have_the_same_columns_whatever_their_parameters_enable(tmp_path):
-    """A magnetometer in one of two IMUs; a value unset in some runs; a run without rows."""
+    """A magnetometer in one IMU, a run without rows, an outage; a value unset in some runs."""
     sets = [str(ROOT / f'config/imu/{name}.yaml') for name in ('bmi088', 'icm_20948')]
-    specification = ensemble_spec.parse({'runs': 6, 'duration': 0.05, 'sample': {
-        'params': {'values': [*sets, {'record.streams': ['gnss']}]},
+    specification = ensemble_spec.parse({'runs': 8, 'duration': 0.3, 'sample': {
+        'params': {'values': [*sets, {'record.streams': ['gnss']}, {
+            'gnss.enabled': True, 'gnss.outages': [0.05, 0.15]}]},
         'spin.lz': {'values': [None, 1.4]}}}, 'test')
-    runs = [table_of_run(specification, run) for run in range(6)]
-    assert parquet.read_table(parts_of(specification, tmp_path)).equals(
-        pa.concat_tables(runs).combine_chunks())
+    runs = [table_of_run(specification, run) for run in range(8)]
+    whole, joined = parquet.read_table(parts_of(specification, tmp_path)), pa.concat_tables(runs)
+    assert whole.schema.equals(joined.schema)
+    assert repr(whole.to_pydict()) == repr(joined.to_pydict())      # with the same NaN
     mag = [one['imu/mag.magnetic_field.x'] for one in runs]
-    assert [len(column) - column.null_count for column in mag] == [0, 6, 0, 0, 6, 0]
-    assert [len(one) > 0 for one in runs] == [True, True, False] * 2
+    assert [len(column) - column.null_count for column in mag] == [0, 31, 0, 0] * 2
+    assert [len(one) > 0 for one in runs] == [True, True, False, True] * 2
     assert [set(one['spin.lz'].to_pylist()) for one in runs] == [
-        {None}, {None}, set(), {1.4}, {1.4}, set()]
+        {None}, {None}, set(), {None}, {1.4}, {1.4}, set(), {1.4}]
+    for topic, field, lost in (('fix', 'status.status', -1.0),
+                               ('velocity', 'twist.twist.linear.x', None)):
+        seen = runs[3].filter(pa.array(np.isin(runs[3]['t'], (0.0, 0.1, 0.2, 0.3))))
+        cells = seen[f'gnss/{topic}.{field}'].to_pylist()
+        assert [cell == lost for cell in cells] == [False, True, False, False]
 
 
 @pytest.mark.parametrize(('changes', 'said'), [

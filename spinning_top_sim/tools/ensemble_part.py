@@ -7,12 +7,14 @@ A file gets its name when it is whole.  One that is there already is not compute
 
 import contextlib
 import json
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spinning_top_sim.recording.errors import reason_of
 from spinning_top_sim.streams.channel import Channel
@@ -46,6 +48,12 @@ def _column_names(channel: Channel) -> list[str]:
     return names
 
 
+def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return arrays one after the other in their last axis."""
+    return parts[0] if len(parts) == 1 else np.concatenate(
+        [*parts] or [np.empty(0, np.int64)], axis=-1)
+
+
 def table_of_run(specification: Specification, run: int) -> 'pyarrow.Table':
     """
     Play a run; return its number, t [s], what is drawn, and the numbers of kept streams.
@@ -61,15 +69,15 @@ def table_of_run(specification: Specification, run: int) -> 'pyarrow.Table':
     simulation = Simulation(values, EPOCH_NS)
     kept = [channel for channel in simulation.channels if channel.name in specification.kept]
     names = {channel.topic: _column_names(channel) for channel in kept}
-    times: dict[str, list[Times]] = {topic: [np.empty(0, np.int64)] for topic in names}
-    sent = {topic: [np.empty((len(labels), 0))] for topic, labels in names.items()}
+    times: dict[str, list[Times]] = {topic: [] for topic in names}
+    sent: dict[str, list[NDArray[np.float64]]] = {topic: [] for topic in names}
     for block in simulation.play(recorded(kept, values),
                                  round(values['duration'] * NANOSECONDS)):
         for channel, times_ns, rows in block.messages:
             times[channel.topic].append(times_ns)
             sent[channel.topic].append(np.hstack(channel.template.decode(rows)).T)
     # Faster than np.unique, for they are sorted in parts.
-    every_ns = np.sort(np.concatenate([*chain(*times.values())]), kind='stable')
+    every_ns = np.sort(_joined([*chain(*times.values())]), kind='stable')
     rows_ns = every_ns[np.diff(every_ns, prepend=-1) > 0]
 
     def repeated(value: Any) -> 'pyarrow.Array':
@@ -79,8 +87,8 @@ def table_of_run(specification: Specification, run: int) -> 'pyarrow.Table':
     columns = {'run': repeated(run), 't': pa.array(rows_ns / NANOSECONDS),
                **{name: repeated(value) for name, value in drawn.items()}}
     for topic, labels in names.items():
-        times_ns = np.concatenate(times[topic])
-        cells, absent = np.concatenate(sent[topic], axis=1), None
+        times_ns, absent = _joined(times[topic]), None
+        cells = _joined(sent[topic] or [np.empty((len(labels), 0))])
         if not np.array_equal(times_ns, rows_ns):
             # A faulty sensor sends some samples twice; they share a row.
             present, known = np.searchsorted(rows_ns, times_ns), cells
