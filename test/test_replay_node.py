@@ -192,7 +192,7 @@ def test_odd_channels_and_times_do_not_stop_the_others(tmp_path, capfd):
 def test_only_message_classes_of_installed_ros_packages_are_found(monkeypatch):
     assert message_class('std_msgs/String') is message_class(STRING) is String
     monkeypatch.setattr(importlib, 'import_module', pytest.fail)
-    for name in ('antigravity/msg/X', '/msg/String', 'std_msgs', '../std_msgs/msg/String'):
+    for name in ('antigravity/msg/X', '/msg/String', '../std_msgs/msg/String'):
         with pytest.raises(ValueError, match='must be an installed type'):
             message_class(name)
 

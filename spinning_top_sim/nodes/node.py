@@ -83,8 +83,7 @@ class Simulator(Node):
             self.create_service(kind, f'~/{name}', partial(self._serve, act))
         answers_later(self.create_service(SetBool, '~/record', self._record))
         self._every('diagnostics', 1.0, self._publish_diagnostics)
-        for warning in ros_parameters.disobeyed_overrides(self, overrides):
-            log.warning(warning)
+        ros_parameters.warn_of_disobeyed(self, overrides)
         if objection := simulation.trajectory.top.objection:
             log.warning(objection)
 

@@ -63,8 +63,7 @@ class Replayer(Node):
                 raise ValueError(f'--{name} {value:g}: must be {allowed}')
         self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
         self.outputs = self._open_publishers()
-        for warning in ros_parameters.disobeyed_overrides(self, overrides):
-            self.get_logger().warning(warning)
+        ros_parameters.warn_of_disobeyed(self, overrides)
         self._paused = options.start_paused
         self._set_log_time(self._begin_ns)
         self._steps = self._play()
