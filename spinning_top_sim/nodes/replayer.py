@@ -58,7 +58,8 @@ class Replayer(Node):
         self._length_s = (log.span[1] - log_begin_ns) / NANOSECONDS
         for name, value, allowed in (('start', options.start, Range(0.0, self._length_s)),
                                      ('rate', options.rate, Range(1e-6, 1e9)),
-                                     ('clock', options.clock or 1.0, Range(1e-6, 1e4))):
+                                     ('clock', 1.0 if options.clock is None else options.clock,
+                                      Range(1e-6, 1e4))):
             if value not in allowed:
                 raise ValueError(f'--{name} {value:g}: must be {allowed}')
         self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
