@@ -192,7 +192,7 @@ def test_odd_channels_and_times_do_not_stop_the_others(tmp_path, capfd):
 def test_only_message_classes_of_installed_ros_packages_are_found(monkeypatch):
     assert message_class('std_msgs/String') is message_class(STRING) is String
     monkeypatch.setattr(importlib, 'import_module', pytest.fail)
-    for name in ('antigravity/msg/X', '/msg/String', 'std_msgs', '../std_msgs/msg/String'):
+    for name in ('antigravity/msg/X', '/msg/String', '../std_msgs/msg/String'):
         with pytest.raises(ValueError, match='must be an installed type'):
             message_class(name)
 
@@ -220,7 +220,7 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, capfd):
             ((no_log,), 'no MCAP'),
             ((path, '--topics', '/nobody'), '/ours/chatter'),
             ((path, '--start', '99'), '--start 99: must be >= 0 and <= 1.18'),
-            ((path, '--clock', '-1'), '--clock -1: must be >= 1e-06 and <= 10000'),
+            ((path, '--clock', '0'), '--clock 0: must be >= 1e-06 and <= 10000'),
             ((path, '--rate', '0'), '--rate 0: must be >= 1e-06 and <= 1e+09'),
             ((path, '--rate', 'x'), "argument -r/--rate: invalid float value: 'x'")):
         run = run_main(replay_node.main, capfd, *options)

@@ -15,6 +15,7 @@ pytest.importorskip('rclpy')
 from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.node_logs import (
+    TRACEBACK,
     assert_clean_end,
     assert_received_from,
     log_of,
@@ -116,6 +117,24 @@ def test_a_log_that_is_still_being_opened_is_whole_in_the_end(tmp_path):
     path = the_log(node.folder)
     assert f'next: spinning-top inspect {path}\n      spinning-top view {path}\n' in node.out
     assert verified(path)['identical']
+
+
+# A node with an error in its 50th tick
+BROKEN = """
+import sys
+from spinning_top_sim.nodes.loop import Loop
+from spinning_top_sim.__main__ import main
+ordinary, ticks = Loop.tick, iter(range(50))
+Loop.tick = lambda self: ordinary(self) or 1 // (49 - next(ticks))
+sys.exit(main())
+"""
+
+
+def test_an_error_that_nobody_expects_ends_the_node_loudly_and_the_log_is_whole(tmp_path):
+    with SimNode(tmp_path, {'record.enabled': True}, program=('-c', BROKEN, 'node')) as node:
+        assert node.process.wait(60.0) == 1
+    assert TRACEBACK in node.err and 'ZeroDivisionError' in node.err
+    assert verified(the_log(node.folder))['identical']
 
 
 # A node that is interrupted when it calls a function

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.installation import needed, remedy
 from spinning_top_sim.recording.errors import text_of
@@ -19,29 +19,19 @@ from spinning_top_sim.tools import cli
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
-    from rclpy.node import Node
-    from rclpy.task import Future
-
-
-class RunnableNode(Protocol):
-    """A node.  `start` is called before the executor spins, and `stop` afterwards in any case."""
-
-    finished: Future                # completes with the exit code, None for 0
-
-    def start(self) -> None: ...
-    def stop(self) -> None: ...
-    def destroy_node(self) -> None: ...
 
 
 def run_node(name: str, argv: Sequence[str] | None,
-             prepare: Callable[[list[str]], tuple[list[str], Callable[[], RunnableNode]]]) -> int:
+             prepare: Callable[[list[str]], tuple[list[str], Callable[[], Any]]]) -> int:
     """
     Run the node of `spinning-top NAME`; return its exit code.
 
     It is OK after an ordinary end, or WRONG_USAGE with one line that says why it cannot start.
 
     argv : arguments, None for those of the program
-    prepare : takes the arguments; returns those for ROS, and what makes the node
+    prepare : takes the arguments; returns those for ROS, and what makes the node.  Its `start` is
+        called before the executor spins, and its `stop` afterwards in any case; its Future
+        `finished` completes with the exit code, None for 0
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     name = f'spinning-top {name}'
@@ -130,14 +120,14 @@ def short_reason(text: object) -> str:
     return cli.one_line(re.sub(r',\s*at \S+:\d+', '', str(text)))
 
 
-def _executor(node: RunnableNode) -> Executor:
+def _executor(node: Any) -> Executor:
     """Return an executor with the node; leave little to the garbage collector."""
     try:                    # this executor takes the least processor time
         from rclpy.experimental import EventsExecutor as Executor  # noqa: PLC0415
     except ImportError:
         from rclpy.executors import SingleThreadedExecutor as Executor  # noqa: PLC0415
     executor = Executor()
-    executor.add_node(cast('Node', node))
+    executor.add_node(node)
     # A task ends `spin_once` at once; `wake` does not.
     node.finished.add_done_callback(lambda _: executor.create_task(lambda: None))
     gc.collect()

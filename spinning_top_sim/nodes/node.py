@@ -70,10 +70,8 @@ class Simulator(Node):
         self.loop = Loop(
             simulation, values, self._recording, self.clock,
             error=log.error, update_subscribers=self._topics.update_subscribers)
-        self._report = NodeStatus(simulation, self.loop, self._recording)
         self._alarms: dict[str, Timer] = {}
         self._topics.open(values)
-        self._show_status(values)
         self._diagnostics = publishers.create_publisher(
             self, DiagnosticArray, '/diagnostics')
         self.create_subscription(Float64MultiArray, '~/commands', self._on_command, 10)
@@ -82,9 +80,7 @@ class Simulator(Node):
                                 ('step', Trigger, self._step), ('reset', Trigger, self._reset)):
             self.create_service(kind, f'~/{name}', partial(self._serve, act))
         answers_later(self.create_service(SetBool, '~/record', self._record))
-        self._every('diagnostics', 1.0, self._publish_diagnostics)
-        for warning in ros_parameters.disobeyed_overrides(self, overrides):
-            log.warning(warning)
+        ros_parameters.warn_of_disobeyed(self, overrides)
         if objection := simulation.trajectory.top.objection:
             log.warning(objection)
 
@@ -92,6 +88,9 @@ class Simulator(Node):
         """Let time run: simulated t = 0 is the next point on the grid of the stamps."""
         # The recorder's thread releases the interpreter this soon when a tick is due.
         sys.setswitchinterval(1e-4)
+        self._report = NodeStatus(self.simulation, self.loop, self._recording)
+        self._every('diagnostics', 1.0, self._publish_diagnostics)
+        self._show_status(self.values)
         self._begin()
         self._align_ticks()
 

@@ -4,8 +4,9 @@
 import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
+from spinning_top_sim.nodes.executable import run_node, split_ros_arguments
 from spinning_top_sim.tools import cli
 
 DESCRIPTION = """\
@@ -37,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_node('replay', argv, _prepare)
 
 
-def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
+def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], Any]]:
     parser = cli.Parser('replay', DESCRIPTION, EPILOG)
     add_arguments(parser)
     options = parser.parse_args(split_ros_arguments(argv)[0])

@@ -58,13 +58,13 @@ class Replayer(Node):
         self._length_s = (log.span[1] - log_begin_ns) / NANOSECONDS
         for name, value, allowed in (('start', options.start, Range(0.0, self._length_s)),
                                      ('rate', options.rate, Range(1e-6, 1e9)),
-                                     ('clock', options.clock or 1.0, Range(1e-6, 1e4))):
+                                     ('clock', 1.0 if options.clock is None else options.clock,
+                                      Range(1e-6, 1e4))):
             if value not in allowed:
                 raise ValueError(f'--{name} {value:g}: must be {allowed}')
         self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
         self.outputs = self._open_publishers()
-        for warning in ros_parameters.disobeyed_overrides(self, overrides):
-            self.get_logger().warning(warning)
+        ros_parameters.warn_of_disobeyed(self, overrides)
         self._paused = options.start_paused
         self._set_log_time(self._begin_ns)
         self._steps = self._play()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameter table as ROS parameters: descriptors, start values, and checked changes."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -54,14 +54,15 @@ def declare(node: Node, given: Mapping[str, Any], overrides: Mapping[str, Any]) 
     return values
 
 
-def disobeyed_overrides(node: Node, overrides: Iterable[str]) -> Iterator[str]:
-    """Yield a warning for each name of qos_overrides that no publisher of a node has used."""
+def warn_of_disobeyed(node: Node, overrides: Iterable[str]) -> None:
+    """Warn of each name of qos_overrides that no publisher of a node has used."""
     prefix = 'qos_overrides.'
     used = node.get_parameters_by_prefix('qos_overrides')
     for name in overrides:
         if name.startswith(prefix) and not node.has_parameter(name):
-            yield (f'{name} is not obeyed: no publisher has this topic and policy'
-                   f'{likely_name(name, used, prefix)}')
+            node.get_logger().warning(
+                f'{name} is not obeyed: no publisher has this topic and policy'
+                f'{likely_name(name, used, prefix)}')
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -6,6 +6,7 @@ import json
 import textwrap
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+from typing import Any
 
 from spinning_top_sim.nodes import executable
 
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--namespace', metavar='NAME', help='of node, topics and frames')
 
 
-def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], executable.RunnableNode]]:
+def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], Any]]:
     words, for_ros = executable.split_ros_arguments(argv)
     given: dict[str, object] = {}
     if words:
@@ -54,7 +55,7 @@ def _prepare(argv: list[str]) -> tuple[list[str], Callable[[], executable.Runnab
         argv = ['--ros-args', *for_ros]
     from spinning_top_sim.nodes.node import Simulator  # noqa: PLC0415
 
-    def make_node() -> executable.RunnableNode:
+    def make_node() -> Any:
         node = Simulator(given)
         if node.values['simulation_interfaces'] and find_spec('simulation_interfaces'):
             from spinning_top_sim.nodes import simulation_handlers  # noqa: PLC0415

@@ -96,8 +96,7 @@ class SimulationHandlers:
         if hasattr(response, 'result'):
             response.result.result = self._results.RESULT_OK if error is None else getattr(
                 error, 'code', self._results.RESULT_OPERATION_FAILED)
-            # A request in YAML can hold text that UTF-8 cannot; sending it would raise an error.
-            response.result.error_message = text.encode(errors='backslashreplace').decode()
+            response.result.error_message = text
         return response
 
     def _unsupported(self, reason: str) -> RefusedError:

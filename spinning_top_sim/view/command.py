@@ -10,10 +10,10 @@ import threading
 import webbrowser
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.nodes.executable import RunnableNode, run_node, split_ros_arguments
+from spinning_top_sim.nodes.executable import run_node, split_ros_arguments
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import cli, scene_file
 
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.error(f'--ros-args {" ".join(for_ros)}: must be with --node')
         return cli.run('view', DESCRIPTION, add_arguments, _show, own)
 
-    def prepare(_: list[str]) -> tuple[list[str], Callable[[], RunnableNode]]:
+    def prepare(_: list[str]) -> tuple[list[str], Callable[[], Any]]:
         _check(arguments)
         from spinning_top_sim.view.node import NodeView  # noqa: PLC0415 - it needs ROS
         if arguments.namespace is not None:
