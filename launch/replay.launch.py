@@ -11,7 +11,6 @@ from pathlib import Path
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
-from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from spinning_top_sim.nodes import launch_helpers
@@ -33,9 +32,9 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             'loop', default_value='false', choices=SWITCH, description='Start again at the end'),
         DeclareLaunchArgument(
-            'clock', default_value=LaunchConfiguration('loop'),
+            'clock', default_value='false',
             description='true, or a rate [Hz]: publish the time of the log on /clock, for TF and '
-            'RViz too; default: the value of loop'),
+            'RViz too'),
         DeclareLaunchArgument(
             'partial', default_value='false', choices=SWITCH,
             description='Play the intact part of a truncated log'),

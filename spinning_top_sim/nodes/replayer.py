@@ -2,16 +2,20 @@
 """The node `replay`: publishes the messages of a log with their recorded spacing."""
 
 import argparse
+import contextlib
 import itertools
 import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+from builtin_interfaces.msg import Time as Stamp
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -51,8 +55,7 @@ class Replayer(Node):
         self.finished: Future = Future()    # completes with the exit code when all is played
         self.sent = self.failed = 0
         self._log, self._options = log, options
-        # Whoever follows /clock begins anew with each round.
-        self._clock_rate = options.clock or (40.0 if options.loop else 0.0)
+        self._later_ns = 0              # what the rounds before have played
         first = next(log.messages(start=1), None)       # a time of 0 says: no clock yet
         log_begin_ns = first.log_time if first else 0
         self._length_s = (log.span[1] - log_begin_ns) / NANOSECONDS
@@ -71,9 +74,9 @@ class Replayer(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(0.02, self._step, clock=steady)
         self._clock_output: Publisher | None = None
-        if self._clock_rate:
+        if options.clock:
             self._clock_output = self.create_publisher(ClockMessage, '/clock', 10)
-            self.create_timer(1.0 / self._clock_rate, self._publish_clock, clock=steady)
+            self.create_timer(1.0 / options.clock, self._publish_clock, clock=steady)
         self.create_service(SetBool, '~/set_pause', self._set_pause)
 
     def _open_publishers(self) -> dict[int, Publisher]:
@@ -95,8 +98,8 @@ class Replayer(Node):
         return outputs
 
     def _publisher(self, topic: LogTopic) -> Publisher:
-        if topic.name == '/clock' and self._clock_rate:
-            raise LookupError('--clock and --loop publish another /clock')
+        if topic.name == '/clock' and self._options.clock:
+            raise LookupError('--clock publishes another /clock')
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
         profiles = topic.qos or (DEFAULT_QOS,)
@@ -171,6 +174,7 @@ class Replayer(Node):
             yield ROUND_GAP_NS
             yield from self._play_round()
             yield ROUND_GAP_NS          # the last messages arrive before the clock goes back
+            self._later_ns += self._next_ns - self._begin_ns + ROUND_GAP_NS
         yield LAST_ANSWERS_NS
         wait_for_all_acked(self.outputs.values(), PATIENCE_S)
         tell(f'played {self.sent} messages' + (
@@ -193,12 +197,16 @@ class Replayer(Node):
             except Exception:       # as with a reader that keeps all and has stopped reading
                 self.failed += 1
 
-    def _messages(self) -> Iterator[tuple[int, Publisher, bytes]]:
+    def _messages(self) -> Iterator[tuple[int, Publisher, Any]]:
         """Yield log time [ns], publisher and message of the messages of a round."""
         names = {topic.name for topic in self._log.topics if topic.channel_id in self.outputs}
+        # Without a /clock that goes back, too, nobody takes stamps that go back.
+        later_ns = 0 if self._clock_output or '/clock' in names else self._later_ns
         for message in self._log.messages(names, self._begin_ns if self._options.start else 0):
             if publisher := self.outputs.get(message.channel_id):   # of several with a topic
-                yield max(message.log_time, self._begin_ns), publisher, message.data
+                data = message.data
+                yield (max(message.log_time, self._begin_ns), publisher,
+                       stamped_later(data, publisher, later_ns) if later_ns else data)
 
     def _publish_clock(self) -> None:
         if self._clock_output is not None:
@@ -213,3 +221,26 @@ def open_log(path: Path, partial: bool) -> LogReader:
         raise ValueError(f'{path} is damaged: `recover` makes a whole log of it, --partial plays '
                          'what is whole')
     return log
+
+
+def stamped_later(data: bytes, publisher: Publisher, later_ns: int) -> Any:
+    """Return a message with later stamps, or the same bytes if it has none."""
+    with contextlib.suppress(Exception):    # recorded with another definition, or too late
+        message = deserialize_message(data, publisher.msg_type)
+        stamps = [*_stamps(message)]
+        for stamp in stamps:
+            stamp.sec, stamp.nanosec = divmod(
+                stamp.sec * NANOSECONDS + stamp.nanosec + later_ns, NANOSECONDS)
+        return message if stamps else data
+    return data
+
+
+def _stamps(message: Any) -> Iterator[Stamp]:
+    """Yield all stamps of a message, except those of 0, which is no time."""
+    for name in message.get_fields_and_field_types():
+        field = getattr(message, name)
+        for part in field if isinstance(field, list) else [field]:
+            if isinstance(part, Stamp) and (part.sec or part.nanosec):
+                yield part
+            elif hasattr(part, 'get_fields_and_field_types'):
+                yield from _stamps(part)
