@@ -98,7 +98,8 @@ class ExactSolution:
         self.theta_min, self.theta_max = self.arrays.bounds
         # Only of sizes that are far apart: it takes a fourth of the time.
         if gravity is None and not all(USUAL < abs(x) < 1.0 / USUAL for x in (
-                *vars(top).values(), *vars(start).values()) if x):
+                top.lambda1, top.lambda3, top.mass, top.com_distance, top.gravity,
+                start.theta, start.theta_dot, start.phi, start.psi, start.l3, start.lz) if x):
             self._check_start()
 
     def _check_start(self) -> None:
