@@ -134,8 +134,9 @@ def _set_up(top: Top, gravity: mpfr, start: State | PreciseState) -> ThetaMotion
     lambda1, lambda3 = mpfr(top.lambda1), mpfr(top.lambda3)
     sin_half, cos_half, theta_dot, alpha, beta, l3, lz = precise(start)
     spin = l3 * (1 / lambda3 - 1 / lambda1)
-    sides = (_Side(lz + l3, spin, mp.argument(alpha), cos_half, -sin_half * theta_dot),
-             _Side(lz - l3, -spin, mp.argument(beta), sin_half, cos_half * theta_dot))
+    arguments = [mp.atan2(z.imag, z.real) for z in (alpha, beta)]
+    sides = (_Side(lz + l3, spin, arguments[0], cos_half, -sin_half * theta_dot),
+             _Side(lz - l3, -spin, arguments[1], sin_half, cos_half * theta_dot))
     f0, f1, f2, f3 = nutation_cubic(lambda1, torque, l3, lz, theta_dot, sin_half, cos_half)
     if not f0 and not f1:
         return ThetaMotion(_resting(sides[0], lambda1), _resting(sides[1], lambda1))

@@ -33,6 +33,8 @@ from spinning_top_sim.times import NANOSECONDS, ns_array
 
 # Beyond so many turns the product of rate and time has no exact fraction left.
 MOST_TURNS = 2.0 ** 52
+# Of a motion that gets there earlier [s], the digits of a phase overflow.
+SHORTEST = 1e-280
 # Doubles hold the constants of all motions whose numbers are between this and its inverse, or 0.
 USUAL = 1e-20
 # Times that are evaluated together: the temporaries of more do not fit into the cache.
@@ -96,25 +98,23 @@ class ExactSolution:
         self.theta_min, self.theta_max = self.arrays.bounds
         # Only of sizes that are far apart: it takes a fourth of the time.
         if gravity is None and not all(USUAL < abs(x) < 1.0 / USUAL for x in (
-                top.lambda1, top.lambda3, top.mass, top.com_distance, top.gravity, start.theta,
-                start.theta_dot, start.phi, start.psi, start.l3, start.lz) if x):
+                top.lambda1, top.lambda3, top.mass, top.com_distance, top.gravity,
+                start.theta, start.theta_dot, start.phi, start.psi, start.l3, start.lz) if x):
             self._check_start()
 
     def _check_start(self) -> None:
         """Refuse constants so large, or so far apart, that doubles lose the start among them."""
-        start, arrays, held = self.start, self.arrays, self.time_limit > 0.0
+        start, arrays, held = self.start, self.arrays, self.time_limit > SHORTEST
         if held:
             with np.errstate(all='ignore'):
                 first = ExactStates(self.top, start, arrays, 1, np.zeros(1))
-                alpha, beta, theta_dot = (
-                    float(x[0]) for x in (*first.moduli, first.theta_dot))
+                error = abs(float(first.theta_dot[0]) - start.theta_dot)
             cosine, sine = abs(math.cos(0.5 * start.theta)), abs(math.sin(0.5 * start.theta))
             across = sum(rate * x / y for rate, x, y in (       # phi' sin(theta)
                 (arrays.bottom_rate, sine, cosine), (arrays.top_rate, cosine, sine)) if rate)
-            # Relative to the distance from either pole, and to a small velocity of the axis.
-            held = (abs(beta * cosine - alpha * sine) <= 1e-14 * abs(alpha * sine)
-                    and abs(theta_dot - start.theta_dot) <= 1e-14 * min(
-                        math.hypot(start.theta_dot, across), max(1.0, abs(start.theta_dot))))
+            # Relative to a small velocity of the axis.  Where theta is lost, its rate is, too.
+            held = error <= 1e-14 * min(
+                math.hypot(start.theta_dot, across), max(1.0, abs(start.theta_dot)))
         if not held:
             raise ValueError(f'the constants of {self.top} and {start} are too far apart in size '
                              'for doubles to hold the motion')

@@ -23,7 +23,7 @@ from operator import add, mul
 from typing import NamedTuple
 
 import gmpy2
-from gmpy2 import agm, const_pi, exp, frexp, get_context, mpc, mpfr, sqrt
+from gmpy2 import agm, const_pi, exp, frexp, get_context, mpfr, sqrt
 
 # Three words of 64 bits, or 57 decimal digits.
 BITS = 192
@@ -46,11 +46,6 @@ def precision(bits: int = BITS) -> Iterator[None]:
 def atan2(y: mpfr, x: mpfr) -> mpfr:
     """Return the argument of x + iy in (-pi, pi]; 0 at the origin, whatever the signs of zeros."""
     return gmpy2.atan2(y + ZERO, x + ZERO)
-
-
-def argument(z: mpc) -> mpfr:
-    """Return the argument in (-pi, pi]; 0 of 0."""
-    return atan2(z.imag, z.real)
 
 
 NEGLIGIBLE = 1e-21      # a ratio whose fourth power does not count
