@@ -5,7 +5,6 @@ import csv
 
 import numpy as np
 import pytest
-import yaml
 from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.recording.errors import LogError
@@ -15,11 +14,8 @@ NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-5,
          'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 0.02,
          'imu.accelerometer_random_walk': 1e-4, 'imu.accelerometer_turn_on_bias': 0.1}
 VALUES = {**NOISY, 'ground_truth_imu_odom.enabled': True, 'ground_truth_imu_odom.rate': 125.0,
-          'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.3, -0.7, 1.9], 'gnss.enabled': True,
-          'gnss.position_noise': [1.0, 2.0], 'gnss.velocity_noise': [0.1, 0.2],
-          'gnss.outages': [0.35, 0.55]}
-FILES = {'tum': 'truth.tum', 'euroc': 'truth.csv', 'euroc_imu': 'imu.csv', 'kalibr': 'imu.yaml',
-         'gnss_fix': 'fix.csv', 'gnss_velocity': 'velocity.csv'}
+          'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.3, -0.7, 1.9]}
+FILES = {'tum': 'truth.tum', 'euroc': 'truth.csv', 'euroc_imu': 'imu.csv'}
 
 
 def options(values, **more):
@@ -112,34 +108,9 @@ def test_euroc_imu_is_what_the_sensor_reads(folder, messages):
     assert head.startswith('#timestamp [ns],w_RS_S_x [rad s^-1],') and head.count(',') == 6
 
 
-def test_tables_of_the_receiver_are_its_messages(folder, messages):
-    for name, topic, values in (
-            ('fix.csv', '/gnss/fix', lambda one: [one.latitude, one.longitude, one.altitude]),
-            ('velocity.csv', '/gnss/velocity', lambda one: xyz(one.twist.twist.linear))):
-        found = rows(folder / name, ',')
-        assert [int(row[0]) for row in found] == stamps(messages[topic])
-        assert np.array_equal(np.array(found, np.float64)[:, 1:], [*map(values, messages[topic])],
-                              equal_nan=True)
-    # Two of the eleven fall into the outage.
-    assert sum('nan' in row for row in rows(folder / 'fix.csv', ',')) == 2
-    assert len(found) == 9
-
-
-def test_kalibr_gets_the_parameters(folder):
-    """The fields and checks of ImuParameters in kalibr_common/ConfigReader.py."""
-    content = yaml.safe_load((folder / 'imu.yaml').read_text())
-    assert content == {
-        'rostopic': '/imu/data_raw', 'update_rate': 200.0,
-        **{name.removeprefix('imu.'): value for name, value in NOISY.items()
-           if 'turn_on' not in name}}
-    assert all(isinstance(content[name], float) and content[name] > 0.0
-               for name in content if name != 'rostopic')
-
-
 @pytest.mark.parametrize(('arguments', 'reason', 'code'), [
     (['--export', 'tum:DIR/a'], 'the log has no ground_truth/imu_odom', 2),
     (['--export', 'euroc_imu:DIR/a', '-p', 'imu.enabled:=false'], 'no imu/data_raw', 2),
-    (['--export', 'kalibr:DIR/a'], 'imu.accelerometer_noise_density = 0.0', 2),
     (['--export', 'euroc_imu:DIR/there'], 'there: it exists, and nothing is overwritten', 1)])
 def test_what_cannot_be_exported_is_told_before_anything_is_computed(
         tmp_path, capsys, arguments, reason, code):
