@@ -5,7 +5,6 @@ import csv
 
 import numpy as np
 import pytest
-import yaml
 from rosbags.highlevel import AnyReader
 
 from spinning_top_sim.tools import inspect, simulate
@@ -14,11 +13,8 @@ NOISY = {'imu.gyroscope_noise_density': 1e-3, 'imu.gyroscope_random_walk': 1e-5,
          'imu.gyroscope_turn_on_bias': 0.01, 'imu.accelerometer_noise_density': 0.02,
          'imu.accelerometer_random_walk': 1e-4, 'imu.accelerometer_turn_on_bias': 0.1}
 VALUES = {**NOISY, 'ground_truth_imu_odom.enabled': True, 'ground_truth_imu_odom.rate': 125.0,
-          'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.3, -0.7, 1.9], 'gnss.enabled': True,
-          'gnss.position_noise': [1.0, 2.0], 'gnss.velocity_noise': [0.1, 0.2],
-          'gnss.outages': [0.35, 0.55]}
-FILES = {'tum': 'truth.tum', 'euroc': 'truth.csv', 'euroc_imu': 'imu.csv', 'kalibr': 'imu.yaml',
-         'gnss_fix': 'fix.csv', 'gnss_velocity': 'velocity.csv'}
+          'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.rpy': [0.3, -0.7, 1.9]}
+FILES = {'tum': 'truth.tum', 'euroc': 'truth.csv', 'euroc_imu': 'imu.csv'}
 
 
 def options(values, **more):
@@ -112,18 +108,11 @@ def test_euroc_has_the_velocity_in_the_world_and_the_bias_of_the_newest_reading(
         [*xyz(one.angular_velocity), *xyz(one.linear_acceleration)] for one in newest])
 
 
-def test_kalibr_gets_the_parameters(folder):
-    """The fields of ImuParameters in kalibr_common/ConfigReader.py."""
-    content = yaml.safe_load((folder / 'imu.yaml').read_text())
-    assert content == {
-        'rostopic': '/imu/data_raw', 'update_rate': 200.0,
-        **{name.removeprefix('imu.'): value for name, value in NOISY.items()
-           if 'turn_on' not in name}}
 
 
 @pytest.mark.parametrize(('arguments', 'reason', 'code'), [
     (['--export', 'tum:DIR/a'], 'the log has no ground_truth/imu_odom', 2),
-    (['--export', 'kalibr:DIR/a'], 'imu.accelerometer_noise_density = 0.0', 2),
+    (['--export', 'euroc_imu:DIR/a', '-p', 'imu.enabled:=false'], 'no imu/data_raw', 2),
     (['--export', 'euroc_imu:DIR/there'], 'there: it exists, and nothing is overwritten', 1)])
 def test_what_cannot_be_exported_is_told_before_anything_is_computed(
         tmp_path, capsys, arguments, reason, code):

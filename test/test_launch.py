@@ -139,7 +139,8 @@ def test_a_log_is_replayed_with_the_frames_that_it_was_recorded_with(tmp_path):
     log = tmp_path / 'run.mcap'
     assert simulate.main(['-o', str(log), '--quiet', '--duration', '1', '--namespace', '/a/b',
                           '-p', 'body_frame:=wheel', '-p', 'imu.lever_arm:=[0.1,0.2,0.3]']) == 0
-    run = started('replay', file=str(log), rate='2', start='0.5', loop='true', rviz='true')
+    run = started('replay', file=str(log), rate='2', start='0.5', loop='true', clock='40',
+                  rviz='true')
     parser = ArgumentParser()
     replay_node.add_arguments(parser)
     options = parser.parse_args(run['replay_node'].arguments)

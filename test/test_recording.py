@@ -13,13 +13,16 @@ import re
 import runpy
 import subprocess
 import sys
+import time
 from contextlib import closing
+from types import SimpleNamespace
 
 import pytest
 import yaml  # type: ignore[import-untyped]
-from helpers.logs import seen_by_mcap
+from helpers.logs import records_of, seen_by_mcap
 from helpers.recordings import EPOCH_NS, JAZZY, METADATA, TOPICS, some_messages
 from helpers.reference import ROOT
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel
 from rosbags.highlevel import AnyReader
@@ -45,6 +48,11 @@ def test_mcap_and_rosbags_read_every_message(tmp_path, compression):
     record(path, messages, compression=compression)
     expected = [(TOPICS[index].name, stamp, data) for index, stamp, data in messages]
     assert seen_by_mcap(path) == expected       # with all checksums
+    indexes = [record for record in records_of(path.read_bytes())
+               if record[0] == Opcode.MESSAGE_INDEX]
+    with path.open('rb') as file:
+        assert sum(end - start for _, start, end in indexes) == sum(
+            one.message_index_length for one in make_reader(file).get_summary().chunk_indexes)
     with AnyReader([path]) as reader:           # by the message indexes
         read = list(reader.messages())
         assert [(connection.topic, stamp, bytes(data)) for connection, stamp, data in read
@@ -148,6 +156,22 @@ def test_too_little_space_leaves_no_file(tmp_path):
                         summary.error)
     assert (summary.path, summary.lost, summary.messages) == (None, 1, 0)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(('harm', 'reason'), [
+    (lambda path, patch: path.unlink(), 'the file was deleted'),
+    (lambda path, patch: patch.setattr(os, 'fstatvfs', lambda descriptor: SimpleNamespace(
+        f_bavail=3, f_frsize=1)), '3 bytes are free on the disk, fewer than min_free_bytes = 5')])
+def test_a_file_that_is_deleted_and_a_disk_that_fills_end_a_recording(
+        tmp_path, monkeypatch, harm, reason):
+    path = tmp_path / 'run.mcap'
+    recorder = Recorder(str(path), TOPICS, METADATA.copy, min_free_bytes=5)
+    while recorder.state == 'opening':
+        time.sleep(0.002)
+    recorder.write([single(*some_messages(1)[0])])
+    harm(path, monkeypatch)
+    assert recorder.close().error == f'recording to {path} stopped: {reason}'
+    assert not path.exists() or len(seen_by_mcap(path)) == 1
 
 
 def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeypatch):

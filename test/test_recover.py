@@ -101,12 +101,23 @@ def test_a_damaged_chunk_is_left_out_and_zeros_end_the_log(tmp_path, log):
     check_with_all_readers(output, log.messages[:MESSAGES_PER_CHUNK])
 
 
-def test_a_chunk_that_has_become_another_record_is_a_loss(tmp_path, log):
-    """All lengths are right; the checksum of the data section is not."""
-    path = tmp_path / 'a.mcap'
+def test_a_chunk_that_has_become_another_record_and_an_endless_index_are_losses(tmp_path, log):
+    """Of the first all lengths are right, but not the checksum of the data section."""
+    path, output = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
     path.write_bytes(flipped(log.content, log.chunks[1][1]))
-    code, out, _ = run(path)
+    code, out, _ = run(path, '-o', output)
     assert code == SOME_LOST and 'found: the checksum of the data section is wrong' in out
+    output.unlink()
+    path.write_bytes(flipped(log.content, log.chunks[0][2] + 5) + bytes(2_000_000))
+    assert run(path, '-o', output)[:1] == (SOME_LOST,)
+
+
+def test_a_log_that_changes_while_it_is_read_is_told(tmp_path, log):
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(log.content)
+    with LogReader(path) as reader, pytest.raises(LogError, match='it has changed meanwhile'):
+        os.truncate(path, log.chunks[1][2] - 1)
+        list(reader.messages())
 
 
 @pytest.mark.parametrize('torn', [False, True])

@@ -271,11 +271,11 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 Place(min(times_ns), offset, end, max(times_ns), frozenset(channels)))
 
     def _declare(self, record: McapRecord, place: tuple[int, int]) -> None:
-        """Note a schema, a channel or metadata; of several with an id, the first counts."""
+        """Note a schema, a channel or metadata."""
         if isinstance(record, Schema):
-            self.schemas.setdefault(record.id, record)
+            self.schemas[record.id] = record
         elif isinstance(record, Channel):
-            self.channels.setdefault(record.id, record)
+            self.channels[record.id] = record
         else:
             self._attached.append(place)
             if isinstance(record, Metadata):

@@ -99,8 +99,6 @@ class McapWriter:
         log_times_ns : log and publish times (n,), n >= 1, in any order
         rows : serialized messages (n, size)
         """
-        if topic_index >= len(self._topics):
-            raise IndexError(f'there is no topic {topic_index}')
         self._rows.append((topic_index, log_times_ns, rows))
         self._chunk_bytes += len(rows) * _message_type(rows.shape[1]).itemsize
 

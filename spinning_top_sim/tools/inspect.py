@@ -174,8 +174,7 @@ def _as_text(content: Content) -> Iterator[str]:
     yield from _topics(content['topics'])
     counts = Counter(event['event'] for event in content['events'])
     yield (f'journal: {counts["command"]} commands, {counts["reset"]} resets, '
-           f'{counts["parameters"]} changes of parameters, {counts["state"]} states set, '
-           f'{counts["drive"]} velocities of the pivot')
+           f'{counts["parameters"]} changes of parameters')
     yield from content['notes']
     for number, motion in enumerate(content['motions'], start=1):
         yield from _motion(number, motion, content['begin_ns'])
