@@ -127,8 +127,8 @@ def turned(axis, deg):
 
 NED = Rotation.from_matrix([(0, 1, 0), (1, 0, 0), (0, 0, -1)]).as_quat()
 RIGHT = {
-    'vqf': Vqf, 'vqf, six axes': partial(Vqf, magnetic=False), 'vqf, slow': partial(
-        Vqf, tauAcc=30.0), 'vqf, options': partial(Vqf, tauAcc=6.0, tauMag=20.0),
+    'vqf': Vqf, 'vqf, six axes': partial(Vqf, magnetic=False),
+    'vqf, slow': partial(Vqf, tauAcc=30.0),
     'reference': ReferenceFilter, 'mahony': Mahony, 'mahony, six axes': partial(Mahony, six=True),
     'mahony, slow': partial(Mahony, 0.1, 0.1, 0.01), 'mahony, slower': partial(
         Mahony, 0.1, 0.05, 0.001), 'mahony, fast': partial(Mahony, 1.0, 1.0, 0.1),
