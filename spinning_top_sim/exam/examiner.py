@@ -92,10 +92,11 @@ def _checked(imu: Mapping[str, Any] | str | Path, level: str,
     given = imu if isinstance(imu, Mapping) else read_scene(imu)
     checked, source = parameters.checked(given), 'imu' if imu is given else imu
     for name, value in given.items():
-        default = parameters.BY_NAME[name].default
-        if not name.startswith(taken) and checked[name] != default:
-            raise ValueError(f'{source} has {name} = {value!r}: must be {default!r}, because '
-                             f'nothing in level {level} has it')
+        # A file of an IMU may say that it has none of the rest.
+        if not name.startswith(taken) and not (name.startswith(('imu.', 'mag.')) and (
+                checked[name] == parameters.BY_NAME[name].default)):
+            raise ValueError(f'{source} has {name} = {value!r}, which nothing in level {level} '
+                             f'has: must be {", ".join(f"{one}*" for one in taken)}')
     return {name: checked[name] for name in given if name.startswith(taken)}
 
 

@@ -29,8 +29,9 @@ LEADS_S, STILL = (10.0, 30.0, 120.0), math.radians(0.05)
 ARM = 0.1, 0.0, 0.0                         # of the IMU off the axis [m]
 FIELD_TURN = math.radians(6.0)              # of the field about the vertical
 SMALL, LARGE = 0.05, 0.3        # kicks [rad], of first order; that a step of first order misses
-# Samples for an answer, a late one, too; gravity has four times that to lead a kick back.
-ANSWER = 50
+# Samples for an answer: for a late one, too, and before gravity leads back what is wrong; it has
+# six times that to lead a tilt back.
+ANSWER = 30
 # Of the gyroscope [rad/s], 0.7 deg/s in all: so large are those of consumer devices at power-on;
 # and how long it lasts in each of two rests [s], so that a slow filter shows where it tends to.
 BIAS, BIAS_S = np.array((0.006, -0.0055, 0.009)), 80.0
@@ -144,7 +145,7 @@ def _tilts(exam: Exam) -> list[Run]:
     runs = []
     for axis, k in zip(np.eye(3), np.argmin(np.abs(up), axis=0), strict=True):
         across, end = np.cross(up[k], axis), exam.ends[k]
-        runs += [exam.kicked(np.array([end - 4 * ANSWER]), SMALL * kick[np.newaxis]).part(
+        runs += [exam.kicked(np.array([end - 6 * ANSWER]), SMALL * kick[np.newaxis]).part(
             slice(end)) for kick in (np.cross(across, up[k]), across)]
     return runs
 

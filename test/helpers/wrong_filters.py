@@ -127,8 +127,8 @@ def turned(axis, deg):
 
 NED = Rotation.from_matrix([(0, 1, 0), (1, 0, 0), (0, 0, -1)]).as_quat()
 RIGHT = {
-    'vqf': Vqf, 'vqf, six axes': partial(Vqf, magnetic=False), 'vqf, slow': partial(
-        Vqf, tauAcc=30.0), 'vqf, options': partial(Vqf, tauAcc=6.0, tauMag=20.0),
+    'vqf': Vqf, 'vqf, six axes': partial(Vqf, magnetic=False),
+    'vqf, slow': partial(Vqf, tauAcc=30.0),
     'reference': ReferenceFilter, 'mahony': Mahony, 'mahony, six axes': partial(Mahony, six=True),
     'mahony, slow': partial(Mahony, 0.1, 0.1, 0.01), 'mahony, slower': partial(
         Mahony, 0.1, 0.05, 0.001), 'mahony, fast': partial(Mahony, 1.0, 1.0, 0.1),
@@ -145,8 +145,7 @@ WRONG = {
     'rates clipped': (partial(Part, rates=lambda v: np.clip(v, -8.0, 8.0)), 'gyroscope'),
     'rates late': (partial(Part, late=(5, 0, 0, 0)), 'timing'),
     'rates smoothed': (partial(Part, smooth=(0.05, 0.0, 0.0)), 'timing'),
-    'slow turns dropped': (partial(Part, Mahony, rates=lambda v: v * (v @ v > 0.04)),
-                           'bias, accuracy'),
+    'slow turns dropped': (partial(Part, Mahony, rates=lambda v: v * (v @ v > 0.04)), 'accuracy'),
     'force y x z': (partial(Part, force=axes(2, 1, 3)), 'accelerometer'),
     'force negated': (partial(Part, force=np.negative), 'accelerometer'),
     'force x 1.2': (partial(Part, force=scaled(1.2, 1.0, 1.0)), 'accelerometer'),
