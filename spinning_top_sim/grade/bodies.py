@@ -2,7 +2,7 @@
 """Grades the IMU of any rigid body against its poses; no top is needed."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,14 +16,13 @@ from spinning_top_sim.tools.identify import beyond
 from spinning_top_sim.tools.kinematics import Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
-EXCERPT = 3000                  # samples by which a convention is found
+EXCERPT = 1000                  # samples by which a convention is found
 # Share of a reading left in ours, of that in another convention, and of the reading there.
 WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
 HELD_RUNS, HELD_SHARE = 20, 0.9     # runs of equal readings that are a hold, and as long as usual
 
 
 def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STANDARD_GRAVITY,
-                   exact_gravity: bool = False, covariance: Mapping[str, Reals] | None = None,
                    subject: str = 'readings') -> Report:
     """
     Grade the IMU of any rigid body against its poses.
@@ -35,11 +34,8 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
         'positions', 'gyroscope', 'accelerations', 'magnetometer' where there are any; SI.
     imu : Imu, optional
         What is known of it; default: nothing, along axes of the body.
-    gravity, exact_gravity : float, bool
-        Where the body is [m/s^2]; whether its place is known: then gravity of another one is a
-        fault, and without positions the origin is at rest.
-    covariance : mapping, optional
-        Covariances (3, 3) that are declared, by name.
+    gravity : float
+        Where the body is [m/s^2]; that of another place on Earth is no fault.
     subject : str
         Name of what is graded.
     """
@@ -53,7 +49,6 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
                 return Report(subject, faults, {}, ['beside held poses readings are not graded'])
             parts[name] = times[new], values[new]
     bodies, left_out = stretches(parts)
-    bodies = [replace(body, covariance=covariance or {}) for body in bodies]
     notes = [f'{left_out:.3g} s in gaps, or between them, are not graded'] if left_out else []
     if not bodies:
         return Report(subject, faults, {}, [*notes, 'no part without a gap is long enough'])
@@ -63,8 +58,7 @@ def grade_readings(parts: Parts, imu: Imu | None = None, *, gravity: float = STA
                               'undone'))
         bodies = [undone(body, convention) for body in bodies]
     return Report(subject, faults, {}, notes).plus(*(
-        judge(name, bodies, imu, gravity, exact_gravity=exact_gravity,
-              placed=exact_gravity or 'positions' in parts) for name in READINGS))
+        judge(name, bodies, imu, gravity, placed='positions' in parts) for name in READINGS))
 
 
 def held(runs: Reals) -> float:
@@ -96,14 +90,21 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     body = body.part(slice(first, first + EXCERPT))     # in which it turns the most
 
     def left(convention: Convention, sign: float = 1.0) -> Reals:
-        told = undone(body, convention)
-        return np.array([_left(Comparison(name, [told], imu, sign * gravity))
-                         for name in present])
+        """Return the shares of readings that are not the right ones, in any unit."""
+        told, shares = undone(body, convention), [0.0]
+        for name in ('gyroscope', 'accelerations'):
+            compared = Comparison(name, [told], imu, sign * gravity)
+            if compared.motions:
+                compared.compare(0)
+                found, _, residual = compared.fit(['total', *compared.always, *OFFSETS])
+                right = any(abs((1.0 + found[0]) * size - 1.0) < 0.1
+                            for size in compared.units.values())
+                shares.append(beyond(residual, compared.floor) if right else 1.0)
+        return np.array(shares)
 
-    present = [name for name in ('gyroscope', 'accelerations') if name in body.readings]
     before = left(ours)
-    enough = min(RIGHT * float(np.max(before, initial=0.0)), SMALL)
-    if np.max(before, initial=0.0) < WRONG or np.max(left(ours, -1.0)) < enough:
+    enough = min(RIGHT * float(np.max(before)), SMALL)
+    if np.max(before) < WRONG or np.max(left(ours, -1.0)) < enough:
         return ours
     after = np.array([left(one) for one in others])
     # No reading may agree less.
@@ -111,13 +112,3 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
     # Of equally good ones the first has the fewest parts.
     best = int(np.argmax(worst <= 1.5 * np.min(worst) + 1e-6))
     return others[best] if worst[best] < enough else ours
-
-
-def _left(comparison: Comparison) -> float:
-    """Return the share of a reading that is not the right one, in any unit."""
-    if not comparison.motions:
-        return 0.0
-    comparison.compare(0)
-    found, _, residual = comparison.fit(['total', *comparison.always, *OFFSETS])
-    right = any(abs((1.0 + found[0]) * size - 1.0) < 0.1 for size in comparison.units.values())
-    return beyond(residual, comparison.floor) if right else 1.0

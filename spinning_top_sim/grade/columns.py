@@ -31,27 +31,27 @@ STANDARD_GRAVITY = 9.80665
 NORM = 1e-2             # by which the norm of a quaternion may differ from 1
 CLEAR = 0.03            # noise of what is differentiated, relative to it, that is small
 NOISY, ROUNDING = 1e-3, 1e-6    # the same, that counts; noise of attitudes that does not
+LAGS = range(-5, 41)    # that are tried [samples]
+ENOUGH = 3              # independent samples a column, from which on a lag can be told
+STILL = 1e-5            # share of a reading below which no lag is looked for
+SURE = 5.0              # standard deviations from which on a number is not chance
+CLEARLY = 10.0          # by which a term must exceed its noise to be missed
+# Effects that any reading may have, along any axes.
+ANY = 'gravity', 'linear', 'world', 'arm', 'turned arm', 'field'
 _per_step = partial(np.gradient, axis=0)        # change per step of values (m, 3)
-
-
-class Kind(NamedTuple):
-    """Units of a reading with their sizes, SI first; the parameter that has its noise density."""
-
-    units: Mapping[str, float]
-    density: str = ''
-
-
 _RATES = {'rad/s': 1.0, 'mrad/s': 1e-3, 'deg/s': math.pi / 180.0, 'dps': math.pi / 180.0,
           'rpm': math.pi / 30.0}
-READINGS = {
-    'gyroscope': Kind(_RATES, 'gyroscope_noise_density'),
-    'accelerations': Kind({'m/s^2': 1.0, 'm/s2': 1.0, 'g': STANDARD_GRAVITY,
-                           'mg': 1e-3 * STANDARD_GRAVITY}, 'accelerometer_noise_density'),
-    'magnetometer': Kind({'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7})}
+# Units of readings with their sizes, SI first.
+READINGS: dict[str, Mapping[str, float]] = {
+    'gyroscope': _RATES,
+    'accelerations': {'m/s^2': 1.0, 'm/s2': 1.0, 'g': STANDARD_GRAVITY,
+                      'mg': 1e-3 * STANDARD_GRAVITY},
+    'magnetometer': {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7}}
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
 # Those of a simulator may be the rates of its state, too.
-KINDS = {'rates': Kind(_RATES), **READINGS}
-ANGLES = 'rates', 'gyroscope'
+KINDS = {'rates': _RATES, **READINGS}
+DENSITIES = {'gyroscope': 'gyroscope_noise_density',
+             'accelerations': 'accelerometer_noise_density'}
 # Entries of a matrix whose noise is not in the discrepancy, that of another axis.
 ACROSS = [f'matrix {i}{j} free' for i, j in ENTRIES if i != j]
 
@@ -72,6 +72,11 @@ class Imu:
     gyroscope_noise_density, accelerometer_noise_density : float, optional
         Of white noise [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)]: a sample has the density over
         sqrt(interval between the samples) as its standard deviation.  0: no noise; None: unknown.
+
+    Raises
+    ------
+    ValueError
+        Naming the field, its value and what is allowed.
     """
 
     lever_arm: tuple[float, float, float] | None = None
@@ -79,6 +84,28 @@ class Imu:
     field: tuple[float, float, float] | None = None
     gyroscope_noise_density: float | None = None
     accelerometer_noise_density: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, length in (('lever_arm', 3), ('mounting', 4), ('field', 3)):
+            value = np.asarray(getattr(self, name) or (0.0,) * length, dtype=float)
+            if value.shape != (length,) or not np.all(np.isfinite(value)):
+                raise ValueError(f'{name} = {getattr(self, name)!r}: must be {length} finite '
+                                 'numbers')
+        if abs(math.hypot(*self.mounting) - 1.0) > 1e-6:
+            raise ValueError(f'mounting = {self.mounting!r}: its norm must be 1')
+
+
+class Lag(NamedTuple):
+    """Samples by which readings are late, their deviation, and whether that explains much."""
+
+    samples: float = math.nan
+    sigma: float = math.inf
+    clear: bool = False
+
+    @property
+    def whole(self) -> int:
+        """The lag to be undone."""
+        return round(self.samples) if self.clear else 0
 
 
 class Comparison:
@@ -90,7 +117,6 @@ class Comparison:
     arm, field : as given, or as last found
     always : names of effects whose size is not known, even of a right reading
     sizes, counts : rms and number of the readings of each stretch
-    units, density : as of its `Kind`
     own_step, steps : interval of the sensor [s], and its samples per sample that is compared
     target : what a right reading does not explain (N, 3)
     effects : by name, changes of the reading by an effect of size 1 (N, 3)
@@ -103,8 +129,8 @@ class Comparison:
     noise: Mapping[str, float]
 
     def __init__(self, kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float) -> None:
-        self.kind, self.gravity, self.angles = kind, gravity, kind in ANGLES
-        self.units, self.density = KINDS[kind]
+        self.kind, self.gravity, self.units = kind, gravity, KINDS[kind]
+        self.angles = kind in ('rates', 'gyroscope')
         self.arm, self.field = (np.array(one or np.zeros(3)) for one in (imu.lever_arm, imu.field))
         known = {'accelerations': imu.lever_arm, 'magnetometer': imu.field}.get(kind, ())
         self.always = [f'{"field" if kind == "magnetometer" else "arm"} {k}'
@@ -124,7 +150,7 @@ class Comparison:
     def _clear(self, stretches: Sequence[Stretch]) -> tuple[float, list[Smoothed]]:
         """Return the share of noise, and the motions smoothed so that it is small."""
         best: tuple[float, list[Smoothed]] = math.inf, []
-        for width in WIDTHS if self.kind in ('gyroscope', 'accelerations') else (1,):
+        for width in (1,) if self.kind in ('rates', 'magnetometer') else WIDTHS:
             if any(len(one.t) < 4 * margin(width) for one in stretches) or not stretches:
                 break
             motions = [Smoothed(one, width) for one in stretches]
@@ -160,31 +186,68 @@ class Comparison:
         scale = abs(np.linalg.det(matrix)) ** (1.0 / 3.0)
         self.sizes, self.reading_noise = self.sizes / scale, self.reading_noise / scale
 
-    def read_at(self, lag: int) -> list[Reals]:
-        """Return readings that are `lag` samples late, smoothed (m, 3); ends are wrapped."""
-        return [(one.rate if self.angles else one.vector)(np.roll(reading, -lag, axis=0))
-                for one, reading in zip(self.motions, self.readings, strict=True)]
+    def read(self, motion: Smoothed, reading: Reals, lag: int) -> Reals:
+        """Return a reading that is `lag` samples late, smoothed (m, 3); ends are wrapped."""
+        return (motion.rate if self.angles else motion.vector)(np.roll(reading, -lag, axis=0))
+
+    def lag(self) -> Lag:
+        """
+        Return by how much readings are late.
+
+        The reading is regressed on all terms, of all axes, at each lag: what else is wrong does
+        not count.
+        """
+        lags = [lag for lag in LAGS if 4 * abs(lag) < min(len(one.rates) for one in self.motions)]
+        keep, misfit, count = slice(-lags[0], -lags[-1] or None), np.zeros(len(lags)), 0
+        for motion, reading in zip(self.motions, self.readings, strict=True):
+            good = motion.smooth[keep]
+            design = np.hstack([effect[keep][good] for name, effect in self.columns(motion).items()
+                                if name.startswith(ANY) or (name == 'total' and self.angles)]
+                               + [np.ones((np.count_nonzero(good), 1))])
+            design /= np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+            read = np.hstack([self.read(motion, reading, lag)[keep][good] for lag in lags])
+            left = read - design @ np.linalg.lstsq(design, read, rcond=1e-9)[0]
+            misfit += np.sum(np.square(left), axis=0).reshape(-1, 3).sum(axis=1)
+            count += 3 * len(left)
+        self.compare(0)
+        best, now = int(np.argmin(misfit)), misfit[lags.index(0)]
+        width, size = self.motions[0].width, rms(self.sizes)
+        # Of smoothed samples fewer are independent: they must be more than the columns.
+        if (count < ENOUGH * 3 * width * design.shape[1] or now < count * (STILL * size) ** 2
+                or rms(self.effects['total']) < CLEARLY * self.noise['total']
+                or best in (0, len(lags) - 1)):
+            return Lag()                        # every lag explains it
+        # Around its minimum the sum of squares is a parabola.
+        sooner, least, later = misfit[best - 1:best + 2].tolist()
+        curvature = sooner - 2.0 * least + later
+        late = lags[best] + 0.5 * (sooner - later) / curvature
+        rest = max(least - 0.125 * (sooner - later) ** 2 / curvature, 0.0)
+        variance = rest / count * 2.0 * width   # of correlated noise
+        clear = rest < 0.25 * now or (
+            rest < 1.5 * count * (self.floor * size) ** 2
+            and now - rest > max((2.0 * SURE) ** 2 * variance, 0.05 * curvature * late ** 2))
+        return Lag(late, math.sqrt(2.0 * variance / curvature), clear)
 
     def compare(self, lag: int) -> None:
         """Compare readings that are `lag` samples late."""
         self._compare(lag)
-        if not self.always:
-            return
-        more, _ = fitted(self.target, [self.effects[name] for name in self.always])
-        if self.kind == 'magnetometer':
-            self.field = self.field + more
-        else:
-            self.arm = self.arm + more
-        self._compare(lag)
+        if self.always:
+            more, _ = fitted(self.target, [self.effects[name] for name in self.always])
+            if self.kind == 'magnetometer':
+                self.field = self.field + more
+            else:
+                self.arm = self.arm + more
+            self._compare(lag)
 
     def _compare(self, lag: int) -> None:
         keep = slice(abs(lag), -abs(lag) or None)       # what a roll has not wrapped
-        parts = [(motion.smooth[keep], motion, reading, size) for motion, reading, size in zip(
-            self.motions, self.read_at(lag), self.sizes, strict=True)]
-        self.counts = [int(np.count_nonzero(good)) for good, *_ in parts]
-        readings, self.effects = pooled((reading[keep][good] / size, {
-            name: effect[keep][good] / size for name, effect in self.columns(motion).items()})
-            for good, motion, reading, size in parts)
+        self.counts = [np.count_nonzero(motion.smooth[keep]) for motion in self.motions]
+        readings, self.effects = pooled((
+            self.read(motion, reading, lag)[keep][motion.smooth[keep]] / size,
+            {name: effect[keep][motion.smooth[keep]] / size
+             for name, effect in self.columns(motion).items()})
+            for motion, reading, size in zip(
+                self.motions, self.readings, self.sizes, strict=True))
         self.target = readings - self.effects['total']
         noises = [self.noises(one) for one in self.motions]
         self.noise = {name: rms(np.array([one[name] for one in noises]) / self.sizes)
@@ -222,7 +285,7 @@ class Comparison:
             'reversed': turned(turned(effects['free'])),
             **{f'world {arm}': turned(effects[arm]) for arm in arms},
             **{f'offset {k}': 0.0 * total + axis for k, axis in enumerate(AXES)}}
-        for of in ('free', *self.always):
+        for of in ('free', *arms):
             effects |= {f'matrix {i}{j} {of}': np.outer(effects[of][:, j], AXES[i])
                         for i, j in ENTRIES}
         return effects
@@ -233,16 +296,12 @@ class Comparison:
                                    for sign in (-1.0, 1.0))
         lever, gravity = tangential + centripetal, self.gravity * motion.back @ UP
         moved = lever + motion.acceleration
-        total, turned = gravity + moved, along(motion.turn, moved)
         return {
             'tangential': tangential, 'centripetal': centripetal, 'gravity': gravity,
             **({'linear': motion.acceleration} if np.any(motion.acceleration) else {}),
-            'lever': lever, 'motion': moved, 'total': total,
-            # The motion a step later, then the axes, then the angular acceleration.
-            'difference': along(motion.back, _per_step(turned)),
-            'axes late': along(motion.back, _per_step(along(motion.turn, total))) - _per_step(
-                total),
-            'tangential step': _per_step(tangential),
+            'lever': lever, 'motion': moved, 'total': gravity + moved,
+            # The motion a step later, then the axes.
+            'difference': along(motion.back, _per_step(along(motion.turn, moved))),
             # A lever arm that is longer by 1 m along axes of the body, and a x r alone.
             **{f'arm {k}': second[:, :, k] for k in range(3)},
             **{f'turned arm {k}': 0.5 * (second - transposed)[:, :, k] for k in range(3)}}

@@ -19,6 +19,7 @@ import argparse
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from decimal import Decimal
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,13 @@ from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
 from spinning_top_sim.grade import files, grade_readings
-from spinning_top_sim.grade.columns import READINGS, STANDARD_GRAVITY, Imu
-from spinning_top_sim.grade.logs import own_attitudes, read_log
+from spinning_top_sim.grade.columns import DENSITIES, READINGS, STANDARD_GRAVITY, Imu
+from spinning_top_sim.grade.logs import read_log
 from spinning_top_sim.grade.scenes import Body, Start
 from spinning_top_sim.grade.simulators import EARLY, TOLERANCE, Judgement
+from spinning_top_sim.solvers.vertical import state_of
 from spinning_top_sim.streams import parameters
+from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.tools import cli, conventions, scene_file
 from spinning_top_sim.tools.kinematics import Smoothed, stretches
 from spinning_top_sim.tools.report import Finding, Mark, Report, printed
@@ -75,15 +78,16 @@ def _run(arguments: argparse.Namespace) -> int:
     known = None if arguments.scene or arguments.params else recorded.run
     values = parameters.checked({**(known.values_in_effect if known else {}), **given})
     of_top = bool(known) or any(name.startswith(('top.', 'initial.', 'spin.')) for name in given)
-    if not of_top and READINGS.keys().isdisjoint(recorded.parts):
-        unused = [f"; {note}: name readings by --columns 'gx=COLUMN:UNIT, ...'"
-                  for note in recorded.notes if note.startswith('not used') and not log]
-        raise ValueError(f'{path}: there are no readings, and no top is known (--scene): '
-                         f'nothing to grade{"".join(unused)}')
+    parts, at = recorded.parts, recorded.parts['attitudes'][0]
+    if not of_top and READINGS.keys().isdisjoint(parts):
+        raise ValueError(f'{path}: there are no readings, and no top is known (--scene): nothing '
+                         f'to grade; {"; ".join(recorded.notes)}; readings are named by --columns '
+                         "'gx=COLUMN:UNIT, ...'")
+    if of_top and not known:            # the pivot is at rest
+        parts = {'positions': (at, np.zeros((len(at), 3))), **parts}
     report = Report(path.name, [], {}, recorded.notes).plus(grade_readings(
-        recorded.parts, _imu(arguments, given, values, of_top), exact_gravity=of_top,
-        gravity=values['top.gravity'] if of_top else STANDARD_GRAVITY,
-        covariance=recorded.covariance))
+        parts, _imu(arguments, given, values, of_top, recorded.densities),
+        gravity=values['top.gravity'] if of_top else STANDARD_GRAVITY))
     if known:
         report = _without_declared(report, known.values_in_effect)
     if of_top:
@@ -92,16 +96,14 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _imu(arguments: argparse.Namespace, given: Mapping[str, Any], values: Mapping[str, Any],
-         of_top: bool) -> Imu:
+         of_top: bool, densities: Mapping[str, float]) -> Imu:
     """Return what is known of the IMU."""
-    arm, field = (values[name] if of_top or name in given else None
+    arm, field = (tuple(values[name]) if of_top or name in given else None
                   for name in ('imu.lever_arm', 'mag.field'))
-    arm = arguments.lever_arm or arm
     return Imu(
-        lever_arm=arm and tuple(arm), field=field and tuple(field),
+        lever_arm=tuple(arguments.lever_arm) if arguments.lever_arm else arm, field=field,
         mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
-        **{kind.density: given.get(f'imu.{kind.density}') for kind in READINGS.values()
-           if kind.density})
+        **{name: given.get(f'imu.{name}', densities.get(kind)) for kind, name in DENSITIES.items()})
 
 
 def _without_declared(report: Report, values: Mapping[str, Any]) -> Report:
@@ -120,24 +122,26 @@ def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) ->
     """Return a report on the motion of a top beside the exact one."""
     bodies, _ = stretches({'attitudes': recorded.parts['attitudes']})
     body = max(bodies, key=lambda one: len(one.t))
-    noise = body.sigma['attitudes']
+    noise, notes = body.sigma['attitudes'], []
     tolerance = TOLERANCE + NOISES * noise
-    if run is not None:
-        truth = own_attitudes(run, 1e9 * body.t + recorded.origin_ns - run.epoch_ns)
+    if run is not None:                 # its own exact motion, its moving pivot included
+        times_ns = np.rint(1e9 * (body.t + float(recorded.origin - Decimal(run.epoch_ns).scaleb(-9))))
+        truth = Simulation({**run.values_in_effect, 'solver.method': 'exact'}).trajectory.evaluate(
+            times_ns.astype(np.int64)).quaternion
         worst = float(np.max((Rotation.from_quat(truth).inv() * body.rotation).magnitude()))
         return Report('', _inaccurate(worst, tolerance), {'total_error_deg': Mark(
             math.degrees(worst), math.degrees(tolerance))})
     top = Body(**vars(parameters.top_of(values)))
-    start, notes, told = Start.of(top, parameters.start_state(values)), [], body.rotation.as_quat()
-    begin = float(recorded.first_s) if 0 <= recorded.first_s < 1 else 0.0
-    truth = solve(top, start, body.t[:EARLY] + begin).quaternion
-    if conventions.best(told[:EARLY], truth).after > START:
+    start, told = Start.of(top, parameters.start_state(values)), body.rotation.as_quat()
+    if conventions.best(told[:EARLY], solve(
+            top, start, body.t[:EARLY] - body.t[0]).quaternion).after > START:
         smoothed = Smoothed(body, 1)
         at = smoothed.inner.start
-        start, begin = Start.at(top, told[at], smoothed.rates[0]), -float(body.t[at])
+        start = Start.of(top, state_of(top, told[at], body.rotation[at].apply(smoothed.rates[0])))
         notes.append('another start than the one that is given: it is read off the first samples')
+        body = replace(body, t=body.t - body.t[at])
     judgement = Judgement(top, body.step, tolerance)
-    motion = judgement.beside_truth('the motion', start, replace(body, t=body.t + begin))
+    motion = judgement.beside_truth('the motion', start, body)
     judgement.motions.append(motion)
     found = Report('', judgement.faults, {}, notes).plus(*judgement.reports())
     return found if noise < EXACT else replace(

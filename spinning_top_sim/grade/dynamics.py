@@ -7,14 +7,13 @@ its own attitudes and rates, would cause.  Errors do not add up there, so that t
 every motion, and for every size of the error.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
 from spinning_top_sim.grade.causes import GRAVITY_BAND, listed
-from spinning_top_sim.grade.columns import STANDARD_GRAVITY
+from spinning_top_sim.grade.columns import AXES, STANDARD_GRAVITY
 from spinning_top_sim.grade.scenes import Body
 from spinning_top_sim.tools.identify import (
     NEAR,
@@ -27,7 +26,7 @@ from spinning_top_sim.tools.identify import (
     rms,
     verdicts,
 )
-from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch
+from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, along
 
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
 _MEAN = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
@@ -50,29 +49,26 @@ def faults_of(body: Body, motions: Sequence[Stretch], dt: float) -> list[Verdict
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
         Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
     names = [name for cause in chosen for name in cause.effects]
-    if not names:
-        return []
-    found, residual = fitted(target, [effects[name] for name in names])
-    explained = rms(residual) < EXPLAINED * rms(target)
-    return [one for one in verdicts(chosen, found) if one and one.name and explained]
+    found, residual = fitted(target, [effects[name] for name in names]) if names else (
+        np.empty(0), target)
+    return [one for one in verdicts(chosen, found) if one] if (
+        rms(residual) < EXPLAINED * rms(target)) else []
 
 
 def _terms(body: Body, motion: Stretch, dt: float) -> tuple[Reals, Mapping[str, Reals]]:
     """Return the angular acceleration that is not explained (N, 3), and effects of causes."""
     smoothed = Smoothed(motion, 1)
     step, w, inertia = motion.step, smoothed.rates, body.inertia
-    rotation = motion.rotation[smoothed.inner]
-    axes = np.eye(3)
-    z, world = rotation.inv().apply((0.0, 0.0, 1.0)), rotation.apply(w)
+    z, world = smoothed.turn[:, 2], along(smoothed.turn, w)
     gyroscopic = -np.cross(w, w * inertia) / inertia
-    arms = [-body.mass * body.gravity * np.cross(axis, z) / inertia for axis in axes]
+    arms = [-body.mass * body.gravity * np.cross(axis, z) / inertia for axis in AXES]
     gravity, products = body.com_distance * arms[2], w[:, [1, 2, 0]] * w[:, [2, 0, 1]]
     # Effects of other moments: on the torque of gravity about e1 and e2 (I1, I2), then on
-    # (I2 - I3)/I1, (I3 - I1)/I2 and (I1 - I2)/I3; the last is fitted, but not read.
-    euler = [gravity * axes[0], gravity * axes[1], *(products * axis for axis in axes)]
+    # (I2 - I3)/I1, (I3 - I1)/I2 and (I1 - I2)/I3, which are fitted, but not read.
+    euler = [gravity * AXES[0], gravity * AXES[1], *(products * axis for axis in AXES)]
     nodes = {'gyroscopic': gyroscopic, 'gravity': gravity,
-             'in world': rotation.inv().apply(-np.cross(world, world * inertia) / inertia),
-             'damping': -w * (1.0, 1.0, 0.0), 'axis damping': -w * axes[2],
+             'in world': along(smoothed.back, -np.cross(world, world * inertia) / inertia),
+             'damping': -w * (1.0, 1.0, 0.0), 'axis damping': -w * AXES[2],
              **{f'arm {k}': arm for k, arm in enumerate(arms)},
              **{f'euler {k}': term for k, term in enumerate(euler)}}
     effects = {name: sum(weight * node[at:len(node) - 5 + at] for at, weight in enumerate(_MEAN))
@@ -87,10 +83,9 @@ def _terms(body: Body, motion: Stretch, dt: float) -> tuple[Reals, Mapping[str, 
 
 def _gyroscopic(found: Reals) -> Verdict | None:
     share = 1.0 + float(found[0])
-    if share >= NEAR:               # `_inertia` tells the moments
-        return None
-    return Verdict('no_gyroscopic_term' if share > -NEAR else 'coriolis_sign',
-                 f'the gyroscopic term w x I w has {share:.3g} times its size', share)
+    return None if share >= NEAR else Verdict(      # else it is the moments
+        'no_gyroscopic_term' if share > -NEAR else 'coriolis_sign',
+        f'the gyroscopic term w x I w has {share:.3g} times its size', share)
 
 
 def _step(found: Reals) -> Verdict:
@@ -101,37 +96,29 @@ def _step(found: Reals) -> Verdict:
                    ('explicit_gyroscopic_term', 'it adds energy') if at > -0.5 else
                    ('coriolis_sign', 'its derivative in an implicit step has the wrong sign'))
     return Verdict(name, f'the gyroscopic term is taken at {at:.3g} of a step, in the mean; right '
-                 f'is 0.5: {means}', at)
+                   f'is 0.5: {means}', at)
 
 
 def _damping(found: Reals) -> Verdict:
-    across, along = found.tolist()
-    return Verdict('damping', f'a torque against the rates, {across:.3g} 1/s of them across the '
-                 f'axis and {along:.3g} 1/s about it', across)
+    return Verdict('damping', f'a torque against the rates, {found[0]:.3g} 1/s of them across the '
+                   f'axis and {found[1]:.3g} 1/s about it', float(found[0]))
 
 
 def _com(body: Body, found: Reals) -> Verdict:
-    com = found + body.com
-    text = f'the torque of gravity is that of a centre of mass at ({listed(com)}) m, not at ' \
-        f'({listed(body.com)}) m'
-    gravity = body.gravity * com[2] / (body.com_distance or math.inf)
-    if abs(gravity / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND and np.linalg.norm(com[:2]) < (
-            SIDEWAYS * np.linalg.norm(found)):
-        return Verdict('gravity', f'the torque is that of gravity of {gravity:.5g} m/s^2, not '
-                       f'{body.gravity:.5g} m/s^2', float(gravity))
-    if np.linalg.norm(com + body.com) < 0.1 * abs(body.com_distance):
-        return Verdict('gravity_sign', f'{text}: gravity points upwards', -1.0)
-    return Verdict('com_offset', text, float(np.linalg.norm(found)))
+    com, size = found + body.com, float(np.linalg.norm(found))
+    ratio = float(com[2]) / (body.com_distance or np.inf)
+    along_axis = np.linalg.norm(found[:2]) < SIDEWAYS * size
+    name, number = (
+        ('gravity', ratio * body.gravity) if along_axis and (
+            abs(ratio * body.gravity / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND) else
+        ('gravity_sign', ratio) if along_axis and ratio < 0.0 else ('com_offset', size))
+    return Verdict(name, f'the torque of gravity is {ratio:.5g} times its size, as of a centre of '
+                   f'mass at ({listed(com)}) m', number)
 
 
 def _inertia(body: Body, found: Reals) -> Verdict | None:
     shares = 1.0 + found[:2]
-    if np.any(shares <= 0.0):
-        return None
-    first, second = body.lambda1 / shares
-    # The others are changes of (I2 - I3)/I1 and (I3 - I1)/I2; each of them tells I3.
-    right = (body.lambda1 - body.lambda3) / body.lambda1
-    third = 0.5 * (second - first * (right + found[2]) + first + second * (found[3] - right))
-    return Verdict('inertia', 'the motion is that of moments of inertia '
-                 f'{listed((first, second, third))} kg m^2, not {listed(body.inertia)}',
-                 float(first))
+    return None if np.any(shares <= 0.0) else Verdict(
+        'inertia', 'the motion is that of moments of inertia across the axis of '
+        f'{listed(body.lambda1 / shares)} kg m^2, not {body.lambda1:.4g}',
+        float(body.lambda1 / shares[0]))

@@ -29,7 +29,7 @@ TIMES = {'s': Decimal(1), 'ms': Decimal('1e-3'), 'us': Decimal('1e-6'), 'ns': De
 PARTS: dict[str, tuple[str, Mapping[str, Any]]] = {
     't': ('t', TIMES), 'attitudes': ('qx qy qz qw', {'1': 1.0}),
     'positions': ('px py pz', LENGTHS),
-    **{name: (' '.join(f'{letter}{axis}' for axis in 'xyz'), READINGS[name].units)
+    **{name: (' '.join(f'{letter}{axis}' for axis in 'xyz'), READINGS[name])
        for name, letter in zip(READINGS, 'gam', strict=True)}}
 UNITS = {name: units for names, units in PARTS.values() for name in names.split()}
 TUM = ['t', 'px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw']
@@ -50,16 +50,15 @@ class Recorded:
 
     parts : times (n,), ascending [s], and values (n, k) by names of PARTS, SI; attitudes are
         q(world <- body) as x, y, z, w
-    covariance : (3, 3) that the first message of an IMU tells, by name
-    first_s, origin_ns : the first stamp, of a table [s] and of a log [ns]
+    densities : of the noise that the first message of an IMU declares, by name
+    origin : the first stamp [s]
     run : of a log of this package, as `recorded_run` describes it
     notes : what was read, and what was not
     """
 
     parts: dict[str, tuple[Reals, Reals]] = field(default_factory=dict)
-    covariance: dict[str, Reals] = field(default_factory=dict)
-    first_s: Decimal = Decimal(0)
-    origin_ns: int = 0
+    densities: dict[str, float] = field(default_factory=dict)
+    origin: Decimal = Decimal(0)
     run: Any = None
     notes: list[str] = field(default_factory=list)
 
@@ -72,31 +71,25 @@ class Recorded:
 
         Raises ValueError.
         """
-        whole = np.flatnonzero(np.all(np.isfinite(values), axis=1) & np.isfinite(times))
+        whole = np.flatnonzero(np.all(np.isfinite(values), axis=1))
+        steps, same = np.diff(times[whole]), np.all(np.diff(values[whole], axis=0) == 0.0, axis=1)
+        for at in np.flatnonzero((steps < 0.0) | ((steps == 0.0) & ~same))[:1]:
+            raise ValueError(f'{rows[whole[at + 1]]}: after {times[whole[at]]:.9g} s the time of '
+                             f'{kind} is {times[whole[at + 1]]:.9g} s: one motion a file, with '
+                             'times of enough digits')
+        if twice := np.count_nonzero(steps == 0.0):
+            self.notes.append(f'{kind}: {twice} rows are there twice: used once')
+        whole = whole[np.append(True, steps > 0.0)] if len(whole) else whole
         times, values = times[whole], values[whole]
-        steps = np.diff(times)
-        for at in np.flatnonzero(steps < 0.0)[:1]:
-            raise ValueError(f'{rows[whole[at + 1]]}: the time goes back from {times[at]:.9g} to '
-                             f'{times[at + 1]:.9g} s: one motion at a time, in a file of its own')
-        same = steps == 0.0
-        for at in np.flatnonzero(same & np.any(values[1:] != values[:-1], axis=1))[:1]:
-            raise ValueError(f'{rows[whole[at + 1]]}: another row of {kind} at the time '
-                             f'{times[at]:.9g} s: write times with more digits')
-        if np.any(same):
-            self.notes.append(f'{kind}: {np.sum(same)} rows are there twice: used once')
-            times, values = times[np.append(True, ~same)], values[np.append(True, ~same)]
-        if len(times) < LEAST_SAMPLES:
-            raise ValueError(f'{len(times)} {kind}: must be {LEAST_SAMPLES} at least')
-        usual = float(np.median(np.diff(times)))
-        if not INTERVALS[0] <= usual <= INTERVALS[1]:
-            raise ValueError(f'the times of {kind} are {usual:.4g} s apart: must be '
-                             f"{INTERVALS[0]:g} to {INTERVALS[1]:g} s; name their unit: --columns "
-                             "'t=t:ms', or us, ns")
+        usual = float(np.median(np.diff(times))) if len(times) > 1 else math.nan
+        if len(times) < LEAST_SAMPLES or not INTERVALS[0] <= usual <= INTERVALS[1]:
+            raise ValueError(f'{len(times)} {kind}, {usual:.4g} s apart: must be {LEAST_SAMPLES} '
+                             f'at least, {INTERVALS[0]:g} to {INTERVALS[1]:g} s apart; the unit of times '
+                             "is named by --columns 't=COLUMN:UNIT'")
         if kind == 'attitudes':
             norms = np.linalg.norm(values, axis=1, keepdims=True)
             for at in np.flatnonzero(~(np.abs(norms - 1.0) < NORM))[:1]:
-                raise ValueError(f'{rows[whole[at]]}: |q| = {float(norms[at, 0]):.4g}: must be 1: '
-                                 'these are no unit quaternions')
+                raise ValueError(f'{rows[whole[at]]}: |q| = {float(norms[at, 0]):.4g}: must be 1')
             values = values / norms
         self.parts[kind] = times, values
         self.notes.append(f'{kind} of {source}: {len(times)} rows, {1.0 / usual:.4g} Hz, from '
@@ -123,20 +116,19 @@ class Table(NamedTuple):
     rows: Sequence[str]
 
     def cells(self, column: str, parse: Callable[[str], Any]) -> list[Any]:
-        """Return the parsed cells of a column, NaN of an empty one.  Raises ValueError."""
+        """Return the parsed cells of a column; an empty value is NaN.  Raises ValueError."""
         found: list[Any] = []
         for row, cell in zip(self.rows, self.columns[column], strict=True):
             text = '' if cell is None else str(cell).strip()
             try:
-                value = parse(text) if text and '_' not in text else math.nan
+                found.append(parse(text or 'nan'))
             except (InvalidOperation, ValueError):
-                value = math.inf
-            if math.isinf(value) or '_' in text or (math.isnan(value) and parse is not float):
+                found.append(math.inf)
+            if '_' in text or math.isinf(found[-1]) or (
+                    math.isnan(found[-1]) and parse is not float):
                 raise ValueError(f'{row}: {column} = {text[:40]!r} is no ' + (
-                    'number: correct it, leave it empty, or cut the line off' if parse is float
-                    else 'time: correct it, or cut the line off; of a date say --columns '
-                    f"'t={column}:iso'"))
-            found.append(value)
+                    'number: correct it, or leave it empty' if parse is float else
+                    f"time: correct it, or of a date say --columns 't={column}:iso'"))
         return found
 
 
@@ -153,15 +145,15 @@ def read_table(path: Path, said: str | None) -> Recorded:
 
     Raises OSError, ImportError or ValueError, which name the file and what to type.
     """
-    recorded = Recorded()
+    recorded, kind = Recorded(), path.suffix.lower()
     try:
         if path.is_dir():
             for part in ('state_groundtruth_estimate0', 'imu0'):
                 _add(recorded, _text(path / part / 'data.csv'), {})
-        elif path.suffix.lower() not in READERS:
+        elif kind not in READERS:
             raise ValueError(f'the name must end in .mcap, {", ".join(READERS)}')
         else:
-            _add(recorded, READERS[path.suffix.lower()](path), columns_said(said) if said else {})
+            _add(recorded, READERS[kind](path), columns_said(said) if said else {})
         recorded.check()
     except (ValueError, EOFError) as error:
         raise ValueError(f'{path}: {one_line(error)}') from error
@@ -185,70 +177,63 @@ def columns_said(text: str) -> Chosen:
         said[name] = []
         for one in filter(None, what.split('+') if name == 't' else [what]):
             column, colon, unit = one.rpartition(':')
-            said[name].append((column.strip(), _unit(name, unit.strip(), item.strip()))
-                              if colon else (one.strip(), next(iter(UNITS[name]))))
+            said[name].append((column.strip(), _unit(name, unit)) if colon else (
+                one.strip(), next(iter(UNITS[name]))))
     return said
 
 
-def _unit(name: str, unit: str, where: str) -> str:
+def _unit(name: str, text: str) -> str:
     """Return a unit by its name.  Raises ValueError."""
-    unit = unit.translate(_SIGNS)
+    unit = text.strip().translate(_SIGNS)
     if unit not in UNITS[name]:
-        raise ValueError(f"{where}: the unit must be {', '.join(UNITS[name])}: say "
-                         f"--columns '{name}=COLUMN:UNIT'")
+        raise ValueError(f"[{unit}]: say --columns '{name}=COLUMN:UNIT' with a UNIT of "
+                         f'{", ".join(UNITS[name])}')
     return unit
 
 
 # ------------------------------------------------------------------------------------- readers
 
 def _text(path: Path) -> Table:
-    try:
-        lines = [(f'line {number}', line.strip()) for number, line in enumerate(
-            path.read_text('utf-8-sig').splitlines(), 1) if line.strip()]
-    except UnicodeDecodeError as error:
-        raise ValueError(f'no UTF-8 text: {error.reason} at byte {error.start}') from error
-    where = [name for name, line in lines if not line.startswith('#')]
-    bare = [line for _, line in lines if not line.startswith('#')]
+    lines = {f'line {k}': line.strip() for k, line in enumerate(
+        path.read_text('utf-8-sig').splitlines(), 1) if line.strip()}
+    bare = [line for line in lines.values() if line[0] != '#']
     if not bare:
         raise ValueError('the file has no rows')
     mark = next((mark for mark in ',;\t' if mark in bare[0]), ' ')
-    comments = [line.lstrip('# \t') for _, line in lines if line.startswith('#')]
-    heads, rows = ([[cell.strip() for cell in row] for row in csv.reader(
-        part, delimiter=mark, skipinitialspace=True)] for part in (comments, bare))
-    if _are_numbers(rows[0]):           # no names: those of a comment, or of TUM
-        count = len(rows[0])
-        names = next((head for head in heads if len(head) == count),
-                     TUM if mark == ' ' and count == len(TUM) else [])
-        if not names:
-            raise ValueError(f'{where[0]}: {count} numbers without names: write a line of names '
-                             'such as t,qw,qx,qy,qz above them')
-    else:
-        names, where, rows = rows[0], where[1:], rows[1:]
+
+    def cells(line: str) -> list[str]:
+        return [cell.strip() for row in csv.reader([line], delimiter=mark, skipinitialspace=True)
+                for cell in row]
+
+    rows = {where: cells(line) for where, line in lines.items() if line[0] != '#'}
+    names = cells(bare[0])
+    try:
+        [float(cell) for cell in names if cell]
+    except ValueError:
+        del rows[next(iter(rows))]
+    else:                               # no names: those of a comment, or of TUM
+        names = next((head for line in lines.values() if line[0] == '#' and len(
+            head := cells(line.lstrip('# \t'))) == len(names)),
+            TUM if mark == ' ' and len(names) == len(TUM) else [])
     if mark == ' ' and names == ['timestamp', 'tx', 'ty', 'tz', *TUM[4:]]:
         names = TUM
+    for where, row in rows.items():
+        if len(row) != len(names):
+            raise ValueError(f'{where} has {len(row)} values, and there are {len(names)} names: '
+                             'correct it, or cut it off; a line of names such as t,qw,qx,qy,qz '
+                             'stands above the numbers')
     if twice := [name for name in names if name and names.count(name) > 1]:
         raise ValueError(f'{len(twice)} columns are called {twice[0]}: each needs a name of its '
                          'own')
-    for line, row in zip(where, rows, strict=True):
-        if len(row) != len(names):
-            raise ValueError(f'{line} has {len(row)} values, the head {len(names)} names: correct '
-                             'it, or cut it off')
-    return Table(dict(zip(names, zip(*rows, strict=True), strict=True)), where)
+    return _arrays(dict(zip(names, zip(*rows.values(), strict=True), strict=False)), [*rows])
 
 
-def _are_numbers(cells: Sequence[str]) -> bool:
-    try:
-        return bool([float(cell) for cell in cells if cell])
-    except ValueError:
-        return False
-
-
-def _arrays(columns: Mapping[str, Sequence[Any]]) -> Table:
+def _arrays(columns: Mapping[str, Sequence[Any]], rows: Sequence[str] = ()) -> Table:
     lengths = {len(column) for column in columns.values()}
     if len(lengths) != 1:
         raise ValueError(f'columns have {", ".join(map(str, sorted(lengths))) or "no"} rows: must '
                          'have as many')
-    return Table(columns, [f'row {k}' for k in range(*lengths)])
+    return Table(columns, rows or [f'row {k}' for k in range(*lengths)])
 
 
 def _parquet(path: Path) -> Table:
@@ -288,27 +273,24 @@ def _add(recorded: Recorded, table: Table, said: Chosen) -> None:
         if not there and (kind not in ('t', 'attitudes') or kind in recorded.parts):
             continue
         if missing := [name for name in names.split() if name not in there]:
-            what = ', '.join(f'{name}=COLUMN' + ':UNIT' * (len(units) > 1) for name in missing)
             raise ValueError(f'no column {", ".join(missing)}: name {unused or "them"}, by '
-                             f"--columns '{what}'" + (
-                                 f' with a UNIT of {", ".join(units)}' if len(units) > 1 else
-                                 '; Euler angles are not read'))
-        source = ', '.join(f'{column} [{unit}]' if unit != '1' and f'[{unit}]' not in column else
-                           column
-                           for name in names.split() for column, unit in chosen[name])
+                             f"--columns '{', '.join(f'{name}=COLUMN:UNIT' for name in missing)}' "
+                             f'with a UNIT of {", ".join(units)}')
+        pairs = [pair for name in names.split() for pair in chosen[name]]
+        source = ', '.join(column if unit in ('1', *re.findall(r'\[(.*)\]', column)) else
+                           f'{column} [{unit}]' for column, unit in pairs)
         if kind == 't':
             stamps: Any = sum(units[unit] * np.array(
                 table.cells(column, _date if unit == 'iso' else Decimal), object)
-                for column, unit in chosen['t'])
+                for column, unit in pairs)
             if not recorded.parts:
-                recorded.first_s = min(stamps, default=Decimal(0))
-                recorded.notes.append(f'times of {source}: the first is '
-                                      f'{float(recorded.first_s):.12g} s')
-            times = (stamps - recorded.first_s).astype(float)
+                recorded.origin = stamps[0]
+                recorded.notes.append(f'times of {source}: the first is {float(stamps[0]):.12g} s')
+            times = (stamps - recorded.origin).astype(float)
         else:
-            recorded.add(kind, source, times, np.stack([units[unit] * np.array(
-                table.cells(column, float)) for name in names.split()
-                for column, unit in chosen[name]], axis=1), table.rows)
+            recorded.add(kind, source, times, np.stack([
+                units[unit] * np.array(table.cells(column, float)) for column, unit in pairs],
+                axis=1), table.rows)
     if unused:
         recorded.notes.append(f'not used: {unused}')
 
@@ -316,18 +298,15 @@ def _add(recorded: Recorded, table: Table, said: Chosen) -> None:
 def _ours(columns: Mapping[str, Sequence[Any]]) -> Chosen:
     """Return the columns that have our names, with or without a unit in brackets, or EuRoC's."""
     bare = {column: re.sub(r'\s*\[.*', '', column.lstrip('#').strip()) for column in columns}
-    if {'timestamp', 'q_RS_w'} <= {*bare.values()} or {'timestamp', 'w_RS_S_x'} <= {
-            *bare.values()}:
+    if 'timestamp' in bare.values() and not {'q_RS_w', 'w_RS_S_x'}.isdisjoint(bare.values()):
         return {EUROC[name]: [(column, 'ns' if name == 'timestamp' else next(iter(
             UNITS[EUROC[name]])))] for column, name in bare.items() if name in EUROC}
     found: Chosen = {}
     for column, name in bare.items():
-        if name not in UNITS:
-            continue
         if name in found:
             raise ValueError(f"{column}: say which column is {name}: --columns "
                              f"'{name}={column}:UNIT'")
-        unit = re.search(r'\[(.*)\]', column)
-        found[name] = [(column, _unit(name, unit[1], column) if unit and unit[1] else next(iter(
-            UNITS[name])))]
+        if name in UNITS:
+            unit = re.search(r'\[(.+)\]', column)
+            found[name] = [(column, _unit(name, unit[1]) if unit else next(iter(UNITS[name])))]
     return found

@@ -2,20 +2,19 @@
 """Chooses poses and readings from a ROS 2 log, by the types of its topics; and the run of ours."""
 
 import contextlib
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spinning_top_sim.grade.files import Recorded
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams.messages import EXACT_VARIANCE
-from spinning_top_sim.streams.play import Simulation
 from spinning_top_sim.tools import recorded_run
 from spinning_top_sim.tools.foreign_messages import PLACES, Sample, samples
-from spinning_top_sim.tools.kinematics import Reals
 
 # Topics of this package that are graded where its log has them, the first of each kind.
 OURS = 'pose', 'ground_truth/odom', 'imu/data_raw', 'imu/data', 'ground_truth/imu', 'imu/mag'
@@ -38,9 +37,9 @@ def read_log(path: Path, wanted: Sequence[str] = ()) -> Recorded:
                            if one.event.kind != 'start'), end_ns)
         if not reader.whole:
             recorded.notes.append('the log is truncated: read as far as it goes')
-        types = {topic.name: topic.type_name for topic in reader.topics}
-        for one in samples(reader, {name: kind for name, kind in types.items() if kind in PLACES},
-                           end_ns):
+        types = {topic.name: topic.type_name for topic in reader.topics
+                 if topic.type_name in PLACES}
+        for one in samples(reader, types, end_ns):
             found[one.kind][one.source].append(one)
         if reader.left_out:
             recorded.notes.append('damaged chunks of the log are left out')
@@ -71,24 +70,17 @@ def _choose(recorded: Recorded, found: Mapping[str, Mapping[str, list[Sample]]],
         if named:
             chosen[kind] = every[named[0]]
     origin = min((rows[0].stamp_ns or rows[0].log_ns for rows in chosen.values()), default=0)
-    recorded.origin_ns = origin
-    recorded.notes.append(f'times of headers: the first is {1e-9 * origin:.9f} s')
+    recorded.origin = Decimal(origin).scaleb(-9)
+    recorded.notes.append(f'times of headers: the first is {recorded.origin} s')
     for kind, rows in chosen.items():
         if not rows[0].stamp_ns:
             recorded.notes.append(f'{kind}: headers without a time: that of the log is used')
-        covariance = rows[0].covariance
-        # The smallest variance means exact, none of noise.
-        if covariance is not None and not 0.0 < np.max(covariance) <= EXACT_VARIANCE:
-            recorded.covariance[kind] = covariance.reshape(3, 3)
-        recorded.add(kind, rows[0].source, np.array([
-            1e-9 * ((row.stamp_ns or row.log_ns) - origin) for row in rows]),
-            np.array([row.values for row in rows]),
+        times = np.array([1e-9 * ((row.stamp_ns or row.log_ns) - origin) for row in rows])
+        recorded.add(kind, rows[0].source, times, np.array([row.values for row in rows]),
                      [f'message {k}' for k in range(len(rows))])
+        covariance = rows[0].covariance         # zeros: unknown; the smallest: exact
+        if covariance is not None and np.max(covariance) > EXACT_VARIANCE:
+            recorded.densities[kind] = math.sqrt(
+                np.trace(covariance.reshape(3, 3)) / 3.0 * np.median(np.diff(times)))
     if unused := sorted(sources - {rows[0].source for rows in chosen.values()}):
         recorded.notes.append(f'not used: {", ".join(unused)}')
-
-
-def own_attitudes(run: Any, times_ns: Reals) -> Reals:
-    """Return the exact attitudes (n, 4) of a run of this package, its moving pivot included."""
-    motion = Simulation({**run.values_in_effect, 'solver.method': 'exact'}).trajectory
-    return motion.evaluate(np.rint(times_ns).astype(np.int64)).quaternion

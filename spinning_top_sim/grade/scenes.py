@@ -7,13 +7,10 @@ from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
 from spinning_top_sim.grade.columns import STANDARD_GRAVITY, Imu
 from spinning_top_sim.physics.top import State, Top
-from spinning_top_sim.solvers.vertical import state_of
-from spinning_top_sim.tools.kinematics import Reals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,13 +26,7 @@ class Body(Imu, Top):
 
     def __post_init__(self) -> None:
         vars(self).update(vars(Top(**{one.name: getattr(self, one.name) for one in fields(Top)})))
-        for name, length in (('lever_arm', 3), ('mounting', 4), ('field', 3)):
-            value = np.asarray(getattr(self, name), dtype=float)
-            if value.shape != (length,) or not np.all(np.isfinite(value)):
-                raise ValueError(f'{name} = {getattr(self, name)!r}: must be {length} finite '
-                                 'numbers')
-        if abs(math.hypot(*self.mounting) - 1.0) > 1e-6:
-            raise ValueError(f'mounting = {self.mounting!r}: its norm must be 1')
+        Imu.__post_init__(self)
 
     @property
     def inertia(self) -> tuple[float, float, float]:
@@ -76,15 +67,8 @@ class Start(State):
     def of(cls, top: Top, state: State) -> Self:
         """Return the start of a state."""
         first = solve(top, state, np.zeros(1))
-        return cls(**{one.name: getattr(state, one.name) for one in fields(State)},
-                   attitude=tuple(first.quaternion[0].tolist()),
+        return cls(**vars(state), attitude=tuple(first.quaternion[0].tolist()),
                    rates=tuple(first.angular_velocity[0].tolist()))
-
-    @classmethod
-    def at(cls, top: Top, attitude: Reals, rates: Reals) -> Self:
-        """Return the start of an attitude x, y, z, w and rates in the body."""
-        world = Rotation.from_quat(attitude).apply(rates)
-        return cls.of(top, state_of(top, np.asarray(attitude), world))
 
 
 @dataclass(frozen=True)

@@ -44,10 +44,9 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
     run : callable
         ``run(top, start, times, dt)`` simulates a `Body` from a `Start` with steps of dt [s] and
         returns the motion at the times (n,) [s]: attitudes q(world <- body) as x, y, z, w (n, 4),
-        or a mapping or an object with `attitudes` and any of `rates`, angular velocities of the
-        state in the body (n, 3) [rad/s], `gyroscope`, `accelerations`, `magnetometer`, readings
-        in the frame of the IMU (n, 3), SI, and `covariance` of the first two, (3, 3) by name or
-        one for both.  The first time is 0, and all are multiples of dt.
+        or a mapping with `attitudes` and any of `rates`, angular velocities of the state in the
+        body (n, 3) [rad/s], `gyroscope`, `accelerations`, `magnetometer`, readings in the frame
+        of the IMU (n, 3), SI.  The first time is 0, and all are multiples of dt.
     dt : float
         The step [s].  Samples are dt apart, also where the order of convergence is measured with
         smaller steps.  A scene in which the top turns by more than 0.7 rad in a step is left out.
@@ -96,32 +95,17 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
 
 def told_motion(said: Any, times: Reals) -> Stretch:
     """Return the motion that a run has said.  Raises InvalidTrajectoryError."""
-    names = 'attitudes', *KINDS, 'covariance'
-    if not isinstance(said, Mapping):
-        said = {name: getattr(said, name, None) for name in names} if (
-            hasattr(said, 'attitudes')) else {'attitudes': said}
-    said = {str(name): part for name, part in said.items() if part is not None}
-    if 'attitudes' not in said:
-        raise InvalidTrajectoryError(f'what is returned has {sorted(said) or "nothing"}: must '
-                                     'have attitudes')
-    attitudes = _numbers('attitudes', said['attitudes'], (len(times), 4))
-    norms = np.linalg.norm(attitudes, axis=1)
-    for at in np.flatnonzero(np.abs(norms - 1.0) > NORM)[:1]:
+    said = said if isinstance(said, Mapping) else {'attitudes': said}
+    readings = {name: _numbers(name, said[name], (len(times), 4 if name == 'attitudes' else 3))
+                for name in ('attitudes', *KINDS) if said.get(name) is not None}
+    if 'attitudes' not in readings:
+        raise InvalidTrajectoryError(f'what is returned has {[*said]}: must have attitudes')
+    attitudes = readings.pop('attitudes')
+    for at in np.flatnonzero(np.abs(np.linalg.norm(attitudes, axis=1) - 1.0) > NORM)[:1]:
         raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
                                      'must be 1')
-    told, noisy = said.get('covariance', {}), [name for name in KINDS if KINDS[name].density]
-    if not isinstance(told, Mapping):
-        told = dict.fromkeys(noisy, told)
-    if others := [*map(str, told.keys() - {*noisy})]:
-        raise InvalidTrajectoryError(f'covariance of {", ".join(others)}: must be of '
-                                     f'{" or ".join(noisy)}')
-    readings = {name: _numbers(name, said[name], (len(times), 3)) for name in KINDS
-                if name in said}
-    return Stretch(
-        times, Rotation.from_quat(attitudes), np.zeros((len(times), 3)), readings,
-        {name: white(values, jumps=False) for name, values in readings.items()},
-        covariance={name: _numbers(f'covariance of {name}', matrix, (3, 3))
-                    for name, matrix in told.items()})
+    return Stretch(times, Rotation.from_quat(attitudes), np.zeros((len(times), 3)), readings,
+                   {name: white(values, jumps=False) for name, values in readings.items()})
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
@@ -139,17 +123,11 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Reals:
 
 @dataclass
 class Motion:
-    """What is told of a motion from a start, and its angles to the exact attitudes (n,) [rad]."""
+    """What is told of a motion, and its largest angle to the exact attitudes [rad]."""
 
     name: str
-    start: State
     told: Stretch
-    errors: Reals
-
-    @property
-    def worst(self) -> float:
-        """The largest error [rad]."""
-        return float(np.max(self.errors))
+    worst: float
 
 
 class Judgement:
@@ -188,20 +166,19 @@ class Judgement:
         """Return a motion; a convention of its attitudes, or a step, is told and undone."""
         solution, early = ExactSolution(self.body, start), slice(0, EARLY)
 
-        def motion_of(late: int) -> Motion:
-            truth = Rotation.from_quat(solution.states_at_seconds(
-                told.t - late * self.dt).quaternion)
-            return Motion(name, start, told, (truth.inv() * told.rotation).magnitude())
+        def errors_of(told: Stretch, late: int = 0) -> Reals:
+            truth = solution.states_at_seconds(told.t - late * self.dt).quaternion
+            return (Rotation.from_quat(truth).inv() * told.rotation).magnitude()
 
-        motion = motion_of(0)
-        error = float(np.max(motion.errors[early]))
+        errors = errors_of(told)
+        error = float(np.max(errors[early]))
         for late in (-1, 1) if error > min(WRONG, 2.0 * self.tolerance) else ():
-            other = motion_of(late)
-            if np.max(other.errors[early]) < RIGHT * error and (
-                    np.median(other.errors) < RIGHT * np.median(motion.errors)):
+            other = errors_of(told, late)
+            if np.max(other[early]) < RIGHT * error and np.median(other) < RIGHT * np.median(
+                    errors):
                 self._tell('late' if late > 0 else 'early', f'{name}: the attitudes are those of '
                            f'one step {"before" if late > 0 else "after"}', float(late))
-                return other
+                return Motion(name, told, float(np.max(other)))
         if error > WRONG:
             q = told.rotation.as_quat()
             found = conventions.best(q[early], solution.states_at_seconds(
@@ -210,8 +187,8 @@ class Judgement:
                 self._tell('convention', f'{name}: attitudes are told as {found.convention.name}; '
                            'this is undone', found.before)
                 told = replace(told, rotation=Rotation.from_quat(found.convention.undo(q)))
-                return motion_of(0)
-        return motion
+                errors = errors_of(told)
+        return Motion(name, told, float(np.max(errors)))
 
     def _tell(self, name: str, evidence: str, number: float) -> None:
         if name not in [fault.name for fault in self.faults]:
@@ -223,12 +200,9 @@ class Judgement:
             return
         of_rates = self._readings('rates').found
         first = of_rates[0].name if of_rates else ''
-        if first in ('', 'rates_scale', 'rates_in_world'):      # rates that are told are known
+        if first in ('', 'rates_scale'):        # rates that are told are known
             for motion in self.motions:
-                rates = motion.told.readings.get('rates')
-                if rates is not None and first == 'rates_in_world':
-                    rates = motion.told.rotation.inv().apply(rates)
-                motion.told = replace(motion.told, rates=rates)
+                motion.told = replace(motion.told, rates=motion.told.readings.get('rates'))
         yield Report('rates', of_rates)
         found = [fault for fault in self._of_motions() if not (
             first == 'rates_scale' and fault.name == 'inaccurate')]
@@ -252,13 +226,12 @@ class Judgement:
         smoothed = Smoothed(motion.told, 1)
         w, up = smoothed.rates, smoothed.turn[:, 2]
         momenta = w * self.body.inertia
-        first = ExactSolution(self.body, motion.start).states_at_seconds(np.zeros(1))
         for name, values in (
                 ('energy', 0.5 * np.sum(momenta * w, axis=1)
                  + self.body.gravity_torque * up[:, 2]),
                 ('l3', momenta[:, 2]), ('lz', np.sum(momenta * up, axis=1))):
             yield f'{name}_drift: {motion.name}', Mark(float(np.max(np.abs(relative_drift(
-                values, float(getattr(first, name)[0]))))))
+                values, float(values[0]))))))
         if motion.name in self.orders:
             yield f'order: {motion.name}', Mark(self.orders[motion.name])
 

@@ -2,14 +2,13 @@
 """Simulators of a top with an IMU: right ones, and ones with a defect, most of them published."""
 
 import math
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from spinning_top_sim import solve
-from spinning_top_sim.physics import attitude
 
 
 def exact(top, start, times, dt, **options):
@@ -18,50 +17,34 @@ def exact(top, start, times, dt, **options):
     return motion.quaternion, motion.angular_velocity, motion.angular_acceleration
 
 
-rk45 = partial(exact, method='rk45')
+def euler(top, start, times, dt, *, inertia=None, com=None, gyroscopic=1.0, world=False,
+          damping=0.0, turn=1.0):
+    """Return the same by Euler's equations, of which something may differ from the top's."""
+    inertia = np.array(top.inertia if inertia is None else inertia)
+    com = np.array(top.com if com is None else com)
 
+    def accelerations(q, w):
+        """Return those of states (4, n), (3, n)."""
+        rotation, rates = Rotation.from_quat(q.T), w.T
+        term = np.cross(rates, rates * inertia)
+        if world:
+            rates = rotation.apply(rates)
+            term = inertia * rotation.inv().apply(np.cross(rates, rates * inertia) / inertia)
+        up = rotation.inv().apply((0.0, 0.0, 1.0))
+        torque = -top.mass * top.gravity * np.cross(com, up) - gyroscopic * term
+        return (torque / inertia - damping * w.T).T
 
-def right_torque(top, spin, across, up, height):
-    """
-    Return the derivatives of the rates across the axis, w1 + i w2, and about it.
+    def slope(t, y):
+        q, w = y[:4], y[4:]
+        x, y, z = 0.5 * turn * w
+        return np.concatenate((
+            [q[3] * x + q[1] * z - q[2] * y, q[3] * y + q[2] * x - q[0] * z,
+             q[3] * z + q[0] * y - q[1] * x, -q[0] * x - q[1] * y - q[2] * z],
+            accelerations(q[:, np.newaxis], w[:, np.newaxis])[:, 0]))
 
-    up : z1 + i z2 of the vertical in the body, height : z3
-    """
-    gyroscopic = (top.lambda1 - top.lambda3) / top.lambda1 * spin
-    return -1j * (gyroscopic * across + top.gravity_torque / top.lambda1 * up), 0.0
-
-
-def without_gyroscopic_term(top, spin, across, up, height):
-    return -1j * top.gravity_torque / top.lambda1 * up, 0.0
-
-
-def gyroscopic_sign(top, spin, across, up, height):
-    right, _ = right_torque(top, spin, across, up, height)
-    return 2.0 * without_gyroscopic_term(top, spin, across, up, height)[0] - right, 0.0
-
-
-def upwards(top, spin, across, up, height):
-    return right_torque(top, spin, across, -up, -height)
-
-
-def damped(top, spin, across, up, height):
-    right, _ = right_torque(top, spin, across, up, height)
-    return right - 0.05 * across, -0.05 * spin
-
-
-def inertia_at_com(top, spin, across, up, height):
-    first = top.lambda1_at_com
-    return -1j * ((first - top.lambda3) / first * spin * across
-                  + top.gravity_torque / first * up), 0.0
-
-
-def offset_com(offset):
-    def torque(top, spin, across, up, height):
-        right, _ = right_torque(top, spin, across, up, height)
-        weight, (x, y, z), (u, v) = top.mass * top.gravity, offset, (up.real, up.imag)
-        more = complex(y * height - z * v, z * u - x * height)
-        return (right - weight / top.lambda1 * more, -weight / top.lambda3 * (x * v - y * u))
-    return torque
+    y = solve_ivp(slope, (0.0, times[-1]), [*start.attitude, *start.rates], 'DOP853', times,
+                  rtol=1e-10, atol=1e-12).y
+    return y[:4].T, y[4:].T, accelerations(y[:4], y[4:]).T
 
 
 def _turned(q, w, dt):
@@ -77,94 +60,30 @@ def _turned(q, w, dt):
 
 def _up(q):
     a, b, c, d = q
-    return complex(2.0 * (b * d - a * c), 2.0 * (c * d + a * b)), a * a + d * d - b * b - c * c
+    return complex(2.0 * (b * d - a * c), 2.0 * (c * d + a * b))
 
 
-def _euler_step(top, torque, q, across, spin, dt, method, turn):
-    """Return the state after a first-order step."""
-    change, spin_change = torque(top, spin, across, *_up(q))
-    gyroscopic = 1j * dt * (top.lambda1 - top.lambda3) / top.lambda1 * spin
-    if method == 'implicit':
-        change /= 1.0 + gyroscopic
-    elif method == 'wrong derivative':
-        change /= 1.0 - gyroscopic
-    elif method == 'midpoint':
-        change /= 1.0 + 0.5 * gyroscopic
-    elif method == 'world inertia':
-        change = _world_inertia(top, q, across, spin)
-    before = across
-    across, spin = across + dt * change, spin + dt * spin_change
-    used = before if method == 'forward' else across
-    return _turned(q, (used.real, used.imag, spin), turn * dt), across, spin
-
-
-def _world_inertia(top, q, across, spin):
-    w, x, y, z = q
-    quaternion, rates = ([x], [y], [z], [w]), ([across.real], [across.imag], [spin])
-    a, b, c = attitude.rotated([np.array(one) for one in quaternion],
-                                [np.array(one) for one in rates])
-    share = (top.lambda1 - top.lambda3) / top.lambda1
-    change = attitude.rotated_back([np.array(one) for one in quaternion],
-                              (share * b * c, -share * a * c, 0.0 * a))
-    gravity = -1j * top.gravity_torque / top.lambda1 * _up(q)[0]
-    return complex(change[0][0], change[1][0]) + gravity
-
-
-def _rk4_step(top, torque, q, across, spin, dt, turn):
-    def slope(q, across, spin):
-        a, b, c, d = q
-        x, y, z = turn * across.real, turn * across.imag, turn * spin
-        return ((-0.5 * (b * x + c * y + d * z), 0.5 * (a * x + c * z - d * y),
-                 0.5 * (a * y - b * z + d * x), 0.5 * (a * z + b * y - c * x)),
-                *torque(top, spin, across, *_up(q)))
-
-    def after(slope, dt):
-        dq, da, ds = slope
-        return tuple(x + dt * y for x, y in zip(q, dq, strict=True)), across + dt * da, \
-            spin + dt * ds
-
-    k1 = slope(q, across, spin)
-    k2 = slope(*after(k1, 0.5 * dt))
-    k3 = slope(*after(k2, 0.5 * dt))
-    k4 = slope(*after(k3, dt))
-    q = [x + dt / 6.0 * (a + 2.0 * (b + c) + d)
-         for x, a, b, c, d in zip(q, k1[0], k2[0], k3[0], k4[0], strict=True)]
-    norm = math.sqrt(sum(x * x for x in q))
-    across, spin = (x + dt / 6.0 * (k1[k] + 2.0 * (k2[k] + k3[k]) + k4[k])
-                    for k, x in ((1, across), (2, spin)))
-    return tuple(x / norm for x in q), across, spin
-
-
-@dataclass
-class Stepped:
+def stepped(top, start, times, dt, method):
     """
-    A simulator that takes steps.
+    Return the same by steps of first order.
 
-    method : rk4, or of first order: semi-implicit, forward, implicit, midpoint,
-        wrong derivative, world inertia
-    turn : factor of the rates with which the attitude turns
+    method : of the gyroscopic term: explicit, implicit, midpoint, or wrong derivative, where an
+        implicit step has its derivative with the wrong sign
     """
-
-    torque: object = right_torque
-    method: str = 'rk4'
-    turn: float = 1.0
-
-    def __call__(self, top, start, times, dt):
-        (x, y, z, w), (w1, w2, spin) = start.attitude, start.rates
-        q = w, x, y, z
-        across, stride = complex(w1, w2), round((times[1] - times[0]) / dt)
-        rows = []
-        for number in range((len(times) - 1) * stride + 1):
-            if number % stride == 0:
-                rows.append((*q, across.real, across.imag, spin))
-            if self.method == 'rk4':
-                q, across, spin = _rk4_step(top, self.torque, q, across, spin, dt, self.turn)
-            else:
-                q, across, spin = _euler_step(top, self.torque, q, across, spin, dt, self.method,
-                                              self.turn)
-        states = np.array(rows)
-        attitudes, w = states[:, [1, 2, 3, 0]], states[:, 4:]
-        return attitudes, w, np.gradient(w, times, axis=0, edge_order=2)
+    (x, y, z, w), (w1, w2, spin) = start.attitude, start.rates
+    q, across, rows = (w, x, y, z), complex(w1, w2), []
+    share = (top.lambda1 - top.lambda3) / top.lambda1 * spin
+    at = {'explicit': 0.0, 'midpoint': 0.5, 'implicit': 1.0, 'wrong derivative': -1.0}[method]
+    stride = round((times[1] - times[0]) / dt)
+    for number in range((len(times) - 1) * stride + 1):
+        if number % stride == 0:
+            rows.append((*q, across.real, across.imag, spin))
+        change = -1j * (share * across + top.gravity_torque / top.lambda1 * _up(q))
+        across += dt * change / (1.0 + at * 1j * dt * share)
+        q = _turned(q, (across.real, across.imag, spin), dt)
+    states = np.array(rows)
+    return states[:, [1, 2, 3, 0]], states[:, 4:], np.gradient(states[:, 4:], times, axis=0,
+                                                              edge_order=2)
 
 
 class Imu:
@@ -316,16 +235,6 @@ class Imu:
         self._set_noise(said, 'accelerations', self.sigma * math.sqrt(3.0)
                         * self._random.uniform(-1.0, 1.0, self.w.shape))
 
-    def covariance_unknown(self, said):
-        """ros-simulation/gazebo_ros_pkgs#1240: covariances of zeros beside noise."""
-        said['covariance'] = np.zeros((3, 3))
-
-    def covariance_right(self, said):
-        said['covariance'] = {
-            name: density ** 2 / self.h * np.eye(3) for name, density in (
-                ('gyroscope', self.top.gyroscope_noise_density),
-                ('accelerations', self.top.accelerometer_noise_density))}
-
 
 # What is wrong with each simulator, and the faults that name it.  These are published:
 PUBLISHED = {
@@ -342,8 +251,7 @@ PUBLISHED = {
     'field_reversed': ('rotation_reversed',),
     'residuals': ('noise_scale',),
     'density_as_deviation': ('noise_scale',),
-    'uniform': ('uniform_noise',),
-    'covariance_unknown': ('covariance_zero',)}
+    'uniform': ('uniform_noise',)}
 OTHER = {
     'without_tangential_term': ('no_tangential_term',),
     'without_gravity': ('no_gravity',),
@@ -354,27 +262,29 @@ OTHER = {
     'field_in_world': ('reading_in_world',),
     'gyroscope_twice': ('reading_scale',),
     'times_root_two': ('noise_scale',)}
-NOISY = ('density_as_deviation', 'uniform', 'covariance_unknown', 'times_root_two')
-STEPPED = {
+NOISY = ('density_as_deviation', 'uniform', 'times_root_two')
+MOVED = {
     # avianphysics/avian#420: the term of the begin of a step adds energy.
-    'semi-implicit': (Stepped(method='semi-implicit'),
-                      ('first_order', 'explicit_gyroscopic_term')),
+    'explicit': (partial(stepped, method='explicit'), ('first_order', 'explicit_gyroscopic_term')),
     # bulletphysics/bullet3#346: that of its end damps.
-    'implicit': (Stepped(method='implicit'), ('first_order', 'implicit_damping')),
+    'implicit': (partial(stepped, method='implicit'), ('first_order', 'implicit_damping')),
     # google-deepmind/mujoco_warp#1662: the derivative has the wrong sign.
-    'wrong derivative': (Stepped(method='wrong derivative'), ('first_order', 'coriolis_sign')),
+    'wrong derivative': (partial(stepped, method='wrong derivative'),
+                         ('first_order', 'coriolis_sign')),
+    'midpoint': (partial(stepped, method='midpoint'), ('first_order',)),
     # godotengine/godot#80703, NVIDIAGameWorks/PhysX#394, jrouwe/JoltPhysics#803, google/brax#48.
-    'no gyroscopic term': (Stepped(without_gyroscopic_term, 'semi-implicit'),
-                           ('no_gyroscopic_term',)),
+    'no gyroscopic term': (partial(euler, gyroscopic=0.0), ('no_gyroscopic_term',)),
     # gszauer/GamePhysicsCookbook#14: the inertia of the body in axes of the world.
-    'world inertia': (Stepped(method='world inertia'), ('inertia_frame',)),
+    'world inertia': (partial(euler, world=True), ('inertia_frame',)),
     # google/brax#62: the attitude turns twice as fast.
-    'turns twice': (Stepped(turn=2.0), ('rates_scale',)),
+    'turns twice': (partial(euler, turn=2.0), ('rates_scale',)),
     # dimforge/parry#334: Steiner's term is wrong.
-    'inertia at com': (Stepped(inertia_at_com), ('inertia',)),
-    'midpoint': (Stepped(method='midpoint'), ('first_order',)),
-    'gyroscopic sign': (Stepped(gyroscopic_sign), ('coriolis_sign',)),
-    'upwards': (Stepped(upwards), ('gravity_sign',)),
-    'damped': (Stepped(damped), ('damping',)),
-    'offset': (Stepped(offset_com((0.003, -0.002, 0.004))), ('com_offset',))}
-RIGHT = {'exact': exact, 'rk45': rk45, 'RK4': Stepped()}
+    'inertia at com': (lambda top, *given: euler(top, *given, inertia=top.inertia_at_com),
+                       ('inertia',)),
+    'gyroscopic sign': (partial(euler, gyroscopic=-1.0), ('coriolis_sign',)),
+    'upwards': (lambda top, *given: euler(top, *given, com=(0.0, 0.0, -top.com_distance)),
+                ('gravity_sign',)),
+    'damped': (partial(euler, damping=0.05), ('damping',)),
+    'offset': (lambda top, *given: euler(top, *given, com=np.add(top.com, (
+        0.003, -0.002, 0.004))), ('com_offset',))}
+RIGHT = {'exact': exact, 'rk45': partial(exact, method='rk45'), 'euler': euler}
