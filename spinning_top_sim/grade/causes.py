@@ -169,7 +169,7 @@ class Causes:
                 ('world', 'rates_in_world' if self.compared.angles else 'reading_in_world',
                  'the world, not of the IMU'),
                 ('reversed', 'rotation_reversed', 'a sensor that turns against the IMU')):
-            yield Cause([*(f'world {arm}' for arm in self.arms), 'free', effect], instead(
+            yield Cause([*(f'in world {arm}' for arm in self.arms), 'free', effect], instead(
                 name, f'the readings are in axes of {text}'))
         # So many columns fit what the origin does, too; of an unknown field they are no product.
         if not self.compared.always or (self.arms and self.placed):

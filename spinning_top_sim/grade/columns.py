@@ -283,7 +283,7 @@ class Comparison:
         effects |= {
             'step': _per_step(total), 'world': turned(effects['free']),
             'reversed': turned(turned(effects['free'])),
-            **{f'world {arm}': turned(effects[arm]) for arm in arms},
+            **{f'in world {arm}': turned(effects[arm]) for arm in arms},
             **{f'offset {k}': 0.0 * total + axis for k, axis in enumerate(AXES)}}
         for of in ('free', *arms):
             effects |= {f'matrix {i}{j} {of}': np.outer(effects[of][:, j], AXES[i])

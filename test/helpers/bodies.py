@@ -43,27 +43,19 @@ def forced(t, random, rate):
     speeds = random.uniform(0.3, 1.0, (3, 2)) * rate
     phases = random.uniform(0.0, 2.0 * np.pi, (3, 2))
 
-    def angles(t):
-        return [np.sum([s * np.sin(v * t + f) for s, v, f in zip(*one, strict=True)], axis=0)
-                for one in zip(sizes, speeds, phases, strict=True)]
-
     def turned(t):
-        return Rotation.from_euler('ZYX', np.stack(angles(t), axis=1))
+        return Rotation.from_euler('ZYX', np.sum(
+            sizes * np.sin(speeds * t[:, np.newaxis, np.newaxis] + phases), axis=2))
 
-    def rates(t):
-        z, y, x = ([np.sum([s * v * np.cos(v * t + f) for s, v, f in zip(*one, strict=True)],
-                           axis=0)] for one in zip(sizes, speeds, phases, strict=True))
-        a = angles(t)
-        roll = Rotation.from_euler('X', a[2][:, np.newaxis])
-        both = Rotation.from_euler('ZYX', np.stack((0.0 * a[0], a[1], a[2]), axis=1))
-        zero = 0.0 * t
-        return (np.stack((x[0], zero, zero), axis=1)
-                + roll.inv().apply(np.stack((zero, y[0], zero), axis=1))
-                + both.inv().apply(np.stack((zero, zero, z[0]), axis=1)))
+    h = 1e-3
 
-    h = 1e-4
-    alpha = (8.0 * (rates(t + h) - rates(t - h)) - rates(t + 2 * h) + rates(t - 2 * h)) / (12 * h)
-    return turned(t), rates(t), alpha
+    def turns(k):
+        """Return the turns in k h and in -k h."""
+        return [(turned(t).inv() * turned(t + sign * k * h)).as_rotvec() for sign in (1, -1)]
+
+    (one, less), (two, least) = turns(1), turns(2)
+    return (turned(t), (8.0 * (one - less) - (two - least)) / (12.0 * h),
+            (16.0 * (one + less) - (two + least)) / (12.0 * h * h))
 
 
 def free(t, random, rate):
