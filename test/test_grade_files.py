@@ -106,11 +106,11 @@ ROWS = {'t': T, **VALUES}
      "'t=COLUMN:UNIT' with a UNIT of s, ms, us, ns, iso"),
     ({'t': T, **{f'ref_{name}': POSES[name] for name in POSES},
       **{f'sim_{name}': POSES[name] for name in POSES}}, None, "'qx=COLUMN:UNIT, qy=COLUMN:UNIT"),
-    ({'t': 1e3 * T, **VALUES}, None, "1e-05 to 0.5 s apart; the unit of times is named by "
-     "--columns 't=COLUMN:UNIT'"),
+    ({'t': 1e3 * T, **VALUES}, None, "1e-05 to 0.5 s apart; name the unit of times by --columns "
+     "'t=COLUMN:UNIT'"),
     ({**ROWS, 't': np.append(T[:300], T[:300])}, None, 'line 302: after 1.495 s the time of '
      'attitudes is 0 s: one motion a file'),
-    ({**ROWS, 't': np.round(T, 2)}, None, 'is 0 s: one motion a file, with times of enough digits'),
+    ({**ROWS, 't': np.round(T, 2)}, None, 'one motion a file, with times of enough digits'),
     ({**ROWS, 'qw': 1.5 * POSES['qw']}, None, 'line 2: |q| = '),
     ({**ROWS, 'gx [deg/s]': T}, None, 'gx [deg/s]: say which column is gx: --columns'),
     ({**ROWS, 'gx': ['1_0'] * len(T)}, None, "line 2: gx = '1_0' is no number"),

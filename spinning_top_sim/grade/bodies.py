@@ -16,7 +16,7 @@ from spinning_top_sim.tools.identify import beyond
 from spinning_top_sim.tools.kinematics import Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
-EXCERPT = 1000                  # samples by which a convention is found
+EXCERPT = 3000                  # samples by which a convention is found
 # Share of a reading left in ours, of that in another convention, and of the reading there.
 WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
 HELD_RUNS, HELD_SHARE = 20, 0.9     # runs of equal readings that are a hold, and as long as usual

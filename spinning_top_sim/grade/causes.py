@@ -14,32 +14,10 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.grade.columns import (
-    AXES,
-    CLEARLY,
-    DENSITIES,
-    ENTRIES,
-    LENGTHS,
-    ROUNDING,
-    STANDARD_GRAVITY,
-    STILL,
-    SURE,
-    Comparison,
-    Imu,
-)
-from spinning_top_sim.tools import conventions
-from spinning_top_sim.tools.identify import (
-    NEAR,
-    Cause,
-    Verdict,
-    beyond,
-    compressed,
-    explain,
-    instead,
-    parts,
-    rms,
-    verdicts,
-)
+from spinning_top_sim.grade import columns
+from spinning_top_sim.grade.columns import AXES, DENSITIES, ENTRIES, SURE, Comparison, Imu
+from spinning_top_sim.tools import conventions, identify
+from spinning_top_sim.tools.identify import NEAR, Cause, Verdict, beyond, instead, rms
 from spinning_top_sim.tools.kinematics import SPREAD, Reals, Stretch, white
 from spinning_top_sim.tools.report import Finding, Mark, Report
 
@@ -56,6 +34,8 @@ LATE = 0.75                 # lag from which on it is a fault [samples of the se
 # the middle of a step; a real device, where poses have noise, has errors that no simulator needs.
 STRANGE, OF_STEPS, REAL = 2e-3, 2e-2, 0.03
 UNEXPLAINED, ROUGH = 0.25, 0.3   # shares of a discrepancy, with noise of a reading, left at most
+# Faults beside which the noise is not known.
+UNCLEAR = {'reading_scale', 'inaccurate', 'matrix', 'rates_in_world'}
 MISSING = 0.05              # share of a whole reading that is none
 # By which a size differs from that of a unit, entries from axes, and from a turn, as a share.
 OF_UNIT, OF_AXES, OF_TURN = 0.02, 0.1, 0.3
@@ -80,29 +60,28 @@ def judge(kind: str, stretches: Sequence[Stretch], imu: Imu, gravity: float, *,
     compared, faults = Comparison(kind, stretches, imu, gravity), list[Verdict]()
     if not compared.motions:
         return Report(kind)
-    lag = compared.lag()
-    late, sigma = lag.samples * compared.steps, lag.sigma * compared.steps
-    if lag.clear and abs(late) > max(LATE, SURE * sigma):
+    samples, sigma, clear = compared.lag()
+    late, sigma = samples * compared.steps, sigma * compared.steps
+    if clear and abs(late) > max(LATE, SURE * sigma):
         faults.append(Verdict(
             'late' if late > 0.0 else 'early', f'the readings belong to the motion of '
             f'{abs(late):.3g} steps ({1e3 * abs(late) * compared.own_step:.3g} ms) '
             f'{"before" if late > 0.0 else "after"}', late))
     for last in (False, False, True):
-        compared.compare(lag.whole)
+        compared.compare(round(samples) if clear else 0)
         found, residual, rest = Causes(compared, placed, slack).find()
-        undone = [one for one in found if one.undo is not None]
-        if last or not undone:
+        undone = next((one for one in found if one.undo is not None), None)
+        if last or not undone or undone.undo is None:
             break
-        faults.append(undone[0])
-        compared.undo(undone[0].undo)
+        faults.append(undone)
+        compared.undo(undone.undo)
     faults.extend(found)
     if kind == 'accelerations' and not placed and rest > max(STRANGE, 2.0 * compared.floor):
         return Report(kind, notes=[f'{kind}: {100.0 * rest:.3g} % of the reading may be the '
                                    'acceleration of the origin: without positions they are not '
                                    'graded'])
     marks = {f'{kind}_lag_steps': Mark(late, LATE, _interval(sigma)), **_marks(compared)}
-    if kind in DENSITIES and {'reading_scale', 'inaccurate', 'matrix', 'rates_in_world'}.isdisjoint(
-            one.name for one in found):
+    if kind in DENSITIES and UNCLEAR.isdisjoint(one.name for one in found):
         faults.extend(_noise_faults(compared, residual, getattr(imu, DENSITIES[kind])))
     return Report(kind, [Finding(one.name, f'{kind}: {one.evidence}', one.number)
                          for one in faults], marks, [*_untold(compared)])
@@ -138,17 +117,19 @@ class Causes:
             return unit, residual, before
         if before <= self.least:
             return [], residual, before
-        chosen = explain(*compressed(compared.target, compared.effects), [*self._causes()],
-                         math.hypot(compared.floor, 0.5 * self.least), always)
+        chosen = identify.explain(
+            *identify.compressed(compared.target, compared.effects), [*self._causes()],
+            math.hypot(compared.floor, 0.5 * self.least), always)
         while True:
             found, sigma, residual = compared.fit([*always, *(
                 name for cause in chosen for name in cause.effects)])
             sure = np.abs(found) > SURE * sigma
-            chance = [cause for cause, of in parts(chosen, len(always)) if not np.any(sure[of])]
+            chance = [cause for cause, of in identify.parts(chosen, len(always))
+                      if not np.any(sure[of])]
             if not chance:
                 break
             chosen.remove(chance[-1])
-        told = verdicts(chosen, found, len(always))
+        told = identify.verdicts(chosen, found, len(always))
         # A cause that is not what it seemed to be explains nothing.
         rest = before if None in told else beyond(residual, most)
         if rest > max(UNEXPLAINED * before, self.strange, 2.0 * compared.floor,
@@ -183,13 +164,13 @@ class Causes:
                 yield Cause([name], partial(self._term, name))
         yield Cause(['difference'], self._difference)
         yield Cause(['gravity', *OFFSETS], self._gravity_frame)
-        yield Cause([f'turned arm {k}' for k in range(3)], self._split_arm) if self.arms else Cause(
-            [f'arm {k}' for k in range(3)], self._arm)
+        arm, judged = ('turned arm', self._split_arm) if self.arms else ('arm', self._arm)
+        yield Cause([f'{arm} {k}' for k in range(3)], judged)
 
     def _clear(self, name: str) -> bool:
         """Return whether an effect is much larger than its noise."""
         return self.kind != 'accelerations' or rms(self.compared.effects[name]) > (
-            STILL + CLEARLY * self.compared.noise.get(name, 0.0))
+            columns.STILL + columns.CLEARLY * self.compared.noise.get(name, 0.0))
 
     def _matrix(self, matrix: Reals) -> Verdict | None:
         """Judge a matrix by which the readings are what they should be, multiplied."""
@@ -257,11 +238,11 @@ class Causes:
         text = f'the term of {what} has {share:.3g} times its size'
         # A term of noise seems to be missing; gravity is in g where the whole reading is.
         if (self.noisy and not self._clear(term)) or (
-                term != 'linear' and abs(share * STANDARD_GRAVITY - 1.0) < OF_UNIT):
+                term != 'linear' and abs(share * columns.STANDARD_GRAVITY - 1.0) < OF_UNIT):
             return None
         if term == 'gravity' and share > NEAR:
             return Verdict('gravity' * (abs(share - 1.0) > GRAVITY_BAND), text, share)
-        for unit, factor in LENGTHS.items() if term == 'linear' else ():
+        for unit, factor in columns.LENGTHS.items() if term == 'linear' else ():
             if factor < 1.0 and abs(share / factor - 1.0) < 0.05:
                 return Verdict('units', f'{text}: positions are in {unit}', share)
         if abs(share) < NEAR:

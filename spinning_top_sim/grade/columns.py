@@ -9,21 +9,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from spinning_top_sim.tools import kinematics
 from spinning_top_sim.tools.identify import Fit, fit, fitted, pooled, rms
-from spinning_top_sim.tools.kinematics import (
-    WIDTHS,
-    Reals,
-    Smoothed,
-    Stretch,
-    along,
-    gain,
-    margin,
-)
+from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, along
 
 UP, AXES = np.array((0.0, 0.0, 1.0)), np.eye(3)
 ENTRIES = [(i, j) for i in range(3) for j in range(3)]
@@ -95,19 +87,6 @@ class Imu:
             raise ValueError(f'mounting = {self.mounting!r}: its norm must be 1')
 
 
-class Lag(NamedTuple):
-    """Samples by which readings are late, their deviation, and whether that explains much."""
-
-    samples: float = math.nan
-    sigma: float = math.inf
-    clear: bool = False
-
-    @property
-    def whole(self) -> int:
-        """The lag to be undone."""
-        return round(self.samples) if self.clear else 0
-
-
 class Comparison:
     """
     Readings of a kind beside a motion, which is smoothed as far as the noise asks for.
@@ -150,8 +129,9 @@ class Comparison:
     def _clear(self, stretches: Sequence[Stretch]) -> tuple[float, list[Smoothed]]:
         """Return the share of noise, and the motions smoothed so that it is small."""
         best: tuple[float, list[Smoothed]] = math.inf, []
-        for width in (1,) if self.kind in ('rates', 'magnetometer') else WIDTHS:
-            if any(len(one.t) < 4 * margin(width) for one in stretches) or not stretches:
+        for width in (1,) if self.kind in ('rates', 'magnetometer') else kinematics.WIDTHS:
+            least = 4 * kinematics.margin(width)
+            if min((len(one.t) for one in stretches), default=0) < least:
                 break
             motions = [Smoothed(one, width) for one in stretches]
             noise = max(self.noises(one)['total'] for one in motions)
@@ -190,15 +170,15 @@ class Comparison:
         """Return a reading that is `lag` samples late, smoothed (m, 3); ends are wrapped."""
         return (motion.rate if self.angles else motion.vector)(np.roll(reading, -lag, axis=0))
 
-    def lag(self) -> Lag:
+    def lag(self) -> tuple[float, float, bool]:
         """
-        Return by how much readings are late.
+        Return by how many samples readings are late, its deviation, and whether it explains much.
 
         The reading is regressed on all terms, of all axes, at each lag: what else is wrong does
         not count.
         """
         lags = [lag for lag in LAGS if 4 * abs(lag) < min(len(one.rates) for one in self.motions)]
-        keep, misfit, count = slice(-lags[0], -lags[-1] or None), np.zeros(len(lags)), 0
+        keep, residuals = slice(-lags[0], -lags[-1] or None), []
         for motion, reading in zip(self.motions, self.readings, strict=True):
             good = motion.smooth[keep]
             design = np.hstack([effect[keep][good] for name, effect in self.columns(motion).items()
@@ -206,27 +186,31 @@ class Comparison:
                                + [np.ones((np.count_nonzero(good), 1))])
             design /= np.maximum(np.linalg.norm(design, axis=0), 1e-300)
             read = np.hstack([self.read(motion, reading, lag)[keep][good] for lag in lags])
-            left = read - design @ np.linalg.lstsq(design, read, rcond=1e-9)[0]
-            misfit += np.sum(np.square(left), axis=0).reshape(-1, 3).sum(axis=1)
-            count += 3 * len(left)
-        self.compare(0)
-        best, now = int(np.argmin(misfit)), misfit[lags.index(0)]
+            residuals.append(read - design @ np.linalg.lstsq(design, read, rcond=1e-9)[0])
+        misfit = sum(np.sum(one ** 2, axis=0) for one in residuals).reshape(-1, 3).sum(axis=1)
+        best, now, count = int(np.argmin(misfit)), misfit[lags.index(0)], 3 * sum(
+            map(len, residuals))
         width, size = self.motions[0].width, rms(self.sizes)
+        self.compare(0)
         # Of smoothed samples fewer are independent: they must be more than the columns.
-        if (count < ENOUGH * 3 * width * design.shape[1] or now < count * (STILL * size) ** 2
-                or rms(self.effects['total']) < CLEARLY * self.noise['total']
-                or best in (0, len(lags) - 1)):
-            return Lag()                        # every lag explains it
+        if (count < ENOUGH * 3 * width * design.shape[1] or best in (0, len(lags) - 1)
+                or now < count * (STILL * size) ** 2
+                or rms(self.effects['total']) < CLEARLY * self.noise['total']):
+            return math.nan, math.inf, False    # every lag explains it
         # Around its minimum the sum of squares is a parabola.
         sooner, least, later = misfit[best - 1:best + 2].tolist()
         curvature = sooner - 2.0 * least + later
         late = lags[best] + 0.5 * (sooner - later) / curvature
         rest = max(least - 0.125 * (sooner - later) ** 2 / curvature, 0.0)
         variance = rest / count * 2.0 * width   # of correlated noise
-        clear = rest < 0.25 * now or (
-            rest < 1.5 * count * (self.floor * size) ** 2
-            and now - rest > max((2.0 * SURE) ** 2 * variance, 0.05 * curvature * late ** 2))
-        return Lag(late, math.sqrt(2.0 * variance / curvature), clear)
+        sigma, unlike = math.sqrt(2.0 * variance / curvature), (2.0 * SURE) ** 2 * variance
+        likely = np.abs(np.array(lags)[misfit - rest < unlike] - late)
+        if np.any(likely > 1.0 + 2.0 * SURE * sigma) or now - rest < unlike * (
+                abs(late) > 2.0 * sigma):
+            return math.nan, math.inf, False    # others, or none, explain it as well
+        clear = rest < 0.25 * now or (rest < 1.5 * count * (self.floor * size) ** 2
+                                      and now - rest > max(unlike, 0.05 * curvature * late ** 2))
+        return late, sigma, clear
 
     def compare(self, lag: int) -> None:
         """Compare readings that are `lag` samples late."""
@@ -253,7 +237,7 @@ class Comparison:
         self.noise = {name: rms(np.array([one[name] for one in noises]) / self.sizes)
                       for name in noises[0]}
         self.floor = math.hypot(self.noise['total'], self.reading_noise * rms(
-            gain(self.motions[0].width) / self.sizes))
+            kinematics.gain(self.motions[0].width) / self.sizes))
 
     def fit(self, names: Sequence[str]) -> Fit:
         """Return the best coefficients of effects."""

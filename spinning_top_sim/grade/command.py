@@ -19,7 +19,6 @@ import argparse
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from decimal import Decimal
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -103,7 +102,8 @@ def _imu(arguments: argparse.Namespace, given: Mapping[str, Any], values: Mappin
     return Imu(
         lever_arm=tuple(arguments.lever_arm) if arguments.lever_arm else arm, field=field,
         mounting=tuple(Rotation.from_euler('xyz', values['imu.rpy']).as_quat().tolist()),
-        **{name: given.get(f'imu.{name}', densities.get(kind)) for kind, name in DENSITIES.items()})
+        **{name: given.get(f'imu.{name}', densities.get(kind))
+           for kind, name in DENSITIES.items()})
 
 
 def _without_declared(report: Report, values: Mapping[str, Any]) -> Report:
@@ -125,9 +125,9 @@ def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) ->
     noise, notes = body.sigma['attitudes'], []
     tolerance = TOLERANCE + NOISES * noise
     if run is not None:                 # its own exact motion, its moving pivot included
-        times_ns = np.rint(1e9 * (body.t + float(recorded.origin - Decimal(run.epoch_ns).scaleb(-9))))
-        truth = Simulation({**run.values_in_effect, 'solver.method': 'exact'}).trajectory.evaluate(
-            times_ns.astype(np.int64)).quaternion
+        first_ns = float(recorded.origin * 10 ** 9 - run.epoch_ns)
+        motion = Simulation({**run.values_in_effect, 'solver.method': 'exact'}).trajectory
+        truth = motion.evaluate(np.rint(1e9 * body.t + first_ns).astype(np.int64)).quaternion
         worst = float(np.max((Rotation.from_quat(truth).inv() * body.rotation).magnitude()))
         return Report('', _inaccurate(worst, tolerance), {'total_error_deg': Mark(
             math.degrees(worst), math.degrees(tolerance))})
@@ -141,11 +141,11 @@ def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) ->
         notes.append('another start than the one that is given: it is read off the first samples')
         body = replace(body, t=body.t - body.t[at])
     judgement = Judgement(top, body.step, tolerance)
-    motion = judgement.beside_truth('the motion', start, body)
-    judgement.motions.append(motion)
+    beside = judgement.beside_truth('the motion', start, body)
+    judgement.motions.append(beside)
     found = Report('', judgement.faults, {}, notes).plus(*judgement.reports())
     return found if noise < EXACT else replace(
-        found, found=[*judgement.faults, *_inaccurate(motion.worst, tolerance)])
+        found, found=[*judgement.faults, *_inaccurate(beside.worst, tolerance)])
 
 
 def _inaccurate(worst: float, tolerance: float) -> list[Finding]:

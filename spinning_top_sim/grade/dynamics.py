@@ -15,17 +15,8 @@ import numpy as np
 from spinning_top_sim.grade.causes import GRAVITY_BAND, listed
 from spinning_top_sim.grade.columns import AXES, STANDARD_GRAVITY
 from spinning_top_sim.grade.scenes import Body
-from spinning_top_sim.tools.identify import (
-    NEAR,
-    Cause,
-    Verdict,
-    explain,
-    fitted,
-    instead,
-    pooled,
-    rms,
-    verdicts,
-)
+from spinning_top_sim.tools import identify
+from spinning_top_sim.tools.identify import NEAR, Cause, Verdict, instead, rms
 from spinning_top_sim.tools.kinematics import Reals, Smoothed, Stretch, along
 
 # Mean over the interval in the middle of six samples, for polynomials of degree 5.
@@ -37,10 +28,10 @@ SIDEWAYS = 1e-2     # of a change of the torque, across the axis, that is none
 
 def faults_of(body: Body, motions: Sequence[Stretch], dt: float) -> list[Verdict]:
     """Return the causes of the error of motions of a body."""
-    target, effects = pooled(_terms(body, motion, dt) for motion in motions)
+    target, effects = identify.pooled(_terms(body, motion, dt) for motion in motions)
     if rms(target) < UNIMPORTANT:
         return []
-    chosen = explain(target, effects, [
+    chosen = identify.explain(target, effects, [
         Cause(['gyroscopic'], _gyroscopic), Cause(['gyroscopic step', 'gravity step'], _step),
         Cause(['gyroscopic', 'in world'], instead(
             'inertia_frame', 'the gyroscopic term is that of moments of inertia about axes of the '
@@ -49,9 +40,9 @@ def faults_of(body: Body, motions: Sequence[Stretch], dt: float) -> list[Verdict
         Cause(['arm 0', 'arm 1', 'arm 2'], partial(_com, body)),
         Cause([f'euler {k}' for k in range(5)], partial(_inertia, body))])
     names = [name for cause in chosen for name in cause.effects]
-    found, residual = fitted(target, [effects[name] for name in names]) if names else (
+    found, residual = identify.fitted(target, [effects[name] for name in names]) if names else (
         np.empty(0), target)
-    return [one for one in verdicts(chosen, found) if one] if (
+    return [one for one in identify.verdicts(chosen, found) if one] if (
         rms(residual) < EXPLAINED * rms(target)) else []
 
 

@@ -39,7 +39,6 @@ EUROC = {'timestamp': 't', **{f'{a}_{axis}': f'{b}{axis}' for a, b in (
 # Intervals of motions that can be graded [s]: others are those of times in another unit.
 INTERVALS = 1e-5, 0.5
 LEAST_SAMPLES = 20
-_SIGNS = str.maketrans({'µ': 'u', 'μ': 'u', '°': 'deg', '²': '^2'})
 Chosen = dict[str, list[tuple[str, str]]]       # by our name: columns and their units
 
 
@@ -84,8 +83,8 @@ class Recorded:
         usual = float(np.median(np.diff(times))) if len(times) > 1 else math.nan
         if len(times) < LEAST_SAMPLES or not INTERVALS[0] <= usual <= INTERVALS[1]:
             raise ValueError(f'{len(times)} {kind}, {usual:.4g} s apart: must be {LEAST_SAMPLES} '
-                             f'at least, {INTERVALS[0]:g} to {INTERVALS[1]:g} s apart; the unit of times '
-                             "is named by --columns 't=COLUMN:UNIT'")
+                             f'at least, {INTERVALS[0]:g} to {INTERVALS[1]:g} s apart; name the '
+                             "unit of times by --columns 't=COLUMN:UNIT'")
         if kind == 'attitudes':
             norms = np.linalg.norm(values, axis=1, keepdims=True)
             for at in np.flatnonzero(~(np.abs(norms - 1.0) < NORM))[:1]:
@@ -184,7 +183,7 @@ def columns_said(text: str) -> Chosen:
 
 def _unit(name: str, text: str) -> str:
     """Return a unit by its name.  Raises ValueError."""
-    unit = text.strip().translate(_SIGNS)
+    unit = text.strip()
     if unit not in UNITS[name]:
         raise ValueError(f"[{unit}]: say --columns '{name}=COLUMN:UNIT' with a UNIT of "
                          f'{", ".join(UNITS[name])}')
