@@ -70,6 +70,18 @@ def test_numbers_have_intervals_that_hold():
     assert np.mean(within) >= 0.95
 
 
+def test_a_lag_that_the_motion_does_not_tell_is_not_told():
+    t = np.arange(0.0, 6.0, 0.01)
+    for seed in (0, 2, 6, 7):
+        random = np.random.default_rng(seed)
+        turn = Rotation.from_euler('ZYX', 0.3 * np.sin(np.outer(t, random.uniform(0.3, 2.0, 3))))
+        f = turn.inv().apply((0.0, 0.0, 9.80665)) + 0.02 * random.standard_normal((len(t), 3))
+        mark = grade_readings({
+            'attitudes': (t, turn.as_quat()), 'positions': (t, np.zeros((len(t), 3))),
+            'accelerations': (t, f)}).marks['accelerations_lag_steps']
+        assert np.isnan(mark.value) or abs(mark.value) <= float(mark.meaning.removeprefix('+- '))
+
+
 def test_what_poses_are_too_coarse_to_tell_is_told_with_the_noise_that_would_do():
     moving = body(4, noisy=False, seconds=20.0, kind='forced', rate=30.0)
     moving.noise = {'attitudes': 0.02, 'positions': 1e-3}

@@ -15,7 +15,8 @@ from spinning_top_sim.grade.files import PARTS, read_table
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.tools.simulate import main as simulate
 
-BODY = body(1, noisy=False, seconds=3.0, kind='forced', rate=200.0)
+BODY = body(0, noisy=False, seconds=3.0, kind='forced', rate=200.0)
+DECLARED = BODY.noise['accelerations'] ** 2 * np.eye(3).ravel()
 T = BODY.t
 NS = np.rint(1e9 * T).astype(np.int64) + 1_700_000_000_123_456_789
 VALUES = {name: column for kind, (_, values) in told(BODY).items()
@@ -169,7 +170,7 @@ def vector(values, kind='Vector3'):
     return MAKE[kind](*map(float, values))
 
 
-def message(kind, k, late=0):
+def message(kind, k, late, declared):
     """Return a message of a kind about sample k."""
     header = MAKE['Header'](MAKE['Time'](*divmod(int(NS[k]), 10 ** 9)), 'world')
     place = [POSES[name][k] for name in ('px', 'py', 'pz')]
@@ -184,16 +185,16 @@ def message(kind, k, late=0):
     now, unknown = max(k - late, 0), np.zeros(9)
     return MAKE['Imu'](header, vector((0, 0, 0, 1), 'Quaternion'), np.array([-1.0, *unknown[1:]]),
                        vector(IMU[f'g{axis}'][now] for axis in 'xyz'), unknown,
-                       vector(IMU[f'a{axis}'][now] for axis in 'xyz'), unknown)
+                       vector(IMU[f'a{axis}'][now] for axis in 'xyz'), declared * DECLARED)
 
 
-def log(path, poses, late=0):
+def log(path, poses, late=0, declared=1.0):
     """Write a log of another program: poses by topic and type, and readings."""
     topics = {**poses, '/imu': 'Imu'}
     types = {'PoseStamped': 'geometry_msgs/msg/PoseStamped', 'TFMessage': 'tf2_msgs/msg/TFMessage',
              'Imu': 'sensor_msgs/msg/Imu'}
     rows = [(number, stamp + 3_000_000, bytes(JAZZY.serialize_cdr(
-        message(kind, k, late), types[kind]))) for k, stamp in enumerate(NS.tolist())
+        message(kind, k, late, declared), types[kind]))) for k, stamp in enumerate(NS.tolist())
         for number, kind in enumerate(topics.values())]
     return str(write_rows(path, [RecordedTopic(name, types[kind])
                                  for name, kind in topics.items()], rows))
@@ -206,6 +207,8 @@ def test_logs_of_other_programs_are_graded_and_a_choice_is_asked_for(tmp_path, c
     said = json.loads('{' + out.partition('\n{')[2])
     assert said['faults'] == ['late']
     assert 'attitudes of /tf:body: 600 rows, 200 Hz, from 0 to 2.995 s' in said['notes']
+    assert main([log(tmp_path / 'd.mcap', {'/pose': 'PoseStamped'}, declared=2.0)]) == 1
+    assert 'noise_scale: accelerations' in capsys.readouterr().out
     both = log(tmp_path / 'c.mcap', {'/pose': 'PoseStamped', '/odometry': 'PoseStamped'})
     assert main([both]) == 2
     assert 'are in /pose, /odometry: choose by --topic /pose' in capsys.readouterr().err

@@ -16,7 +16,7 @@ from spinning_top_sim.tools.identify import beyond
 from spinning_top_sim.tools.kinematics import Parts, Reals, Stretch, stretches
 from spinning_top_sim.tools.report import Finding, Report
 
-EXCERPT = 3000                  # samples by which a convention is found
+EXCERPT_S, FEWEST, MOST = 5.0, 1000, 3000     # of a motion by which a convention is found
 # Share of a reading left in ours, of that in another convention, and of the reading there.
 WRONG, RIGHT, SMALL = 0.2, 0.3, 0.1
 HELD_RUNS, HELD_SHARE = 20, 0.9     # runs of equal readings that are a hold, and as long as usual
@@ -86,8 +86,9 @@ def convention_of(bodies: Sequence[Stretch], imu: Imu, gravity: float) -> Conven
         part.startswith('sensor') for part in one.parts)]
     body = max(bodies, key=lambda one: len(one.t))
     angles = np.append(0.0, np.cumsum((body.rotation[:-1].inv() * body.rotation[1:]).magnitude()))
-    first = int(np.argmax(angles[EXCERPT:] - angles[:-EXCERPT])) if len(angles) > EXCERPT else 0
-    body = body.part(slice(first, first + EXCERPT))     # in which it turns the most
+    count = max(FEWEST, min(MOST, round(EXCERPT_S / body.step)))
+    first = int(np.argmax(angles[count:] - angles[:-count])) if len(angles) > count else 0
+    body = body.part(slice(first, first + count))       # in which it turns the most
 
     def left(convention: Convention, sign: float = 1.0) -> Reals:
         """Return the shares of readings that are not the right ones, in any unit."""

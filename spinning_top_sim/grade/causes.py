@@ -44,7 +44,6 @@ GRAVITY_BAND = 6e-3         # share by which gravity differs on Earth
 EARTH_FIELD = 15e-6, 90e-6  # [T]
 SAME_POWER = 1.05           # of noise, by which it may be larger besides
 NOISE_BAND, NOISY = 0.05, 1e-4  # by which noise may differ from what is declared; is rounding
-LEAST_KURTOSIS = 2.4        # of normal noise; it is 3, and 1.8 of uniform noise
 FOUR_SIGMA = 4.0            # standard deviations by which a measured noise may differ besides
 TELLS = 0.5                 # uncertainty of a share of a term up to which its fault can be told
 
@@ -321,25 +320,15 @@ def _untold(compared: Comparison) -> Iterator[str]:
 
 def _noise_faults(compared: Comparison, residual: Reals, density: float | None,
                   ) -> Iterator[Verdict]:
-    """Compare noise with what is declared, and with normal noise."""
+    """Compare noise with what is declared."""
     noise = compared.reading_noise
     if not compared.noisy:              # all that is left is noise of the readings
-        parts = [part * size for part, size in zip(np.split(
-            residual, np.cumsum(compared.counts)[:-1]), compared.sizes, strict=True)]
+        parts = np.split(residual, np.cumsum(compared.counts)[:-1])
         # Either has fast motion, too: that of the reading, or of what no cause explains.
-        noise = min(noise, rms(np.array([white(part) for part in parts])))
-        residual = np.concatenate(parts)
+        noise = min(noise, rms(compared.sizes * [white(part) for part in parts]))
     exists = noise > NOISY * float(np.min(compared.sizes))
-    band = NOISE_BAND + FOUR_SIGMA * SPREAD / math.sqrt(residual.size)
-    text = f'the noise has a standard deviation of {noise:.4g}'
-    if density is not None:
-        declared = density / math.sqrt(compared.own_step)
-        ratio = noise / declared if declared else math.inf if exists else 1.0
-        if abs(ratio - 1.0) > band:
-            yield Verdict('noise_scale', f'{text}, {ratio:.4g} times what is declared, '
-                          f'{declared:.4g}', ratio)
-    if exists and not compared.noisy and noise > rms(residual) / (1.0 + band):
-        kurtosis = float(np.mean(residual ** 4)) / rms(residual) ** 4
-        if kurtosis < min(LEAST_KURTOSIS, 3.0 - FOUR_SIGMA * math.sqrt(24.0 / residual.size)):
-            yield Verdict('uniform_noise', f'{text} and a kurtosis of {kurtosis:.3g}; normal '
-                          'noise has 3, uniform noise 1.8', kurtosis)
+    declared = math.nan if density is None else density / math.sqrt(compared.own_step)
+    ratio = noise / declared if declared else math.inf if exists else 1.0
+    if abs(ratio - 1.0) > NOISE_BAND + FOUR_SIGMA * SPREAD / math.sqrt(residual.size):
+        yield Verdict('noise_scale', f'the noise has a standard deviation of {noise:.4g}, '
+                      f'{ratio:.4g} times what is declared, {declared:.4g}', ratio)

@@ -133,8 +133,8 @@ def _of_motion(recorded: files.Recorded, values: Mapping[str, Any], run: Any) ->
             math.degrees(worst), math.degrees(tolerance))})
     top = Body(**vars(parameters.top_of(values)))
     start, told = Start.of(top, parameters.start_state(values)), body.rotation.as_quat()
-    if conventions.best(told[:EARLY], solve(
-            top, start, body.t[:EARLY] - body.t[0]).quaternion).after > START:
+    body = replace(body, t=body.t - body.t[0])
+    if conventions.best(told[:EARLY], solve(top, start, body.t[:EARLY]).quaternion).after > START:
         smoothed = Smoothed(body, 1)
         at = smoothed.inner.start
         start = Start.of(top, state_of(top, told[at], body.rotation[at].apply(smoothed.rates[0])))

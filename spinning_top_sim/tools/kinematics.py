@@ -97,7 +97,6 @@ class Stretch:
     sigma : white noise of the attitudes about each axis [rad], of positions [m], of readings
     intervals : between the samples of each, as they were read [s]
     rates : (n, 3) in the body, where they are known better than by the attitudes [rad/s]
-    covariance : (3, 3) that is declared, by name of the reading
     """
 
     t: Reals
@@ -107,7 +106,6 @@ class Stretch:
     sigma: Mapping[str, float] = field(default_factory=dict)
     intervals: Mapping[str, float] = field(default_factory=dict)
     rates: Reals | None = None
-    covariance: Mapping[str, Reals] = field(default_factory=dict)
 
     @property
     def step(self) -> float:

@@ -91,178 +91,92 @@ class Imu:
     A simulator of a motion and of an IMU on it, with a defect.
 
     motion : function of (top, start, times, dt) that returns attitudes, rates and accelerations
-    defect : a method below, which changes the readings
+    defect : a name in DEFECTS, or a function that returns readings along axes of the body
     seed : of the noise
     parts : of what is returned, beside the attitudes
     """
 
-    def __init__(self, motion=exact, defect='none', seed=0,
+    def __init__(self, motion=exact, defect=None, seed=0,
                  parts=('rates', 'accelerations', 'gyroscope', 'magnetometer')):
-        self._motion, self._defect = motion, getattr(self, defect)
-        self._random, self._parts = np.random.default_rng(seed), parts
-        self.__name__ = defect
+        self._motion, self._parts = motion, parts
+        self._defect = DEFECTS[defect][1] if isinstance(defect, str) else defect
+        self.random = np.random.default_rng(seed)
 
     def __call__(self, top, start, times, dt):
-        q, w, a = self._motion(top, start, times, dt)
-        self.top, self.h = top, times[1] - times[0]
-        self.rotation, self.w, self.a = Rotation.from_quat(q), w, a
-        self.mounting = Rotation.from_quat(top.mounting)
-        self.arm = np.array(top.lever_arm)
-        self.up = self.rotation.inv().apply((0.0, 0.0, 1.0))
-        said = {'attitudes': q, 'rates': w,
-                'accelerations': self.mounting.inv().apply(self.force()),
-                'gyroscope': self.mounting.inv().apply(w),
-                'magnetometer': self.mounting.inv().apply(self.rotation.inv().apply(top.field))}
-        for name, density in (('gyroscope', top.gyroscope_noise_density),
-                              ('accelerations', top.accelerometer_noise_density)):
-            self.density = density or 0.0
-            self.sigma = self.density / math.sqrt(self.h)
-            said[name] = said[name] + self.sigma * self._random.standard_normal(w.shape)
-        self._defect(said)
-        return {name: value for name, value in said.items()
-                if name in ('attitudes', 'covariance', *self._parts)}
+        self.q, self.w, self.a = self._motion(top, start, times, dt)
+        self.top, self.h, self.arm = top, times[1] - times[0], np.array(top.lever_arm)
+        self.rotation, self.mounting = Rotation.from_quat(self.q), Rotation.from_quat(top.mounting)
+        self.sigma = {'gyroscope': (top.gyroscope_noise_density or 0.0) / math.sqrt(self.h),
+                      'accelerations': (top.accelerometer_noise_density or 0.0)
+                      / math.sqrt(self.h), 'magnetometer': 0.0}
+        said = {'rates': self.w, 'gyroscope': self.w, 'accelerations': self.force(),
+                'magnetometer': self.rotation.inv().apply(top.field), 'attitudes': self.q}
+        said.update((self._defect and self._defect(self)) or {})
+        for name, sigma in self.sigma.items():
+            said[name] = self.mounting.inv().apply(
+                said[name]) + sigma * self.random.standard_normal(self.w.shape)
+        return {name: said[name] for name in ('attitudes', *self._parts)}
 
     def force(self, tangential=1.0, centripetal=1.0, gravity=1.0, arm=None):
-        """Return the specific force in the body frame."""
+        """Return the specific force along axes of the body."""
         arm = self.arm if arm is None else arm
-        return (gravity * self.top.gravity * self.up + tangential * np.cross(self.a, arm)
+        up = self.rotation.inv().apply((0.0, 0.0, 1.0))
+        return (gravity * self.top.gravity * up + tangential * np.cross(self.a, arm)
                 + centripetal * np.cross(self.w, np.cross(self.w, arm)))
 
-    def _set_force(self, said, force):
-        """Replace the right force in a reading, whose noise stays."""
-        said['accelerations'] += self.mounting.inv().apply(force - self.force())
-
-    def none(self, said):
-        pass
-
-    def no_transport_term(self, said):
-        """isaac-sim/IsaacSim#735: velocities differentiated in axes of the body, without w x v."""
-        self._set_force(said, self.force(centripetal=0.0))
-
-    def without_tangential_term(self, said):
-        self._set_force(said, self.force(tangential=0.0))
-
-    def velocity_of_com(self, said):
-        """isaac-sim/IsaacSim#825: the velocity of the centre of mass, not of the sensor."""
-        self._set_force(said, self.force(arm=np.array(self.top.com)))
-
-    def force_at_pivot(self, said):
-        """Field-Robotics-Japan/UnitySensors#162: accelerations of the origin."""
-        self._set_force(said, self.force(arm=np.zeros(3)))
-
-    def wrong_dt(self, said):
-        """isaac-sim/IsaacLab#7163, o3de/o3de-extras#484: differences over 4 steps, over one dt."""
-        self._set_force(said, 4.0 * self._differences() + self.force(0.0, 0.0))
-
-    def differences(self, said):
-        """gazebosim/gazebo-classic#893: the difference of the last two velocities."""
-        self._set_force(said, self._differences() + self.force(0.0, 0.0))
-
-    def _differences(self):
+    def differences(self, size):
+        """Return the same by differences of the last two velocities, times a size."""
         v = self.rotation.apply(np.cross(self.w, self.arm))
         a = np.diff(v, axis=0, prepend=v[:1]) / self.h
-        return self.rotation.inv().apply(a)
-
-    def gravity_added(self, said):
-        """Field-Robotics-Japan/UnitySensors#116: gravity is added, not subtracted."""
-        self._set_force(said, self.force(gravity=-1.0))
-
-    def gravity_fixed(self, said):
-        """carla-simulator/carla#2795: gravity is added after the rotation into the sensor."""
-        self._set_force(said, self.force(gravity=0.0))
-        said['accelerations'][:, 2] += self.top.gravity
-
-    def without_gravity(self, said):
-        self._set_force(said, self.force(gravity=0.0))
-
-    def in_g(self, said):
-        said['accelerations'] /= 9.80665
-
-    def gyroscope_in_world(self, said):
-        """carla-simulator/carla#2939: the gyroscope reads in axes of the world."""
-        said['gyroscope'] += self.rotation.apply(self.w) - self.mounting.inv().apply(self.w)
-
-    def in_degrees(self, said):
-        said['gyroscope'] = np.degrees(said['gyroscope'])
-
-    def mounting_ignored(self, said):
-        """opensim-org/opensim-core#3366: rates do not turn with the frame of the IMU."""
-        said['gyroscope'] += self.w - self.mounting.inv().apply(self.w)
-
-    def late(self, said, steps=1):
-        """google-deepmind/mujoco#430: readings are those of the step before."""
-        for name in ('accelerations', 'gyroscope', 'magnetometer'):
-            said[name] = np.concatenate((said[name][:1].repeat(steps, axis=0),
-                                         said[name][:-steps]))
-
-    def late_by_seven(self, said):
-        self.late(said, 7)
-
-    def gyroscope_sign(self, said):
-        said['gyroscope'] = -said['gyroscope']
-
-    def field_reversed(self, said):
-        """gazebosim/gz-sim#2536: the field turns against the rotation of the sensor."""
-        turn = self.rotation * self.mounting
-        said['magnetometer'] = turn.apply(self.top.field)
-
-    def field_in_world(self, said):
-        said['magnetometer'][:] = self.top.field
-
-    def gyroscope_twice(self, said):
-        said['gyroscope'] *= 2.0
-
-    def residuals(self, said):
-        """microsoft/AirSim#4661: noise that is declared as none."""
-        said['accelerations'] += 0.02 * self._random.standard_normal(self.w.shape)
-
-    def _set_noise(self, said, name, noise):
-        right = self.force() if name == 'accelerations' else self.w
-        said[name] = self.mounting.inv().apply(right) + noise
-
-    def density_as_deviation(self, said):
-        """gazebosim/gazebo-classic#2670: the density is taken for the standard deviation."""
-        self._set_noise(said, 'accelerations', self.top.accelerometer_noise_density
-                        * self._random.standard_normal(self.w.shape))
-
-    def times_root_two(self, said):
-        self._set_noise(said, 'gyroscope', math.sqrt(2.0 / self.h)
-                        * self.top.gyroscope_noise_density
-                        * self._random.standard_normal(self.w.shape))
-
-    def uniform(self, said):
-        """jdelacroix/simiam#3: uniform instead of normal noise."""
-        self._set_noise(said, 'accelerations', self.sigma * math.sqrt(3.0)
-                        * self._random.uniform(-1.0, 1.0, self.w.shape))
+        return {'accelerations': size * self.rotation.inv().apply(a) + self.force(0.0, 0.0)}
 
 
-# What is wrong with each simulator, and the faults that name it.  These are published:
-PUBLISHED = {
-    'no_transport_term': ('no_centripetal_term',),
-    'velocity_of_com': ('no_lever_arm',),
-    'force_at_pivot': ('no_lever_arm',),
-    'wrong_dt': ('acceleration_scale',),
-    'differences': ('finite_differences',),
-    'gravity_added': ('gravity_sign',),
-    'gravity_fixed': ('gravity_frame',),
-    'gyroscope_in_world': ('rates_in_world',),
-    'mounting_ignored': ('mounting',),
-    'late': ('late',),
-    'field_reversed': ('rotation_reversed',),
-    'residuals': ('noise_scale',),
-    'density_as_deviation': ('noise_scale',),
-    'uniform': ('uniform_noise',)}
-OTHER = {
-    'without_tangential_term': ('no_tangential_term',),
-    'without_gravity': ('no_gravity',),
-    'in_g': ('units',),
-    'in_degrees': ('units',),
-    'late_by_seven': ('late',),
-    'gyroscope_sign': ('reading_sign',),
-    'field_in_world': ('reading_in_world',),
-    'gyroscope_twice': ('reading_scale',),
-    'times_root_two': ('noise_scale',)}
-NOISY = ('density_as_deviation', 'uniform', 'times_root_two')
+def late(b):
+    return {name: np.concatenate((values[:1], values[:-1])) for name, values in (
+        ('gyroscope', b.w), ('accelerations', b.force()),
+        ('magnetometer', b.rotation.inv().apply(b.top.field)))}
+
+
+# By name: the fault that tells a defect, and what readings are, or a change of `sigma`.
+DEFECTS = {
+    # isaac-sim/IsaacSim#735: velocities differentiated in axes of the body, without w x v.
+    'no transport term': ('no_centripetal_term', lambda b: {
+        'accelerations': b.force(centripetal=0.0)}),
+    # Field-Robotics-Japan/UnitySensors#162: accelerations of the origin.
+    'force at pivot': ('no_lever_arm', lambda b: {'accelerations': b.force(arm=np.zeros(3))}),
+    # isaac-sim/IsaacSim#825: the velocity of the centre of mass, not of the sensor.
+    'velocity of com': ('no_lever_arm', lambda b: {
+        'accelerations': b.force(arm=np.array(b.top.com))}),
+    # isaac-sim/IsaacLab#7163, o3de/o3de-extras#484: differences over 4 steps, over one dt.
+    'wrong dt': ('acceleration_scale', lambda b: b.differences(4.0)),
+    # gazebosim/gazebo-classic#893: the difference of the last two velocities.
+    'differences': ('finite_differences', lambda b: b.differences(1.0)),
+    # Field-Robotics-Japan/UnitySensors#116: gravity is added, not subtracted.
+    'gravity added': ('gravity_sign', lambda b: {'accelerations': b.force(gravity=-1.0)}),
+    # carla-simulator/carla#2795: gravity is added after the rotation into the sensor.
+    'gravity fixed': ('gravity_frame', lambda b: {
+        'accelerations': b.force(gravity=0.0) + b.mounting.apply((0.0, 0.0, b.top.gravity))}),
+    # carla-simulator/carla#2939: the gyroscope reads in axes of the world.
+    'gyroscope in world': ('rates_in_world', lambda b: {
+        'gyroscope': b.mounting.apply(b.rotation.apply(b.w))}),
+    # opensim-org/opensim-core#3366: rates do not turn with the frame of the IMU.
+    'mounting ignored': ('mounting', lambda b: {'gyroscope': b.mounting.apply(b.w)}),
+    # google-deepmind/mujoco#430: readings are those of the step before.
+    'late': ('late', late),
+    # gazebosim/gz-sim#2536: the field turns against the rotation of the sensor.
+    'field reversed': ('rotation_reversed', lambda b: {
+        'magnetometer': (b.mounting * b.rotation * b.mounting).apply(b.top.field)}),
+    # microsoft/AirSim#4661: noise that is declared as none.
+    'residuals': ('noise_scale', lambda b: b.sigma.update(accelerations=0.02)),
+    # gazebosim/gazebo-classic#2670: the density is taken for the standard deviation.
+    'density as deviation': ('noise_scale', lambda b: b.sigma.update(
+        accelerations=b.sigma['accelerations'] * math.sqrt(b.h))),
+    'no tangential term': ('no_tangential_term', lambda b: {
+        'accelerations': b.force(tangential=0.0)}),
+    'field in world': ('reading_in_world', lambda b: {
+        'magnetometer': b.mounting.apply(np.tile(b.top.field, (len(b.w), 1)))}),
+    'gyroscope twice': ('reading_scale', lambda b: {'gyroscope': 2.0 * b.w})}
+NOISY = 'density as deviation',
 MOVED = {
     # avianphysics/avian#420: the term of the begin of a step adds energy.
     'explicit': (partial(stepped, method='explicit'), ('first_order', 'explicit_gyroscopic_term')),
