@@ -195,8 +195,8 @@ def test_without_a_reader_of_the_output_all_is_done_and_the_code_is_kept(short, 
     ours, theirs = os.pipe()
     os.close(ours)
     ended = subprocess.run([sys.executable, '-m', 'spinning_top_sim', 'inspect', torn, '--verify',
-                            f'--export=euroc_imu:{readings}'], stdout=theirs, stderr=subprocess.PIPE, timeout=60,
-                           check=False)
+                            f'--export=euroc_imu:{readings}'], stdout=theirs,
+                           stderr=subprocess.PIPE, timeout=60, check=False)
     os.close(theirs)
     assert (ended.returncode, ended.stderr) == (1, b'') and readings.exists()
 
