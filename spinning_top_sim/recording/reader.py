@@ -74,27 +74,17 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     Opening reads it through once.  What is damaged is left out from then on.
 
-    Parameters
-    ----------
-    path : path
-        The file, or a folder as `ros2 bag` makes it, which must hold exactly one.
-    max_bytes : int
-        Of the largest record, and the largest uncompressed chunk, that is read; and of the
-        messages of other chunks that `messages` holds while it reads one.
-    compressed : bool
-        Read a log whose messages rosbag2 has compressed one by one, and leave them so.
+    path : the file, or a folder as `ros2 bag` makes it, which must hold exactly one
+    max_bytes : of the largest record, and the largest uncompressed chunk, that is read; and of the
+        messages of other chunks that `messages` holds while it reads one
+    compressed : read a log whose messages rosbag2 has compressed one by one, and leave them so
 
-    Raises
-    ------
-    LogError
-        If it is no MCAP file, or its messages are compressed.
-
-    Notes
-    -----
     Attributes are `path` and `size` [bytes] of the file when it was opened; `profile` and
     `library`, which its header names; `damage`; `whole`, whether there is none; `metadata`, the
     last of each name; `schemas` and `channels`, mcap's records by id; `span`, the earliest and the
     latest log time [ns], both 0 without messages.
+
+    Raises LogError if it is no MCAP file, or its messages are compressed.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES, *,
