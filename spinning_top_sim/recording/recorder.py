@@ -3,8 +3,8 @@
 Recording while the simulation runs: bounded loss, bounded memory, and no waiting for a disk.
 
 The caller only appends to a queue.  The recorder's thread opens the file, writes chunks at least
-every half `max_loss`, brings them to the disk, so that neither a SIGKILL nor a power loss takes
-more, and closes the file.  It may hang as a disk does; `possible_loss` tells what would be lost.
+every half `max_loss`, so that a SIGKILL takes no more, and closes the file.  Another thread, which
+may hang as a disk does, brings them to the disk; `possible_loss` tells what a power loss takes.
 """
 
 from __future__ import annotations
@@ -83,6 +83,8 @@ class Recorder:
         self._accepting = True
         # (time, bytes): what had left the queue by that time is on the disk.
         self._on_disk = clock(), 0
+        self._sync_error: Exception | None = None
+        self._syncing: threading.Thread | None = None
         self._wake, self._taken = threads.Event(), threads.Event()
         # A daemon, so that a disk that hangs cannot hold up the end of the interpreter.
         self._thread = threads.Thread(target=self._run, name='recorder', daemon=True)
@@ -180,6 +182,8 @@ class Recorder:
             self._taken.set()
             # Cutting off the truncated chunk may have freed enough space for the summary.
             with contextlib.suppress(Exception):
+                if self._syncing is not None:
+                    self._syncing.join()
                 if self._file is not None:
                     self._file.finish()
 
@@ -220,14 +224,36 @@ class Recorder:
             if closing or now >= next_flush:
                 next_flush = now + interval
                 file.flush()
+                if closing and self._syncing is not None:
+                    self._syncing.join()
+                if self._sync_error is not None:
+                    raise self._sync_error
                 file.check_disk(self._min_free_bytes)
                 if closing:
                     file.finish()
                     return
-                if self._bytes_out != self._on_disk[1]:
-                    file.sync()
-                self._on_disk = now, self._bytes_out
+                self._begin_sync(file, now)
             self._wake.wait(max(0.0, next_flush - self._clock()))
+
+    def _begin_sync(self, file: McapWriter, now: float) -> None:
+        if self._syncing is not None and self._syncing.is_alive():
+            return
+        written = now, self._bytes_out
+        if self._bytes_out == self._on_disk[1]:
+            self._on_disk = written
+        else:
+            self._syncing = self._threads.Thread(
+                target=self._sync, args=(file, written), name='recorder sync', daemon=True)
+            self._syncing.start()
+
+    def _sync(self, file: McapWriter, written: tuple[float, int]) -> None:
+        try:
+            file.sync()
+        except Exception as error:
+            self._sync_error = error
+            self._wake.set()
+        else:
+            self._on_disk = written
 
 
 def single(topic_index: int, log_time_ns: int, data: bytes) -> Rows:
