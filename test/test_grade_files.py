@@ -258,3 +258,13 @@ def test_poses_of_a_top_that_is_known_are_graded_without_readings(
     assert main([str(table(tmp_path / 'a.csv', columns)), '--scene', 'looping']) == code
     out = capsys.readouterr().out
     assert says in out and 'no readings: the IMU is not graded' in out
+
+
+def test_readings_of_a_top_that_is_known_need_no_positions(tmp_path, capsys):
+    q = solve(TOP, START, T).quaternion
+    force = Rotation.from_quat(q).inv().apply((0.0, 0.0, -9.80665))
+    path = table(tmp_path / 'a.csv', {
+        't': T, **dict(zip(('qx', 'qy', 'qz', 'qw', 'ax', 'ay', 'az'), [*q.T, *force.T],
+                           strict=True))})
+    assert main([str(path), '--scene', 'looping']) == 1
+    assert 'a.csv: gravity_sign' in capsys.readouterr().out

@@ -167,7 +167,8 @@ DEFECTS = {
     'field reversed': ('rotation_reversed', lambda b: {
         'magnetometer': (b.mounting * b.rotation * b.mounting).apply(b.top.field)}),
     # microsoft/AirSim#4661: noise that is declared as none.
-    'residuals': ('noise_scale', lambda b: b.sigma.update(accelerations=0.02)),
+    'residuals': ('noise_scale', lambda b: b.sigma.update(
+        accelerations=math.hypot(b.sigma['accelerations'], 0.02))),
     # gazebosim/gazebo-classic#2670: the density is taken for the standard deviation.
     'density as deviation': ('noise_scale', lambda b: b.sigma.update(
         accelerations=b.sigma['accelerations'] * math.sqrt(b.h))),

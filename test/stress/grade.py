@@ -27,8 +27,10 @@ def check(seed, folder):
         simulator = Imu(RIGHT[name], seed=seed) if name in RIGHT else Imu(exact, name, seed)
         report = grade(simulator, body=_body(random, name in NOISY or bool(seed % 2)), seed=seed,
                        dt=random.choice((0.001, 0.002, 0.004)), scenes=scenes)
+        # Differences are half a step late.
+        found = {*report.faults} - ({'late'} if name == 'wrong dt' else set())
         wrong += [f'{name}: {report}'] * (
-            {*report.faults} != ({DEFECTS[name][0]} if name in DEFECTS else set()))
+            found != ({DEFECTS[name][0]} if name in DEFECTS else set()))
     for name, (simulator, faults) in MOVED.items():
         # Smaller steps would be right within the tolerance.
         report = grade(Imu(simulator, seed=seed), body=_body(random, bool(seed % 2)), seed=seed,
