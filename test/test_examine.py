@@ -19,7 +19,7 @@ from helpers.reference import ROOT
 from helpers.wrong_filters import RIGHT, WRONG, Mahony, Part, ReferenceFilter
 from scipy.spatial.transform import Rotation
 
-from spinning_top_sim.exam import examine, feeding, measures, motions
+from spinning_top_sim.exam import examine, feeding, measures, motions, runs
 from spinning_top_sim.exam.adapters import FILTERS, Vqf
 from spinning_top_sim.exam.checks import CHECKS
 from spinning_top_sim.exam.command import main
@@ -120,13 +120,25 @@ def test_north_is_magnetic_north():
     assert north == pytest.approx(math.hypot(10e-6, 20e-6))
 
 
+def test_off_the_axis_the_acceleration_is_that_of_the_point():
+    exam = runs.Exam(None, {}, [0])
+    exam.lead = 10
+    ((part,), (arm,)) = exam.motion.of('top'), runs.RUNS['arm'](exam)
+    rows, rates = slice(part.begin + 450, part.end - 50), exam.run.gyroscope
+    expected = np.cross(np.gradient(rates, 0.01, axis=0), runs.ARM) + np.cross(
+        rates, np.cross(rates, runs.ARM))
+    # The rates are those of the middle of a step.
+    middle = 0.5 * (expected[1:] + expected[:-1])
+    assert np.max(np.abs((arm.accelerometer - exam.run.accelerometer)[rows] - middle[rows])) < 0.02
+
+
 @pytest.mark.parametrize('factor', [1.0, 50.0])
 def test_covariances_may_be_about_the_axes_of_sensor_or_world(factor):
-    runs = [motions.noisy('', motions.CALIBRATED, seed, 3.0, 12.0) for seed in range(2)]
+    noisy = [motions.noisy('', motions.CALIBRATED, seed, 3.0, 12.0) for seed in range(2)]
     found = []
     for in_world in (False, True):
         said = []
-        for one in feeding.feed(ReferenceFilter, runs):
+        for one in feeding.feed(ReferenceFilter, noisy):
             turn = Rotation.from_quat(one.estimates).as_matrix()
             p = turn @ one.covariances @ turn.transpose(0, 2, 1) if in_world else one.covariances
             said.append(feeding.Outcome(one.run, one.estimates, p / factor, one.biases))

@@ -176,8 +176,8 @@ def _arm(exam: Exam) -> list[Run]:
 
 
 def _bias(exam: Exam) -> list[Run]:
-    """Add a bias in a rest, and in one about other axes."""
-    run = Motion(NEAR).rest(BIAS_S).turn((0.0, -1.4, 0.0)).rest(BIAS_S).run('bias')
+    """Add a bias in a rest, and in one in which its axes of the world have other signs."""
+    run = Motion(NEAR).rest(BIAS_S).turn((0.0, 1.4, 0.0)).rest(BIAS_S).run('bias')
     return [replace(run, gyroscope=run.gyroscope + BIAS)]
 
 
