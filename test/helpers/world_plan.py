@@ -138,7 +138,7 @@ def _kinds(chance, topics, values, follows):
         kind = chance.choice(('error', 'error', 'short', 'short', 'slow', 'slow', 'stop'))
         value = {'error': chance.choice(ERRORS), 'slow': chance.choice((
             20 * MILLISECOND, 300 * MILLISECOND, SECOND))}.get(kind, 0)
-        return 'fault', (call, kind, value, round(chance.random(), 2))
+        return 'fault', (call, kind, value)
 
     yield 2, lambda: ('busy', (duration(),))
     yield 1, lambda: ('lose_ticks', (chance.randrange(1, 30),))
