@@ -16,7 +16,7 @@ import yaml
 from helpers.machine import MILLISECOND, SECOND
 from helpers.world import World
 from helpers.world_plan import plan_of
-from spinning_top_sim.recording import provenance
+from spinning_top_sim.recording import provenance, rosbag2, writer
 from spinning_top_sim.recording.errors import LogError
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recovery import recover
@@ -222,16 +222,17 @@ def digest(world):
     return found.hexdigest()
 
 
-_load = functools.cache(yaml.safe_load)
-_environment = functools.cache(provenance.environment)
+_CACHED = [(yaml, 'safe_load'), (provenance, 'environment'), (writer, 'version')]
+_SHORTCUTS = [(rosbag2, 'as_yaml', json.dumps), *(
+    (module, name, functools.cache(getattr(module, name))) for module, name in _CACHED)]
 
 
 @contextlib.contextmanager
 def shortcuts():
     """Compute once what is the same in all worlds, and write YAML as JSON, which is YAML."""
-    with (mock.patch.object(yaml, 'dump', lambda value, **_: json.dumps(value)),
-          mock.patch.object(yaml, 'safe_load', _load),
-          mock.patch.object(provenance, 'environment', _environment)):
+    with contextlib.ExitStack() as stack:
+        for one in _SHORTCUTS:
+            stack.enter_context(mock.patch.object(*one))
         yield
 
 
