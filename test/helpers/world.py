@@ -198,14 +198,13 @@ class World:
         """Ask for a velocity at each tick from now on, or no more."""
         self._steered = velocity
 
-    def pause(self):
-        self.loop.pause()
-
     def resume(self):
+        """Time goes on from where it was held."""
+        before_ns = self.loop.now_ns if self.loop.paused and not self.plan.follows else None
         self.loop.resume()
-
-    def step(self, length_ns):
-        self.loop.step(length_ns)
+        self._tick()
+        if before_ns is not None and self.machine.now_ns >= self._cost_until_ns:
+            assert self.loop.now_ns == before_ns, 'nothing is caught up with'
 
     def reset(self, paused):
         momenta = {name: self._start[name] for name in ('spin.l3', 'spin.lz')}
@@ -269,7 +268,8 @@ class World:
         for action in self.plan.actions:
             self._tick_until(self._begin_ns + action.at_ms * MILLISECOND)
             with contextlib.suppress(ValueError, RuntimeError):
-                getattr(self, action.name)(*action.arguments)
+                act = getattr(self, action.name, None) or getattr(self.loop, action.name)
+                act(*action.arguments)
         ends_ns = self._begin_ns + self.plan.ends_ms * MILLISECOND
         self._tick_until(max(self.machine.now_ns, ends_ns))
         if self.plan.ends != 'close':
