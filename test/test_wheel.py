@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The source distribution, and what is said where extras are missing; .ci/wheel installs it."""
 
-import contextlib
-import io
 import json
 import os
 import re
@@ -64,30 +62,32 @@ EXTRAS = ('rclpy', 'viser', 'matplotlib', 'pyarrow', 'pymap3d', 'vqf', 'dask', '
           'geometry_msgs', 'sensor_msgs', 'std_msgs')
 
 
-def answers(lines):
-    """Return exit code, output and errors of each command line, where no extra is installed."""
-    sys.modules.update(dict.fromkeys(EXTRAS))
-    said = []
-    for arguments in lines:
-        with (contextlib.redirect_stdout(io.StringIO()) as out,
-              contextlib.redirect_stderr(io.StringIO()) as err):
-            try:
-                code = main(arguments)
-            except SystemExit as ended:
-                code = ended.code
-        said.append((code, out.getvalue(), err.getvalue()))
-    return said
+RUN_ALL = """
+import contextlib, io, json, sys
+lines, missing = json.loads(sys.argv[1])
+sys.modules.update(dict.fromkeys(missing))
+from spinning_top_sim.__main__ import main
+said = []
+for arguments in lines:
+    with (contextlib.redirect_stdout(io.StringIO()) as out,
+          contextlib.redirect_stderr(io.StringIO()) as err):
+        try:
+            code = main(arguments)
+        except SystemExit as ended:
+            code = ended.code
+    said.append((code, out.getvalue(), err.getvalue()))
+print(json.dumps(said))
+"""
 
 
 def test_without_extras_there_is_help_and_what_is_missing_is_told_with_its_remedy(tmp_path):
     assert main(['simulate', '--duration', '0.1', '--quiet', '-o', str(tmp_path / 'a.mcap')]) == 0
     shutil.copy(ROOT / 'examples/ensemble.yaml', tmp_path / 'e.yaml')
     helps = [['--help'], *([name, '--help'] for name in COMMANDS)]
-    code = 'import json, sys, test_wheel as t; print(json.dumps(t.answers(json.loads(sys.argv[1]))))'
-    said = json.loads(subprocess.run(
-        [sys.executable, '-c', code, json.dumps([*helps, *(one for one, _ in REMEDIES)])],
-        cwd=tmp_path, stdout=subprocess.PIPE, check=True, timeout=120,
-        env={**os.environ, 'PYTHONPATH': f'{ROOT / "test"}{os.pathsep}{ROOT}'}).stdout)
+    lines = [*helps, *(arguments for arguments, _ in REMEDIES)]
+    said = json.loads(subprocess.check_output(
+        [sys.executable, '-c', RUN_ALL, json.dumps([lines, EXTRAS])], cwd=tmp_path, timeout=120,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)}))
     for name, (code, out, err) in zip(['', *COMMANDS], said, strict=False):
         assert (code, err) == (0, '') and out.startswith(f'usage: spinning-top {name}')
     for (arguments, remedy), (code, _, err) in zip(REMEDIES, said[len(helps):], strict=True):

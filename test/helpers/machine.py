@@ -189,11 +189,6 @@ class Disk:
         for name, call in self._real.items():
             setattr(os, name, call)
 
-    def delete(self, path):
-        """Remove a file while it may be open."""
-        path.unlink(missing_ok=True)
-        self.is_disturbed = True
-
     def cut_power(self, path):
         """Leave of a file what was synced, and any subset of the rest, or no file."""
         file, random = self._files[str(path)], self._machine.random

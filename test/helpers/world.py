@@ -65,7 +65,7 @@ class Log(recorder.Recorder):
 
 @dataclass
 class Reader:
-    """A subscriber while it listens; `sent` and `unsent` count its topic."""
+    """A subscriber while it listens."""
 
     world: Any
     output: Output
@@ -73,22 +73,11 @@ class Reader:
     ends: Place | None = None
     heard: list = field(default_factory=list)       # numbers in the order of all, and data
 
-    def __post_init__(self):
-        self.sent, self.unsent = self._counters()
-
-    def _counters(self):
-        return self.output.sent, self.output.skipped + self.output.failed
-
     def __call__(self, data):
         if self.world.wanted.get(self.output.channel.topic) == 'stalled':
             self.world.machine.sleep(100 * MILLISECOND)
             raise RuntimeError('a reader stalls')
         self.heard.append((next(self.world.numbers), data))
-
-    def leave(self):
-        sent, unsent = self._counters()
-        self.ends, self.sent = self.world.place, sent - self.sent
-        self.unsent = unsent - self.unsent
 
 
 class World:
@@ -104,9 +93,7 @@ class World:
         self.wanted = {}                        # by topic of a subscriber: 'heard' or 'stalled'
         self._lost_ticks = self._cost_ns = self._cost_until_ns = 0
         self._date_ns = self._jump_ns = self._stops_at_ns = 0
-        self._lag_ns = None                     # of a second /clock
-        self._is_second, self._steered, self.was_full = False, (), False
-        self.was_killed = True
+        self._drives, self.was_full, self.was_killed = [], False, True
         self.disk = Disk(machine, plan.kill_at, is_slow=plan.is_slow)
         self.simulation = LiveSimulation(self.values, clock=self._seconds)
         self.simulation.apply = self._apply
@@ -116,8 +103,7 @@ class World:
         self.loop = Loop(
             self.simulation, self.values, self.recording,
             SimulatedClock(self._source if follows else self._date, str,
-                           (lambda: 1 + (self._lag_ns is not None)) if follows else None,
-                           self._steady),
+                           (lambda: 1) if follows else None, self._steady),
             warn=str, error=str, update_subscribers=self._update_subscribers)
 
     @property
@@ -149,9 +135,6 @@ class World:
         if now_ns < self._stops_at_ns:          # it stands until then
             now_ns = self._stands_since_ns
         at_ns = now_ns - self._begin_ns + self._jump_ns
-        self._is_second = not self._is_second
-        if self._lag_ns is not None and self._is_second:
-            at_ns -= self._lag_ns
         return max(SOURCE_NS + at_ns - at_ns % (5 * MILLISECOND), 1)
 
     # -------------------------------------------------------------------- what may happen
@@ -165,10 +148,6 @@ class World:
     def lose_ticks(self, count):
         self._lost_ticks = count
 
-    def double_tick(self):
-        self._tick()
-        self._tick()
-
     def step_date(self, by_ms):
         self._date_ns += by_ms * MILLISECOND
 
@@ -180,9 +159,6 @@ class World:
     def jump_source(self, by_ms):
         self._jump_ns += by_ms * MILLISECOND
 
-    def second_source(self, lag_ms):
-        self._lag_ns = None if self._lag_ns is not None else lag_ms * MILLISECOND
-
     def command(self, l3, lz):
         self.loop.change('command', lambda: {'l3': l3, 'lz': lz})
         self._check_time()
@@ -191,12 +167,10 @@ class World:
         self.loop.change('state', lambda: asdict(State(theta=theta, l3=l3, lz=lz)))
         self._check_time()
 
-    def drive(self, *velocity):
-        self.loop.change('drive', lambda: self.simulation.drive_details(velocity))
-
-    def steer(self, *velocity):
-        """Ask for a velocity at each tick from now on, or no more."""
-        self._steered = velocity
+    def drive(self, count, *velocity):
+        """Ask for a velocity, and so often again at each tick."""
+        self.loop.drive(velocity)
+        self._drives = count * [velocity]
 
     def resume(self):
         """Time goes on from where it was held."""
@@ -244,9 +218,11 @@ class World:
         self.disk.room = room
 
     def delete_log(self):
+        """Remove it while it may be open."""
         if self.logs:
-            self.disk.delete(self.logs[-1].file)
+            self.logs[-1].file.unlink(missing_ok=True)
             self.deleted.add(self.logs[-1])
+            self.disk.is_disturbed = True
 
     # ------------------------------------------------------------------------ the executor
 
@@ -255,12 +231,10 @@ class World:
         with (self.disk, mock.patch.object(recorder, 'QUEUE_BYTES', QUEUE_BYTES),
               mock.patch.object(recorder, 'Recorder', Log)):
             self.machine.run(self._live)
-        for output in self.simulation.outputs:
-            if output.publish is not None:
-                output.publish.leave()
+        for one in (*self.readers, *self.logs):
+            one.ends = one.ends or self.place
         for log in self.logs:
             atexit.unregister(log.close)
-            log.ends = log.ends or self.place
 
     def _live(self):
         self.loop.start()
@@ -300,8 +274,8 @@ class World:
                 self._tick()
 
     def _tick(self):
-        if self._steered and self.loop.state is LoopState.RUNNING:
-            self.drive(*self._steered)
+        if self._drives:
+            self.loop.drive(self._drives.pop())
         self.loop.tick()
         self._check_time()
         self.recording.check()
@@ -350,8 +324,7 @@ class World:
                 output.publish = Reader(self, output, self.place)
                 self.readers.append(output.publish)
             else:
-                reader.leave()
-                output.publish = None
+                reader.ends, output.publish = self.place, None
         if changed:
             self.simulation.refresh()
 

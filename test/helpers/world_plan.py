@@ -22,8 +22,8 @@ FAULTS = (*(('error', number) for number in (errno.ENOSPC, errno.EIO, errno.EINT
           ('slow', SECOND), ('stop',))
 CALLS = (*(3 * ('pwrite', 'fsync')), 'ftruncate', 'fstatvfs')
 # Actions after which no tick is late, and those after which simulated time is another one.
-CALM = frozenset(('command', 'put', 'drive', 'steer', 'start_recording', 'stop_recording',
-                  'listen', 'leave', 'step_date'))
+CALM = frozenset(('command', 'put', 'drive', 'start_recording', 'stop_recording', 'listen',
+                  'leave', 'step_date'))
 TURNS = frozenset(('pause', 'resume', 'step', 'reset', 'change'))
 
 
@@ -140,16 +140,15 @@ def _kinds(chance, topics, values):
     return [
         (3, 'busy', lambda: (duration(), pick((0, 0, 20, 300, 3000, 30_000)))),
         (1, 'lose_ticks', lambda: (chance.randrange(1, 30),)),
-        (1, 'double_tick', tuple),
+        (1, 'tick', tuple),
         (1, 'step_date', lambda: (pick((-3600_000, -5, 5, 40, 3600_000)),)),
         (2, 'stop_source', lambda: (duration(),)),
         (3, 'jump_source', lambda: (pick((-9000, -300, 300, 4000, 9000)),)),
-        (1, 'second_source', lambda: (pick((1, 20, 9000)),)),
         (4, 'command', lambda: (momentum(), momentum())),
         (1, 'put', lambda: (pick((0.0, 0.3, 2.0, 9.0)), momentum(), momentum())),
-        (3, 'drive', lambda: pick(((0.0, 0.0, 0.0), (chance.uniform(-1.0, 1.0), 0.5, 0.0),
-                                   (0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (1e9, 0.0, 0.0)))),
-        (1, 'steer', lambda: pick(((), (0.5, 0.0, 0.0), (0.0, 0.2, 0.1)))),
+        (4, 'drive', lambda: (pick((0, 0, 3, 100)), *pick((
+            (0.0, 0.0, 0.0), (chance.uniform(-1.0, 1.0), 0.5, 0.0), (0.5, 0.0, 0.0),
+            (0.5, 0.0, 0.0), (1e9, 0.0, 0.0))))),
         (1, 'pause', tuple),
         (2, 'resume', tuple),
         (1, 'step', lambda: (pick((1, 10_000_000, 123_456_789)),)),
