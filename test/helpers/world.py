@@ -185,7 +185,7 @@ class World:
         self.loop.reset({**self.values, **momenta}, paused)
         self._drives = []
         self._tick()
-        assert self.events[-1].kind != 'drive', 'what was asked for before the reset counts no more'
+        assert self.events[-1].kind != 'drive', 'a reset forgets what was asked for'
 
     def change(self, changes):
         values = {**self.values, **changes}
