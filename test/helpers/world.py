@@ -49,6 +49,7 @@ class Log(recorder.Recorder):
         self.begins, self.ends = world.place, None
         world.logs.append(self)
         super().__init__(uri, topics, *arguments, **options)
+        atexit.unregister(self.close)       # the process that it belongs to is not this one
 
     def write(self, rows):
         for number, stamps_ns, messages in rows:
@@ -236,8 +237,6 @@ class World:
             self.machine.run(self._live)
         for one in (*self.readers, *self.logs):
             one.ends = one.ends or self.place
-        for log in self.logs:
-            atexit.unregister(log.close)
 
     def _live(self):
         self.loop.start()
