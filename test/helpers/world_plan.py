@@ -20,7 +20,7 @@ FALLS = {'solver.method': 'rk45', 'solver.equations': 'euler', 'initial.theta': 
 FAULTS = (*(('error', number) for number in (errno.ENOSPC, errno.EIO, errno.EINTR)),
           ('short',), ('short',), ('slow', 20 * MILLISECOND), ('slow', 300 * MILLISECOND),
           ('slow', SECOND), ('stop',))
-CALLS = (*(3 * ('pwrite', 'fsync')), 'ftruncate', 'fstatvfs')
+CALLS = (*(2 * ('pwrite', 'pwrite', 'fsync')), 'ftruncate', 'fstatvfs')
 # Actions after which no tick is late, and those after which simulated time is another one.
 CALM = frozenset(('command', 'put', 'drive', 'start_recording', 'stop_recording', 'listen',
                   'leave', 'step_date'))
@@ -80,7 +80,7 @@ def plan_of(seed):
     chance = random.Random(seed)
     streams = chance.sample([*STREAMS], chance.choice((1, 1, 1, 2)))
     values, topics = _values(chance, streams), [one for name in streams for one in STREAMS[name]]
-    ends_ms, ends = chance.choice((200, 400, 700)), chance.choice(('close', 'kill', 'cut'))
+    ends_ms, ends = chance.choice((200, 400, 700)), chance.choice(('close', 'close', 'kill', 'cut'))
     is_calm = chance.random() < 0.2
     follows = not is_calm and chance.random() < 0.25
     kinds = [kind for kind in _kinds(chance, topics, values)
@@ -145,7 +145,7 @@ def _kinds(chance, topics, values):
         (1, 'step_date', lambda: (pick((-3600_000, -5, 5, 40, 3600_000)),)),
         (2, 'stop_source', lambda: (duration(),)),
         (3, 'jump_source', lambda: (pick((-9000, -300, 300, 4000, 9000)),)),
-        (4, 'command', lambda: (momentum(), momentum())),
+        (5, 'command', lambda: (momentum(), momentum())),
         (1, 'put', lambda: (pick((0.0, 0.3, 2.0, 9.0)), momentum(), momentum())),
         (4, 'drive', lambda: (pick((0, 0, 3, 100)), *pick((
             (0.0, 0.0, 0.0), (chance.uniform(-1.0, 1.0), 0.5, 0.0), (0.5, 0.0, 0.0),
@@ -153,7 +153,7 @@ def _kinds(chance, topics, values):
         (1, 'pause', tuple),
         (2, 'resume', tuple),
         (1, 'step', lambda: (pick((1, 10_000_000, 123_456_789)),)),
-        (2, 'reset', lambda: (pick((None, None, True, False)),)),
+        (3, 'reset', lambda: (pick((None, None, True, False)),)),
         (2, 'change', lambda: (dict.fromkeys(rates, pick((20.0, 33.0, 100.0, 250.0))),)),
         (1, 'change', lambda: ({'time_scale': pick((0.3, 1.0, 2.0))},)),
         (1, 'change', lambda: ({'tick_rate': pick((20.0, 100.0, 300.0))},)),
@@ -162,6 +162,6 @@ def _kinds(chance, topics, values):
         (2, 'listen', topic),
         (1, 'leave', topic),
         (1, 'stall', topic),
-        (4, 'fault', lambda: (pick(CALLS), *pick(FAULTS))),
+        (5, 'fault', lambda: (pick(CALLS), *pick(FAULTS))),
         (0.5, 'fill_disk', lambda: (pick((100, 3000, 20_000)),)),
         (0.3, 'delete_log', tuple)]
