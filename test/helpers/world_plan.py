@@ -80,13 +80,15 @@ def plan_of(seed):
     chance = random.Random(seed)
     streams = chance.sample([*STREAMS], chance.choice((1, 1, 1, 2)))
     values, topics = _values(chance, streams), [one for name in streams for one in STREAMS[name]]
-    ends_ms, ends = chance.choice((200, 400, 700)), chance.choice(('close', 'close', 'kill', 'cut'))
+    ends = chance.choice(('close', 'close', 'kill', 'cut'))
+    ends_ms = chance.choice((200, 400, 700))
     is_calm = chance.random() < 0.2
     follows = not is_calm and chance.random() < 0.25
     kinds = [kind for kind in _kinds(chance, topics, values)
              if (kind[1] in CALM or not is_calm) and (follows or not kind[1].endswith('source'))]
-    actions = [Action(chance.randrange(ends_ms), name, make()) for _, name, make in chance.choices(
-        kinds, [weight for weight, *_ in kinds], k=chance.choice((2, 4, 8, 12)))]
+    weights, happens = [weight for weight, *_ in kinds], chance.choice((2, 4, 8, 12))
+    actions = [Action(chance.randrange(ends_ms), name, make())
+               for _, name, make in chance.choices(kinds, weights, k=happens)]
     actions += [Action(0, 'listen', (topic,)) for topic in topics if chance.random() < 0.6]
     if chance.random() < 0.8:
         actions.append(Action(chance.choice((0, 0, 50)), 'start_recording'))
