@@ -49,7 +49,6 @@ class Log(recorder.Recorder):
         self.begins, self.ends = world.place, None
         world.logs.append(self)
         super().__init__(uri, topics, *arguments, **options)
-        atexit.unregister(self.close)       # the process that it belongs to is not this one
 
     def write(self, rows):
         for number, stamps_ns, messages in rows:
@@ -105,7 +104,7 @@ class World:
             self.simulation, self.values, self.recording,
             SimulatedClock(self._source if follows else self._date, str,
                            (lambda: 1) if follows else None, self._steady),
-            warn=str, error=str, update_subscribers=self._update_subscribers)
+            error=str, update_subscribers=self._update_subscribers)
 
     @property
     def place(self):
@@ -170,7 +169,7 @@ class World:
 
     def drive(self, count, *velocity):
         """Ask for a velocity, and so often again at each tick."""
-        self.loop.drive(velocity)
+        self.loop.change('drive', lambda: self.simulation.drive_details(velocity))
         self._drives = count * [velocity]
 
     def resume(self):
@@ -185,15 +184,11 @@ class World:
     def reset(self, paused):
         momenta = {name: self._start[name] for name in ('spin.l3', 'spin.lz')}
         self.loop.reset({**self.values, **momenta}, paused)
-        self._drives = []
-        self._tick()
-        assert self.events[-1].kind != 'drive', 'a reset forgets what was asked for'
 
     def change(self, changes):
         values = {**self.values, **changes}
-        if values['imu.rate'] >= self.simulation.lowest_imu_rate:
-            self.loop.set_parameters(values, changes)
-            self.values = values
+        self.loop.set_parameters(values, changes)
+        self.values = values
 
     def start_recording(self):
         path = self._folder / f'run_{self.asked}.mcap'
@@ -277,8 +272,9 @@ class World:
                 self._tick()
 
     def _tick(self):
-        if self._drives:
-            self.loop.drive(self._drives.pop())
+        if self._drives and self.loop.state is LoopState.RUNNING:
+            with contextlib.suppress(ValueError):
+                self.drive(len(self._drives) - 1, *self._drives[0])
         self.loop.tick()
         self._check_time()
         self.recording.check()
