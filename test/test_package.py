@@ -63,6 +63,8 @@ def test_the_manifest_is_valid_and_versions_agree(project):
 
 def test_ctrl_c_during_the_imports_of_a_tool_is_quiet():
     code = ('import runpy, signal, sys\n'
+            # A shell ignores it for what runs in the background.
+            'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
             'class Interrupted:\n'
             '    def find_spec(self, name, path=None, target=None):\n'
             "        if name == 'spinning_top_sim.recording.errors':\n"
