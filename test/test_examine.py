@@ -29,7 +29,7 @@ pytest.importorskip('vqf')
 
 NAMES = {'convention', 'gyroscope', 'accelerometer', 'magnetometer', 'timing', 'integration',
          'lever_arm', 'bias', 'covariance', 'accuracy', 'nondeterministic', 'invalid_output'}
-# The others take minutes: `python test/stress wrong` examines them.
+# The others take minutes: STRESS=100 pytest test/test_stress.py -k wrong
 FAST = [name for name, (make, _) in WRONG.items() if make.func is Part and make.args == ()]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wheel, in an environment that has its dependencies and nothing else: no ROS, no extras."""
+"""The source distribution, and what is said where extras are missing; .ci/wheel installs it."""
 
 import json
 import os
@@ -7,13 +7,10 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 import zipfile
 from importlib import metadata
 
-import pytest
 from helpers.reference import ROOT
-from packaging.requirements import Requirement
 
 from spinning_top_sim.__main__ import COMMANDS, main
 
@@ -21,65 +18,20 @@ NAME = 'spinning_top_sim'
 BUILD = 'import sys, setuptools.build_meta as m; getattr(m, sys.argv[1])(sys.argv[2])'
 
 
-def run(*command, cwd=ROOT, **variables):
-    """Run a command in an environment that knows nothing of this one."""
-    done = subprocess.run(
-        [*map(str, command)], cwd=cwd, capture_output=True, text=True, timeout=120, check=False,
-        env={'PATH': '/usr/bin:/bin', 'HOME': tempfile.gettempdir(), **variables})
-    return done.returncode, done.stdout, done.stderr
-
-
-@pytest.fixture(scope='module')
-def wheel(tmp_path_factory):
-    """Return the wheel that is made of the source distribution."""
-    folder = tmp_path_factory.mktemp('build')
-    settings = folder / 'setup.cfg'
-    settings.write_text(f'[build]\nbuild_base={folder}/build\n[egg_info]\negg_base={folder}\n')
+def test_the_source_distribution_installs_what_the_checkout_does(tmp_path):
+    """Here the package is installed from the checkout."""
+    settings = tmp_path / 'setup.cfg'
+    settings.write_text(f'[build]\nbuild_base={tmp_path}/b\n[egg_info]\negg_base={tmp_path}\n')
 
     def build(what, place):
-        code, _, err = run(sys.executable, '-c', BUILD, what, folder, cwd=place,
-                           DIST_EXTRA_CONFIG=str(settings))
-        assert code == 0, err
+        subprocess.run([sys.executable, '-c', BUILD, what, tmp_path], cwd=place, check=True,
+                       timeout=120, env={**os.environ, 'DIST_EXTRA_CONFIG': str(settings)})
 
     build('build_sdist', ROOT)
-    (archive,) = folder.glob('*.tar.gz')
-    shutil.unpack_archive(archive, folder)
-    build('build_wheel', *folder.glob('spinning_top_sim-*/'))
-    (made,) = folder.glob('*.whl')
-    return made
-
-
-def dependencies(name):
-    """Yield the distributions that one needs, and itself."""
-    yield metadata.distribution(name)
-    for requirement in map(Requirement, metadata.requires(name) or ()):
-        if requirement.marker is None or requirement.marker.evaluate({'extra': ''}):
-            yield from dependencies(requirement.name)
-
-
-@pytest.fixture(scope='module')
-def empty(tmp_path_factory, wheel):
-    """Return an environment with the wheel and its dependencies."""
-    folder = tmp_path_factory.mktemp('empty')
-    code, _, err = run(sys.executable, '-m', 'venv', '--without-pip', folder)
-    assert code == 0, err
-    code, _, err = run(sys.executable, '-m', 'pip', '--disable-pip-version-check', '--python',
-                       folder / 'bin/python', 'install', '--no-deps', '--no-index',
-                       '--no-compile', wheel)
-    assert code == 0, err
-    (packages,) = folder.glob('lib/python*/site-packages')
-    for distribution in dependencies('spinning_top_sim'):
-        tops = {file.parts[0] for file in distribution.files if file.parts[0] != '..'}
-        for top in tops - {'__pycache__'}:
-            if not (packages / top).exists():
-                (packages / top).symlink_to(distribution.locate_file(top))
-    return folder
-
-
-def test_the_source_distribution_installs_what_the_checkout_does(wheel):
-    """Here the package is installed from the checkout."""
+    shutil.unpack_archive(*tmp_path.glob('*.tar.gz'), tmp_path)
+    build('build_wheel', *tmp_path.glob('spinning_top_sim-*/'))
     folder = metadata.distribution(NAME).locate_file('')
-    with zipfile.ZipFile(wheel) as archive:
+    with zipfile.ZipFile(*tmp_path.glob('*.whl')) as archive:
         of_sdist = {
             os.path.normpath(folder / re.sub('.*[.]data/data/', '../../../', name)):
             archive.read(name) for name in archive.namelist() if '.dist-info/' not in name}
@@ -91,29 +43,7 @@ def test_the_source_distribution_installs_what_the_checkout_does(wheel):
     assert str(folder / NAME / 'py.typed') in of_sdist
 
 
-RUN_ALL = """
-import contextlib, io, json, sys
-from spinning_top_sim.__main__ import main
-said = []
-for arguments in json.loads(sys.argv[1]):
-    with (contextlib.redirect_stdout(io.StringIO()) as out,
-          contextlib.redirect_stderr(io.StringIO()) as err):
-        try:
-            code = main(arguments)
-        except SystemExit as ended:
-            code = ended.code
-    said.append((code, out.getvalue(), err.getvalue()))
-print(json.dumps(said))
-"""
-
-
-def run_all(empty, folder, lines):
-    """Return exit code, output and errors of each command line; one process runs them all."""
-    code, out, err = run(empty / 'bin/python', '-c', RUN_ALL, json.dumps(lines), cwd=folder)
-    assert (code, err) == (0, '')
-    return json.loads(out)
-
-
+# Commands, and the extra that they need.
 REMEDIES = [
     (['node'], "pip install 'ros-jazzy-rclpy"),
     (['replay', 'a.mcap'], "pip install 'ros-jazzy-rclpy"),
@@ -128,28 +58,39 @@ REMEDIES = [
     (['examine', '--node', 'a', '--topic', 'b'], "pip install 'ros-jazzy-rclpy"),
     (['ensemble', 'e.yaml', '-o', 'runs'], "pip install 'distributed"),
 ]
+EXTRAS = ('rclpy', 'viser', 'matplotlib', 'pyarrow', 'pymap3d', 'vqf', 'dask', 'distributed',
+          'geometry_msgs', 'sensor_msgs', 'std_msgs')
 
 
-@pytest.fixture(scope='module')
-def answers(empty, tmp_path_factory):
-    """Return what the commands of REMEDIES say, and all --help after it."""
-    folder = tmp_path_factory.mktemp('answers')
-    assert main(['simulate', '--duration', '0.1', '--quiet', '-o', str(folder / 'a.mcap')]) == 0
-    shutil.copy(ROOT / 'examples/ensemble.yaml', folder / 'e.yaml')
-    return run_all(empty, folder, [*(arguments for arguments, _ in REMEDIES), ['--help'],
-                                   *([name, '--help'] for name in COMMANDS)])
+RUN_ALL = """
+import contextlib, io, json, sys
+lines, missing = json.loads(sys.argv[1])
+sys.modules.update(dict.fromkeys(missing))
+from spinning_top_sim.__main__ import main
+said = []
+for arguments in lines:
+    with (contextlib.redirect_stdout(io.StringIO()) as out,
+          contextlib.redirect_stderr(io.StringIO()) as err):
+        try:
+            code = main(arguments)
+        except SystemExit as ended:
+            code = ended.code
+    said.append((code, out.getvalue(), err.getvalue()))
+print(json.dumps(said))
+"""
 
 
-def test_help_needs_nothing(answers):
-    for name, (code, out, err) in zip(['', *COMMANDS], answers[len(REMEDIES):], strict=True):
-        assert (code, err) == (0, '')
-        assert out.startswith(f'usage: spinning-top {name}')
-
-
-def test_what_is_missing_is_told_with_its_remedy(empty, answers):
-    for (arguments, remedy), (code, _, err) in zip(REMEDIES, answers, strict=False):
+def test_without_extras_there_is_help_and_what_is_missing_is_told_with_its_remedy(tmp_path):
+    assert main(['simulate', '--duration', '0.1', '--quiet', '-o', str(tmp_path / 'a.mcap')]) == 0
+    shutil.copy(ROOT / 'examples/ensemble.yaml', tmp_path / 'e.yaml')
+    helps = [['--help'], *([name, '--help'] for name in COMMANDS)]
+    lines = [*helps, *(arguments for arguments, _ in REMEDIES)]
+    said = json.loads(subprocess.check_output(
+        [sys.executable, '-c', RUN_ALL, json.dumps([lines, EXTRAS])], cwd=tmp_path, timeout=120,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)}))
+    for name, (code, out, err) in zip(['', *COMMANDS], said, strict=False):
+        assert (code, err) == (0, '') and out.startswith(f'usage: spinning-top {name}')
+    for (arguments, remedy), (code, _, err) in zip(REMEDIES, said[len(helps):], strict=True):
         assert code in (1, 2)
         assert err.startswith(f'spinning-top {arguments[0]}: ') and err.count('\n') == 1
-        assert f'{empty}/bin/python -m {remedy}' in err
-        words = err.split()
-        assert len(set(words)) == len(words)
+        assert f'{sys.executable} -m {remedy}' in err

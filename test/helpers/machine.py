@@ -9,10 +9,11 @@ gives way where it waits, and at each operation of the disk.
 import errno
 import heapq
 import itertools
-import math
 import os
+from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import greenlet
 
@@ -77,20 +78,12 @@ class Machine:
                                      next(self._numbers), thread, thread.turn))
 
     def sleep(self, duration_ns=None):
-        """Let other threads go on for a time, or for ever."""
+        """Let other threads go on for a time, or until this one is woken."""
         if self.is_dead:
             raise Killed
         if duration_ns is not None:
             self.wake(greenlet.getcurrent(), duration_ns)
         self._hub.switch()
-
-    def wait(self, waiting, timeout):
-        """Sleep among those that wait, at most so long [s]."""
-        thread = greenlet.getcurrent()
-        waiting.append(thread)
-        self.sleep(None if timeout is None else max(math.ceil(timeout * SECOND), MICROSECOND))
-        if thread in waiting:
-            waiting.remove(thread)
 
     def Event(self):  # noqa: N802, as in threading
         return _Event(self)
@@ -115,30 +108,46 @@ class _Event:
             self._machine.wake(self._waiting.pop(), self._machine.random.randrange(MILLISECOND))
 
     def wait(self, timeout=None):
+        thread = greenlet.getcurrent()
         if not self._set:
-            self._machine.wait(self._waiting, timeout)
+            self._waiting.append(thread)
+            self._machine.sleep(None if timeout is None
+                                else max(round(timeout * SECOND), MICROSECOND))
+            if thread in self._waiting:
+                self._waiting.remove(thread)
         return self._set
 
 
 class _Started:
     def __init__(self, machine, target, args):
         self._machine, self._target, self._args = machine, target, args
-        self._thread, self._waiting = None, []
+        self._ended = machine.Event()
 
     def start(self):
-        self._thread = self._machine.begin(self._work)
+        self._machine.begin(self._work)
 
     def _work(self):
         self._target(*self._args)
-        while self._waiting:
-            self._machine.wake(self._waiting.pop())
+        self._ended.set()
 
     def is_alive(self):
-        return not self._thread.dead
+        return not self._ended.is_set()
 
     def join(self, timeout=None):
-        if self.is_alive():
-            self._machine.wait(self._waiting, timeout)
+        self._ended.wait(timeout)
+
+
+class Fault(NamedTuple):
+    """
+    What goes wrong with the next call of a name, once.
+
+    kind : 'error' with its number, 'short', 'slow' with the duration [ns], or 'stop': it never
+        returns
+    """
+
+    call: str
+    kind: str
+    value: int = 0
 
 
 @dataclass
@@ -151,39 +160,24 @@ class _File:
     is_listed: bool = False     # so is its name
 
 
-@dataclass
-class Fault:
-    """
-    What goes wrong with the next call of a name, once.
-
-    kind : 'error' with its number, 'short', 'slow' with the duration [ns], or 'stop': it never
-        returns
-    """
-
-    call: str
-    kind: str
-    value: int = 0
-    part: float = 0.5           # of the data that is written nevertheless
-
-
 class Disk:
     """
     Files in a folder, through the calls of `os` that the recorder makes; used by `with`.
 
     kill_at : number of the call in which the process is killed
-    faults : of class Fault, that are to come
-    size : bytes of a file that go onto the disk
-    calls, failures : how many there were; failures of files, not of folders
     is_slow : whether all calls take long
-    is_disturbed : whether one has failed, or taken long
+    faults : that are to come
+    room : bytes that can still be written
+    failures : how many calls for files have failed
+    is_disturbed : whether a call has failed, or taken long
     is_misused : whether a file was closed while it was being synced
     """
 
     def __init__(self, machine, kill_at=None, *, is_slow=False):
-        self.faults, self.size, self.calls, self.failures = [], 1 << 60, 0, 0
+        self.faults, self.room, self.failures = [], 1 << 60, 0
         self.is_disturbed, self.is_misused = is_slow, False
-        self._machine, self._kill_at, self._files = machine, kill_at, {}
-        self._times = 20 if is_slow else 1
+        self._machine, self._times = machine, 20 if is_slow else 1
+        self._calls_left, self._files = kill_at, defaultdict(_File)
         self._real = {name: getattr(os, name) for name in CALLS}
 
     def __enter__(self):
@@ -195,85 +189,74 @@ class Disk:
         for name, call in self._real.items():
             setattr(os, name, call)
 
-    @property
-    def largest(self):
-        """Size of the largest file [bytes]."""
-        return max((len(_image(one.changes)) for one in self._files.values()), default=0)
-
-    def delete(self, path):
-        """Remove a file while it may be open."""
-        if path.exists():
-            path.unlink()
-            self.is_disturbed = True
-            self._files.pop(str(path), None)
-
-    def content(self, path):
-        """Return what a file was when the process ended; None: there is none."""
-        file = self._files.get(str(path))
-        return None if file is None else _image(file.changes)
-
-    def after_a_power_cut(self, path):
-        """Return what may be left: what was synced, and any subset of the rest; None: nothing."""
-        file, random = self._files.get(str(path)), self._machine.random
-        if file is None or not (file.is_listed or random.random() < 0.5):
-            return None
+    def cut_power(self, path):
+        """Leave of a file what was synced, and any subset of the rest, or no file."""
+        file, random = self._files[str(path)], self._machine.random
+        path.unlink(missing_ok=True)
+        if not file.is_listed and random.random() < 0.5:
+            return
         kept = [change for number, change in enumerate(file.changes)
                 if (number < file.synced and number not in file.doubtful)
                 or random.random() < 0.6]
-        left = bytearray(_image(kept))
-        if kept and len(kept) > file.synced and random.random() < 0.3:      # half a write
-            data, offset = kept[-1]
-            if data is not None:
-                begin = offset + random.randrange(len(data) + 1) // SECTOR * SECTOR
-                left[begin:] = bytes(max(len(left) - begin, 0))
-        return bytes(left)
+        content = bytearray()
+        for data, where in kept:
+            if data is None:
+                del content[where:]
+                continue
+            content.extend(bytes(max(where - len(content), 0)))
+            content[where:where + len(data)] = data
+        if len(kept) > file.synced and random.random() < 0.3:       # half a write
+            begin = min(kept[-1][1], len(content))
+            begin += random.randrange(len(content) + 1 - begin) // SECTOR * SECTOR
+            content[begin:] = bytes(len(content) - begin)
+        path.write_bytes(content)
 
     # ----------------------------------------------------------------------- calls of `os`
 
     def _before(self, name, duration_ns):
         """Return the fault of a call that has begun."""
-        self.calls += 1
-        machine = self._machine
+        machine, random = self._machine, self._machine.random
         if machine.is_dead:
             raise Killed
         # One in eight takes long, as it does where others use the disk.
-        machine.sleep(machine.random.randrange(
-            self._times * (duration_ns if machine.random.random() < 0.875 else 2 * MILLISECOND)))
-        if self.calls == self._kill_at:
-            return Fault(name, 'kill', part=machine.random.random())
-        for fault in self.faults:
-            if fault.call == name:
-                self.faults.remove(fault)
-                self.is_disturbed = True
-                if fault.kind == 'slow':
-                    machine.sleep(fault.value)
-                return fault
-        return Fault(name, 'none')
+        machine.sleep(random.randrange(
+            self._times * (duration_ns if random.random() < 0.875 else 2 * MILLISECOND)))
+        if self._calls_left is not None:
+            self._calls_left -= 1
+            if self._calls_left == 0:
+                return Fault(name, 'kill')
+        fault = next((one for one in self.faults if one.call == name), Fault(name, 'none'))
+        if fault in self.faults:
+            self.faults.remove(fault)
+            self.is_disturbed = True
+        if fault.kind == 'slow':
+            machine.sleep(fault.value)
+        return fault
 
     def _after(self, fault, *, is_file=True):
-        if fault.kind == 'stop':
-            self.failures += 1
-            self._machine.sleep()
         if fault.kind == 'kill':
             raise Killed
-        if fault.kind == 'error':
+        if fault.kind in ('stop', 'error'):
             self.failures += is_file
+        if fault.kind == 'stop':
+            self._machine.sleep()
+        if fault.kind == 'error':
             raise OSError(fault.value, os.strerror(fault.value))
 
     def _file(self, descriptor):
-        return self._files.setdefault(os.readlink(f'/proc/self/fd/{descriptor}'), _File())
+        return self._files[os.readlink(f'/proc/self/fd/{descriptor}')]
 
     def _pwrite(self, descriptor, data, offset):
         file, fault = self._file(descriptor), self._before('pwrite', 50 * MICROSECOND)
-        room = self.size - offset
-        if room <= 0:
+        if self.room <= 0:
             self.is_disturbed = True
-            self.failures += 1
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        data = bytes(data[:room])
+            fault = Fault('pwrite', 'error', errno.ENOSPC)
+        data = bytes(data[:max(self.room, 0)])
         if fault.kind in ('short', 'stop', 'kill', 'error'):
-            data = data[:max(int(fault.part * len(data)), fault.kind == 'short')]
+            part = int(self._machine.random.random() * len(data))
+            data = data[:max(part, fault.kind == 'short')]
         if data:
+            self.room -= len(data)
             file.changes.append((data, offset))
             self._real['pwrite'](descriptor, data, offset)
         self._after(fault)
@@ -282,36 +265,24 @@ class Disk:
     def _ftruncate(self, descriptor, size):
         file, fault = self._file(descriptor), self._before('ftruncate', 20 * MICROSECOND)
         self._after(fault)
+        self.room += os.fstat(descriptor).st_size - size
         file.changes.append((None, size))
         self._real['ftruncate'](descriptor, size)
 
     def _fsync(self, descriptor):
         path = os.readlink(f'/proc/self/fd/{descriptor}')
-        file = None if Path(path).is_dir() else self._file(descriptor)
-        written = file and len(file.changes)
+        is_file = not Path(path).is_dir()
+        written = len(self._files[path].changes) if is_file else 0
         fault = self._before('fsync', 8 * MILLISECOND)
         self.is_misused |= not os.path.exists(f'/proc/self/fd/{descriptor}')
-        if file is not None and fault.kind == 'error':
-            file.doubtful.update(range(file.synced, written))
-        self._after(fault, is_file=file is not None)
-        if file is not None:
-            file.synced = max(file.synced, written)
-        else:
-            for name, one in self._files.items():
-                one.is_listed |= Path(name).parent == Path(path)
+        if is_file and fault.kind == 'error':
+            self._files[path].doubtful.update(range(self._files[path].synced, written))
+        self._after(fault, is_file=is_file)
+        for name, file in self._files.items():
+            if name == path:
+                file.synced = max(file.synced, written)
+            file.is_listed |= Path(name).parent == Path(path)
 
     def _fstatvfs(self, descriptor):
-        fault = self._before('fstatvfs', 20 * MICROSECOND)
-        self._after(fault)
+        self._after(self._before('fstatvfs', 20 * MICROSECOND))
         return self._real['fstatvfs'](descriptor)
-
-
-def _image(changes):
-    content = bytearray()
-    for data, where in changes:
-        if data is None:
-            del content[where:]
-            continue
-        content.extend(bytes(max(where - len(content), 0)))
-        content[where:where + len(data)] = data
-    return bytes(content)

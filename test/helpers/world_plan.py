@@ -14,13 +14,17 @@ STREAMS = {'pose': ('pose',), 'joint_states': ('joint_states',),
            'invariants': ('~/invariants',), 'ground_truth_odom': ('ground_truth/odom',),
            'markers': ('markers',), 'mag': ('imu/mag', 'ground_truth/mag'),
            'increments': ('imu/dq', 'imu/dv'), 'gnss': ('gnss/fix',)}
-ALWAYS_ON = ('ground_truth_imu',)       # by default: switched off here
 SCENES = ('cusp', 'cusp', 'looping', 'sleeping', 'shuttle', 'near_separatrix')
-CALM = frozenset(('command', 'put', 'drive', 'steer', 'start_recording', 'stop_recording',
-                  'listen', 'leave', 'step_date'))
 FALLS = {'solver.method': 'rk45', 'solver.equations': 'euler', 'initial.theta': 0.5,
          'initial.theta_dot': -3.0, 'spin.l3': 0.2, 'spin.lz': -0.2}    # through a pole
-ERRORS = (errno.ENOSPC, errno.EIO, errno.EINTR)
+FAULTS = (*(('error', number) for number in (errno.ENOSPC, errno.EIO, errno.EINTR)),
+          ('short',), ('short',), ('slow', 20 * MILLISECOND), ('slow', 300 * MILLISECOND),
+          ('slow', SECOND), ('stop',))
+CALLS = (*(2 * ('pwrite', 'pwrite', 'fsync')), 'ftruncate', 'fstatvfs')
+# Actions after which no tick is late, and those after which simulated time is another one.
+CALM = frozenset(('command', 'put', 'drive', 'start_recording', 'stop_recording', 'listen',
+                  'leave', 'step_date'))
+TURNS = frozenset(('pause', 'resume', 'step', 'reset', 'change'))
 
 
 class Action(NamedTuple):
@@ -54,13 +58,18 @@ class Plan:
     actions: tuple[Action, ...]
     ends: str
     ends_ms: int
-    kill_at: int | None = None
-    is_slow: bool = False
+    kill_at: int | None
+    is_slow: bool
 
     @property
     def is_calm(self):
         """Whether no tick is late, and nothing holds the loop up."""
         return not self.follows and CALM.issuperset(one.name for one in self.actions)
+
+    @property
+    def keeps_time(self):
+        """Whether simulated time is that since the start, but for what has slipped."""
+        return not self.follows and TURNS.isdisjoint(one.name for one in self.actions)
 
     def only(self, numbers):
         """Return the plan with these of its actions."""
@@ -69,105 +78,92 @@ class Plan:
 
 def plan_of(seed):
     chance = random.Random(seed)
-    values, topics = _values(chance)
+    streams = chance.sample([*STREAMS], chance.choice((1, 1, 1, 2)))
+    values, topics = _values(chance, streams), [one for name in streams for one in STREAMS[name]]
+    ends = chance.choice(('close', 'close', 'kill', 'cut'))
     ends_ms = chance.choice((200, 400, 700))
     is_calm = chance.random() < 0.2
     follows = not is_calm and chance.random() < 0.25
-    kinds = [*_kinds(chance, topics, values, follows)]
-    if is_calm:
-        kinds = [(weight, kind) for weight, kind in kinds if kind()[0] in CALM]
-    names, weights = zip(*((kind, weight) for weight, kind in kinds), strict=True)
-    actions = [Action(chance.randrange(ends_ms), *make())
-               for make in chance.choices(names, weights, k=chance.choice((2, 4, 8, 12)))]
-    for topic in topics:
-        if chance.random() < 0.6:
-            actions.append(Action(0, 'listen', (topic,)))
-    if chance.random() < 0.7:
+    kinds = [kind for kind in _kinds(chance, topics, values)
+             if (kind[1] in CALM or not is_calm) and (follows or not kind[1].endswith('source'))]
+    weights, happens = [weight for weight, *_ in kinds], chance.choice((2, 4, 8, 12))
+    actions = [Action(chance.randrange(ends_ms), name, make())
+               for _, name, make in chance.choices(kinds, weights, k=happens)]
+    actions += [Action(0, 'listen', (topic,)) for topic in topics if chance.random() < 0.6]
+    if chance.random() < 0.8:
         actions.append(Action(chance.choice((0, 0, 50)), 'start_recording'))
     if 'solver.equations' in values:        # it falls, stands still, and begins again
         actions.append(Action(ends_ms - 50, 'reset', (None,)))
-    ends = chance.choice(('close', 'close', 'kill', 'cut'))
+    kill_at = chance.randrange(4, 60) if ends != 'close' and chance.random() < 0.3 else None
     return Plan(seed, values, follows, tuple(sorted(actions, key=lambda one: one.at_ms)), ends,
-                ends_ms, chance.randrange(4, 60) if chance.random() < 0.3 and ends != 'close'
-                else None, is_slow=chance.random() < 0.15)
+                ends_ms, kill_at, is_slow=chance.random() < 0.15)
 
 
-def _values(chance):
-    streams = chance.sample([*STREAMS], chance.choice((1, 1, 1, 2)))
+def _values(chance, streams):
     values = {**scene_parameters(chance.choice(SCENES)),
               'solver.method': chance.choice(('rk45', 'exact', 'exact')),
               'tick_rate': chance.choice((50.0, 100.0, 200.0)),
               'time_scale': chance.choice((1.0, 1.0, 1.0, 0.5, 3.0)),
               'seed': chance.randrange(1000), 'start_paused': chance.random() < 0.1,
-              'record.max_loss': chance.choice((0.05, 0.1, 0.3)), 'record.min_free_bytes': 0,
+              # To open a file, to write and to sync takes up to 40 ms.
+              'record.max_loss': chance.choice((0.1, 0.2, 0.3)), 'record.min_free_bytes': 0,
               'record.compression': chance.choice(('zstd', 'lz4', 'none')),
-              'markers.trace_length': 0.2}
-    for name in (*STREAMS, *ALWAYS_ON):
+              'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.gyroscope_noise_density': 0.01,
+              'imu.gyroscope_random_walk': 0.001, 'markers.trace_length': 0.2,
+              'gnss.latency': 0.03, 'gnss.outages': [0.05, 0.1]}
+    for name in (*STREAMS, 'ground_truth_imu'):     # which is on by default
         values[f'{name}.enabled'] = name in streams
         if name in streams and name != 'increments':
             values[f'{name}.rate'] = chance.choice((33.0, 50.0, 100.0))
-    if 'imu' in streams:
-        values |= {'imu.lever_arm': [0.1, -0.2, 0.3], 'imu.gyroscope_noise_density': 0.01,
-                   'imu.gyroscope_random_walk': 0.001}
-        if chance.random() < 0.5:
-            values |= {'imu.drop_rate': 0.2, 'imu.duplicate_rate': 0.1, 'imu.stamp_jitter': 0.001}
-    if 'gnss' in streams:
-        values |= {'gnss.rate': 50.0, 'gnss.latency': 0.03, 'gnss.outages': [0.05, 0.1]}
+    if chance.random() < 0.5:
+        values |= {'imu.drop_rate': 0.2, 'imu.duplicate_rate': 0.1, 'imu.stamp_jitter': 0.001}
     if 'increments' in streams:
         values |= {'imu.sampling': 'mean', 'imu.rate': 200.0}
     if chance.random() < 0.07:
         values |= FALLS
     if chance.random() < 0.1:
         values['duration'] = chance.uniform(0.05, 0.5)
-    return values, [topic for name in streams for topic in STREAMS[name]]
+    return values
 
 
-def _kinds(chance, topics, values, follows):
-    """Yield weights, and makers of actions: each returns a name and its arguments."""
+def _kinds(chance, topics, values):
+    """Return what may happen: weights, names of actions, and makers of arguments."""
+    pick = chance.choice
+    rates = [name for name in values if name.endswith('.rate')]
+
     def momentum():
-        return chance.choice((chance.uniform(-3.0, 3.0), 1.0, 1.6, float('nan'), 1e20))
-
-    def velocity():
-        return chance.choice(((0.0, 0.0, 0.0), (chance.uniform(-1.0, 1.0), 0.5, 0.0),
-                              (0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (1e9, 0.0, 0.0)))
+        return pick((chance.uniform(-3.0, 3.0), 1.0, 1.6, float('nan'), 1e20))
 
     def duration():
-        return chance.choice((7, 30, 120, 700, 1500))
+        return pick((7, 30, 120, 700, 1500))
 
-    def fault(call):
-        kind = chance.choice(('error', 'error', 'short', 'short', 'slow', 'slow', 'stop'))
-        value = {'error': chance.choice(ERRORS), 'slow': chance.choice((
-            20 * MILLISECOND, 300 * MILLISECOND, SECOND))}.get(kind, 0)
-        return 'fault', (call, kind, value, round(chance.random(), 2))
+    def topic():
+        return (pick(topics),)
 
-    yield 2, lambda: ('busy', (duration(),))
-    yield 1, lambda: ('lose_ticks', (chance.randrange(1, 30),))
-    yield 1, lambda: ('double_tick', ())
-    yield 1, lambda: ('slow_clock', (chance.choice((20, 300, 3000)), duration()))
-    yield 1, lambda: ('step_date', (chance.choice((-3600_000, -5, 5, 40, 3600_000)),))
-    if follows:
-        yield 2, lambda: ('stop_source', (duration(),))
-        yield 3, lambda: ('jump_source', (chance.choice((-9000, -300, 300, 4000, 9000)),))
-        yield 1, lambda: ('second_source', (chance.choice((1, 20, 9000)),))
-    yield 4, lambda: ('command', (momentum(), momentum()))
-    yield 1, lambda: ('put', (chance.choice((0.0, 0.3, 2.0, 9.0)), momentum(), momentum()))
-    yield 3, lambda: ('drive', velocity())
-    yield 1, lambda: ('steer', chance.choice(((), (0.5, 0.0, 0.0), (0.0, 0.2, 0.1))))
-    yield 1, lambda: ('pause', ())
-    yield 2, lambda: ('resume', ())
-    yield 1, lambda: ('step', (chance.choice((1, 10_000_000, 123_456_789)),))
-    yield 2, lambda: ('reset', (chance.choice((None, None, True, False)),))
-    yield 2, lambda: ('change', ({f'{name}.rate': chance.choice((20.0, 33.0, 100.0, 250.0))
-                                  for name in STREAMS if f'{name}.rate' in values},))
-    yield 1, lambda: ('change', ({'time_scale': chance.choice((0.3, 1.0, 2.0))},))
-    yield 1, lambda: ('change', ({'tick_rate': chance.choice((20.0, 100.0, 300.0))},))
-    yield 3, lambda: ('start_recording', ())
-    yield 2, lambda: ('stop_recording', ())
-    yield 2, lambda: ('listen', (chance.choice(topics),))
-    yield 1, lambda: ('leave', (chance.choice(topics),))
-    yield 1, lambda: ('stall', (chance.choice(topics),))
-    yield 2, lambda: fault('pwrite')
-    yield 1, lambda: fault('fsync')
-    yield 0.5, lambda: fault(chance.choice(('ftruncate', 'fstatvfs')))
-    yield 0.5, lambda: ('fill_disk', (chance.choice((100, 3000, 20_000)),))
-    yield 0.3, lambda: ('delete_log', ())
+    return [
+        (3, 'busy', lambda: (duration(), pick((0, 0, 20, 300, 3000, 30_000)))),
+        (1, 'lose_ticks', lambda: (chance.randrange(1, 30),)),
+        (1, 'tick', tuple),
+        (1, 'step_date', lambda: (pick((-3600_000, -5, 5, 40, 3600_000)),)),
+        (2, 'stop_source', lambda: (duration(),)),
+        (3, 'jump_source', lambda: (pick((-9000, -300, 300, 4000, 9000)),)),
+        (5, 'command', lambda: (momentum(), momentum())),
+        (1, 'put', lambda: (pick((0.0, 0.3, 2.0, 9.0)), momentum(), momentum())),
+        (4, 'drive', lambda: (pick((0, 0, 3, 100)), *pick((
+            (0.0, 0.0, 0.0), (chance.uniform(-1.0, 1.0), 0.5, 0.0), (0.5, 0.0, 0.0),
+            (0.5, 0.0, 0.0), (1e9, 0.0, 0.0))))),
+        (1, 'pause', tuple),
+        (2, 'resume', tuple),
+        (1, 'step', lambda: (pick((1, 10_000_000, 123_456_789)),)),
+        (3, 'reset', lambda: (pick((None, None, True, False)),)),
+        (2, 'change', lambda: (dict.fromkeys(rates, pick((20.0, 33.0, 100.0, 250.0))),)),
+        (1, 'change', lambda: ({'time_scale': pick((0.3, 1.0, 2.0))},)),
+        (1, 'change', lambda: ({'tick_rate': pick((20.0, 100.0, 300.0))},)),
+        (3, 'start_recording', tuple),
+        (2, 'stop_recording', tuple),
+        (2, 'listen', topic),
+        (1, 'leave', topic),
+        (1, 'stall', topic),
+        (5, 'fault', lambda: (pick(CALLS), *pick(FAULTS))),
+        (0.5, 'fill_disk', lambda: (pick((100, 3000, 20_000)),)),
+        (0.3, 'delete_log', tuple)]
