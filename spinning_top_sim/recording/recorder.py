@@ -9,6 +9,7 @@ may hang as a disk does, brings them to the disk; `possible_loss` tells what a p
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import threading
 import time
@@ -86,7 +87,9 @@ class Recorder:
         self._sync_error: Exception | None = None
         self._syncing: threading.Thread | None = None
         self._wake, self._taken = threads.Event(), threads.Event()
-        # A daemon, so that a disk that hangs cannot hold up the end of the interpreter.
+        # A daemon, so that a disk that hangs cannot hold up the end of the interpreter; the exit
+        # handler runs before daemons are stopped and closes the file properly.
+        atexit.register(self.close)
         self._thread = threads.Thread(target=self._run, name='recorder', daemon=True)
         self._thread.start()
 
@@ -186,6 +189,7 @@ class Recorder:
                     self._syncing.join()
                 if self._file is not None:
                     self._file.finish()
+        atexit.unregister(self.close)
 
     def _open(self) -> McapWriter:
         """Return the file that `uri` names."""

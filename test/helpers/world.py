@@ -228,7 +228,8 @@ class World:
 
     def run(self):
         """Run the plan."""
-        with (self.disk, mock.patch.object(recorder, 'QUEUE_BYTES', QUEUE_BYTES),
+        with (self.disk, mock.patch.object(recorder, 'atexit'),
+              mock.patch.object(recorder, 'QUEUE_BYTES', QUEUE_BYTES),
               mock.patch.object(recorder, 'Recorder', Log)):
             self.machine.run(self._live)
         for one in (*self.readers, *self.logs):
