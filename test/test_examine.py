@@ -123,7 +123,7 @@ def test_north_is_magnetic_north():
 def test_off_the_axis_the_acceleration_is_that_of_the_point():
     exam = runs.Exam(None, {}, [0])
     exam.lead = 10
-    ((part,), (arm,)) = exam.motion.of('top'), runs.RUNS['arm'](exam)
+    ((part,), (arm,)) = exam.motion.of('top'), runs.RUNS['lever arm'](exam)
     rows, rates = slice(part.begin + 450, part.end - 50), exam.run.gyroscope
     expected = np.cross(np.gradient(rates, 0.01, axis=0), runs.ARM) + np.cross(
         rates, np.cross(rates, runs.ARM))

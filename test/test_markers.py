@@ -10,8 +10,6 @@ from spinning_top_sim import solve
 from spinning_top_sim.shape import Shape
 from spinning_top_sim.streams import parameters
 
-PERIOD_NS = 50_000_000
-
 
 def axis_of(q):
     x, y, z, w = np.asarray(q).T

@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--data', type=Path, metavar='FOLDER', help='examine with the trials of BROAD in this '
         'folder: readings of a real IMU beside an optical truth (.mat)')
     add('--level', choices=SEEDS, help='level of the exam; default: quick; field: scenes of a '
-        'sensor in a hand; full: both')
+        'sensor in a hand')
     scene_file.add_arguments(parser, 'imu')
     add('--seeds', type=int, metavar='N', help='number of noisy runs')
     add('--json', action='store_true', help='print everything as JSON')

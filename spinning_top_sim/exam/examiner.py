@@ -114,6 +114,7 @@ def _sit(exam: Exam, subject: str, show: Callable[[float, float], object]) -> Re
             measured = check.measure(exam)
         except InvalidOutputError as error:
             found.append(Finding('invalid_output', str(error)))
+            left_out.append(check.mark)
             continue
         if measured is None:
             continue

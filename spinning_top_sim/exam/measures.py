@@ -58,7 +58,7 @@ def settled(quaternions: Reals, most: float) -> bool:
 
 def differ(one: Reals, other: Reals) -> bool:
     """Return whether attitudes (n, 4) are others than these, beyond rounding."""
-    return bool(np.max(np.abs(one - other)) > ROUNDING)
+    return largest_turn(one, other) > ROUNDING
 
 
 def degrees(angle: float) -> str:

@@ -15,7 +15,7 @@ from spinning_top_sim.tools.report import Report
 LEAST_DEG = 1e-4        # lower limit of the logarithmic axes
 LINE = 0.15             # height of a line of text [inch]
 # Marks whose limit holds for the errors of the outcomes.
-LIMITS = 'noisy_deg', 'error_rms_deg'
+LIMITS = 'noisy_deg', 'error_rms_deg', 'field_rms_deg', 'data_rms_deg'
 
 
 def draw_page(report: Report, path: Path) -> None:
@@ -44,7 +44,7 @@ def draw_page(report: Report, path: Path) -> None:
                               linewidth=0.8, label=outcome.run.name)
         for axes, name in ((tilt, 'tilt'), (heading, 'heading')):
             axes.axhline(limit, color='0.5', linestyle=':', label='limit of the rms')
-            axes.set(ylabel=f'{name} error [deg]', xlabel='t [s]')
+            axes.set(ylabel=f'{name} error [deg]', xlabel='time that is judged [s]')
             axes.yaxis.set_major_formatter('{x:g}')         # the default is TeX
             axes.tick_params(which='minor', labelleft=False)
         if report.outcomes:

@@ -55,7 +55,9 @@ class Exam:
     def outcomes(self, name: str) -> list[Outcome]:
         """Return the outcomes of a run by its name in RUNS, in our convention."""
         if name not in self.told:
-            self.told[name] = self._feed(RUNS[name](self))
+            self.told[name] = self._feed([
+                run if run.name.startswith(name) else replace(run, name=name)
+                for run in RUNS[name](self)])
         return list(map(self.ours, self.told[name]))
 
     def ours(self, told: Outcome) -> Outcome:
@@ -130,7 +132,7 @@ class Exam:
         run = self.run.without_field()
         gyroscope = run.gyroscope.copy()
         gyroscope[steps] += turns / run.dt[steps, np.newaxis]
-        return replace(run, name='kicks', gyroscope=gyroscope)
+        return replace(run, gyroscope=gyroscope)
 
     def turned(self, steps: NDArray[np.intp], sizes: Reals | float) -> Run:
         """Return the run without field, with kicks about the vertical of so many rad (n,)."""
@@ -155,14 +157,14 @@ def _field_turned(exam: Exam) -> list[Run]:
     turns, middle = Rotation.from_quat(exam.run.truth), len(exam.run.dt) // 2
     field = turns.inv().apply(Rotation.from_euler('z', FIELD_TURN).apply(motions.FIELD))
     field[:middle] = exam.run.magnetometer[:middle]
-    return [replace(exam.run, name='field turned', magnetometer=field)]
+    return [replace(exam.run, magnetometer=field)]
 
 
 def _begin(exam: Exam) -> list[Run]:
     """Read force and field at the begin of each step."""
     force, field = (np.vstack((rows[:1], rows[:-1]))
                     for rows in (exam.run.accelerometer, exam.run.magnetometer))
-    return [replace(exam.run, name='force of the begin', accelerometer=force, magnetometer=field)]
+    return [replace(exam.run, accelerometer=force, magnetometer=field)]
 
 
 def _arm(exam: Exam) -> list[Run]:
@@ -172,7 +174,7 @@ def _arm(exam: Exam) -> list[Run]:
     turns = Rotation.from_quat(exam.run.truth[rows])
     velocity = np.gradient(turns.apply(ARM), 1.0 / RATE, axis=0)
     force[rows] += turns.inv().apply(np.gradient(velocity, 1.0 / RATE, axis=0))
-    return [replace(exam.run, name='lever arm', accelerometer=force)]
+    return [replace(exam.run, accelerometer=force)]
 
 
 def _bias(exam: Exam) -> list[Run]:
@@ -194,4 +196,4 @@ RUNS: Mapping[str, Callable[[Exam], list[Run]]] = {
     # As fast as those of equal steps.
     'uneven turns': lambda exam: [exam.turned(
         exam.uneven, SMALL * RATE * exam.run.dt[exam.uneven])],
-    'tilts': _tilts, 'bias': _bias, 'arm': _arm}
+    'tilts': _tilts, 'bias': _bias, 'lever arm': _arm}

@@ -62,4 +62,4 @@ def report_of(make_filter: MakeFilter, runs: Sequence[Callable[[], ScoredRun]], 
         of_run = [error[0] for error, other in zip(errors, names, strict=True) if other == name]
         marks[f'{kind}_rms_{name}_deg'] = Mark(float(np.mean(of_run)))
     return Report(subject, faults, marks, [] if whole else [
-        'the magnetometer changes nothing: the filter is judged by its tilt'], outcomes)
+        'the magnetometer changes nothing: the filter is judged by its tilt'], outcomes, whole)

@@ -290,7 +290,8 @@ def _marks(compared: Comparison) -> dict[str, Mark]:
         found, sigma, _ = compared.fit(effects)
         marks.update({name: Mark(float(value), meaning=_interval(deviation))
                       for name, value, deviation in zip(
-                          names, values + found[:len(values)], sigma, strict=False)})
+                          names, values + found[:len(values)], sigma, strict=False)
+                      if math.isfinite(deviation)})
 
     what, value = ('field', compared.field) if kind == 'magnetometer' else (
         'lever_arm', compared.arm)

@@ -43,7 +43,9 @@ START = 0.02            # angle to the start that is given, beyond which there i
 NOISES = 5.0            # standard deviations of noise by which an attitude may be off besides
 EXACT = 1e-6            # noise of attitudes from which rates cannot tell causes [rad]
 # Errors of a device in our parameters, and faults that they are in the readings of its logs.
-DECLARED = {'bias': {'bias'}, 'random_walk': {'bias'}, 'drop': {'held'}, 'duplicate': {'held'},
+DECLARED = {**{name: {'bias', 'reading_scale', 'matrix', 'inaccurate'} for name in (
+                'turn_on_bias', 'hard_iron', 'soft_iron', 'disturbance')},
+            'bias': {'bias'}, 'random_walk': {'bias'}, 'drop': {'held'}, 'duplicate': {'held'},
             **{name: {'matrix', 'mounting', 'reading_scale', 'sign'} for name in ('_M', '_A')},
             **{name: {'late', 'early', 'inaccurate', 'noise_scale', 'acceleration_scale',
                       'reading_scale', 'matrix', 'finite_differences'} for name in (

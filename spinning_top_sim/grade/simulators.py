@@ -90,6 +90,8 @@ def grade(run: Simulate, *, dt: float = 0.002, body: Body = WHEEL,
     if len(notes) == len(scenes):
         raise ValueError(f'dt = {dt!r} s: the top turns by more than {MOST:g} rad in a step')
     subject = one_line(subject or getattr(run, '__name__', type(run).__name__))
+    if judgement.motions and READINGS.keys().isdisjoint(judgement.motions[0].told.readings):
+        notes.append('no readings: the IMU is not graded')
     return Report(subject, judgement.faults, {}, notes).plus(*judgement.reports())
 
 
@@ -99,7 +101,9 @@ def told_motion(said: Any, times: Reals) -> Stretch:
     readings = {name: _numbers(name, said[name], (len(times), 4 if name == 'attitudes' else 3))
                 for name in ('attitudes', *KINDS) if said.get(name) is not None}
     if 'attitudes' not in readings:
-        raise InvalidTrajectoryError(f'what is returned has {[*said]}: must have attitudes')
+        raise InvalidTrajectoryError(
+            f'what is returned has {[name for name in said if said[name] is not None]}: must have '
+            'attitudes')
     attitudes = readings.pop('attitudes')
     for at in np.flatnonzero(np.abs(np.linalg.norm(attitudes, axis=1) - 1.0) > NORM)[:1]:
         raise InvalidTrajectoryError(f'attitudes[{at}] = {attitudes[at].tolist()}: the norm '
@@ -207,9 +211,7 @@ class Judgement:
         found = [fault for fault in self._of_motions() if not (
             first == 'rates_scale' and fault.name == 'inaccurate')]
         yield Report('motions', found, {
-            name: mark for motion in self.motions for name, mark in self._marks(motion)}, [
-                'no readings: the IMU is not graded'] * READINGS.keys().isdisjoint(
-                    self.motions[0].told.readings))
+            name: mark for motion in self.motions for name, mark in self._marks(motion)})
         yield from map(self._readings, READINGS)
 
     def _readings(self, kind: str) -> Report:

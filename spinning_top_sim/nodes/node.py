@@ -200,7 +200,8 @@ class Simulator(Node):
             raise
         if rest:
             self.loop.set_parameters(values, {name: values[name] for name in rest})
-            self._show_status(values)
+            if 'status_period' in rest:
+                self._show_status(values)
             self._align_ticks()
         self.values = values
 

@@ -151,7 +151,8 @@ class Channel:
     template : of its messages
     fields : returns the numbers that go into the fields of `template`
     faults : of stamps, and losses; None: every sample is sent once, with its time
-    delay_ns : time from a sample to its message [ns]
+    delay_ns : time from a sample to its message [ns]; the place of the pivot is known so long,
+        states by steps for the memory of the IMU only
     """
 
     name: str

@@ -86,11 +86,10 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
                 fields: Callable[[Samples], Sequence[Values]] = lambda _: (),
                 rate: str = '', timed: bool = False) -> Channel:
         """Return a channel; one that is `timed` has the stamps and the losses of the IMU."""
-        period = period_ns(values[rate or f'{name}.rate'])
-        timing = Timing(values, period) if timed else None
-        return Channel(name, topic, type_name, period, template, fields,
-                       None if timing is None or timing.is_right else timing)
+        return Channel(name, topic, type_name, period_ns(values[rate or f'{name}.rate']), template,
+                       fields, timing if timed and not timing.is_right else None)
 
+    timing = Timing(values, imu.period_ns)
     # Covariances of angular velocity, specific force and orientation.
     noisy = [messages.diagonal(*variances) for variances in (
         3 * (imu.gyroscope.variance,), 3 * (imu.accelerometer.variance,),
@@ -120,7 +119,7 @@ def all_channels(values: Mapping[str, Any], imu: Imu) -> list[Channel]:
                 lambda samples: (samples.orientation, *samples.exact)),
         channel('imu_timing', 'ground_truth/imu_timing', ARRAY,
                 messages.float64_multi_array(TIMING),
-                partial(_timing, Timing(values, imu.period_ns)), 'imu.rate'),
+                partial(_timing, timing), 'imu.rate'),
         channel('mag', 'imu/mag', MAGNETIC_FIELD, magnetic_field,
                 partial(_magnetic_field, magnetometer)),
         channel('mag', 'ground_truth/mag', MAGNETIC_FIELD, magnetic_field,

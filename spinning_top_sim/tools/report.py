@@ -137,8 +137,8 @@ class Report:
             'subject': self.subject, 'passed': self.passed, 'faults': self.faults,
             'found': [{'name': finding.name, 'evidence': finding.evidence,
                        'number': finite(finding.number)} for finding in self.found],
-            'marks': {name: {'value': finite(mark.value), 'limit': finite(mark.limit)}
-                      for name, mark in self.marks.items()},
+            'marks': {name: {'value': finite(mark.value), 'limit': finite(mark.limit),
+                             'meaning': mark.meaning} for name, mark in self.marks.items()},
             'notes': list(self.notes)}, indent=2)
 
 

@@ -145,14 +145,8 @@ class Topic:
         wait_for(f'{count} messages of {self.kind.__name__}', lambda: len(self.raw) >= count)
         return self
 
-    def wait_more(self, count):
-        return self.wait(len(self.raw) + count)
-
     def messages(self, first=0):
         return [deserialize_message(data, self.kind) for data in self.raw[first:]]
-
-    def last(self):
-        return deserialize_message(self.raw[-1], self.kind)
 
 
 class Peer:

@@ -6,7 +6,6 @@ import io
 import json
 from pathlib import Path
 
-import numpy as np
 from mcap.reader import make_reader
 
 from spinning_top_sim.tools import inspect
@@ -19,10 +18,6 @@ def stamp_of(data):
     """Return the stamp [ns] of a serialized message that begins with a header."""
     sec = int.from_bytes(data[4:8], 'little', signed=True)
     return sec * SECOND + int.from_bytes(data[8:12], 'little')
-
-
-def stamps_of(topic):
-    return np.array([stamp_of(data) for data in topic.raw])
 
 
 def xyzw(q):

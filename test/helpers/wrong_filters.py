@@ -106,6 +106,17 @@ class Mahony:
         return self._q.copy()
 
 
+class IntegralInTheWorld(Mahony):
+    """Keeps its integral in axes of the world, and says it in those of the sensor."""
+
+    def update(self, *readings):
+        if self._q is not None:
+            self.bias = reference.matrix_of(self._q).T @ self._kept
+        said = super().update(*readings)
+        self._kept = reference.matrix_of(said) @ self.bias
+        return said
+
+
 def axes(*rows):
     """Return what reads other axes: numbers from 1 on, negative where the sign is changed."""
     chosen, signs = np.abs(rows) - 1, np.sign(rows)
@@ -174,6 +185,7 @@ WRONG = {
     'bias gain < 0': (partial(Mahony, learns=-0.02), 'bias'),
     'bias clamped': (partial(Mahony, most=math.radians(0.1)), 'bias'),
     'bias negated': (partial(Part, report=np.negative), 'bias'),
+    'bias in the world': (partial(IntegralInTheWorld, 0.5, 0.5, 0.05), 'bias'),
     'covariance / 9': (partial(Part, ReferenceFilter, covariance=1.0 / 9.0), 'covariance'),
     'covariance x 50': (partial(Part, ReferenceFilter, covariance=50.0), 'covariance'),
     'not a number': (partial(Part, said=lambda q: q * np.nan), 'invalid_output')}
