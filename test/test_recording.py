@@ -13,6 +13,7 @@ import re
 import runpy
 import subprocess
 import sys
+import threading
 import time
 from contextlib import closing
 from types import SimpleNamespace
@@ -27,7 +28,7 @@ from mcap.reader import make_reader
 from mcap.records import Channel
 from rosbags.highlevel import AnyReader
 
-from spinning_top_sim.recording import provenance
+from spinning_top_sim.recording import provenance, recorder
 from spinning_top_sim.recording.errors import MAX_BYTES
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder, single
@@ -172,6 +173,18 @@ def test_a_file_that_is_deleted_and_a_disk_that_fills_end_a_recording(
     harm(path, monkeypatch)
     assert recorder.close().error == f'recording to {path} stopped: {reason}'
     assert not path.exists() or len(seen_by_mcap(path)) == 1
+
+
+def test_a_queue_that_is_full_when_the_recording_fails_holds_nobody_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder, 'QUEUE_BYTES', 100)
+    is_full = threading.Event()
+    failing = Recorder(str(tmp_path / 'missing/run.mcap'), TOPICS,
+                       lambda: {'asked': str(is_full.wait(60.0))})
+    failing.write([single(*message) for message in some_messages(3)])
+    assert not failing.room
+    is_full.set()
+    assert failing.close().lost == 3
+    assert failing.state == 'failed' and failing.room
 
 
 def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeypatch):

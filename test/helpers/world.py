@@ -197,7 +197,13 @@ class World:
 
     def stop_recording(self):
         self.asked += 1
-        self.recording.end(self._answer)
+        ended = self.logs[-1:] if self.recording.is_on else []
+
+        def answer(*said):
+            assert all(log.state in ('closed', 'failed') for log in ended), 'too early'
+            self._answer(*said)
+
+        self.recording.end(answer)
 
     def _answer(self, *answer):
         self.answers.append(answer)
@@ -278,7 +284,9 @@ class World:
                 self.drive(len(self._drives) - 1, *self._drives[0])
         self.loop.tick()
         self._check_time()
-        self.recording.check()
+        if failed := self.recording.check():
+            assert (self.recording.error, self.recording.numbers()) == (
+                failed, {'recorder': 'failed'}), 'a failure is told until the next recording'
         assert all(log.counters.queued <= MOST_QUEUED for log in self.logs)
         if self.recording.is_on:
             log, warning = self.logs[-1], self.recording.warning or ''
