@@ -53,4 +53,4 @@ def test_a_report_is_a_table_and_json():
     assert 'unknown' not in str(report)
     said = json.loads(report.as_json())
     assert said['found'] == [{'name': 'timing', 'evidence': '3 samples late', 'number': 3.0}]
-    assert said['marks']['far'] == {'value': None, 'limit': None}
+    assert said['marks']['far'] == {'value': None, 'limit': None, 'meaning': ''}
