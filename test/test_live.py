@@ -94,7 +94,24 @@ def test_a_motion_that_ends_is_sent_up_to_its_end():
         with pytest.raises(IntegrationError, match='pole') as error:
             advance(simulation)
         assert simulation.now_ns == error.value.reached_ns > SECOND // 10
-    assert times(taken, 'pose') == [*range(0, simulation.now_ns + 1, MILLISECOND)]
+    sent, end_ns = [*range(0, simulation.now_ns + 1, MILLISECOND)], simulation.now_ns
+    assert times(taken, 'pose') == sent
+    # After a reset it ends so again.
+    simulation.apply('reset', parameters=simulation.values, epoch_ns=EPOCH_NS)
+    with pytest.raises(IntegrationError, match='pole'):
+        simulation.send(SECOND)
+    assert simulation.now_ns == end_ns and times(taken, 'pose') == 2 * sent
+
+
+def test_a_late_fix_has_its_place_from_before_a_command():
+    pytest.importorskip('pymap3d')
+    simulation = simulate({'gnss.enabled': True, 'gnss.latency': 1.0, 'markers.trace_length': 0.0})
+    taken = record(simulation, 'gnss/fix')
+    for tick in range(1, 61):
+        simulation.send(50 * MILLISECOND * tick)
+        if tick % 4 == 0:
+            simulation.apply('command', l3=1.6, lz=1.3)
+    assert times(taken, 'gnss/fix') == [*range(SECOND, 3 * SECOND + 1, SECOND // 10)]
 
 
 def test_each_sample_is_computed_once_for_all_and_what_nobody_takes_is_not(monkeypatch):
