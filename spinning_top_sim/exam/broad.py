@@ -31,7 +31,12 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     The filter gets each trial from its first sample on.  The measures are the root mean squares
     of the errors in motion, of each trial and their means.
 
-    folder : with the trials; the other arguments are those of `examine`
+    Parameters
+    ----------
+    folder : path
+        With the trials.
+    make_filter, subject, feed, show : object
+        As for `examine`.
 
     Raises
     ------

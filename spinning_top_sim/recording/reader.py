@@ -74,17 +74,27 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     Opening reads it through once.  What is damaged is left out from then on.
 
-    path : the file, or a folder as `ros2 bag` makes it, which must hold exactly one
-    max_bytes : of the largest record, and the largest uncompressed chunk, that is read; and of the
-        messages of other chunks that `messages` holds while it reads one
-    compressed : read a log whose messages rosbag2 has compressed one by one, and leave them so
+    Parameters
+    ----------
+    path : path
+        The file, or a folder as `ros2 bag` makes it, which must hold exactly one.
+    max_bytes : int
+        Of the largest record, and the largest uncompressed chunk, that is read; and of the
+        messages of other chunks that `messages` holds while it reads one.
+    compressed : bool
+        Read a log whose messages rosbag2 has compressed one by one, and leave them so.
 
+    Raises
+    ------
+    LogError
+        If it is no MCAP file, or its messages are compressed.
+
+    Notes
+    -----
     Attributes are `path` and `size` [bytes] of the file when it was opened; `profile` and
     `library`, which its header names; `damage`; `whole`, whether there is none; `metadata`, the
     last of each name; `schemas` and `channels`, mcap's records by id; `span`, the earliest and the
     latest log time [ns], both 0 without messages.
-
-    Raises LogError if it is no MCAP file, or its messages are compressed.
     """
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES, *,
@@ -142,10 +152,22 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         """
         Iterate over the messages in the order of their log times, equal ones in file order.
 
-        topics : names; default: all
-        start, end : log times [ns]; `end` is exclusive
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Names; default: all.
+        start, end : int
+            Log times [ns]; `end` is exclusive.
 
-        Raises LogError for too many chunks of one time.
+        Yields
+        ------
+        LogMessage
+            With its serialized bytes.
+
+        Raises
+        ------
+        LogError
+            For too many chunks of one time.
         """
         names = None if topics is None else frozenset(topics)
         wanted = {number for number, channel in self.channels.items()
@@ -168,19 +190,45 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
 
     def groups(self, topics: Iterable[str] | None = None,
                ) -> Iterator[tuple[str, list[LogMessage]]]:
-        """Iterate over messages as `messages` does, some of one topic at a time, and its name."""
+        """
+        Iterate over messages as `messages` does, some of one topic at a time.
+
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Names; default: all.
+
+        Yields
+        ------
+        (str, list of LogMessage)
+            A topic, and messages in the order of `messages`.
+        """
         messages = self.messages(topics)
         while block := sorted(itertools.islice(messages, BLOCK), key=attrgetter('topic')):
             for topic, group in itertools.groupby(block, attrgetter('topic')):
                 yield topic, list(group)
 
     def in_file_order(self) -> Iterator[LogMessage]:
-        """Iterate over all messages."""
+        """
+        Iterate over all messages.
+
+        Yields
+        ------
+        LogMessage
+            In the order of the file.
+        """
         for place in sorted(self._places, key=attrgetter('offset')):
             yield from self._messages_in(place)
 
     def attached(self) -> Iterator[Metadata | Attachment]:
-        """Iterate over metadata and attachments, in file order."""
+        """
+        Iterate over metadata and attachments.
+
+        Yields
+        ------
+        Metadata or Attachment
+            Records of mcap, in the order of the file.
+        """
         for offset, end in self._attached:
             record = next(_records_in(self._at(offset, end)))
             if isinstance(record, Metadata | Attachment):
