@@ -33,10 +33,12 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
 
     Parameters
     ----------
+    make_filter : callable
+        As for `examine`, and so are `subject`, `feed` and `show`.
     folder : path
         With the trials.
-    make_filter, subject, feed, show : object
-        As for `examine`.
+    subject, feed, show
+        See `examine`.
 
     Raises
     ------
