@@ -34,11 +34,13 @@ def examine_data(make_filter: MakeFilter, folder: str | Path, *, subject: str | 
     Parameters
     ----------
     make_filter : callable
-        As for `examine`, and so are `subject`, `feed` and `show`.
+        As for `examine`.
     folder : path
         With the trials.
-    subject, feed, show
-        See `examine`.
+    subject : str, optional
+        As for `examine`.
+    feed, show : callable, optional
+        As for `examine`.
 
     Raises
     ------
