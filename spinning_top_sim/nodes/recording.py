@@ -92,7 +92,7 @@ class Recording:
         """Wait until all logs are closed; return a text for the user about the last one."""
         recorder = self._recorder
         self.end()
-        for one in {asked for asked, *_ in self._requests}:     # each waits once
+        for one in dict.fromkeys(asked for asked, *_ in self._requests):    # each waits once
             one.close()
         self.check()
         if recorder is None or recorder.path is None:
