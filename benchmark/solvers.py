@@ -24,7 +24,7 @@ import numpy as np
 from cases import FINEST_NS, WORK_PRECISION, Case
 from peers import FailedError, Peer, Runner, peer
 from report import number, preamble, table, write_section
-from timing import TimeUpError, interleaved, one_thread, seconds_of, time_limit
+from timing import TimeUpError, interleaved, one_thread, time_limit
 from truth import angles_between
 
 from spinning_top_sim.solvers.exact import ExactSolution
@@ -74,7 +74,7 @@ def measure(case: Case, count: int, rounds: int) -> dict[str, tuple[float, float
         try:
             with time_limit(LONGEST_S):
                 runner = one.ready(case, setting)
-                _, result = seconds_of(lambda runner=runner: runner.attitudes(ns))
+                result = runner.attitudes(ns)
         except (FailedError, TimeUpError) as error:
             found[name] = str(error)
             continue

@@ -20,8 +20,7 @@ from typing import Any
 
 def one_thread() -> None:
     """Restart this script if its numerical libraries may use more than one thread."""
-    wanted = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1', 'MKL_NUM_THREADS': '1',
-              'XLA_FLAGS': '--xla_cpu_multi_thread_eigen=false'}
+    wanted = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1', 'MKL_NUM_THREADS': '1'}
     if not wanted.items() <= os.environ.items():
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | wanted)
 

@@ -20,6 +20,7 @@ from spinning_top_sim.physics import attitude
 from spinning_top_sim.physics.attitude import Column, Quaternion, Vector
 from spinning_top_sim.physics.states import Point, States
 from spinning_top_sim.physics.top import Top
+from spinning_top_sim.times import ns_array
 
 # Increments over panels of a larger angle are differences: the rounding is below 1e-13 of them.
 LEAST_ANGLE = 0.05
@@ -86,8 +87,8 @@ def increments(states: Callable[[NDArray[np.int64]], States], begins: range, len
     angle = rate * length_ns * 1e-9
     rule = _rule(length_ns, _nodes(angle))
     # Of each panel both ends and the nodes between them, (n, nodes and ends).
-    times_ns = np.array(begins)[:, np.newaxis] + [
-        0, *(offset_ns for offset_ns, _ in rule), length_ns]
+    times_ns = ns_array(begins)[:, np.newaxis] + np.array(
+        [0, *(offset_ns for offset_ns, _ in rule), length_ns])
     now = states(times_ns.ravel())
 
     def rows_of(vector: Sequence[Column | float]) -> Matrix:
