@@ -78,6 +78,23 @@ def test_a_filter_without_an_estimate_of_a_bias_is_right_unless_it_reports_one(r
     assert found.measures['bias_tilt_s'] == pytest.approx(2.0, rel=0.1)
 
 
+def test_a_bias_that_is_said_a_few_times_is_not_judged():
+    class Rarely:
+        def __init__(self):
+            self._filter, self._updates = ReferenceFilter(), 0
+
+        def update(self, *readings):
+            self._updates += 1
+            return self._filter.update(*readings)
+
+        @property
+        def bias(self):
+            return self._filter.bias if self._updates % 7500 == 0 else None
+
+    found = examine(Rarely, seeds=1, feed=feeding.feed)
+    assert found.passed and 'bias_report_off' not in found.measures, found
+
+
 def test_a_convention_is_undone_for_the_other_checks(report):
     found, right = report('w first, NED'), report('vqf')
     assert 'read as w, x, y, z, world north-east-down' in found.found[0].evidence

@@ -156,6 +156,12 @@ def test_errors_are_one_line(tmp_path, capsys, name, content, words, code):
     assert words in err and name in err
 
 
+def test_arrays_without_rows_are_refused(tmp_path):
+    np.savez(tmp_path / 'a.npz', **dict.fromkeys(ROWS, np.empty(0)))
+    with pytest.raises(ValueError, match='0 attitudes'):
+        read_table(tmp_path / 'a.npz', None)
+
+
 def test_rows_that_are_there_twice_and_empty_cells_are_noted_or_left_out(tmp_path):
     twice = {name: np.repeat(values, 2) for name, values in ROWS.items()}
     recorded = read_table(table(tmp_path / 'a.csv', twice), None)

@@ -74,7 +74,7 @@ def examine_log(path: str | Path, topic: str, truth: str = TRUTH,
     if (wrong := invalid(said.quaternions, said.covariances)) is not None:
         return Report(subject, [Finding('invalid_output', 'the message of '
                                         f'{stamp_text(int(said.stamps_ns[wrong[0]]))} s: '
-                                        f'{wrong[1]}')])
+                                        f'{wrong[1]}')], notes=notes)
     outcome = _beside(one_line(topic), said, true)
     return replace(_judge(subject, outcome, heading == 'true'), notes=notes)
 
@@ -105,7 +105,7 @@ def _beside(name: str, said: Stamped, true: Stamped) -> Outcome:
     """Return the estimates with the truth at their stamps, interpolated."""
     after = np.clip(np.searchsorted(true.stamps_ns, said.stamps_ns), 1, len(true.stamps_ns) - 1)
     chosen = ((said.stamps_ns >= true.stamps_ns[0]) & (said.stamps_ns <= true.stamps_ns[-1])
-              & (np.diff(true.stamps_ns)[after - 1] <= LONGEST_GAP_S * 1e9))
+              & (true.stamps_ns[after] - true.stamps_ns[after - 1] <= LONGEST_GAP_S * 1e9))
     if np.count_nonzero(chosen) < FEWEST:
         raise ValueError(f'{name} has {np.count_nonzero(chosen)} attitudes at times of the truth: '
                          f'must have {FEWEST} at least')

@@ -283,8 +283,9 @@ def _add(recorded: Recorded, table: Table, said: Chosen) -> None:
                 table.cells(column, _date if unit == 'iso' else Decimal), object)
                 for column, unit in pairs)
             if not recorded.parts:
-                recorded.origin = stamps[0]
-                recorded.notes.append(f'times of {source}: the first is {float(stamps[0]):.12g} s')
+                recorded.origin = next(iter(stamps), Decimal(0))
+                recorded.notes.append(f'times of {source}: the first is '
+                                      f'{float(recorded.origin):.12g} s')
             times = (stamps - recorded.origin).astype(float)
         else:
             recorded.add(kind, source, times, np.stack([

@@ -46,12 +46,12 @@ class LogSource:
     def _read(self, reader: LogReader, run: recorded_run.RunDescription, last_ns: int) -> None:
         """Read the samples up to a log time [ns]."""
         name = next((name for name in TOPICS if name in run.topics), '')
-        found = [message for _, group in reader.groups([run.topics[name]] if name else [])
-                 for message in group if message.log_time <= last_ns
-                 and len(message.data) == len(self.track.templates[name])]     # else none of ours
+        found = [message for message in reader.messages(
+            [run.topics[name]] if name else [], end=last_ns + 1)
+            if len(message.data) == len(self.track.templates[name])]       # else none of ours
         if found:
             self.track.add_messages(name, [one.data for one in found],
-                                     [one.log_time for one in found])
+                                    [one.log_time for one in found])
 
     def update(self, seconds: float) -> int:
         return self.player.advance(seconds)
