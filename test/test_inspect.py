@@ -178,6 +178,14 @@ def test_pictures_are_drawn(short, tmp_path, capsys):
     assert np.mean(np.abs(shown[1] - shown[0]).max(axis=2) > 30) > 0.01
 
 
+def test_samples_that_are_far_apart_are_drawn(tmp_path, capsys):
+    pytest.importorskip('matplotlib')
+    pytest.importorskip('PIL.Image')
+    log = log_of(tmp_path / 'run.mcap', '--duration', 60, '-p', 'record.streams:=[pose]',
+                 '-p', 'pose.rate:=0.05')
+    assert told(capsys, log, '--animate', tmp_path / 'top.gif')[0] == 0
+
+
 @pytest.mark.parametrize('options', [
     ('--animate', 'a.png'), ('--export', 'tum:./a.png'),
     ('--export', 'tum:b', '--export', 'euroc_imu:sub/../b')])

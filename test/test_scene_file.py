@@ -112,6 +112,13 @@ def test_a_namespace_is_the_prefix_of_frames_but_the_world(tmp_path):
     assert [values[name] for name in parameters.FRAMES] == ['world', 'left/base_link', 'left/chip']
 
 
+@pytest.mark.parametrize('frame', ['5', "''", '/chip'])
+def test_a_namespace_makes_no_frame_of_what_is_none(tmp_path, capsys, frame):
+    assert main(['--namespace', 'left', '-p', f'imu.frame_id:={frame}', '--duration', '1',
+                 '-o', str(tmp_path / 'log.mcap')]) == 2
+    assert 'imu.frame_id = ' in capsys.readouterr().err
+
+
 def test_a_file_that_is_given_to_the_node_and_names_it_applies_in_any_namespace(tmp_path):
     path = tmp_path / 'p.yaml'
     path.write_text(''.join(f'{name}: {{ros__parameters: {{world_frame: f{k}}}}}\n'

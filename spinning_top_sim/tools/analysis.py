@@ -54,8 +54,8 @@ class SampledStates(States):
         self._rows = rows
 
     def until(self, seconds: float) -> SampledStates:
-        """Return the states of so many seconds from the first one on."""
-        count = int(np.searchsorted(self.t, self.t[0] + seconds, 'right'))
+        """Return the states of so many seconds from the first one on, but two at least."""
+        count = max(2, int(np.searchsorted(self.t, self.t[0] + seconds, 'right')))
         return SampledStates(self.top, self.t[:count], self._rows[:, :count])
 
 

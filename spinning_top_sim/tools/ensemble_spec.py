@@ -103,9 +103,10 @@ class Specification:
         return [name for name in STREAMS if any(
             topics.is_recorded(name, {**DEFAULTS, **values}) for values in self._given)]
 
-    @cached_property
+    @property
     def parts(self) -> Sequence[range]:
         """The runs that one task computes each, and that share a file."""
+        # Not cached: every task carries what is, and there may be 100 000 parts.
         values = {**DEFAULTS, **self._given[0]}
         # A stream without a rate of its own has that of the IMU.
         rows = self.duration * max(values.get(f'{name}.rate', values['imu.rate'])

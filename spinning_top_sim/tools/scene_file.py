@@ -117,9 +117,13 @@ def given(arguments: argparse.Namespace, node: str = NODE, *, to_ros: bool = Fal
     values |= {name: value for name, value in map(parse_assignment, arguments.param)
                if is_of_ros(name) == to_ros}
     namespace = (getattr(arguments, 'namespace', None) or '').strip('/')
-    return values if to_ros or not namespace else values | {
-        name: f'{namespace}/{values.get(name, parameters.BY_NAME[name].default)}'
-        for name in parameters.FRAMES[1:]}
+    if namespace and not to_ros:
+        for name in parameters.FRAMES[1:]:
+            frame = values.get(name, parameters.BY_NAME[name].default)
+            # With a prefix, what is no name of a frame would look like one.
+            if isinstance(frame, str) and frame and not frame.startswith('/'):
+                values[name] = f'{namespace}/{frame}'
+    return values
 
 
 def chosen_files(arguments: argparse.Namespace) -> list[Path]:
