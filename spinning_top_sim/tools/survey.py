@@ -4,7 +4,7 @@
 import itertools
 import math
 from bisect import bisect_left
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -92,6 +92,7 @@ class Survey:
         self.shown: list[SampledStates] = []
         self.notes: list[str] = []
         self._due: defaultdict[str, list[Times]] = defaultdict(list)    # log times [ns]
+        self._samples: Counter[str] = Counter()     # that were due, in all
         with np.errstate(all='ignore'):         # a log may hold any numbers
             if run is not None:
                 self._follow(run)
@@ -142,11 +143,14 @@ class Survey:
         for name, channel in section.channels.items():
             self.topics[name].grid_rate = NANOSECONDS / channel.period_ns
             times = channel.times(max(section.after_ns, -1), end_ns)
-            if len(times) <= recorded_run.most_samples(run):
+            before, most = self._samples[name], recorded_run.most_samples(run)
+            self._samples[name] += len(times)
+            if self._samples[name] <= most:
                 self._due[name].append(section.epoch_ns + np.unique(channel.due(ns_array(times))))
-            else:
+            elif before <= most:
+                self._due[name].clear()
                 self.notes.append(f'{name}: what is missing is not counted: the log lacks most of '
-                                  f'{len(times)} samples')
+                                  f'{self._samples[name]} samples')
 
     def _read(self, reader: LogReader) -> dict[str, Times]:
         """Compare all messages with their motions; return the log times of each topic [ns]."""
