@@ -90,7 +90,7 @@ next start, and take effect with `~/reset` as the others do.
 
 ## Parameters
 
-An integer is accepted as a double; a number in quotes only with an exponent, such as '1e-3'. A change
+An integer is accepted as a double, and so is a number in quotes. A change
 takes effect at once, at the next `~/reset`, with the next recording, or only at the start of the node
 (read-only).
 
