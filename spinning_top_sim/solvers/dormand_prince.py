@@ -49,7 +49,7 @@ SHRINK, GROW = 0.2, 5.0
 SMALLEST_STEP_ULPS = 16
 # A time that so many steps of the present size do not reach is refused: minutes of work.
 MOST_STEPS = 1e7
-# Steps that are taken and read together, and those that are kept at most: some 50 MB.
+# Steps that are taken and read together, and those that a call takes or keeps: some 50 MB.
 STEPS_TOGETHER, MOST_KEPT = 256, 50_000
 
 
@@ -205,12 +205,23 @@ class SteppedMotion(ABC):
         return bisect_left(self._kept, t, hi=len(self._kept) - 1, key=attrgetter('t1'))
 
     def states(self, times_ns: NDArray[np.int64] | range) -> States:
-        """Return the states at ascending times (n,) [ns]; see `states_at_seconds`."""
-        return self.states_at_seconds(ns_array(times_ns) / NANOSECONDS)
+        """
+        Return the states at ascending times (n,) [ns]; missing steps are taken, and kept.
+
+        Raises IntegrationError for a time before the steps that are kept, out of reach, or more
+        than MOST_KEPT steps away; up to its `reached_ns`, the states can be had then.
+        """
+        t, most = ns_array(times_ns) / NANOSECONDS, self.steps + MOST_KEPT
+        while len(t) and self._kept[-1].t1 < t[-1]:
+            if self.steps >= most:
+                raise IntegrationError(f't = {float(t[-1])!r} s is more than {MOST_KEPT} steps '
+                                       'away: ask for times between', reached_ns=self.reached_ns)
+            self._take_steps(float(t[-1]))
+        return self.states_at_seconds(t)
 
     def states_at_seconds(self, t: Column) -> States:
         """
-        Return the states at ascending times t (n,) [s]; missing steps are taken here.
+        Return the states at ascending times t (n,) [s]; many missing steps are not all kept.
 
         Raises IntegrationError for a time before the steps that are kept, or out of reach.
         """

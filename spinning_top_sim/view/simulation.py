@@ -80,7 +80,8 @@ class SimulatedTrack(Track):
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values, epoch_ns=NANOSECONDS)
-        self.trajectory = Simulation(values).trajectory
+        self._simulation, self._reached_ns = Simulation(values), -1
+        self.trajectory = self._simulation.trajectory
 
     def times(self, begin_ns: int, end_ns: int) -> Times:
         first = max(-(-begin_ns // PERIOD_NS), 0) * PERIOD_NS
@@ -97,8 +98,10 @@ class SimulatedTrack(Track):
 
     def go_on(self, t_ns: int) -> None:
         """Solve up to a time.  Raises IntegrationError if the motion ends before."""
-        self.trajectory.evaluate(np.array([t_ns]))
-        self.trajectory.forget(t_ns - 2 * WINDOW_NS, t_ns - 2 * WINDOW_NS)
+        while self._reached_ns < t_ns:
+            self._reached_ns = self._simulation.reach(self._reached_ns, t_ns)
+            before_ns = self._reached_ns - 2 * WINDOW_NS
+            self.trajectory.forget(before_ns, before_ns)
 
 
 class OwnSimulation:
