@@ -262,6 +262,9 @@ class World:
             is_closed = log.state in ('closed', 'failed')
             assert is_closed or self.disk.is_disturbed, 'a log is closed'
             assert is_closed or f'{log.file.name} could not be closed within' in said
+        self.recording.check()
+        if all(log.state in ('closed', 'failed') for log in self.logs):
+            assert len(self.answers) == self.asked, 'each request is answered once'
         self.was_killed = False
 
     def _tick_until(self, until_ns):
@@ -280,7 +283,7 @@ class World:
 
     def _tick(self):
         if self._drives and self.loop.state is LoopState.RUNNING:
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ValueError, RuntimeError):     # the motion may end here
                 self.drive(len(self._drives) - 1, *self._drives[0])
         self.loop.tick()
         self._check_time()
@@ -314,10 +317,11 @@ class World:
         self._tick_until(max(machine.now_ns, self._cost_until_ns, self._stops_at_ns) + QUIET_NS)
         self._tick()
         self._check_time(is_quiet=True)
-        before_ns, had_room = loop.now_ns, self.recording.has_room()
+        before_ns, had_room = self.simulation.now_ns, self.recording.has_room()
         self._tick_until(machine.now_ns + QUIET_NS)
+        # Simulated time may be held before the stamp of t = 0.
         if not self.plan.follows and loop.state is LoopState.RUNNING and had_room and (
-                self.recording.has_room()):
+                self.recording.has_room()) and before_ns > 0:
             late_ns = QUIET_NS * self.values['time_scale'] - (loop.now_ns - before_ns)
             assert abs(late_ns) <= 2 * loop.tick_period_ns * self.values['time_scale'], (
                 'time goes on')
