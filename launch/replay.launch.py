@@ -53,8 +53,8 @@ def _nodes(context: LaunchContext) -> list:
     # replay_node refuses what is no number.
     options = [f'--{name}={given[name]}' for name in ('rate', 'start')]
     options += [f'--{name}' for name in ('loop', 'partial') if on[name]]
-    clocked = given['clock'].lower() != 'false'
-    if clocked:
+    clocked = given['clock'].lower() != 'false' or on['loop']
+    if given['clock'].lower() != 'false':
         options.append('--clock' if given['clock'].lower() == 'true'
                        else f'--clock={given["clock"]}')
     node = Node(package='spinning_top_sim', executable='replay_node', output='screen',
