@@ -67,14 +67,10 @@ def test_a_node_waits_for_a_clock_follows_its_steps_and_names_its_jumps(tmp_path
 def test_stamps_are_dates_that_have_come_after_resets_too_beside_a_clock_of_its_own(tmp_path):
     leads_ns = []
     with OwnNode(tmp_path, use_sim_time=True, clock__enabled=True).listen('pose') as node:
-        heard = []
-        listener = node.node.create_subscription(Clock, '/clock', heard.append, 10)
         node.heard['pose'] = SimpleNamespace(
             append=lambda data: leads_ns.append(stamp_of(data) - time.time_ns()))
         for _ in range(4):
             count = len(leads_ns)
             node.spin_until('samples', lambda count=count: len(leads_ns) > count + 5)
             assert node.trigger('reset').success
-        node.spin_until('its clock', lambda: heard)
-        node.node.destroy_subscription(listener)
-    assert max(leads_ns) <= 0 and heard[0].clock.sec > 1_000_000_000
+    assert max(leads_ns) <= 0
