@@ -92,17 +92,6 @@ def test_a_motion_that_ends_is_sent_up_to_its_end():
     assert times(taken, 'pose') == [*range(0, simulation.now_ns + 1, MILLISECOND)]
 
 
-def test_a_late_fix_has_its_place_from_before_a_command():
-    pytest.importorskip('pymap3d')
-    simulation = simulate({'gnss.enabled': True, 'gnss.latency': 1.0, 'markers.trace_length': 0.0})
-    taken = record(simulation, 'gnss/fix')
-    for tick in range(1, 61):
-        simulation.send(50 * MILLISECOND * tick)
-        if tick % 4 == 0:
-            simulation.apply('command', l3=1.6, lz=1.3)
-    assert times(taken, 'gnss/fix') == [*range(SECOND, 3 * SECOND + 1, SECOND // 10)]
-
-
 def test_each_sample_is_computed_once_for_all_and_what_nobody_takes_is_not(monkeypatch):
     simulation = simulate(pose__rate=1000.0, joint_states__rate=500.0, clock__rate=1000.0)
     taken = record(simulation, 'pose', 'joint_states', '/clock')
@@ -151,23 +140,3 @@ def test_motions_are_forgotten_when_nothing_reaches_back_to_them():
     assert kept == list(range(kept[0], 6 * SECOND + 1, SECOND // 10))
     with pytest.raises(LookupError, match=r't = 0 ns: the motion before .* is forgotten'):
         simulation.trajectory.evaluate(np.array([0]))
-
-
-@pytest.mark.parametrize(('kind', 'details', 'words'), [
-    ('reset', {'initial.theta': 0.0, 'spin.lz': 0.5}, 'pole'),
-    ('command', {'l3': float('nan'), 'lz': 1.0}, 'l3 = nan kg m.2/s: must be finite'),
-    ('command', {'l3': 1.0, 'lz': 1e20}, 'no motion'),
-    ('state', {'theta': 4.0, 'theta_dot': 0.0, 'phi': 0.0, 'psi': 0.0, 'l3': 1.0, 'lz': 1.0},
-     r'theta = 4\.0'),
-    ('epoch', {'epoch_ns': 2 ** 70}, 'must be >= 0 and < 2147483648 s'),
-    ('jump', {}, "event 'jump': must be one of command, state, drive, parameters, epoch, reset")])
-def test_an_event_that_is_refused_leaves_the_run_as_it_was(kind, details, words):
-    expected, simulation = play(simulate(), SECOND, 'pose'), simulate()
-    taken = record(simulation, 'pose')
-    simulation.send(SECOND // 2)
-    if kind == 'reset':
-        details = {'parameters': {**simulation.values, **details}, 'epoch_ns': 0}
-    with pytest.raises(ValueError, match=words):
-        simulation.apply(kind, **details)
-    simulation.send(SECOND)
-    assert taken == expected and simulation.history == []
