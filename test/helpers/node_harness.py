@@ -25,8 +25,7 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
+from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
 import helpers.own_domain  # noqa: F401, for programs without conftest.py
@@ -82,27 +81,20 @@ class SimNode:
         return self
 
     def __exit__(self, *_):
-        self.kill()
+        self.signal(signal.SIGKILL)
+        self.process.wait()
 
     def signal(self, number):
         """Signal the process group, if it is there."""
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.process.pid, number)
-
-    def kill(self):
-        if self.alive:
-            self.signal(signal.SIGKILL)
-            self.process.wait()
+        if self.process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, number)
 
     def end(self, *numbers):
         """Signal the process group, wait, and return the exit code."""
         for number in numbers or (signal.SIGINT,):
             self.signal(number)
         return self.process.wait(PATIENCE_S)
-
-    @property
-    def alive(self):
-        return self.process.poll() is None
 
     @property
     def out(self):
@@ -122,31 +114,6 @@ def options(parameters):
     return [item for name, value in parameters.items() for item in ('-p', f'{name}:=' + (
         value if isinstance(value, str)
         else json.dumps(value).replace('Infinity', '.inf').replace('NaN', '.nan')))]
-
-
-class Topic:
-    """
-    The messages that have arrived on one topic, serialized, in order.
-
-    muted: further ones are ignored; rclpy cannot destroy a subscription that is waited for
-    """
-
-    def __init__(self, kind):
-        self.kind = kind
-        self.raw = []
-        self.muted = False
-
-    def receive(self, data):
-        if not self.muted:
-            self.raw.append(data)
-
-    def wait(self, count):
-        """Wait until `count` messages have arrived in all."""
-        wait_for(f'{count} messages of {self.kind.__name__}', lambda: len(self.raw) >= count)
-        return self
-
-    def messages(self, first=0):
-        return [deserialize_message(data, self.kind) for data in self.raw[first:]]
 
 
 class Peer:
@@ -178,13 +145,11 @@ class Peer:
         self.node.destroy_node()
         rclpy.shutdown(context=self.node.context)
 
-    def listen(self, name, kind, reliability=ReliabilityPolicy.RELIABLE):
-        """Subscribe with a queue that is long enough for any test."""
-        topic = Topic(kind)
-        self.node.create_subscription(
-            kind, name, topic.receive, QoSProfile(depth=20_000, reliability=reliability),
-            raw=True)
-        return topic
+    def listen(self, name, kind):
+        """Return the list to which the serialized messages on a topic are appended."""
+        heard = []
+        self.node.create_subscription(kind, name, heard.append, QoSProfile(depth=20_000), raw=True)
+        return heard
 
     def call(self, kind, name, request):
         """Call a service, again where no answer comes, and return the answer."""
