@@ -30,7 +30,8 @@ def generate_launch_description() -> LaunchDescription:
             'start', default_value='0.0',
             description='Start this many seconds after the start of the log'),
         DeclareLaunchArgument(
-            'loop', default_value='false', choices=SWITCH, description='Start again at the end'),
+            'loop', default_value='false', choices=SWITCH,
+            description='Start again at the end; /clock begins anew, for TF and RViz too'),
         DeclareLaunchArgument(
             'clock', default_value='false',
             description='true, or a rate [Hz]: publish the time of the log on /clock, for TF and '

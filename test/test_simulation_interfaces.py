@@ -6,6 +6,7 @@ The handlers are called as the executor calls them, with stand-ins for the messa
 installed ones where there are some.
 """
 
+import functools
 import importlib
 import importlib.util
 import math
@@ -15,7 +16,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import Twist, Vector3
+from geometry_msgs.msg import Pose, Quaternion, Twist, Vector3
 from helpers import standard_types
 from helpers.node_logs import events_in, log_of, verified, xyz, xyzw
 from helpers.own_node import OwnNode
@@ -59,7 +60,12 @@ class StandardNode(OwnNode):
         assert result.error_message
         return result.result, result.error_message
 
-    def put(self, state, **flags):
+    def put(self, numbers=None, *, state=None, **flags):
+        """Return a request to set a state, by default upright but for numbers by their paths."""
+        state = state or self.messages.EntityState(pose=Pose(orientation=Quaternion(w=1.0)))
+        for path, value in (numbers or {}).items():
+            *way, name = path.split('.')
+            setattr(functools.reduce(getattr, way, state), name, value)
         return {'entity': NAME, 'state': state, 'set_pose': True, 'set_twist': True, **flags}
 
     @property
@@ -81,18 +87,6 @@ class StandardNode(OwnNode):
         assert self.set_state('PAUSED') == OK
         if steps:
             self.done('StepSimulation', steps=steps)
-
-    def upright(self, **changes):
-        """Return a state with these numbers, by paths such as twist__linear__x."""
-        state = self.messages.EntityState()
-        state.pose.orientation.w = 1.0
-        for path, value in changes.items():
-            *way, name = path.split('__')
-            target = state
-            for part in way:
-                target = getattr(target, part)
-            setattr(target, name, value)
-        return state
 
 
 @pytest.fixture(params=('stand-in', 'installed') if INSTALLED else ('stand-in',))
@@ -177,7 +171,7 @@ def test_a_reset_begins_the_motion_again_or_lets_time_go_on(top, scope, now_ns, 
 def test_a_log_of_all_this_verifies_and_has_the_states(top, tmp_path):
     """States and resets are events; a state is bit by bit what is published at its stamp."""
     path = tmp_path / 'run.mcap'
-    put = top.put(top.upright(twist__angular__x=0.5, twist__angular__z=11.0))
+    put = top.put({'twist.angular.x': 0.5, 'twist.angular.z': 11.0})
     top.pause(steps=3)
     top.done('SetEntityState', **{**put, 'set_pose': False})
     assert top.switch('record', True).success
@@ -204,10 +198,8 @@ def test_a_log_of_all_this_verifies_and_has_the_states(top, tmp_path):
 def test_a_state_that_is_set_is_the_state(top, which):
     top.pause(steps=20)
     before, q, rates = numbers(top.entity), (0.2, -0.4, 0.4, 0.8), (1.0, -2.0, 9.0)
-    wanted = top.upright(
-        pose__orientation__x=q[0], pose__orientation__y=q[1], pose__orientation__z=q[2],
-        pose__orientation__w=q[3], twist__angular__x=1.0, twist__angular__y=-2.0,
-        twist__angular__z=9.0)
+    wanted = {f'pose.orientation.{axis}': value for axis, value in zip('xyzw', q, strict=True)} | {
+        f'twist.angular.{axis}': value for axis, value in zip('xyz', rates, strict=True)}
     top.done('SetEntityState', **top.put(wanted, set_pose=which == 'pose',
                                          set_twist=which == 'twist'))
     expected = ([*q, *before[4:7]] if which == 'pose' else [*before[:4], *rates])
@@ -218,13 +210,13 @@ def test_a_state_that_is_set_is_the_state(top, which):
 
 
 BAD_STATES = [
-    ({'pose__position__x': 0.1}, INVALID_POSE, 'pose.position [m] = [0.1, 0.0, 0.0]: must be'),
-    ({'pose__orientation__w': 0.9}, INVALID_POSE, '[0.0, 0.0, 0.0, 0.9]: must have the length 1'),
-    ({'pose__orientation__x': math.nan}, INVALID_POSE, 'must have the length 1'),
-    ({'twist__linear__y': 0.5}, FAILED, 'twist.linear [m/s] = [0.0, 0.5, 0.0]: must be that of'),
-    ({'twist__angular__z': math.inf}, FAILED, 'twist.angular = [0.0, 0.0, inf] rad/s: must be'),
-    ({'twist__angular__z': 1e200}, FAILED, 'no motion from'),
-    ({'header__frame_id': 'map'}, UNSUPPORTED, "header.frame_id = 'map': must be 'world'"),
+    ({'pose.position.x': 0.1}, INVALID_POSE, 'pose.position [m] = [0.1, 0.0, 0.0]: must be'),
+    ({'pose.orientation.w': 0.9}, INVALID_POSE, '[0.0, 0.0, 0.0, 0.9]: must have the length 1'),
+    ({'pose.orientation.x': math.nan}, INVALID_POSE, 'must have the length 1'),
+    ({'twist.linear.y': 0.5}, FAILED, 'twist.linear [m/s] = [0.0, 0.5, 0.0]: must be that of'),
+    ({'twist.angular.z': math.inf}, FAILED, 'twist.angular = [0.0, 0.0, inf] rad/s: must be'),
+    ({'twist.angular.z': 1e200}, FAILED, 'no motion from'),
+    ({'header.frame_id': 'map'}, UNSUPPORTED, "header.frame_id = 'map': must be 'world'"),
 ]
 
 
@@ -232,16 +224,16 @@ def test_a_bad_state_changes_nothing(top):
     top.pause(steps=5)
     before = top.entity
     for changes, code, text in BAD_STATES:
-        found, reason = top.refused('SetEntityState', **top.put(top.upright(**changes)))
+        found, reason = top.refused('SetEntityState', **top.put(changes))
         assert (found, text in reason) == (code, True), (found, reason)
         assert (numbers(top.entity) == numbers(before)).all()
 
 
 @pytest.mark.parametrize(('x', 'w', 'theta'), [(3e-9, 1.0, 0.0), (1.0, 3e-9, math.pi)])
 def test_next_to_a_pole_what_is_not_spin_is_nutation(top, x, w, theta):
-    top.done('SetEntityState', **top.put(top.upright(
-        pose__orientation__x=x, pose__orientation__w=w, twist__angular__x=0.3,
-        twist__angular__z=2.0)))
+    top.done('SetEntityState', **top.put({
+        'pose.orientation.x': x, 'pose.orientation.w': w, 'twist.angular.x': 0.3,
+        'twist.angular.z': 2.0}))
     start = top.simulation.state()
     assert start.theta == theta and abs(start.lz) == abs(start.l3)
     assert start.theta_dot == pytest.approx(0.3)
@@ -254,9 +246,9 @@ def test_a_state_can_be_set_where_the_pivot_is(top):
     top.done('StepSimulation', steps=30)
     state = top.entity
     assert state.pose.position.x > 0.01 and state.twist.linear.x > 0.1
-    assert top.refused('SetEntityState', **top.put(top.upright(), set_twist=False))[0] == (
+    assert top.refused('SetEntityState', **top.put(set_twist=False))[0] == (
         INVALID_POSE)
-    top.done('SetEntityState', **top.put(state))
+    top.done('SetEntityState', **top.put(state=state))
     after = top.entity
     assert xyz(after.pose.position) == xyz(state.pose.position)
     assert xyz(after.twist.linear) == xyz(state.twist.linear)
