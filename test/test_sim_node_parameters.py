@@ -67,14 +67,10 @@ REFUSED_COMMANDS = {
     (1e300, 1e300): '1e+300', (1e20, 1.0): '1e+20', (-1e150, 1e15): '1e+150'}
 REFUSED_PARAMETERS = [
     ({'spin__l3': math.nan}, 'nan'), ({'spin__l3': 1e20, 'spin__lz': 1.0}, '1e+20'),
-    ({'spin__l3': 'fast'}, 'fast'), ({'spin__l3': True}, 'True'), ({'pose__enabled': 1}, '1'),
-    ({'top__lambda1': 0.0}, '0.0'), ({'top__lambda3': -2}, '-2.0'),
+    ({'spin__l3': 'fast'}, 'fast'), ({'pose__enabled': 1}, '1'), ({'top__lambda3': -2}, '-2.0'),
     ({'top__mass': 1e300, 'top__gravity': 1e300}, '1e+300'), ({'imu__rate': 1e5}, '1000'),
-    ({'time_scale': math.inf}, 'inf'), ({'solver__method': 'magic'}, 'magic'),
     ({'imu__lever_arm': [0.0, 1.5]}, 'imu.lever_arm = [0.0, 1.5]: must be'),
-    ({'imu__bias_instability_band': [5.0, 1.0]}, 'the second number must be larger'),
-    ({'record__streams': ['pose', 'poise']}, 'poise'), ({'step__count': 1.5}, '1.5'),
-    ({'solver__rtol': '1e-9x'}, '1e-9x'), ({'solver__rtol': '3.5'}, '3.5'),
+    ({'record__streams': ['pose', 'poise']}, 'poise'), ({'solver__rtol': '3.5'}, '3.5'),
     ({'imu__lever_arm': ['1e-2', 'x', '2e0']}, 'must be a list of 3 numbers'),
     ({'initial__theta': 4.0, 'pose__rate': 50.0}, '4.0'), ({'use_sim_time': True}, 'read-only')]
 
