@@ -2,8 +2,7 @@
 """
 What a node does for simulation_interfaces: states, steps, resets, features, and its entity.
 
-The handlers are called as the executor calls them, with stand-ins for the messages, and with the
-installed ones where there are some.
+The handlers are called as the executor calls them, with the installed messages or stand-ins.
 """
 
 import functools
@@ -31,16 +30,16 @@ STOPPED, PLAYING, PAUSED, QUITTING = range(4)
 ALREADY = INVALID_POSE = 101
 TRANSITION_ERROR, INCORRECT_TRANSITION = 102, 103
 NAME = 'spinning_top'
-INSTALLED = importlib.util.find_spec('simulation_interfaces') is not None
 
 
 class StandardNode(OwnNode):
     """The node, which starts paused; `call` calls a handler as the executor calls it."""
 
-    def __init__(self, folder, kind='stand-in', **values):
+    def __init__(self, folder, **values):
         super().__init__(folder, start_paused=True, **values)
-        self.messages, self.services = standard_types.modules() if kind == 'stand-in' else [
-            importlib.import_module(f'simulation_interfaces.{part}') for part in ('msg', 'srv')]
+        self.messages, self.services = [
+            importlib.import_module(f'simulation_interfaces.{part}') for part in ('msg', 'srv')
+        ] if importlib.util.find_spec('simulation_interfaces') else standard_types.modules()
         self.handlers = SimulationHandlers(self.node, self.messages)
 
     def call(self, name, **request):
@@ -89,9 +88,9 @@ class StandardNode(OwnNode):
             self.done('StepSimulation', steps=steps)
 
 
-@pytest.fixture(params=('stand-in', 'installed') if INSTALLED else ('stand-in',))
-def top(request, tmp_path):
-    with StandardNode(tmp_path, request.param) as top:
+@pytest.fixture
+def top(tmp_path):
+    with StandardNode(tmp_path) as top:
         yield top
 
 
