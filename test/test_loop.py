@@ -123,16 +123,6 @@ def test_a_change_of_parameters_does_not_hide_a_jump_of_the_clock():
     assert run.kinds == ['epoch', 'parameters'] and run.loop.now_ns == 6 * TICK_NS
 
 
-def test_the_duration_ends_with_its_last_sample_and_nothing_leads_on():
-    run = Run(duration=0.0723).ticks(100)
-    run.loop.fail('a test')
-    assert run.loop.state is LoopState.ENDED
-    with pytest.raises(RuntimeError, match='at the end: nothing follows'):
-        run.loop.reset(run.values)
-    assert run.loop.now_ns == 72_300_000 and run.kinds == []
-    assert run.ticks(5).times == grid(72_300_000)
-
-
 def test_what_a_tick_has_no_time_or_room_for_comes_later_and_a_clock_too_far_ahead_slips(
         monkeypatch):
     """By a second of real time."""

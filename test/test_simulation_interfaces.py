@@ -151,6 +151,7 @@ def test_a_failed_motion_is_paused_until_it_is_stopped_and_quitting_ends_the_nod
         OK, QUITTING, ALREADY)
     assert top.set_state('PLAYING') == INCORRECT_TRANSITION
     assert top.refused('ResetSimulation', scope=0)[0] == INCORRECT_STATE
+    assert top.trigger('reset').message == 'at the end: nothing follows'
     top.spin_until('the end', top.node.finished.done)
     assert top.node.finished.result() is None       # exit code 0
 
