@@ -50,13 +50,6 @@ def peer():
 
 
 @pytest.fixture(scope='session')
-def diagnostics(peer):
-    from helpers.node_harness import Diagnostics
-
-    return Diagnostics(peer)
-
-
-@pytest.fixture(scope='session')
 def stepped(tmp_path_factory):
     """Four motions by steps, with noise, in a namespace."""
     from helpers.inspected import log_of

@@ -33,7 +33,8 @@ MOUNTED = {
     'imu.drop_rate': 0.1, 'imu.duplicate_rate': 0.1, 'mag.noise_density': 1e-7,
     'mag.random_walk': 1e-7, 'mag.resolution': 1.5e-7, 'mag.rate': 125.0, 'gnss.latency': 0.03,
     'mag.disturbance.world': (0.1, 0.2, 1e-5, 0.0, 0.0), 'gnss.outages': (0.05, 0.1),
-    'gnss.position_noise': (1.0, 2.0), 'gnss.velocity_noise': (0.1, 0.2), 'imu.sampling': 'mean'}
+    'gnss.position_noise': (1.0, 2.0), 'gnss.velocity_noise': (0.1, 0.2), 'imu.sampling': 'mean',
+    'markers.trace_length': 0.02}         # a late fix reaches back further
 FILTERED = {
     **MOUNTED, 'imu.sampling': 'instant', 'imu.bandwidth': 150.0, 'imu.bandwidth_order': 2,
     'imu.vibration.force': (1.0, 2.0, 3.0), 'imu.vibration.rate_psd': (10.0, 1e-3, 90.0, 1e-4)}

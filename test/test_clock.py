@@ -68,36 +68,6 @@ def test_what_a_slow_clock_makes_due_is_on_time_for_half_a_second():
         assert top.tick(steady_ns * MS, second * S)[1] == late_ns
 
 
-@pytest.mark.parametrize('jump_ns', [10 * S, 985 * S + 3 * MS])
-def test_a_jump_forward_moves_the_stamps_and_not_the_motion(jump_ns):
-    top = Top(publishers=1).begin(10 * S + 7 * MS)
-    top.tick(1 * S, 11 * S)
-    sent_ns = top.sent_ns
-    top.tick(2 * S, 11 * S + jump_ns)
-    assert top.sent_ns == sent_ns and top.epoch_ns % EPOCH_GRID_NS == 0
-    top.tick(3 * S, 12 * S + jump_ns)
-    assert top.sent_ns == sent_ns + S
-    assert 0 <= 12 * S + jump_ns - top.stamp_ns < EPOCH_GRID_NS
-    assert top.warnings == [f'/clock jumped forward by {jump_ns / S:g} s: so do the stamps']
-
-
-def test_a_step_back_is_named_and_a_reset_brings_the_stamps_back():
-    top = Top(publishers=1).begin(300 * S)
-    for steady_ns, date_ns in ((1 * S, 301 * S), (2 * S, 10 * MS), (3 * S, 1010 * MS)):
-        top.tick(steady_ns, date_ns)
-    (warning,) = top.warnings
-    assert top.stamp_ns == 302 * S and warning.startswith('/clock stepped back by 300.99 s:')
-    top.begin(1015 * MS)
-    assert top.epoch_ns == 1010 * MS
-    top.tick(4 * S, 1515 * MS)
-    assert 0 <= 1515 * MS - top.stamp_ns < EPOCH_GRID_NS
-    top.begin(1515 * MS)
-    assert top.epoch_ns == 1520 * MS, 'a reset that follows no step back keeps the order'
-    assert top.tick(4 * S, 1515 * MS)[0] < 0
-    early = Top(publishers=1).begin(5)          # 0 is no time
-    assert (early.epoch_ns, early.tick(0, 5)[0]) == (EPOCH_GRID_NS, 5 - EPOCH_GRID_NS)
-
-
 @pytest.mark.parametrize('lag_ns', [5 * MS, 30 * MS, 990 * S])
 @pytest.mark.parametrize('leads_first', [True, False])
 def test_of_two_clocks_the_latest_counts_and_stamps_are_never_ahead_of_it(lag_ns, leads_first):

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from helpers.simulations import MILLISECOND, SECOND, run
 
-from spinning_top_sim.streams import parameters
-
 STANDING = {'initial.theta': 0.0, 'spin.l3': 0.0, 'spin.lz': 0.0, 'solver.method': 'exact'}
 ALONG = {'E': 1e-6, 'N': 20e-6, 'U': -40e-6, 'W': -1e-6, 'S': -20e-6, 'D': 40e-6}
 QUARTER = 0.5 * math.pi
@@ -26,14 +24,6 @@ def test_each_axis_reads_the_field_along_it(values, axes):
                    'imu/mag', 'ground_truth/mag')
     for _, _, field, _ in found.values():
         assert field == pytest.approx(np.array([[ALONG[axis] for axis in axes]]), abs=1e-19)
-
-
-def test_the_default_is_the_world_magnetic_model_in_munich():
-    """WMM2025 at 48.14 N, 11.58 E, 520 m, on 1 January 2026, by `ahrs`; it is given in nT."""
-    wmm = pytest.importorskip('ahrs').utils.WMM(
-        date=2026.0, latitude=48.14, longitude=11.58, height=0.52)
-    assert parameters.checked({})['mag.field'] == pytest.approx(
-        (1e-9 * wmm.Y, 1e-9 * wmm.X, -1e-9 * wmm.Z), abs=10e-9)
 
 
 def test_noise_has_the_covariance_that_is_published_at_each_rate():

@@ -9,13 +9,10 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from builtin_interfaces.msg import Time as Stamp
 from helpers.node_logs import SECOND, events_in, log_of, stamp_of, verified
 from helpers.own_node import OwnNode
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
-
-from spinning_top_sim.nodes import executable
 
 GRID_NS = 10_000_000        # of the stamps, and of pose
 
@@ -47,8 +44,8 @@ def test_a_node_waits_for_a_clock_follows_its_steps_and_names_its_jumps(tmp_path
             now_ns += step * SECOND
             show(now_ns)
         assert set(np.diff([*map(stamp_of, heard)])) == {GRID_NS}, 'every sample is published'
-        for jump in (10, 985):
-            now_ns += jump * SECOND
+        for jump in (10, 985.004):
+            now_ns += round(jump * SECOND)
             told(f'/clock jumped forward by {jump} s: so do the stamps', now_ns)
             now_ns += SECOND
             show(now_ns)
@@ -61,6 +58,7 @@ def test_a_node_waits_for_a_clock_follows_its_steps_and_names_its_jumps(tmp_path
         assert int(answer.message.split()[-2]) == 8 * SECOND
         told('recording stopped: stamps have gone back', 9 * SECOND)
         show(9 * SECOND)
+    assert {stamp_of(data) % GRID_NS for data in heard} == {0}
     assert ''.join(said).count('/clock jumped') == 2 and 'keep up' not in ''.join(said)
     path = tmp_path / 'run.mcap'
     assert verified(path)['identical']
@@ -70,24 +68,10 @@ def test_a_node_waits_for_a_clock_follows_its_steps_and_names_its_jumps(tmp_path
 def test_stamps_are_dates_that_have_come_after_resets_too_beside_a_clock_of_its_own(tmp_path):
     leads_ns = []
     with OwnNode(tmp_path, use_sim_time=True, clock__enabled=True).listen('pose') as node:
-        heard = []
-        listener = node.node.create_subscription(Clock, '/clock', heard.append, 10)
         node.heard['pose'] = SimpleNamespace(
             append=lambda data: leads_ns.append(stamp_of(data) - time.time_ns()))
         for _ in range(4):
             count = len(leads_ns)
             node.spin_until('samples', lambda count=count: len(leads_ns) > count + 5)
             assert node.trigger('reset').success
-        node.spin_until('its clock', lambda: heard)
-        node.node.destroy_subscription(listener)
-    assert max(leads_ns) <= 0 and heard[0].clock.sec > 1_000_000_000
-
-
-def test_what_is_no_time_on_a_clock_is_left_out_with_one_line(tmp_path, capfd):
-    with OwnNode(tmp_path, use_sim_time=True) as node:
-        executable.guard_clock(node.node)
-        (clock,) = [one for one in node.node.subscriptions if one.msg_type is Clock]
-        for sec, nanosec in ((7, 0), (-1, 0), (2 ** 31 - 1, 4_000_000_000)):
-            clock.callback(Clock(clock=Stamp(sec=sec, nanosec=nanosec)))
-        assert node.node.get_clock().now().nanoseconds == 7 * SECOND
-    assert capfd.readouterr().err.count('/clock is left out: the stamp -1 s: must be >= 0') == 1
+    assert max(leads_ns) <= 0

@@ -98,16 +98,6 @@ def test_the_allan_deviation_of_a_flicker_bias_is_flat():
     assert found / 0.3 == pytest.approx(1.0, abs=0.15)
 
 
-def test_one_imu_has_one_noise_and_one_bias_at_all_rates():
-    _, found = run({**NOISY, 'imu.rate': 100.0, 'imu_data.rate': 250.0}, SECOND,
-                   'imu/data_raw', 'imu/data')
-    raw, data = (dict(zip(times_ns.tolist(), np.hstack((rates, force)), strict=True))
-                 for times_ns, *_, rates, force in found.values())
-    common = raw.keys() & data.keys()
-    assert len(common) >= 4 and len(data) == 251
-    assert all(np.array_equal(raw[t_ns], data[t_ns]) for t_ns in common)
-
-
 def test_the_chain_by_hand():
     """Matrices, g-sensitivity, then rounding, then the range; no reading is beyond a grid code."""
     values = {'imu.gyroscope_M': (2.0, 0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0),

@@ -41,12 +41,15 @@ def test_each_message_is_labelled_with_its_true_time():
     assert jitter == pytest.approx(3e-4, rel=4.0 / math.sqrt(2.0 * len(t)))
 
 
-def test_one_imu_has_one_clock_at_whatever_rate_it_is_read():
-    _, found = run({**FAULTS, 'imu_data.enabled': True, 'imu_data.rate': 100.0}, 3 * SECOND,
+def test_one_imu_has_one_clock_and_one_noise_at_whatever_rate_it_is_read():
+    noise = {'imu.gyroscope_noise_density': 2e-4, 'imu.gyroscope_random_walk': 2e-4}
+    _, found = run({**FAULTS, **noise, 'imu_data.rate': 100.0}, 3 * SECOND,
                    'imu/data_raw', 'imu/data')
-    (raw_ns, raw_stamps, *_), (times_ns, stamps, *_) = found.values()
+    (raw_ns, *raw), (times_ns, *data) = found.values()
     both = raw_ns % (2 * PERIOD_NS) == 0
-    assert np.array_equal(raw_ns[both], times_ns) and np.array_equal(raw_stamps[both], stamps)
+    assert np.array_equal(raw_ns[both], times_ns)
+    for column in (0, -2, -1):          # stamps, rates and forces
+        assert np.array_equal(raw[column][both], data[column])
 
 
 def test_losses_and_repetitions_have_their_rates_and_are_independent():

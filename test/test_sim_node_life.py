@@ -16,7 +16,6 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import clock, loop
-from spinning_top_sim.recording import recorder
 from spinning_top_sim.recording.writer import McapWriter
 from spinning_top_sim.streams import parameters
 
@@ -56,14 +55,6 @@ def test_overload_skips_what_is_live_records_everything_and_stays_reachable(
         assert node.switch('set_pause', True).success
     assert capfd.readouterr().err.count('live topics skip samples') == 1
     assert verified(tmp_path / 'run.mcap')['identical']
-
-
-def test_a_step_waits_for_a_recorder_that_has_no_room(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorder, 'QUEUE_BYTES', 20_000)
-    with OwnNode(tmp_path, start_paused=True) as node:
-        assert node.switch('record', True).success
-        node.step(500)
-    assert len(log_of(tmp_path / 'run.mcap')[0]['/pose']) == 501
 
 
 def test_a_recording_that_fails_is_told_and_gives_way_to_the_next(

@@ -12,12 +12,10 @@ pytest.importorskip('rclpy')
 import rclpy
 from geometry_msgs.msg import Twist, Vector3
 from helpers.examples import TIMES
-from helpers.extremes import DOUBLES, parameter_set
-from helpers.node_harness import wait_for
+from helpers.extremes import DOUBLES
 from helpers.node_logs import events_in, log_of, verified
 from helpers.own_node import OwnNode
 
-from spinning_top_sim.nodes import publishers
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.parameter import ANY, Effect
@@ -69,14 +67,10 @@ REFUSED_COMMANDS = {
     (1e300, 1e300): '1e+300', (1e20, 1.0): '1e+20', (-1e150, 1e15): '1e+150'}
 REFUSED_PARAMETERS = [
     ({'spin__l3': math.nan}, 'nan'), ({'spin__l3': 1e20, 'spin__lz': 1.0}, '1e+20'),
-    ({'spin__l3': 'fast'}, 'fast'), ({'spin__l3': True}, 'True'), ({'pose__enabled': 1}, '1'),
-    ({'top__lambda1': 0.0}, '0.0'), ({'top__lambda3': -2}, '-2.0'),
+    ({'spin__l3': 'fast'}, 'fast'), ({'pose__enabled': 1}, '1'), ({'top__lambda3': -2}, '-2.0'),
     ({'top__mass': 1e300, 'top__gravity': 1e300}, '1e+300'), ({'imu__rate': 1e5}, '1000'),
-    ({'time_scale': math.inf}, 'inf'), ({'solver__method': 'magic'}, 'magic'),
     ({'imu__lever_arm': [0.0, 1.5]}, 'imu.lever_arm = [0.0, 1.5]: must be'),
-    ({'imu__bias_instability_band': [5.0, 1.0]}, 'the second number must be larger'),
-    ({'record__streams': ['pose', 'poise']}, 'poise'), ({'step__count': 1.5}, '1.5'),
-    ({'solver__rtol': '1e-9x'}, '1e-9x'), ({'solver__rtol': '3.5'}, '3.5'),
+    ({'record__streams': ['pose', 'poise']}, 'poise'), ({'solver__rtol': '3.5'}, '3.5'),
     ({'imu__lever_arm': ['1e-2', 'x', '2e0']}, 'must be a list of 3 numbers'),
     ({'initial__theta': 4.0, 'pose__rate': 50.0}, '4.0'), ({'use_sim_time': True}, 'read-only')]
 
@@ -89,10 +83,15 @@ def test_refused_commands_and_parameters_change_nothing(node, capfd):
     for data, named in REFUSED_COMMANDS.items():
         node.command(*data)
         assert named in capfd.readouterr().err, data
-    node.receive('cmd_vel', Twist(angular=Vector3(z=0.5)))
-    assert 'angular = [0.0, 0.0, 0.5] rad/s: must be 0' in capfd.readouterr().err
-    rejected += 1
-    assert node.loop.rejected_commands == rejected + len(REFUSED_COMMANDS)
+    for twist, named in (
+            (Twist(angular=Vector3(z=0.5)), 'angular = [0.0, 0.0, 0.5] rad/s: must be 0'),
+            (Twist(linear=Vector3(x=math.nan)), 'linear = [nan, 0.0, 0.0] m/s: each must be'),
+            (Twist(linear=Vector3(z=1e5)), '100000.0] m/s: each must be finite and within 10000')):
+        node.receive('cmd_vel', twist)
+        assert named in capfd.readouterr().err
+    node.receive('cmd_vel', Twist())        # of a pivot that rests: no event
+    rejected += 3 + len(REFUSED_COMMANDS)
+    assert node.loop.rejected_commands == rejected
     for given, named in REFUSED_PARAMETERS:
         result = node.set(**given)
         name = next(iter(given)).split('__')[-1]
@@ -100,25 +99,19 @@ def test_refused_commands_and_parameters_change_nothing(node, capfd):
             False, True, True), (given, result.reason)
     assert not node.set(world_frame='map').successful, 'read-only'
     spins = sum(any('spin__' in key for key in given) for given, _ in REFUSED_PARAMETERS)
-    assert node.loop.rejected_commands == rejected + len(REFUSED_COMMANDS) + spins
+    assert node.loop.rejected_commands == rejected + spins
     assert (node.node.values, node.loop.commands) == before
     node.step(10)
-    assert 'command' not in {event['event'] for event in events_in(recorded(node))}
+    assert {event['event'] for event in events_in(recorded(node))} == {'start', 'parameters'}
 
 
-@pytest.mark.parametrize('fault', ['publisher', 'messages'])
-def test_a_stream_that_cannot_be_published_is_refused_before_anything_changes(
-        tmp_path, monkeypatch, fault):
+def test_a_stream_that_cannot_be_published_is_refused_before_anything_changes(tmp_path):
     with OwnNode(tmp_path, '-p', 'qos_overrides./imu/mag.publisher.reliability:=foo',
                  start_paused=True) as node:
         before, rates = node.node.values, [one.period_ns for one in node.simulation.channels]
         topics = {one.topic_name for one in node.node.publishers}
-        with monkeypatch.context() as patch:
-            if fault == 'messages':
-                patch.setattr(publishers, 'check_for_type_support', None)   # a call raises
-            result = node.set(imu_data__enabled=True, mag__enabled=True, pose__rate=20.0)
-        assert not result.successful
-        assert ('foo' if fault == 'publisher' else 'sensor_msgs/msg/') in result.reason
+        result = node.set(imu_data__enabled=True, mag__enabled=True, pose__rate=20.0)
+        assert not result.successful and 'foo' in result.reason
         assert node.node.values == before and not node.get('mag.enabled')[0]
         assert [one.period_ns for one in node.simulation.channels] == rates
         assert {one.topic_name for one in node.node.publishers} == topics
@@ -135,60 +128,61 @@ def test_texts_that_are_numbers_are_taken_as_ros2_param_sends_them(node):
 
 
 def test_streams_can_be_switched_off_and_on_and_only_subscribers_make_work(node):
-    assert node.set(pose__enabled=False).successful
-    assert '/pose' not in {name for name, _ in node.node.get_publisher_names_and_types_by_node(
-        'spinning_top', '/')}
-    assert node.set(pose__enabled=True).successful
     output = next(one for one in node.simulation.outputs if one.channel.topic == 'pose')
+    assert node.set(pose__enabled=False).successful
+    assert not [one for one in node.node.publishers if one.topic_name == '/pose']
+    assert node.set(pose__enabled=True).successful
     node.step(5)
     assert not output.is_used and output.sent == 0
-    publisher = node.publisher('pose')
-    subscription = node.node.create_subscription(publisher.msg_type, 'pose', print, 10)
-    wait_for('a subscriber', publisher.get_subscription_count)
-    node.step(5)
+    node.listen('pose').step(5)
     assert output.is_used and output.sent > 0
     assert node.set(pose__enabled=False).successful
     assert output.publish is None
-    node.node.destroy_subscription(subscription)
 
 
 def test_parameters_are_described(node):
-    """What `ros2 param describe` shows: text with unit, range and effect, and what is allowed."""
-    names = list(parameters.BY_NAME)
-    found = node.node.describe_parameters(names)
-    assert [descriptor.name for descriptor in found] == names
+    """What `ros2 param describe` shows: text with unit and effect, range, and what is allowed."""
+    found = node.node.describe_parameters(list(parameters.BY_NAME))
     for descriptor, parameter in zip(found, parameters.TABLE, strict=True):
-        assert parameter.text in descriptor.description
-        assert f'[{parameter.unit}]' in descriptor.description or not parameter.unit
-        assert parameter.effect.value in descriptor.description
-        assert 'must' not in descriptor.description, 'what is allowed is a constraint'
+        assert descriptor.name == parameter.name
+        assert descriptor.description == parameter.describe(range_too=False)
         assert descriptor.read_only == (parameter.effect is Effect.START)
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
         assert len(ranges) == (parameter.range is not ANY), parameter.name
         for limits in ranges:
-            bounds = [limits.from_value, limits.to_value]
-            assert bounds[0] in parameter.range or parameter.range.is_open, parameter.name
-            assert bounds[1] == parameter.range.highest, parameter.name
+            assert limits.from_value in parameter.range or parameter.range.is_open, parameter.name
+            assert limits.to_value == parameter.range.highest, parameter.name
         assert descriptor.additional_constraints == parameter.allowed
+
+
+def extreme(dice, row):
+    """Return an end of the range or a number of any size, as a rule in the type of a parameter."""
+    value = dice.choice((row.range.lowest, row.range.highest, row.default, *DOUBLES, math.nan))
+    if row.kind in (bool, str):
+        value = dice.choice((*row.choices, True, False, '', 'a/b', '\x1b[31m', 1))
+    elif row.kind is int and isinstance(value, float) and math.isfinite(value):
+        value = int(value)
+    return [value] * len(row.default) if row.is_list and not isinstance(value, tuple) else value
 
 
 @pytest.mark.parametrize('seed', range(2 * TIMES))
 def test_extreme_parameters_are_taken_or_refused_in_a_line(tmp_path, seed):
     """The node answers and lives on, and its log is whole."""
-    rng = random.Random(seed)
+    dice, rows = random.Random(seed), [row for row in parameters.TABLE if row.name != 'duration'
+                                       and not row.name.startswith('record.')]
     with OwnNode(tmp_path, record__enabled=True) as node:
         for _ in range(12):
-            values = parameter_set(rng)
+            values = {row.name: extreme(dice, row)
+                      for row in dice.sample(rows, dice.choice((1, 3)))}
             try:
                 answer = node.set(**values)
             except (AssertionError, TypeError, ValueError, OverflowError, AttributeError):
                 continue            # rclpy itself has no such value
             assert bool(answer.reason) != answer.successful, values
-            node.command(rng.choice(DOUBLES), rng.choice(DOUBLES))
+            node.command(dice.choice(DOUBLES), dice.choice(DOUBLES))
             said = answer.reason + node.trigger('reset').message + node.switch(
                 'set_pause', False).message
             assert '\n' not in said, values
-            for _ in range(3):
-                rclpy.spin_once(node.node, timeout_sec=0.01)
+            rclpy.spin_once(node.node, timeout_sec=0.02)
     with LogReader(tmp_path / 'run.mcap') as log:
         assert log.whole

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import gc
 import os
-import re
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -15,12 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.installation import needed, remedy
 from spinning_top_sim.recording.errors import text_of
-from spinning_top_sim.times import NANOSECONDS, check_stamp
 from spinning_top_sim.tools import cli
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
-    from rclpy.node import Node
 
 
 def run_node(name: str, argv: Sequence[str] | None,
@@ -58,7 +55,6 @@ def run_node(name: str, argv: Sequence[str] | None,
     node, started = None, False
     try:
         node = make_node()
-        guard_clock(node)
         executor = _executor(node)
         node.start()
         started = True
@@ -79,25 +75,6 @@ def run_node(name: str, argv: Sequence[str] | None,
             node.destroy_node()
         rclpy.try_shutdown()
         _handle(signal.SIG_IGN, *signals)       # rclpy has restored the handlers that it found
-
-
-def guard_clock(node: Node) -> None:
-    """Let a node that has use_sim_time leave out what on /clock is no time: rclpy would raise."""
-    from rosgraph_msgs.msg import Clock  # noqa: PLC0415
-
-    def guarded(take: Callable[[Clock], object]) -> Callable[[Clock], None]:
-        def receive(message: Clock) -> None:
-            try:
-                check_stamp(message.clock.sec * NANOSECONDS + message.clock.nanosec)
-            except ValueError as error:
-                node.get_logger().warning(f'/clock is left out: {error}', once=True)
-            else:
-                take(message)
-        return receive
-
-    for subscription in node.subscriptions:
-        if subscription.msg_type is Clock:
-            subscription.callback = guarded(subscription.callback)
 
 
 def _handle(handler: Any, *signals: signal.Signals) -> None:
@@ -137,13 +114,8 @@ def _cannot_start(name: str, error: Exception) -> int:
     if isinstance(error, ImportError) and not find_spec('rclpy'):
         error = RuntimeError('it needs ROS 2: source the setup.bash of an installation, or '
                              f'{remedy("ros")}')
-    print(f'{name}: cannot start: {short_reason(text_of(error))}', file=sys.stderr)
+    print(f'{name}: cannot start: {cli.one_line(text_of(error))}', file=sys.stderr)
     return cli.WRONG_USAGE
-
-
-def short_reason(text: object) -> str:
-    """Return a text as one line, without positions in the code of rcl."""
-    return cli.one_line(re.sub(r',\s*at \S+:\d+', '', str(text)))
 
 
 def _executor(node: Any) -> Executor:

@@ -154,7 +154,6 @@ class Loop:
         self._update_subscribers()
         target_ns = min(self.now_ns + length_ns, self._duration_ns)
         stop_at_ns = self._clock.steady() + STEP_BUDGET_NS
-
         # Other than a tick it waits for the recorder.
         self._send(target_ns, 0, lambda: self._clock.steady() > stop_at_ns or (
             not self._recording.has_room(STEP_BUDGET_NS / NANOSECONDS)))

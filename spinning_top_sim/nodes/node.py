@@ -90,7 +90,8 @@ class Simulator(Node):
         sys.setswitchinterval(1e-4)
         self._report = NodeStatus(self.simulation, self.loop, self._recording)
         self._every('diagnostics', 1.0, self._publish_diagnostics)
-        self._show_status(self.values)
+        self._every('status', self.values['status_period'],
+                    lambda: tell(self._report.status_line()))
         self._begin()
         self._align_ticks()
 
@@ -188,7 +189,9 @@ class Simulator(Node):
         command = parameters.checked_changes(spin if ros_parameters.is_command(changes) else {})
         values = parameters.checked({**self.values, **{
             name: value for name, value in changes.items() if name not in command}})
-        self._check_context(values)
+        if self._follows and parameters.is_enabled('clock', values):
+            raise ValueError('clock.enabled = True: must be false while this node follows another '
+                             '/clock (use_sim_time)')
         rest = sorted(changes.keys() - SPIN)
         try:                # what may be refused comes first
             if rest:
@@ -200,8 +203,6 @@ class Simulator(Node):
             raise
         if rest:
             self.loop.set_parameters(values, {name: values[name] for name in rest})
-            if 'status_period' in rest:
-                self._show_status(values)
             self._align_ticks()
         self.values = values
 
@@ -210,15 +211,6 @@ class Simulator(Node):
         self.loop.change('command', lambda: {
             name.removeprefix('spin.'): command.get(name, present)
             for name, present in self._spin().items()})
-
-    def _check_context(self, values: Mapping[str, Any]) -> None:
-        if self._follows and parameters.is_enabled('clock', values):
-            raise ValueError('clock.enabled = True: must be false while this node follows another '
-                             '/clock (use_sim_time)')
-
-    def _show_status(self, values: Mapping[str, Any]) -> None:
-        self._every('status', values['status_period'],
-                    lambda: tell(self._report.status_line()))
 
     def outcome(self, act: Callable[[], str | None]) -> tuple[Exception | None, str]:
         """

@@ -2,37 +2,35 @@
 """The node `replay`: publishes the messages of a log with their recorded spacing."""
 
 import argparse
-import contextlib
 import itertools
 import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from builtin_interfaces.msg import Time as Stamp
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import ros_parameters
-from spinning_top_sim.nodes.executable import short_reason, tell
+from spinning_top_sim.nodes.executable import tell
 from spinning_top_sim.nodes.publishers import create_publisher, message_class, wait_for_all_acked
 from spinning_top_sim.recording.reader import LogReader, LogTopic
 from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
 from spinning_top_sim.streams.parameter import Range
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS
+from spinning_top_sim.tools.cli import one_line
 
 BUDGET_NS = 20_000_000          # services wait for messages that are due at most so long
 ROUND_GAP_NS = 10_000_000       # real time before the first message of a round, and after the last
 SHORTEST_WAIT_NS = 300_000      # denser messages are sent together: each wait takes 0.1 ms
 LAST_ANSWERS_NS = 300_000_000   # best-effort subscribers read shared memory, which ends with us
+CLOCK_HZ = 40.0                 # rate of /clock
 PATIENCE_S = 5.0                # Fast DDS asks every 3 s for acknowledgements
 
 
@@ -55,18 +53,20 @@ class Replayer(Node):
         self.finished: Future = Future()    # completes with the exit code when all is played
         self.sent = self.failed = 0
         self._log, self._options = log, options
-        self._later_ns = 0              # what the rounds before have played
         first = next(log.messages(start=1), None)       # a time of 0 says: no clock yet
         log_begin_ns = first.log_time if first else 0
         self._length_s = (log.span[1] - log_begin_ns) / NANOSECONDS
         for name, value, allowed in (('start', options.start, Range(0.0, self._length_s)),
                                      ('rate', options.rate, Range(1e-6, 1e9)),
-                                     ('clock', 1.0 if options.clock is None else options.clock,
-                                      Range(1e-6, 1e4))):
+                                     ('clock', CLOCK_HZ if options.clock is None else
+                                      options.clock, Range(1e-6, 1e4))):
             if value not in allowed:
                 raise ValueError(f'--{name} {value:g}: must be {allowed}')
         self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
         self.outputs = self._open_publishers()
+        self._names = {topic.name for topic in log.topics if topic.channel_id in self.outputs}
+        if options.loop and '/clock' not in self._names:
+            options.clock = options.clock or CLOCK_HZ       # it goes back with the stamps
         ros_parameters.warn_of_disobeyed(self, overrides)
         self._paused = options.start_paused
         self._set_log_time(self._begin_ns)
@@ -91,7 +91,7 @@ class Replayer(Node):
                 try:
                     outputs[topic.channel_id] = self._publisher(topic)
                 except Exception as error:  # a log may ask for anything; the others are played
-                    warn(short_reason(f'{topic.name} is not played: {error}'))
+                    warn(one_line(f'{topic.name} is not played: {error}'))
         if wanted and not outputs and not self._options.clock:
             raise ValueError('none of the topics can be played; the log has '
                              f'{", ".join(sorted(there)) or "none at all"}')
@@ -155,15 +155,12 @@ class Replayer(Node):
         except StopIteration:
             self._timer.cancel()
         except Exception as error:      # there is no further step then
-            self._fail(f'cannot be played any further: {error}')
+            self.get_logger().error(f'cannot be played any further: {error}')
+            self.finished.set_result(2)
 
     def _step_after(self, wait_ns: float) -> None:
         self._timer.timer_period_ns = int(min(max(wait_ns, SHORTEST_WAIT_NS), NANOSECONDS))
         self._timer.reset()
-
-    def _fail(self, reason: str) -> None:
-        self.get_logger().error(reason)
-        self.finished.set_result(2)
 
     def _play(self) -> Iterator[float]:
         """Play the log; yield how long to wait each time [ns]."""
@@ -174,7 +171,6 @@ class Replayer(Node):
             yield ROUND_GAP_NS
             yield from self._play_round()
             yield ROUND_GAP_NS          # the last messages arrive before the clock goes back
-            self._later_ns += self._next_ns - self._begin_ns + ROUND_GAP_NS
         yield LAST_ANSWERS_NS
         wait_for_all_acked(self.outputs.values(), PATIENCE_S)
         tell(f'played {self.sent} messages' + (
@@ -197,16 +193,12 @@ class Replayer(Node):
             except Exception:       # as with a reader that keeps all and has stopped reading
                 self.failed += 1
 
-    def _messages(self) -> Iterator[tuple[int, Publisher, Any]]:
+    def _messages(self) -> Iterator[tuple[int, Publisher, bytes]]:
         """Yield log time [ns], publisher and message of the messages of a round."""
-        names = {topic.name for topic in self._log.topics if topic.channel_id in self.outputs}
-        # Without a /clock that goes back, too, nobody takes stamps that go back.
-        later_ns = 0 if self._clock_output or '/clock' in names else self._later_ns
-        for message in self._log.messages(names, self._begin_ns if self._options.start else 0):
+        begin_ns = self._begin_ns if self._options.start else 0
+        for message in self._log.messages(self._names, begin_ns):
             if publisher := self.outputs.get(message.channel_id):   # of several with a topic
-                data = message.data
-                yield (max(message.log_time, self._begin_ns), publisher,
-                       stamped_later(data, publisher, later_ns) if later_ns else data)
+                yield max(message.log_time, self._begin_ns), publisher, message.data
 
     def _publish_clock(self) -> None:
         if self._clock_output is not None:
@@ -221,26 +213,3 @@ def open_log(path: Path, partial: bool) -> LogReader:
         raise ValueError(f'{path} is damaged: `recover` makes a whole log of it, --partial plays '
                          'what is whole')
     return log
-
-
-def stamped_later(data: bytes, publisher: Publisher, later_ns: int) -> Any:
-    """Return a message with later stamps, or the same bytes if it has none."""
-    with contextlib.suppress(Exception):    # recorded with another definition, or too late
-        message = deserialize_message(data, publisher.msg_type)
-        stamps = [*_stamps(message)]
-        for stamp in stamps:
-            stamp.sec, stamp.nanosec = divmod(
-                stamp.sec * NANOSECONDS + stamp.nanosec + later_ns, NANOSECONDS)
-        return message if stamps else data
-    return data
-
-
-def _stamps(message: Any) -> Iterator[Stamp]:
-    """Yield all stamps of a message, except those of 0, which is no time."""
-    for name in message.get_fields_and_field_types():
-        field = getattr(message, name)
-        for part in field if isinstance(field, list) else [field]:
-            if isinstance(part, Stamp) and (part.sec or part.nanosec):
-                yield part
-            elif hasattr(part, 'get_fields_and_field_types'):
-                yield from _stamps(part)

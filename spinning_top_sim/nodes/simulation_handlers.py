@@ -3,8 +3,7 @@
 Offers simulation_interfaces, the standard of ROS 2 for simulators; the top is its one entity.
 
 The handler of GetEntities is `get_entities`.  A handler takes a request, fills the response, and
-may return a text for `error_message`.  RefusedError has the result code of a refusal; other errors
-mean RESULT_OPERATION_FAILED.
+may return a text for `error_message`.  RefusedError has the result code of a refusal.
 """
 
 import importlib
@@ -52,8 +51,8 @@ NEAR, LENGTH_ERROR = 1e-6, 1e-3
 class RefusedError(RuntimeError):
     """A request is refused with a result code."""
 
-    def __init__(self, code: int, reason: object) -> None:
-        super().__init__(str(reason))
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
         self.code = code
 
 
@@ -79,28 +78,27 @@ class SimulationHandlers:
     def __init__(self, node: Simulator, messages: types.ModuleType) -> None:
         self._node, self._loop, self._simulation = node, node.loop, node.simulation
         self._messages, self._results = messages, messages.Result
+        self._unsupported = partial(RefusedError, messages.Result.RESULT_FEATURE_UNSUPPORTED)
         self._name = node.get_name()            # of the entity
 
     def serve(self, name: str, request: Message, response: Message) -> Message:
         """Handle a request for the service of this type; return the response."""
-        def handle() -> str | None:
+        def handle() -> Any:
             if name in ON_A_MOTION and self._loop.state in (LoopState.WAITING, LoopState.ENDED):
                 raise RefusedError(self._results.RESULT_INCORRECT_STATE, self._loop.state.value)
             if getattr(request, 'entity', self._name) != self._name:
                 raise RefusedError(self._results.RESULT_NOT_FOUND,
                                    f'entity = {request.entity!r}: must be {self._name!r}')
-            text: str | None = getattr(self, f'_{service_name(name)}')(request, response)
-            return text
+            return getattr(self, f'_{service_name(name)}')(request, response)
 
         error, text = self._node.outcome(handle)
         if hasattr(response, 'result'):
+            failed = getattr(response, 'STATE_TRANSITION_ERROR',
+                             self._results.RESULT_OPERATION_FAILED)
             response.result.result = self._results.RESULT_OK if error is None else getattr(
-                error, 'code', self._results.RESULT_OPERATION_FAILED)
+                error, 'code', failed)
             response.result.error_message = text
         return response
-
-    def _unsupported(self, reason: str) -> RefusedError:
-        return RefusedError(self._results.RESULT_FEATURE_UNSUPPORTED, reason)
 
     def _get_simulator_features(self, _: Message, response: Message) -> None:
         known = self._messages.SimulatorFeatures
@@ -133,10 +131,7 @@ class SimulationHandlers:
             raise RefusedError(response.INCORRECT_TRANSITION, (
                 f'state = {request.state.state} from {present}: must be one of {numbers}, and '
                 'not after QUITTING'))
-        try:
-            changes[wanted]()
-        except (ValueError, RuntimeError) as error:
-            raise RefusedError(response.STATE_TRANSITION_ERROR, error) from error
+        changes[wanted]()
 
     def _pause(self) -> None:
         self._loop.pause()

@@ -20,14 +20,13 @@ import time
 from pathlib import Path
 
 import rclpy
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
-from std_srvs.srv import SetBool, Trigger
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from std_srvs.srv import SetBool
 
 import helpers.own_domain  # noqa: F401, for programs without conftest.py
 import spinning_top_sim
@@ -82,27 +81,20 @@ class SimNode:
         return self
 
     def __exit__(self, *_):
-        self.kill()
+        self.signal(signal.SIGKILL)
+        self.process.wait()
 
     def signal(self, number):
         """Signal the process group, if it is there."""
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.process.pid, number)
-
-    def kill(self):
-        if self.alive:
-            self.signal(signal.SIGKILL)
-            self.process.wait()
+        if self.process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, number)
 
     def end(self, *numbers):
         """Signal the process group, wait, and return the exit code."""
         for number in numbers or (signal.SIGINT,):
             self.signal(number)
         return self.process.wait(PATIENCE_S)
-
-    @property
-    def alive(self):
-        return self.process.poll() is None
 
     @property
     def out(self):
@@ -124,31 +116,6 @@ def options(parameters):
         else json.dumps(value).replace('Infinity', '.inf').replace('NaN', '.nan')))]
 
 
-class Topic:
-    """
-    The messages that have arrived on one topic, serialized, in order.
-
-    muted: further ones are ignored; rclpy cannot destroy a subscription that is waited for
-    """
-
-    def __init__(self, kind):
-        self.kind = kind
-        self.raw = []
-        self.muted = False
-
-    def receive(self, data):
-        if not self.muted:
-            self.raw.append(data)
-
-    def wait(self, count):
-        """Wait until `count` messages have arrived in all."""
-        wait_for(f'{count} messages of {self.kind.__name__}', lambda: len(self.raw) >= count)
-        return self
-
-    def messages(self, first=0):
-        return [deserialize_message(data, self.kind) for data in self.raw[first:]]
-
-
 class Peer:
     """A node in the test's process, with a thread that listens, within the `with`."""
 
@@ -161,7 +128,6 @@ class Peer:
         self._closed = False
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
-        self._clients = {}
 
     def _spin(self):
         # Not spin(): shutdown() may destroy its guard condition before it waits for it.
@@ -179,43 +145,29 @@ class Peer:
         self.node.destroy_node()
         rclpy.shutdown(context=self.node.context)
 
-    def listen(self, name, kind, reliability=ReliabilityPolicy.RELIABLE):
-        """Subscribe with a queue that is long enough for any test."""
-        topic = Topic(kind)
-        self.node.create_subscription(
-            kind, name, topic.receive, QoSProfile(depth=20_000, reliability=reliability),
-            raw=True)
-        return topic
+    def listen(self, name, kind):
+        """Return the list to which the serialized messages on a topic are appended."""
+        heard = []
+        self.node.create_subscription(kind, name, heard.append, QoSProfile(depth=20_000), raw=True)
+        return heard
 
-    def call(self, kind, name, request, again=False):
-        """
-        Call a service and return its answer.
-
-        again: repeat the request if there is no answer; only for idempotent requests.  A node that
-        has ended stays in the graph for seconds, and requests to it are lost.
-        """
-        new = name not in self._clients
-        if new:
-            self._clients[name] = self.node.create_client(kind, name)
-        client = self._clients[name]
+    def call(self, kind, name, request):
+        """Call a service, again where no answer comes, and return the answer."""
+        client = self.node.create_client(kind, name)
         assert client.wait_for_service(PATIENCE_S), f'no service {name}'
-        # A server that has not discovered a new client drops its answer after 0.1 s
-        # ("client will not receive response", rmw_fastrtps).
+        # A server that has not discovered a new client drops its answer after 0.1 s, and a node
+        # that has ended stays in the graph for seconds.
         asked = []
 
         def answered():
-            if not asked or ((new or again) and time.monotonic() > asked[-1][0] + PATIENCE_S / 10):
+            if not asked or time.monotonic() > asked[-1][0] + PATIENCE_S / 10:
                 asked.append((time.monotonic(), client.call_async(request)))
             return next((future for _, future in asked if future.done()), None)
 
         return wait_for(f'an answer from {name}', answered).result()
 
-    def trigger(self, node, name):
-        return self.call(Trigger, node.topic(f'~/{name}'), Trigger.Request())
-
     def switch(self, node, name, on):
-        return self.call(SetBool, node.topic(f'~/{name}'), SetBool.Request(data=on),
-                         again=name == 'set_pause')
+        return self.call(SetBool, node.topic(f'~/{name}'), SetBool.Request(data=on))
 
     def set_together(self, node, **values):
         """Set parameters all or none (`__` for the dot); return the one result."""
@@ -224,31 +176,3 @@ class Peer:
             for name, value in values.items()])
         return self.call(SetParametersAtomically, node.topic('~/set_parameters_atomically'),
                          request).result
-
-    def get(self, node, *names):
-        answer = self.call(GetParameters, node.topic('~/get_parameters'),
-                           GetParameters.Request(names=list(names)), again=True)
-        return [parameter_value_to_python(value) for value in answer.values]
-
-
-class Diagnostics:
-    """The newest /diagnostics of every node."""
-
-    def __init__(self, peer):
-        from diagnostic_msgs.msg import DiagnosticArray
-        self._topic = peer.listen('/diagnostics', DiagnosticArray)
-
-    def next(self, node):
-        """Return the numbers of the next status but one, which is measured entirely after now."""
-        first, name = len(self._topic.raw), node.name.lstrip('/')
-
-        def second():
-            return [status for message in self._topic.messages(first) for status in message.status
-                    if status.name == name][1:]
-
-        (status, *_) = wait_for('two /diagnostics', second)
-        return numbers(status)
-
-
-def numbers(status):
-    return {pair.key: pair.value for pair in status.values}

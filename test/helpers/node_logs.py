@@ -61,11 +61,3 @@ def assert_clean_end(node, code):
     assert code == 0, node.err
     assert TRACEBACK not in node.err, node.err
     assert TRACEBACK not in node.out, node.out
-
-
-def assert_received_from(received, logged):
-    """Whether all that was received is in the log, in the same order."""
-    place = {data: index for index, data in enumerate(logged)}
-    assert len(received) > 0
-    places = [place[data] for data in received]
-    assert places == sorted(set(places))

@@ -12,7 +12,7 @@ from rclpy.task import Future
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from helpers.node_harness import numbers, options, wait_for
+from helpers.node_harness import options, wait_for
 from spinning_top_sim.nodes.node import Simulator
 
 
@@ -105,7 +105,8 @@ class OwnNode(InThisProcess):
         (timer,) = (one for one in self.node.timers if one.timer_period_ns == 10 ** 9)
         timer.callback()
         (status,) = self._diagnosed[-1].status
-        return status.level[0], status.message, numbers(status)
+        return status.level[0], status.message, {
+            pair.key: pair.value for pair in status.values}
 
     def wait_until(self, t_ns):
         self.spin_until(f't = {t_ns} ns', lambda: self.simulation.now_ns >= t_ns)

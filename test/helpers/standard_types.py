@@ -2,8 +2,7 @@
 """
 The messages of simulation_interfaces 2.1 for machines without that package: stand-ins.
 
-They have its fields and constants, and no others, but no type support: they cannot be sent.  Where
-the package is installed, a test compares the two.
+They have its fields and constants, and no others, but no type support: they cannot be sent.
 """
 
 from dataclasses import field, make_dataclass
