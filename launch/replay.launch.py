@@ -30,8 +30,7 @@ def generate_launch_description() -> LaunchDescription:
             'start', default_value='0.0',
             description='Start this many seconds after the start of the log'),
         DeclareLaunchArgument(
-            'loop', default_value='false', choices=SWITCH,
-            description='Start again at the end; /clock begins anew, for TF and RViz too'),
+            'loop', default_value='false', choices=SWITCH, description='Start again at the end'),
         DeclareLaunchArgument(
             'clock', default_value='false',
             description='true, or a rate [Hz]: publish the time of the log on /clock, for TF and '
@@ -54,8 +53,8 @@ def _nodes(context: LaunchContext) -> list:
     # replay_node refuses what is no number.
     options = [f'--{name}={given[name]}' for name in ('rate', 'start')]
     options += [f'--{name}' for name in ('loop', 'partial') if on[name]]
-    clocked = given['clock'].lower() != 'false' or on['loop']
-    if given['clock'].lower() != 'false':
+    clocked = given['clock'].lower() != 'false'
+    if clocked:
         options.append('--clock' if given['clock'].lower() == 'true'
                        else f'--clock={given["clock"]}')
     node = Node(package='spinning_top_sim', executable='replay_node', output='screen',

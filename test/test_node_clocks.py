@@ -9,10 +9,13 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from builtin_interfaces.msg import Time as Stamp
 from helpers.node_logs import SECOND, events_in, log_of, stamp_of, verified
 from helpers.own_node import OwnNode
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
+
+from spinning_top_sim.nodes import executable
 
 GRID_NS = 10_000_000        # of the stamps, and of pose
 
@@ -75,3 +78,13 @@ def test_stamps_are_dates_that_have_come_after_resets_too_beside_a_clock_of_its_
             node.spin_until('samples', lambda count=count: len(leads_ns) > count + 5)
             assert node.trigger('reset').success
     assert max(leads_ns) <= 0
+
+
+def test_what_is_no_time_on_a_clock_is_left_out_with_one_line(tmp_path, capfd):
+    with OwnNode(tmp_path, use_sim_time=True) as node:
+        executable.guard_clock(node.node)
+        (clock,) = [one for one in node.node.subscriptions if one.msg_type is Clock]
+        for sec, nanosec in ((7, 0), (-1, 0), (2 ** 31 - 1, 4_000_000_000)):
+            clock.callback(Clock(clock=Stamp(sec=sec, nanosec=nanosec)))
+        assert node.node.get_clock().now().nanoseconds == 7 * SECOND
+    assert capfd.readouterr().err.count('/clock is left out: the stamp -1 s: must be >= 0') == 1

@@ -19,12 +19,15 @@ pytest.importorskip('rclpy')
 
 import rclpy
 import yaml
+from geometry_msgs.msg import PoseStamped
 from helpers.node_harness import SimNode, wait_for
 from helpers.own_node import InThisProcess, run_main
 from mcap.writer import Writer as McapWriter
+from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.serialization import serialize_message
-from std_msgs.msg import String
+from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.time import Time
+from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 
 from spinning_top_sim.nodes import replay_node, replayer
@@ -213,7 +216,7 @@ def test_what_cannot_be_played_is_one_line_and_exit_code_2(tmp_path, capfd):
 def test_each_round_begins_with_the_clock_of_its_begin(tmp_path):
     """What robot_state_publisher takes: stamps that go back after the time went back."""
     path = write_log(tmp_path / 'run.mcap', texts(21, 10_000_000))
-    with OwnReplay(path, '--loop') as replay:
+    with OwnReplay(path, '--loop', '--clock', '40') as replay:
         replay.spin_until('three rounds', lambda: len(replay.of('/ours/chatter')) > 30)
     first, now_ns, rounds = text(0), 0, 0
     for topic, message in replay.heard:
@@ -224,6 +227,26 @@ def test_each_round_begins_with_the_clock_of_its_begin(tmp_path):
         elif message == first:
             assert now_ns == EPOCH_NS
     assert rounds >= 2
+
+
+def test_without_a_clock_the_stamps_of_later_rounds_go_on(tmp_path):
+    messages = []
+    for time_ns in range(EPOCH_NS, EPOCH_NS + SECOND // 5 + 1, SECOND // 100):
+        header = Header(stamp=Time(nanoseconds=time_ns).to_msg(), frame_id='world')
+        messages += [(0, time_ns, serialize_message(PathMessage(
+            header=header, poses=[PoseStamped(header=header), PoseStamped()]))),
+            (1, time_ns, text(7))]
+    path = write_log(tmp_path / 'run.mcap', messages, [
+        ('/path', 'nav_msgs/msg/Path'), ('/chatter', STRING)])
+    with OwnReplay(path, '--loop') as replay:
+        replay.spin_until('three rounds', lambda: len(replay.of('/path')) >= 60)
+    assert set(replay.of('/chatter')) == {text(7)}, 'what has no stamps keeps its bytes'
+    paths = [one if isinstance(one, PathMessage) else deserialize_message(one, PathMessage)
+             for one in replay.of('/path')]
+    stamps = [Time.from_msg(one.header.stamp).nanoseconds for one in paths]
+    assert stamps == [EPOCH_NS + n * SECOND // 100 for n in range(len(stamps))]
+    assert all(one.poses[0].header.stamp == one.header.stamp for one in paths)
+    assert all(one.poses[1].header.stamp.sec == 0 for one in paths), '0 is no time'
 
 
 def test_one_publisher_serves_all_whom_those_of_a_topic_have_served(tmp_path, capfd):

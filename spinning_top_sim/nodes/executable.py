@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from spinning_top_sim.installation import needed, remedy
 from spinning_top_sim.recording.errors import text_of
+from spinning_top_sim.times import NANOSECONDS, check_stamp
 from spinning_top_sim.tools import cli
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
+    from rclpy.node import Node
 
 
 def run_node(name: str, argv: Sequence[str] | None,
@@ -55,6 +57,7 @@ def run_node(name: str, argv: Sequence[str] | None,
     node, started = None, False
     try:
         node = make_node()
+        guard_clock(node)
         executor = _executor(node)
         node.start()
         started = True
@@ -75,6 +78,25 @@ def run_node(name: str, argv: Sequence[str] | None,
             node.destroy_node()
         rclpy.try_shutdown()
         _handle(signal.SIG_IGN, *signals)       # rclpy has restored the handlers that it found
+
+
+def guard_clock(node: Node) -> None:
+    """Let a node that has use_sim_time leave out what on /clock is no time: rclpy would raise."""
+    from rosgraph_msgs.msg import Clock  # noqa: PLC0415
+
+    def guarded(take: Callable[[Clock], object]) -> Callable[[Clock], None]:
+        def receive(message: Clock) -> None:
+            try:
+                check_stamp(message.clock.sec * NANOSECONDS + message.clock.nanosec)
+            except ValueError as error:
+                node.get_logger().warning(f'/clock is left out: {error}', once=True)
+            else:
+                take(message)
+        return receive
+
+    for subscription in node.subscriptions:
+        if subscription.msg_type is Clock:
+            subscription.callback = guarded(subscription.callback)
 
 
 def _handle(handler: Any, *signals: signal.Signals) -> None:

@@ -22,8 +22,10 @@ Topics keep their recorded names and QoS, which `--ros-args -r FROM:=TO` and
 `-p qos_overrides.<topic>.publisher.<policy>:=...` change. Messages go out in
 the order of their log times and with their recorded bytes, old stamps included.
 
-In each round of --loop the time on /clock begins anew, and so do nodes with
-use_sim_time; others, such as robot_state_publisher, may ignore old stamps.
+With --clock, or a /clock in the log, time begins anew in each round of --loop,
+and so do nodes with use_sim_time, such as robot_state_publisher. Without it the
+time of other nodes goes on, and they would ignore old stamps: from the second
+round on, stamps are later by the rounds before.
 
 while playing:
   ros2 service call /replay/set_pause std_srvs/srv/SetBool '{data: true}'
@@ -52,8 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('file', type=Path, metavar='FILE', help='the log')
     add('-r', '--rate', type=float, default=1.0, metavar='R', help='recorded over real time')
-    add('-l', '--loop', action='store_true',
-        help='begin again at the end; implies --clock without a /clock in the log')
+    add('-l', '--loop', action='store_true', help='begin again at the end')
     add('--start', type=float, default=0.0, metavar='S',
         help='begin S seconds after the begin of the log')
     add('--topics', nargs='+', default=[], metavar='T',

@@ -2,16 +2,20 @@
 """The node `replay`: publishes the messages of a log with their recorded spacing."""
 
 import argparse
+import contextlib
 import itertools
 import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+from builtin_interfaces.msg import Time as Stamp
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -30,7 +34,6 @@ BUDGET_NS = 20_000_000          # services wait for messages that are due at mos
 ROUND_GAP_NS = 10_000_000       # real time before the first message of a round, and after the last
 SHORTEST_WAIT_NS = 300_000      # denser messages are sent together: each wait takes 0.1 ms
 LAST_ANSWERS_NS = 300_000_000   # best-effort subscribers read shared memory, which ends with us
-CLOCK_HZ = 40.0                 # rate of /clock
 PATIENCE_S = 5.0                # Fast DDS asks every 3 s for acknowledgements
 
 
@@ -53,20 +56,18 @@ class Replayer(Node):
         self.finished: Future = Future()    # completes with the exit code when all is played
         self.sent = self.failed = 0
         self._log, self._options = log, options
+        self._later_ns = 0              # what the rounds before have played
         first = next(log.messages(start=1), None)       # a time of 0 says: no clock yet
         log_begin_ns = first.log_time if first else 0
         self._length_s = (log.span[1] - log_begin_ns) / NANOSECONDS
         for name, value, allowed in (('start', options.start, Range(0.0, self._length_s)),
                                      ('rate', options.rate, Range(1e-6, 1e9)),
-                                     ('clock', CLOCK_HZ if options.clock is None else
-                                      options.clock, Range(1e-6, 1e4))):
+                                     ('clock', 1.0 if options.clock is None else options.clock,
+                                      Range(1e-6, 1e4))):
             if value not in allowed:
                 raise ValueError(f'--{name} {value:g}: must be {allowed}')
         self._begin_ns = log_begin_ns + round(options.start * NANOSECONDS)
         self.outputs = self._open_publishers()
-        self._names = {topic.name for topic in log.topics if topic.channel_id in self.outputs}
-        if options.loop and '/clock' not in self._names:
-            options.clock = options.clock or CLOCK_HZ       # it goes back with the stamps
         ros_parameters.warn_of_disobeyed(self, overrides)
         self._paused = options.start_paused
         self._set_log_time(self._begin_ns)
@@ -171,6 +172,7 @@ class Replayer(Node):
             yield ROUND_GAP_NS
             yield from self._play_round()
             yield ROUND_GAP_NS          # the last messages arrive before the clock goes back
+            self._later_ns += self._next_ns - self._begin_ns + ROUND_GAP_NS
         yield LAST_ANSWERS_NS
         wait_for_all_acked(self.outputs.values(), PATIENCE_S)
         tell(f'played {self.sent} messages' + (
@@ -193,12 +195,16 @@ class Replayer(Node):
             except Exception:       # as with a reader that keeps all and has stopped reading
                 self.failed += 1
 
-    def _messages(self) -> Iterator[tuple[int, Publisher, bytes]]:
+    def _messages(self) -> Iterator[tuple[int, Publisher, Any]]:
         """Yield log time [ns], publisher and message of the messages of a round."""
-        begin_ns = self._begin_ns if self._options.start else 0
-        for message in self._log.messages(self._names, begin_ns):
+        names = {topic.name for topic in self._log.topics if topic.channel_id in self.outputs}
+        # Without a /clock that goes back, too, nobody takes stamps that go back.
+        later_ns = 0 if self._clock_output or '/clock' in names else self._later_ns
+        for message in self._log.messages(names, self._begin_ns if self._options.start else 0):
             if publisher := self.outputs.get(message.channel_id):   # of several with a topic
-                yield max(message.log_time, self._begin_ns), publisher, message.data
+                data = message.data
+                yield (max(message.log_time, self._begin_ns), publisher,
+                       stamped_later(data, publisher, later_ns) if later_ns else data)
 
     def _publish_clock(self) -> None:
         if self._clock_output is not None:
@@ -213,3 +219,26 @@ def open_log(path: Path, partial: bool) -> LogReader:
         raise ValueError(f'{path} is damaged: `recover` makes a whole log of it, --partial plays '
                          'what is whole')
     return log
+
+
+def stamped_later(data: bytes, publisher: Publisher, later_ns: int) -> Any:
+    """Return a message with later stamps, or the same bytes if it has none."""
+    with contextlib.suppress(Exception):    # recorded with another definition, or too late
+        message = deserialize_message(data, publisher.msg_type)
+        stamps = [*_stamps(message)]
+        for stamp in stamps:
+            stamp.sec, stamp.nanosec = divmod(
+                stamp.sec * NANOSECONDS + stamp.nanosec + later_ns, NANOSECONDS)
+        return message if stamps else data
+    return data
+
+
+def _stamps(message: Any) -> Iterator[Stamp]:
+    """Yield all stamps of a message, except those of 0, which is no time."""
+    for name in message.get_fields_and_field_types():
+        field = getattr(message, name)
+        for part in field if isinstance(field, list) else [field]:
+            if isinstance(part, Stamp) and (part.sec or part.nanosec):
+                yield part
+            elif hasattr(part, 'get_fields_and_field_types'):
+                yield from _stamps(part)
