@@ -104,7 +104,7 @@ def test_euroc_has_the_velocity_in_the_world_and_the_bias_of_the_newest_reading(
 @pytest.mark.parametrize(('arguments', 'reason', 'code'), [
     (['--export', 'tum:DIR/a'], 'the log has no ground_truth/imu_odom', 2),
     (['--export', 'euroc_imu:DIR/a', '-p', 'imu.enabled:=false'], 'no imu/data_raw', 2),
-    (['--export', 'euroc_imu:DIR/there'], 'there: it exists, and nothing is overwritten', 1)])
+    (['--export', 'euroc_imu:DIR/there'], 'there: File exists', 1)])
 def test_what_cannot_be_exported_is_told_before_anything_is_computed(
         tmp_path, capsys, arguments, reason, code):
     (tmp_path / 'there').write_text('precious')

@@ -40,7 +40,8 @@ def record(path, messages, **options):
             str(path), TOPICS, METADATA.copy, **{'min_free_bytes': 0} | options)) as recorder:
         for message in messages:
             recorder.write([single(*message)])
-        return recorder.close()
+        recorder.close()
+    return recorder
 
 
 @pytest.mark.parametrize('compression', ['zstd', 'lz4', 'none'])
@@ -68,7 +69,7 @@ def test_mcap_and_rosbags_read_every_message(tmp_path, compression):
 def test_channels_and_the_metadata_of_the_bag_are_those_of_rosbag2(tmp_path, monkeypatch, count):
     monkeypatch.delenv('ROS_DISTRO', raising=False)
     path = tmp_path / 'a "b": #ü.mcap'
-    assert record(path, some_messages(count)).messages == count
+    assert record(path, some_messages(count)).written[0] == count
     with open(path, 'rb') as file:
         reader = make_reader(file)
         summary, profile = reader.get_summary(), reader.get_header().profile
@@ -152,10 +153,10 @@ def test_messages_of_any_length_are_all_kept_and_the_bytes_are_always_the_same(t
 
 
 def test_too_little_space_leaves_no_file(tmp_path):
-    summary = record(tmp_path / 'run.mcap', [(0, 1, b'')], min_free_bytes=10 ** 30)
+    recorder = record(tmp_path / 'run.mcap', [(0, 1, b'')], min_free_bytes=10 ** 30)
     assert re.fullmatch(rf'cannot write {tmp_path}/run\.mcap: \d+ bytes are free .* 10{{30}}',
-                        summary.error)
-    assert (summary.path, summary.lost, summary.messages) == (None, 1, 0)
+                        recorder.error)
+    assert (recorder.path, recorder.missing, recorder.written) == (None, 1, (0, 0))
     assert not list(tmp_path.iterdir())
 
 
@@ -171,7 +172,8 @@ def test_a_file_that_is_deleted_and_a_disk_that_fills_end_a_recording(
         time.sleep(0.002)
     recorder.write([single(*some_messages(1)[0])])
     harm(path, monkeypatch)
-    assert recorder.close().error == f'recording to {path} stopped: {reason}'
+    recorder.close()
+    assert recorder.error == f'recording to {path} stopped: {reason}'
     assert not path.exists() or len(seen_by_mcap(path)) == 1
 
 
@@ -183,8 +185,8 @@ def test_a_queue_that_is_full_when_the_recording_fails_holds_nobody_up(tmp_path,
     failing.write([single(*message) for message in some_messages(3)])
     assert not failing.room
     is_full.set()
-    assert failing.close().lost == 3
-    assert failing.state == 'failed' and failing.room
+    failing.close()
+    assert (failing.missing, failing.state, failing.room) == (3, 'failed', True)
 
 
 def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeypatch):
@@ -194,18 +196,20 @@ def test_a_file_has_its_name_or_a_date_and_none_is_overwritten(tmp_path, monkeyp
     dated = r'spinning_top_\d{4}(-\d\d){2}_\d\d(-\d\d){2}_\d{6}\.mcap'
     for uri, path in (('run.mcap', r'run\.mcap'), ('new/er/', f'new/er/{dated}'),
                       ('old', f'old/{dated}'), ('', dated), ('', dated)):
-        summary = record(uri, [])
-        assert re.fullmatch(f'{tmp_path}/{path}', str(summary.path))
-        with LogReader(summary.path) as reader:
+        recorder = record(uri, [])
+        assert re.fullmatch(f'{tmp_path}/{path}', str(recorder.path))
+        with LogReader(recorder.path) as reader:
             assert reader.whole
     content = (tmp_path / 'run.mcap').read_bytes()
-    for uri, reason in (('run.mcap', 'it exists, and nothing is overwritten'),
-                        ('none/a.mcap', f'there is no directory {tmp_path}/none')):
+    for uri, reason in (('run.mcap', 'File exists'),
+                        ('none/a.mcap', 'No such file or directory')):
         assert record(uri, []).error == f'cannot write {tmp_path}/{uri}: {reason}'
     assert 'run.mcap' in record('run.mcap/', []).error
-    twice = Recorder('twice.mcap', [TOPICS[0], TOPICS[0]], dict).close()
+    twice = Recorder('twice.mcap', [TOPICS[0], TOPICS[0]], dict)
+    twice.close()
     assert twice.error == "topic '/top/pose' is listed twice: once is allowed"
-    long = Recorder('long.mcap', TOPICS, lambda: {'history': MAX_BYTES * ' '}).close()
+    long = Recorder('long.mcap', TOPICS, lambda: {'history': MAX_BYTES * ' '})
+    long.close()
     assert 'too many events' in long.error and not (tmp_path / 'long.mcap').exists()
     assert (tmp_path / 'run.mcap').read_bytes() == content
 
@@ -214,7 +218,9 @@ def test_what_is_not_installed_is_named_in_a_line(tmp_path):
     """The simulation needs neither mcap nor rosbags until it records."""
     code = ("import sys; sys.modules.update(dict.fromkeys(('mcap', 'rosbags')))\n"
             'from spinning_top_sim.recording.recorder import Recorder\n'
-            "print(Recorder(sys.argv[1], [], dict).close().error)")
+            'failed = Recorder(sys.argv[1], [], dict)\n'
+            'failed.close()\n'
+            'print(failed.error)')
     done = subprocess.run([sys.executable, '-c', code, tmp_path / 'run.mcap'], text=True,
                           env=os.environ | {'PYTHONPATH': str(ROOT)}, capture_output=True,
                           timeout=60, check=True)
