@@ -207,8 +207,6 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
         for place in sorted([*self._places, *self._attached], key=attrgetter('offset')):
             yield from self._recorded_in(place)
 
-    # -------------------------------------------------------------------------------- the bytes
-
     def _at(self, offset: int, end: int) -> bytes:
         """Return the bytes there.  Raises UNREADABLE if there are fewer, or too many."""
         if end > min(self.size, offset + self._max_bytes):

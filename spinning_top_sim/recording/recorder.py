@@ -78,7 +78,7 @@ class Recorder:
     @property
     def room(self) -> bool:
         """Whether the queue takes more, or the recording has stopped and takes nothing."""
-        return self._bytes_in - self._bytes_out < QUEUE_BYTES
+        return not self._accepting or self._bytes_in - self._bytes_out < QUEUE_BYTES
 
     @property
     def possible_loss(self) -> float:
@@ -154,8 +154,6 @@ class Recorder:
             self.error = text_of(error) if self.path is None else (
                 f'recording to {self.path} stopped: {reason_of(error)}')
             self.state = 'failed'
-            self._queue.clear()
-            self._bytes_out = self._bytes_in
             self._taken.set()
             # Cutting off the truncated chunk may have freed enough space for the summary.
             with contextlib.suppress(Exception):
