@@ -183,8 +183,7 @@ class Recorder:
         return file
 
     def _record(self, file: McapWriter) -> None:
-        interval = self._max_loss / 2.0
-        next_flush = self._clock() + interval
+        next_flush = self._clock() + self._max_loss / 2.0
         while True:
             self._wake.clear()
             closing = not self._accepting  # read before the queue: once set, nothing more comes
@@ -198,7 +197,7 @@ class Recorder:
             if self.room:
                 self._taken.set()
             if closing or now >= next_flush:
-                next_flush = now + interval
+                next_flush = now + self._max_loss / 2.0
                 file.flush()
                 if closing and self._syncing is not None:
                     self._syncing.join()

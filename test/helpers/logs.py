@@ -20,7 +20,7 @@ from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import McapWriter
-from spinning_top_sim.tools.recover import main
+from spinning_top_sim.tools import recover
 
 CHUNKS, MESSAGES_PER_CHUNK = 3, 12
 
@@ -52,11 +52,11 @@ def records_of(content: bytes) -> list[tuple[int, int, int]]:
     return [(content[begin], begin, end) for begin, end in records(content)]
 
 
-def run(*argv) -> tuple[int, str, str]:
-    """Run the command in this process; return exit code, output and errors."""
+def run(*argv, tool=recover) -> tuple[int, str, str]:
+    """Run a command in this process; return exit code, output and errors."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main([str(argument) for argument in argv])
+        code = tool.main([str(argument) for argument in argv])
     return code, out.getvalue(), err.getvalue()
 
 
