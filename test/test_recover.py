@@ -107,6 +107,9 @@ def test_a_chunk_that_has_become_another_record_and_an_endless_index_are_losses(
     output.unlink()
     path.write_bytes(flipped(log.content, log.chunks[0][2] + 5) + bytes(2_000_000))
     assert run(path, '-o', output)[:1] == (SOME_LOST,)
+    path.write_bytes(flipped(log.content, len(log.content) - 60))     # in the summary
+    with LogReader(path) as reader:
+        assert reader.torn and not reader.lost_bytes
 
 
 def test_a_log_that_changes_while_it_is_read_is_told(tmp_path, log):
@@ -238,10 +241,10 @@ FIRST, SECOND = message(5, b'first'), message(5, b'second' * 50)
     chunk_of(message(5, b'', channel=7)), chunk_of(FIRST, 'brotli'), chunk_of(FIRST[:-1]),
     chunk_of(message(5, bytes(5000))), record_bytes(MetadataRecord('big', {'k': 'v' * 5000}))])
 def test_what_is_damaged_or_too_large_is_left_out_alone(tmp_path, bad):
-    path = closed(tmp_path, chunk_of(message(4, b'a')), bad, chunk_of(message(6, b'c')))
+    path = closed(tmp_path, bad, chunk_of(message(4, b'a')), bad, chunk_of(message(6, b'c')))
     with LogReader(path, max_bytes=4000) as reader:
         assert [one.data for one in reader.messages()] == [b'a', b'c']
-        assert reader.lost_bytes == len(bad)
+        assert reader.lost_bytes == 2 * len(bad)
 
 
 def test_a_small_file_whose_chunks_unpack_to_all_memory_is_refused(tmp_path):
