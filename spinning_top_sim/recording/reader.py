@@ -11,7 +11,7 @@ import os
 import struct
 import zlib
 from bisect import bisect_left
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Container, Iterator
 from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
@@ -189,9 +189,8 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 raise LogError(f'cannot read {self.path}: its chunks overlap in time, and '
                                f'more than {self._max_bytes} bytes of them are not held')
             waiting += [(one.log_time, place.offset, number, one)
-                        for number, one in enumerate(self._recorded_in(place))
-                        if isinstance(one, LogMessage) and one.channel_id in wanted
-                        and start <= one.log_time < end]
+                        for number, one in enumerate(self._contents(place))
+                        if one.channel_id in wanted and start <= one.log_time < end]
             waiting.sort()
 
     def groups(self, topics: Collection[str] | None = None,
@@ -205,7 +204,7 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
     def recorded(self) -> Iterator[LogMessage | Metadata | Attachment]:
         """Yield messages, and metadata and attachments as records of mcap, in file order."""
         for place in sorted([*self._places, *self._attached], key=attrgetter('offset')):
-            yield from self._recorded_in(place)
+            yield from self._contents(place, ATTACHED)
 
     def _at(self, offset: int, end: int) -> bytes:
         """Return the bytes there.  Raises UNREADABLE if there are fewer, or too many."""
@@ -286,14 +285,15 @@ class LogReader(contextlib.AbstractContextManager['LogReader']):
                 footer.summary_crc in (0, zlib.crc32(rest[:-MAGIC_SIZE - 4])))
         return False
 
-    def _recorded_in(self, place: Place) -> Iterator[LogMessage | Metadata | Attachment]:
+    def _contents(self, place: Place, also: Container[int] = ()) -> Iterator[Any]:
+        """Yield messages, and records of other opcodes."""
         try:
             for opcode, content in _records(self._at(place.offset, place.end), self._max_bytes):
                 if opcode == Opcode.MESSAGE:
                     channel, sequence, log_time, publish_time = MESSAGE.unpack_from(content)
                     yield LogMessage(self.channels[channel].topic, log_time, publish_time,
                                      sequence, content[MESSAGE.size:], channel)
-                elif opcode in ATTACHED:
+                elif opcode in also:
                     yield _parsed(KINDS[opcode], content)
         except UNREADABLE as error:
             raise LogError(f'cannot read {self.path}: it has changed meanwhile') from error
