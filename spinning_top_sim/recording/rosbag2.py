@@ -84,7 +84,8 @@ def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
 def _understood(policy: str, value: Any) -> Any:
     names = _POLICY_NAMES.get(policy, ())
     number = names.index(value) if value in names else value
-    allowed = [known for known, name in enumerate(names) if name != 'unknown'] or range(1 << 31)
+    allowed = [known for known, name in enumerate(names) if name != 'unknown'] or (
+        range(-1 << 31, 1 << 31))
     return number if type(number) is int and number in allowed else DEFAULT_QOS[policy]
 
 
