@@ -103,7 +103,8 @@ OFFERED = {     # any style of YAML; a policy that is not understood is the defa
     '# offered\n- depth: 7  # last\n  reliability: 2\n  durability: 1': [(2, 1, 1, 7)],
     **{f'- {{history: {x}, depth: {x}, reliability: {x}}}': [(1, 2, 1, 10)] for x in (
         '1.5', '[1]', '{}', 'true', '"7"', '~', 'unknown', 1 << 63)},
-    **{text: [] for text in ('', '7', '[' * 1000, '!!timestamp x', '\x00', '? {} : 1')}}
+    **{text: [] for text in (
+        '', '7', '[' * 1000, '!!timestamp x', '\x00', '? {} : 1', '- <<: {depth: 7}')}}
 
 
 @pytest.mark.parametrize('text', OFFERED)
