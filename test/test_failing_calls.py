@@ -12,13 +12,13 @@ import resource
 import pytest
 from helpers.failing_calls import Calls
 from helpers.inspected import log_of
-from helpers.logs import seen_by_us
+from helpers.logs import run, seen_by_us
 from helpers.machine import Machine
 from helpers.recordings import METADATA, TOPICS, rows_of
 
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import Recorder
-from spinning_top_sim.tools import ensemble_part, ensemble_spec, inspect, recover, simulate
+from spinning_top_sim.tools import ensemble_part, ensemble_spec, inspect, simulate
 
 FAILURES = (errno.ENOSPC, errno.EIO, errno.EINTR, None)
 
@@ -34,13 +34,6 @@ def each_failing(act, check, more=()):
             with Calls(number, error):
                 found = act(f'{number}_{error}')
             check(found, f'{name}, call {number}, fails with {error}')
-
-
-def command(main, *arguments):
-    try:
-        return main([*map(str, arguments)])
-    except SystemExit as stopped:
-        return stopped.code
 
 
 def test_of_a_recording(tmp_path):
@@ -62,13 +55,13 @@ def test_of_a_recording(tmp_path):
 
     def check(found, failure):
         recorder, path = found
-        counters = recorder.counters
-        assert counters.messages + counters.lost == 100 and counters.queued == 0, failure
+        written = recorder.written[0]
+        assert written + recorder.missing == 100, failure
         if recorder.path is None:
             assert not path.exists() and failure, failure
             return
         kept = [stamp for _, stamp, _ in seen_by_us(path)]
-        assert kept == list(range(counters.messages)), failure
+        assert kept == list(range(written)), failure
         if recorder.error is None:      # one that closes the directory, or was made good
             with LogReader(path) as reader:
                 assert reader.whole and len(kept) == 100, failure
@@ -78,13 +71,13 @@ def test_of_a_recording(tmp_path):
     each_failing(act, check)
 
 
-def test_of_a_log_of_simulate(tmp_path, capsys):
+def test_of_a_log_of_simulate(tmp_path):
     """What was computed before is in the log, or there is none."""
     def act(name):
         path = tmp_path / f'{name}.mcap'
-        code = command(simulate.main, '--duration', 0.1, '--command', '0.05:1.7:1.4', '--quiet',
-                       '-p', 'record.streams:=[pose]', '-o', path)
-        return code, path, capsys.readouterr().err
+        code, _, said = run('--duration', 0.1, '--command', '0.05:1.7:1.4', '--quiet', '-p',
+                            'record.streams:=[pose]', '-o', path, tool=simulate)
+        return code, path, said
 
     _, path, _ = act('expected')
     expected = seen_by_us(path)
@@ -103,7 +96,7 @@ def test_of_a_log_of_simulate(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('kind', ['recovery', 'euroc', 'csv', 'parquet'])
-def test_of_a_file_that_is_whole_or_not_there(tmp_path, capsys, kind):
+def test_of_a_file_that_is_whole_or_not_there(tmp_path, kind):
     """After each failure the command says so in a line that names the file, and leaves none."""
     if kind == 'parquet':
         pytest.importorskip('pyarrow')
@@ -115,20 +108,20 @@ def test_of_a_file_that_is_whole_or_not_there(tmp_path, capsys, kind):
 
     def act(path):
         if kind == 'recovery':
-            return command(recover.main, log, '-o', path)
+            return run(log, '-o', path)
         if kind == 'euroc':
-            return command(inspect.main, log, '--export', f'euroc:{path}')
-        return command(simulate.main, '--duration', 0.1, '--quiet', '-o', path)
+            return run(log, '--export', f'euroc:{path}', tool=inspect)
+        return run('--duration', 0.1, '--quiet', '-o', path, tool=simulate)
 
     expected = tmp_path / f'expected.{kind}'
-    assert act(expected) == 0
+    assert act(expected)[0] == 0
 
     def done(name):
         path = tmp_path / f'{name}.{"mcap" if kind == "recovery" else kind}'
-        return act(path), path, capsys.readouterr().err
+        return path, *act(path)
 
     def check(found, failure):
-        code, path, said = found
+        path, code, _, said = found
         is_whole = path.exists() and path.read_bytes() == expected.read_bytes()
         if code == 0:
             assert is_whole, failure

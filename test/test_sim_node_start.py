@@ -14,6 +14,7 @@ from test_scene_file import scene
 
 from spinning_top_sim.nodes import replay_node, sim_node, simulation_handlers
 from spinning_top_sim.recording.reader import LogReader
+from spinning_top_sim.recording.rosbag2 import qos_profiles
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.tools import simulate
 from spinning_top_sim.tools.recorded_run import read_run_description
@@ -91,7 +92,8 @@ def test_a_run_warns_of_what_is_odd_and_tells_where_its_log_is(main, monkeypatch
     path = the_log(tmp_path)
     assert len(log_of(path)[0]['/attitude']) == 51
     with LogReader(path) as log:        # overrides are for the remapped topic
-        assert {one.name: one.qos for one in log.topics}['/attitude'][0]['depth'] == 3
+        (channel,) = (one for one in log.channels.values() if one.topic == '/attitude')
+        assert qos_profiles(channel)[0]['depth'] == 3
     for text in ('there is no parameter spin.l33: ignored; did you mean spin.l3?',
                  'qos_overrides./pose.publisher.depth is not obeyed',
                  'top.lambda3 = 0.5 kg m^2: no rigid body', f'recording to {path}'):

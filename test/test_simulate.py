@@ -70,7 +70,7 @@ def test_commands_at_one_time_are_applied_in_the_order_given_also_at_the_end(tmp
     (['--scene', 'cups'], '--scene cups: must be the path of a file, or one of braking, cusp'),
     (['--params', '/nowhere.yaml'], 'spinning-top simulate: /nowhere.yaml: No such file'),
     (['--duration', '1', '-o', '/nowhere/run.mcap'], 'spinning-top simulate: '
-     'cannot write /nowhere/run.mcap: there is no directory /nowhere\n'),
+     'cannot write /nowhere/run.mcap: No such file or directory\n'),
     (['--duration', '0'], '--duration S, or the parameter duration'),
     (['--duration', '1', '-p', 'top.lambda1:=-1'], 'top.lambda1 = -1'),
     (['--duration', '1', '-p', 'spin.l3=2'], "'spin.l3=2'"),

@@ -282,7 +282,7 @@ def test_a_source_that_raises_an_error_is_asked_again_and_the_reason_is_shown(mo
         raise OSError('the disk has gone')
 
     Page.show(desk, SimpleNamespace(update=update), stopped)
-    assert len(asked) == 3 and desk.message.content == '**OSError: the disk has gone**'
+    assert len(asked) == 3 and desk.message.content == '**the disk has gone**'
 
 
 def test_a_simulation_imports_no_ros_and_writes_a_file(tmp_path):

@@ -96,9 +96,9 @@ def _read(reader: LogReader, name: str) -> Stamped:
         raise ValueError(f'a message of {topic.name} cannot be read: {error}') from error
     if len(rows) < FEWEST:
         raise ValueError(f'{topic.name} has {len(rows)} messages: must have {FEWEST} at least')
-    stamps, first = np.unique([row.stamp_ns for row in rows], return_index=True)
-    return Stamped(stamps, np.array([rows[k].quaternion for k in first]),
-                   np.array([rows[k].covariance for k in first]))
+    stamps_ns, quaternions, covariances = map(np.array, zip(*rows, strict=True))
+    stamps_ns, first = np.unique(stamps_ns, return_index=True)
+    return Stamped(stamps_ns, quaternions[first], covariances[first])
 
 
 def _beside(name: str, said: Stamped, true: Stamped) -> Outcome:

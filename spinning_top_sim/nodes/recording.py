@@ -130,14 +130,14 @@ class Recording:
         recorder = self._recorder
         if recorder is None:
             return {RECORDER: 'failed' if self.error else 'off'}
-        counters = recorder.counters
+        messages, size = recorder.written
         return {RECORDER: recorder.state, RECORDED_FILE: recorder.path,
-                'recorded messages': counters.messages, 'recorded bytes': counters.bytes,
-                'queued messages': counters.queued,
+                'recorded messages': messages, 'recorded bytes': size,
+                'queued messages': recorder.missing,
                 'possible loss [s]': f'{recorder.possible_loss:.3f}'}
 
 
 def _summary(recorder: Recorder) -> str:
-    counters = recorder.counters
-    text = f'{counters.path}: {counters.messages} messages, {counters.bytes / 1e6:.1f} MB'
-    return f'{text}; stopped early: {counters.error}' if counters.error else text
+    messages, size = recorder.written
+    text = f'{recorder.path}: {messages} messages, {size / 1e6:.1f} MB'
+    return f'{text}; stopped early: {recorder.error}' if recorder.error else text

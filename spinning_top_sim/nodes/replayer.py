@@ -25,7 +25,7 @@ from spinning_top_sim.nodes import ros_parameters
 from spinning_top_sim.nodes.executable import tell
 from spinning_top_sim.nodes.publishers import create_publisher, message_class, wait_for_all_acked
 from spinning_top_sim.recording.reader import LogReader, LogTopic
-from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS
+from spinning_top_sim.recording.rosbag2 import DEFAULT_QOS, qos_profiles
 from spinning_top_sim.streams.parameter import Range
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS
 from spinning_top_sim.tools.cli import one_line
@@ -103,7 +103,7 @@ class Replayer(Node):
             raise LookupError('--clock publishes another /clock')
         if topic.encoding != 'cdr':
             raise LookupError(f'its messages are encoded as {topic.encoding!r}, not as CDR')
-        profiles = topic.qos or (DEFAULT_QOS,)
+        profiles = qos_profiles(self._log.channels[topic.channel_id]) or (DEFAULT_QOS,)
         # It serves all subscribers that the recorded publishers have served together.
         publisher = create_publisher(self, message_class(topic.type_name), topic.name, QoSProfile(
             reliability=min(one['reliability'] for one in profiles),

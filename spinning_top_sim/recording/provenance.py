@@ -25,10 +25,8 @@ def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: in
     Return the metadata record METADATA_NAME, but for the `environment`.
 
     values_at_start : parameters at the start of the motion (the last reset)
-    epoch_ns : stamp of t = 0
-    begun_ns : simulated time at which the recording begins
-    history : the events before, as in ~/events: 'event', 't_ns', ...
-    values_at_recording : parameters when the recording begins, with later changes
+    epoch_ns, begun_ns : stamp of t = 0; simulated time at which the recording begins
+    history : the events before, as in ~/events
     """
     return {
         'format': FORMAT,
@@ -43,11 +41,7 @@ def run_metadata(values_at_start: Mapping[str, Any], epoch_ns: int, begun_ns: in
 
 
 def environment() -> dict[str, str]:
-    """
-    Return what else decides the last bits: this package's version, machine, libraries.
-
-    It takes 20 ms to find out.
-    """
+    """Return what else decides the last bits: version, machine, libraries.  It takes 20 ms."""
     return {
         'version': version(),
         'platform': f'{platform.machine()} {platform.system()} '

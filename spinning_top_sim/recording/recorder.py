@@ -15,7 +15,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -23,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from spinning_top_sim.installation import needed
-from spinning_top_sim.recording.errors import MAX_BYTES, LogError, text_of, why_not_written
+from spinning_top_sim.recording.errors import MAX_BYTES, LogError, reason_of, text_of
 from spinning_top_sim.recording.provenance import environment
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 
@@ -34,33 +33,17 @@ QUEUE_BYTES = 32_000_000    # of a full queue; a burst that began with room may 
 ENTRY_BYTES = 300           # what queued rows cost besides their data, about
 
 
-@dataclass(frozen=True)
-class RecordingSummary:
-    """What a recording has come to."""
-
-    path: Path | None       # None before the file is open
-    bytes: int              # size of the file
-    messages: int           # in it
-    queued: int             # messages accepted, not yet in the file
-    lost: int               # handed over after the recording stopped, or when it failed
-    error: str | None       # why the recording stopped early
-
-
 class Recorder:
     """
     A recording into a new file from now on until `close`.  Raises nothing for the disk's sake.
 
-    Messages may be handed over at once; they wait in memory while the file is being opened.  After
-    trouble with the disk `state` is 'failed', `error` says why, naming the path, and what was
-    written stays readable.
+    Messages wait in memory while the file is being opened.  After trouble with the disk `state` is
+    'failed', `error` says why, naming the path, and what was written stays readable.
 
-    uri : the file, which must not exist; or a folder, in which a name with the date is taken, and
-        which is made if it ends with '/'; '' is the working directory
-    topics : a message refers to one by its index
-    metadata : returns those of the run, in the recorder's thread; see `provenance.run_metadata`;
-        the `environment` is added
+    uri : the new file; or a folder, in which a name with the date is taken, and which is made if
+        it ends with '/'; '' is the working directory
+    metadata : returns those of `provenance.run_metadata`, in the recorder's thread
     max_loss : most wall time whose messages a SIGKILL or a power loss may take [s], > 0
-    compression : 'zstd', 'lz4' or 'none'
     min_free_bytes : the recording stops if the disk has less left than this
     threads, clock : make threads and events as `threading` does, and return steady time [s]
     """
@@ -79,8 +62,7 @@ class Recorder:
         self._file: McapWriter | None = None
         # Appending to a deque and taking from its other end need no lock between threads.
         self._queue: deque[tuple[Sequence[Rows], int]] = deque()     # rows, and their bytes
-        self._bytes_in = self._bytes_out = 0    # of the queue, ever
-        self._offered = 0                       # messages handed over, ever
+        self._bytes_in = self._bytes_out = self._offered = 0    # of the queue; messages, ever
         self._accepting = True
         # (time, bytes): what had left the queue by that time is on the disk.
         self._on_disk = clock(), 0
@@ -96,7 +78,7 @@ class Recorder:
     @property
     def room(self) -> bool:
         """Whether the queue takes more, or the recording has stopped and takes nothing."""
-        return self._bytes_in - self._bytes_out < QUEUE_BYTES
+        return not self._accepting or self._bytes_in - self._bytes_out < QUEUE_BYTES
 
     @property
     def possible_loss(self) -> float:
@@ -115,23 +97,17 @@ class Recorder:
             f'{loss:.1f} s, more than max_loss = {self._max_loss:g} s')
 
     @property
-    def counters(self) -> RecordingSummary:
-        """What the recording has come to so far."""
-        running = self.state in ('opening', 'recording')    # read first: nothing is written after
-        file = self._file
-        messages = file.message_counts.total() if file else 0
-        missing = self._offered - messages
-        return RecordingSummary(
-            self.path, file.size if file else 0, messages, queued=missing if running else 0,
-            lost=0 if running else missing, error=self.error)
+    def written(self) -> tuple[int, int]:
+        """Number of messages and of bytes in the file."""
+        return (self._file.message_counts.total(), self._file.size) if self._file else (0, 0)
+
+    @property
+    def missing(self) -> int:
+        """Number of messages that wait for the file, or are lost if the recording has stopped."""
+        return self._offered - self.written[0]
 
     def write(self, rows: Sequence[Rows]) -> None:
-        """
-        Hand over messages, from one thread at a time; never waits.
-
-        Those of a topic keep their order.  The arrays must not change afterwards.  After the
-        recording stopped the messages are only counted, as lost.
-        """
+        """Hand over messages, whose arrays must not change; one thread at a time, no waits."""
         self._offered += sum(len(times_ns) for _, times_ns, _ in rows)
         if self._accepting:
             size = sum(ENTRY_BYTES + messages.nbytes for _, _, messages in rows)
@@ -153,19 +129,17 @@ class Recorder:
         self._accepting = False
         self._wake.set()
 
-    def close(self, timeout: float = 10.0) -> RecordingSummary:
+    def close(self, timeout: float = 10.0) -> None:
         """
-        Bring everything to the disk, write the summary, and return what the file holds.
+        Bring everything to the disk, and write the summary; `error` says what went wrong.
 
-        May be called again.  Where the disk does not finish within `timeout` [s], the summary's
-        `error` says so and the file goes on being closed in the background.
+        A disk that does not finish within `timeout` [s] goes on in the background.
         """
         self.end()
         self._thread.join(timeout)
         if self._thread.is_alive():
             self.error = self.error or (
                 f'{self.path or self._uri} could not be closed within {timeout:g} s')
-        return self.counters
 
     # ----------------------------------------------------------------- in the recorder's thread
 
@@ -178,11 +152,8 @@ class Recorder:
         except Exception as error:  # whatever it is, the simulation goes on without a log
             self._accepting = False
             self.error = text_of(error) if self.path is None else (
-                f'recording to {self.path} stopped: {why_not_written(self.path, error)}')
+                f'recording to {self.path} stopped: {reason_of(error)}')
             self.state = 'failed'
-            self._queue.clear()
-            self._bytes_out = self._bytes_in
-            self._taken.set()
             # Cutting off the truncated chunk may have freed enough space for the summary.
             with contextlib.suppress(Exception):
                 if self._syncing is not None:
@@ -211,8 +182,7 @@ class Recorder:
         return file
 
     def _record(self, file: McapWriter) -> None:
-        interval = self._max_loss / 2.0
-        next_flush = self._clock() + interval
+        next_flush = self._clock() + self._max_loss / 2.0
         while True:
             self._wake.clear()
             closing = not self._accepting  # read before the queue: once set, nothing more comes
@@ -226,7 +196,7 @@ class Recorder:
             if self.room:
                 self._taken.set()
             if closing or now >= next_flush:
-                next_flush = now + interval
+                next_flush = now + self._max_loss / 2.0
                 file.flush()
                 if closing and self._syncing is not None:
                     self._syncing.join()
@@ -236,19 +206,12 @@ class Recorder:
                 if closing:
                     file.finish()
                     return
-                self._begin_sync(file, now)
+                if self._syncing is None or not self._syncing.is_alive():
+                    self._syncing = self._threads.Thread(
+                        target=self._sync, args=(file, (now, self._bytes_out)),
+                        name='recorder sync', daemon=True)
+                    self._syncing.start()
             self._wake.wait(max(0.0, next_flush - self._clock()))
-
-    def _begin_sync(self, file: McapWriter, now: float) -> None:
-        if self._syncing is not None and self._syncing.is_alive():
-            return
-        written = now, self._bytes_out
-        if self._bytes_out == self._on_disk[1]:
-            self._on_disk = written
-        else:
-            self._syncing = self._threads.Thread(
-                target=self._sync, args=(file, written), name='recorder sync', daemon=True)
-            self._syncing.start()
 
     def _sync(self, file: McapWriter, written: tuple[float, int]) -> None:
         try:

@@ -8,7 +8,6 @@ Sources: rosbag2_storage, qos.cpp and yaml.hpp; rosbag2_storage_mcap, mcap_stora
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -49,6 +48,7 @@ _POLICY_NAMES = {
     'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
                    'best_available'),
 }
+_PLAYED = ('reliability', 'durability', 'history', 'depth')
 
 
 class RecordedTopic(NamedTuple):
@@ -64,43 +64,29 @@ class RecordedTopic(NamedTuple):
 
 
 def definition(type_name: str) -> tuple[str, str]:
-    """
-    Return schema (`ros2msg`) and type hash (REP-2011) of a type that a stream has.
-
-    Other than rosbag2's, the schema, which is the definition followed by those it depends on, has
-    no comments.
-    """
+    """Return schema (`ros2msg`, without comments) and type hash (REP-2011) of a stream's type."""
     text, type_hash = read_table('recording/definitions.json')[type_name]
     return text, type_hash
 
 
 def qos_profiles(channel: Channel) -> tuple[Qos, ...]:
-    """
-    Return the QoS profiles in the metadata of a channel, with policies by number or name.
-
-    A policy that is missing or not understood is as in DEFAULT_QOS; a text that is no list of
-    profiles has none.
-    """
+    """Return the profiles that a channel offers, with _PLAYED; what is wrong is as by default."""
     text = channel.metadata.get('offered_qos_profiles', '')
     if len(text) > 1 << 16 or '<<' in text:     # merged keys may grow exponentially
         return ()
     try:
-        return tuple({key: _understood(profile.get(key), default, _POLICY_NAMES.get(key, ()))
-                      for key, default in DEFAULT_QOS.items()} for profile in yaml.safe_load(text))
+        return tuple({policy: _understood(policy, profile.get(policy)) for policy in _PLAYED}
+                     for profile in yaml.safe_load(text))
     except Exception:   # PyYAML raises many kinds for what it does not understand
         return ()
 
 
-def _understood(value: Any, default: Any, names: Sequence[str] = ()) -> Any:
-    """Return a policy by number or name, as its default where it is none of these."""
-    if isinstance(default, dict):
-        parts = value if isinstance(value, dict) else {}
-        return {part: _understood(parts.get(part), known) for part, known in default.items()}
+def _understood(policy: str, value: Any) -> Any:
+    names = _POLICY_NAMES.get(policy, ())
     number = names.index(value) if value in names else value
-    if type(number) is not type(default) or not -1 << 63 <= number < 1 << 63 or (
-            names and (number not in range(len(names)) or names[number] == 'unknown')):
-        return default
-    return number
+    allowed = [known for known, name in enumerate(names) if name != 'unknown'] or (
+        range(-1 << 31, 1 << 31))
+    return number if type(number) is int and number in allowed else DEFAULT_QOS[policy]
 
 
 def has_compressed_messages(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> bool:
@@ -138,7 +124,7 @@ def bag_metadata(topics: Sequence[RecordedTopic], counts: Sequence[int], file_na
         'relative_file_paths': [file_name],
         'files': [{'path': file_name, **numbers}],
         'custom_data': None,
-        'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy'})}
+        'ros_distro': 'jazzy'})}
 
 
 def as_yaml(value: object) -> str:

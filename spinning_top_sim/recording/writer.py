@@ -15,7 +15,6 @@ import struct
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
 
@@ -30,13 +29,17 @@ from numpy.typing import NDArray
 
 from spinning_top_sim.installation import version
 from spinning_top_sim.recording import rosbag2
-from spinning_top_sim.recording.errors import LogError, why_not_written
+from spinning_top_sim.recording.errors import LogError, reason_of
 from spinning_top_sim.recording.provenance import METADATA_NAME, OUR_LIBRARY
 
 CHUNK_BYTES = 1_000_000     # of messages that make a chunk, about
 # The fastest level that compresses nearly as well as zstd's own default, 3, with a window of a
 # whole chunk: its default, half of one, costs up to 20 %.
 ZSTD = zstandard.ZstdCompressionParameters.from_level(-1, window_log=20)
+# A record of a message, before its data.
+MESSAGE = [('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
+           ('log_time', '<u8'), ('publish_time', '<u8')]
+MESSAGE_BYTES = np.dtype(MESSAGE).itemsize
 INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, length of the entries
 
 # The next messages of a topic: its index, log times (n,) [ns], serialized messages (n, size).
@@ -50,7 +53,6 @@ class McapWriter:
     Every write goes to an explicit position behind the last whole record, so neither an OSError
     nor an interrupt can shift what follows.  After an OSError `finish` may still be tried.
 
-    path : must not exist
     topics : the channel of a topic is its index + 1
     metadata : the `spinning_top_sim` record
     compression : of the chunks, 'zstd', 'lz4' or 'none'
@@ -65,8 +67,8 @@ class McapWriter:
         self._compression = '' if compression == 'none' else compression
         self._rows: list[Rows] = []                 # of the next chunk,
         self._chunk_bytes = 0                       # and its size
-        self.message_counts = Counter[int]()        # messages in the file by channel
-        self._times_ns: list[int] = []              # earliest and latest stamp of each chunk
+        self.message_counts = Counter(dict.fromkeys(range(1, len(topics) + 1), 0))   # by channel
+        self._span: tuple[int, ...] = ()            # earliest and latest stamp of all chunks
         self._end = 0, 0    # size and checksum of the file; one assignment, so always consistent
         # Records of the summary.  Serialized: thousands of objects would take memory.
         self._summary = [*map(record_bytes, _declarations(topics))]
@@ -85,7 +87,7 @@ class McapWriter:
                 path.unlink()
                 raise
         except (OSError, ValueError) as error:
-            raise LogError(f'cannot write {path}: {why_not_written(path, error)}') from error
+            raise LogError(f'cannot write {path}: {reason_of(error)}') from error
 
     @property
     def size(self) -> int:
@@ -93,20 +95,14 @@ class McapWriter:
 
     def add(self, topic_index: int, log_times_ns: NDArray[np.int64],
             rows: NDArray[np.uint8]) -> None:
-        """
-        Add messages of a topic.  The arrays must not change before they are written.
-
-        log_times_ns : log and publish times (n,), n >= 1, in any order
-        rows : serialized messages (n, size)
-        """
+        """Add `Rows`, n >= 1, with times in any order.  The arrays must not change afterwards."""
         self._rows.append((topic_index, log_times_ns, rows))
-        self._chunk_bytes += len(rows) * _message_type(rows.shape[1]).itemsize
+        self._chunk_bytes += len(rows) * (MESSAGE_BYTES + rows.shape[1])
 
     def flush(self, if_full: bool = False) -> None:
         """
-        Write the chunk in memory, and its message indexes; or only if it is full.
+        Write the chunk in memory, or only if it is full, where no topic lags behind another.
 
-        Call it where no topic lags behind another: a file that is torn there has no holes.
         An exception loses the chunk, so that the file can be finished; an interrupt does not.
         """
         if self._chunk_bytes < (CHUNK_BYTES if if_full else 1):
@@ -117,15 +113,15 @@ class McapWriter:
             self._rows, self._chunk_bytes = [], 0
             raise
 
-    def _chunk(self) -> tuple[bytearray, dict[int, NDArray[np.uint64]]]:
-        """Return the messages in memory, and by channel log times and offsets in them (n, 2)."""
+    def _chunk(self) -> tuple[bytearray, dict[int, NDArray[np.uint64]], Counter[int]]:
+        """Return messages, log times and offsets in them (n, 2), and counts, both by channel."""
         plain, offset, counts = bytearray(self._chunk_bytes), 0, self.message_counts.copy()
         index: defaultdict[int, list[NDArray[np.uint64]]] = defaultdict(list)
         for (topic, size), alike in itertools.groupby(
                 sorted(self._rows, key=itemgetter(0)), lambda rows: (rows[0], rows[2].shape[1])):
             _, times, parts = zip(*alike, strict=True)
-            times_ns, record, channel = np.concatenate(times), _message_type(size), topic + 1
-            numbers = np.arange(len(times_ns))
+            times_ns, channel = np.concatenate(times), topic + 1
+            record, numbers = np.dtype([*MESSAGE, ('data', 'u1', size)]), np.arange(len(times_ns))
             messages = np.frombuffer(plain, record, len(numbers), offset)
             messages['opcode'], messages['length'] = Opcode.MESSAGE, record.itemsize - 9
             messages['channel'], messages['sequence'] = channel, numbers + counts[channel]
@@ -135,9 +131,10 @@ class McapWriter:
                 [times_ns, numbers * record.itemsize + offset], axis=1).astype(np.uint64))
             counts[channel] += len(numbers)
             offset += messages.nbytes
-        return plain, {channel: np.concatenate(parts) for channel, parts in index.items()}
+        return plain, {channel: np.concatenate(parts) for channel, parts in index.items()}, counts
 
-    def _write_chunk(self, plain: bytearray, index: Mapping[int, NDArray[np.uint64]]) -> None:
+    def _write_chunk(self, plain: bytearray, index: Mapping[int, NDArray[np.uint64]],
+                     counts: Counter[int]) -> None:
         times_ns = np.concatenate([entries[:, 0] for entries in index.values()])
         span = {'message_start_time': int(times_ns.min()), 'message_end_time': int(times_ns.max())}
         # A tenth of the time of `simulate` is all of this: not worth a thread.
@@ -156,15 +153,13 @@ class McapWriter:
             message_index_offsets=dict(zip(index, offsets, strict=True)),
             message_index_length=end - offsets[0], compression=self._compression,
             compressed_size=len(data), uncompressed_size=len(plain), **span))
-        counts = self.message_counts + Counter({
-            channel: len(entries) for channel, entries in index.items()})
-        start_and_end = list(span.values())
+        times = [*self._span, *span.values()]
+        whole_span = min(times), max(times)
         written = self._write(blocks)
         # A KeyboardInterrupt comes behind a call, and none is between these assignments.
-        self._end, self.message_counts = written, counts
+        self._end, self.message_counts, self._span = written, counts, whole_span
         self._rows, self._chunk_bytes = [], 0
         self._summary += [summary]
-        self._times_ns += start_and_end
 
     def sync(self) -> None:
         os.fsync(self._file.fileno())
@@ -184,15 +179,14 @@ class McapWriter:
         """Write the chunk in memory and the summary, bring all to the disk, close the file."""
         try:
             self.flush()
-            start_ns, end_ns = min(self._times_ns, default=0), max(self._times_ns, default=0)
-            counts = {channel: self.message_counts[channel]
-                      for channel, _ in enumerate(self._topics, start=1)}
+            start_ns, end_ns = self._span or (0, 0)
             self._write_metadata(rosbag2.BAG_METADATA, rosbag2.bag_metadata(
-                self._topics, [*counts.values()], self._path.name, start_ns, end_ns))
+                self._topics, [*self.message_counts.values()], self._path.name, start_ns, end_ns))
             self._end = self._write([record_bytes(records.DataEnd(self._end[1]))])
             kinds = Counter(raw[0] for raw in self._summary)
             statistics = record_bytes(records.Statistics(
-                attachment_count=0, channel_count=len(counts), channel_message_counts=counts,
+                attachment_count=0, channel_count=len(self._topics),
+                channel_message_counts=self.message_counts,
                 chunk_count=kinds[Opcode.CHUNK_INDEX], message_count=self.message_counts.total(),
                 message_end_time=end_ns, message_start_time=start_ns,
                 metadata_count=kinds[Opcode.METADATA_INDEX], schema_count=kinds[Opcode.SCHEMA]))
@@ -202,7 +196,6 @@ class McapWriter:
             self._end = self._write(
                 [summary, zlib.crc32(summary).to_bytes(4, 'little'), MCAP0_MAGIC])
             self.sync()
-            _sync_directory(self._path.parent)
         except OSError as error:
             error.filename = str(self._path)
             raise
@@ -260,13 +253,6 @@ def record_bytes(record: records.McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()
-
-
-@lru_cache
-def _message_type(size: int) -> np.dtype[np.void]:
-    """Return the type of a message record with so many bytes of data."""
-    return np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                     ('log_time', '<u8'), ('publish_time', '<u8'), ('data', 'u1', (size,))])
 
 
 def _sync_directory(directory: Path) -> None:

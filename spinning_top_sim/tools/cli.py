@@ -14,7 +14,7 @@ from typing import Any, NoReturn, TextIO
 
 from spinning_top_sim.files import new_file
 from spinning_top_sim.installation import version
-from spinning_top_sim.recording.errors import text_of, why_not_written
+from spinning_top_sim.recording.errors import reason_of, text_of
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130         # argparse uses 2, too
 
@@ -99,7 +99,7 @@ def check_output(*paths: Path | None) -> None:
             with new_file(path):
                 path.unlink()
         except OSError as error:
-            raise OSError(f'cannot write {path}: {why_not_written(path, error)}') from error
+            raise OSError(f'cannot write {path}: {reason_of(error)}') from error
 
 
 def printable(text: str) -> str:

@@ -49,14 +49,6 @@ class Sample(NamedTuple):
     covariance: NDArray[np.float64] | None
 
 
-class Attitude(NamedTuple):
-    """Stamp [ns], quaternion x, y, z, w (4,) and covariance (3, 3) [rad^2], NaN if unknown."""
-
-    stamp_ns: int
-    quaternion: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-
-
 @cache
 def _types() -> Any:
     with needed('a log', 'rosbags'):
@@ -73,8 +65,12 @@ def deserialized(data: bytes, type_name: str) -> Any:
         raise ValueError(f'no {type_name}: {error}') from error
 
 
-def decode(data: bytes, type_name: str) -> Attitude:
-    """Return the attitude in a message of a type of LAYOUTS.  Raises ValueError without one."""
+def decode(data: bytes, type_name: str) -> tuple[int, list[float], NDArray[np.float64]]:
+    """
+    Return the attitude in a message of a type of LAYOUTS.  Raises ValueError without one.
+
+    It is a stamp [ns], quaternion x, y, z, w and covariance (3, 3) [rad^2], NaN if unknown.
+    """
     message, (place, matrix_place) = deserialized(data, type_name), LAYOUTS[type_name]
     stamp, q = message.header.stamp, attrgetter(place)(message)
     covariance = np.full((3, 3), np.nan)
@@ -87,8 +83,7 @@ def decode(data: bytes, type_name: str) -> Attitude:
         # A matrix of zeros means unknown (sensor_msgs); the streams of this package are exact.
         if np.max(np.abs(matrix)) > EXACT_VARIANCE:
             covariance = matrix
-    return Attitude(stamp.sec * NANOSECONDS + stamp.nanosec, np.array((q.x, q.y, q.z, q.w)),
-                    covariance)
+    return stamp.sec * NANOSECONDS + stamp.nanosec, [q.x, q.y, q.z, q.w], covariance
 
 
 def samples(reader: LogReader, types: Mapping[str, str], end_ns: int) -> Iterator[Sample]:

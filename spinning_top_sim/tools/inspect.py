@@ -111,10 +111,11 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _content(reader: LogReader, found: Survey, run: RunDescription | None) -> dict[str, Any]:
     """Return the findings for JSON; docs/logs.md has the keys."""
-    damage, (begin_ns, end_ns) = reader.damage, reader.span
+    begin_ns, end_ns = reader.span
     return {
         'file': str(reader.path), 'whole': reader.whole,
-        'damage': {'torn': damage.torn, 'lost_bytes': damage.lost_bytes, 'report': damage.lines()},
+        'damage': {'torn': reader.torn, 'lost_bytes': reader.lost_bytes,
+                   'report': reader.damage},
         'begin_ns': begin_ns, 'end_ns': end_ns, 'duration': (end_ns - begin_ns) / NANOSECONDS,
         'topics': {name: asdict(topic) for name, topic in found.topics.items()},
         'notes': found.notes,

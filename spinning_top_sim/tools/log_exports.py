@@ -8,7 +8,7 @@ aerial vehicle datasets", IJRR 35, 2016).
 """
 
 import argparse
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -45,21 +45,16 @@ def _parse(text: str) -> tuple[str, Path]:
     return kind, Path(name)
 
 
-def check(exports: Sequence[tuple[str, Path]], topics: Collection[str]) -> None:
-    """Raise ValueError if files cannot be made of a log with these topics of streams."""
-    for kind, _ in exports:
-        for topic in KINDS[kind][0]:
-            if topic not in topics:
-                raise ValueError(f'--export {kind}: the log has no {topic}')
-
-
 def write(reader: LogReader, run: RunDescription,
           exports: Sequence[tuple[str, Path]]) -> Iterator[str]:
     """Write the files; yield a line about each.  Raises ValueError or OSError."""
-    check(exports, run.topics)
     for kind, path in exports:
+        topics, rows = KINDS[kind]
+        for topic in topics:
+            if topic not in run.topics:
+                raise ValueError(f'--export {kind}: the log has no {topic}')
         with new_file(path) as file:
-            file.writelines(KINDS[kind][1](reader, run))
+            file.writelines(rows(reader, run))
         yield f'{path}: {kind}'
 
 

@@ -18,8 +18,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recovery import recover
+from spinning_top_sim.recording.reader import LogReader, recover
 from spinning_top_sim.tools import cli
 
 SOME_LOST = 3
@@ -35,14 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    with LogReader(arguments.log, compressed=True) as reader:
+    with LogReader(arguments.log) as reader:
         output: Path = arguments.output or reader.path.with_name(
             f'{reader.path.stem}_recovered.mcap')
         cli.check_output(output)
         messages = recover(reader, output)
-    for line in reader.damage.lines():
+    for line in reader.damage:
         cli.print_line(line)
-    is_all = not (reader.damage.lost_bytes or reader.damage.changed)
+    is_all = not (reader.lost_bytes or reader.changed)
     cli.print_line(f'{"kept all" if is_all else "kept"}: {messages} messages, '
                    f'{output.stat().st_size} bytes in {output}')
     return cli.OK if is_all else SOME_LOST

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from spinning_top_sim.recording.provenance import environment, run_metadata
-from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import single
 from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import McapWriter
@@ -31,8 +30,7 @@ from spinning_top_sim.streams.play import Block, Simulation
 from spinning_top_sim.streams.topics import recorded, resolve_topic
 from spinning_top_sim.table import RIDE_UNITS, UNITS, columns, write_csv, write_parquet
 from spinning_top_sim.times import LAST_STAMP_NS, NANOSECONDS, period_ns
-from spinning_top_sim.tools import cli, log_exports, scene_file
-from spinning_top_sim.tools.recorded_run import read_run_description
+from spinning_top_sim.tools import cli, scene_file
 
 FORMATS = ('mcap', 'csv', 'parquet')
 
@@ -55,7 +53,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--epoch', type=float, default=1.0, metavar='S',        # in ROS a stamp of 0 is "no time"
         help='stamp of t = 0 [s], default %(default)g')
     add('--namespace', default='/', help='of the topics and frames in the log')
-    log_exports.add_argument(parser)
     add('--quiet', action='store_true', help='no progress, no summary')
 
 
@@ -67,28 +64,19 @@ def _run(arguments: argparse.Namespace) -> int:
     epoch_ns = arguments.epoch * NANOSECONDS
     if not 0.0 <= epoch_ns <= LAST_STAMP_NS:
         raise ValueError(f'--epoch {arguments.epoch!r}: must be >= 0 and < {2 ** 31} s')
-    if arguments.export and file_format != 'mcap':
-        raise ValueError(f'--export: needs a log, and {output} is {file_format}')
     values = _parameters(arguments)
     simulation = Simulation(values, round(epoch_ns))
     if objection := simulation.trajectory.top.objection:
         cli.print_line(f'spinning-top simulate: warning: {objection}', sys.stderr)
-    log_exports.check(arguments.export, [
-        channel.topic for channel in recorded(simulation.channels, values)])
-    cli.check_output(output, *(path for _, path in arguments.export))
+    cli.check_output(output)
     stops = _parse_stops(arguments.command, round(values['duration'] * NANOSECONDS))
     with cli.progress('simulated', values['duration'], 's', quiet=arguments.quiet) as show:
         if file_format == 'mcap':
             summary = write_log(output, simulation, stops, show, arguments.namespace)
         else:
             summary = ', '.join(_write_table(output, file_format, simulation, stops, show))
-    lines = [f'{output}: {summary}']
-    if arguments.export:
-        with LogReader(output) as reader:
-            lines += log_exports.write(reader, read_run_description(reader), arguments.export)
     if not arguments.quiet:
-        for line in lines:
-            cli.print_line(line)
+        cli.print_line(f'{output}: {summary}')
     return cli.OK
 
 

@@ -4,7 +4,6 @@
 import contextlib
 import io
 import random
-import struct
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,14 +11,16 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.highlevel import AnyReader
 
-from helpers.recordings import METADATA, TOPICS, some_messages
+from helpers.mutations import records
+from helpers.recordings import METADATA, TOPICS, some_messages, write_rows
 from spinning_top_sim.recording.reader import LogReader
 from spinning_top_sim.recording.recorder import single
+from spinning_top_sim.recording.rosbag2 import RecordedTopic
 from spinning_top_sim.recording.writer import McapWriter
-from spinning_top_sim.tools.recover import main
+from spinning_top_sim.tools import recover
 
 CHUNKS, MESSAGES_PER_CHUNK = 3, 12
 
@@ -47,21 +48,15 @@ def flipped(content: bytes, position: int, bit: int = 0) -> bytes:
 
 
 def records_of(content: bytes) -> list[tuple[int, int, int]]:
-    """Return opcode, start and end of every record, of a whole file."""
-    found = []
-    offset = len(MCAP0_MAGIC)
-    while offset < len(content) - len(MCAP0_MAGIC):
-        opcode, length = struct.unpack_from('<BQ', content, offset)
-        found.append((opcode, offset, offset + 9 + length))
-        offset += 9 + length
-    return found
+    """Return opcode, begin and end of every record."""
+    return [(content[begin], begin, end) for begin, end in records(content)]
 
 
-def run(*argv) -> tuple[int, str, str]:
-    """Run the command in this process; return exit code, output and errors."""
+def run(*argv, tool=recover) -> tuple[int, str, str]:
+    """Run a command in this process; return exit code, output and errors."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main([str(argument) for argument in argv])
+        code = tool.main([str(argument) for argument in argv])
     return code, out.getvalue(), err.getvalue()
 
 
@@ -130,20 +125,14 @@ def write_bag(folder, mode='', form='zstd', compress=zstandard.compress, split=1
     """Write what matters of a bag as rosbag2 does, with ten strings."""
     folder.mkdir()
     about = f"compression_format: {form}\ncompression_mode: '{mode}'\n"
+    texts = [b'\0\1\0\0\x06\0\0\0text%d\0' % number for number in range(10)]
+    rows = [(0, number, compress(text) if mode == 'MESSAGE' else text)
+            for number, text in enumerate(texts)]
     for part in range(split):
-        path = folder / f'{folder.name}_{part}.mcap'
-        with path.open('wb') as file:
-            writer = Writer(file)
-            writer.start('ros2', 'libmcap')
-            channel = writer.register_channel('/said', 'cdr', writer.register_schema(
-                'std_msgs/msg/String', 'ros2msg', b'string data\n'))
-            for number in range(10):
-                data = b'\0\1\0\0\x06\0\0\0text%d\0' % number
-                writer.add_message(channel, number, compress(data) if mode == 'MESSAGE' else data,
-                                   number)
-            if record:
-                writer.add_metadata('rosbag2', {'serialized_metadata': about})
-            writer.finish()
+        path = write_rows(
+            folder / f'{folder.name}_{part}.mcap',
+            [RecordedTopic('/said', 'std_msgs/msg/String')], rows,
+            **({'rosbag2': {'serialized_metadata': about}} if record else {}))
         if mode == 'FILE':
             path.with_name(f'{path.name}.{form}').write_bytes(compress(path.read_bytes()))
             path.unlink()

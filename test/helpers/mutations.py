@@ -9,17 +9,19 @@ of chunks.  The records are found by their lengths alone; nothing of this packag
 import random
 import struct
 import zlib
+from io import BytesIO
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.records import Chunk
 
 MAGIC_SIZE = 8
 HEAD = struct.Struct('<BQ')         # opcode, length
 FOOTER, CHUNK, DATA_END = 0x02, 0x06, 0x0f
 DATA_END_SIZE, FOOTER_SIZE = 13, 29
-CHUNK_FIELDS = struct.Struct('<QQQI')   # times, uncompressed size and checksum
-CODECS = {b'zstd': (zstandard.decompress, zstandard.compress),
-          b'lz4': (lz4.frame.decompress, lz4.frame.compress)}
+CODECS = {'zstd': (zstandard.decompress, zstandard.compress),
+          'lz4': (lz4.frame.decompress, lz4.frame.compress)}
 NUMBERS = (0, 1, 2, 15, 0x7f, 0x80, 0xff, 0xffff, 1 << 31, (1 << 32) - 1, 1 << 40, 1 << 62,
            (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 
@@ -86,18 +88,13 @@ def _change(data: bytearray, places: list[tuple[int, int]], rng: random.Random) 
 
 def _mutate_in_chunk(data: bytearray, begin: int, end: int, rng: random.Random) -> None:
     """Change records inside of a chunk, whose checksum is mostly right then."""
-    start_time, end_time, *_ = CHUNK_FIELDS.unpack_from(data, begin + HEAD.size)
-    at = begin + HEAD.size + CHUNK_FIELDS.size
-    compression = bytes(data[at + 4:at + 4 + int.from_bytes(data[at:at + 4], 'little')])
-    packed = bytes(data[at + 4 + len(compression) + 8:end])
-    unpack, pack = CODECS.get(compression, (bytes, bytes))
-    content = bytearray(unpack(packed))
+    chunk = Chunk.read(ReadDataStream(BytesIO(data[begin + HEAD.size:end])))
+    unpack, pack = CODECS.get(chunk.compression, (bytes, bytes))
+    content = bytearray(unpack(chunk.data))
     for _ in range(rng.choice((1, 1, 3))):
         _change(content, records(content, 0), rng)
-    size = len(content) if rng.random() < 0.8 else rng.choice(NUMBERS)
-    crc = zlib.crc32(content) if rng.random() < 0.8 else rng.choice((0, 1))
-    packed = pack(bytes(content))
-    body = b''.join([
-        CHUNK_FIELDS.pack(start_time, end_time, size, crc), struct.pack('<I', len(compression)),
-        compression, struct.pack('<Q', len(packed)), packed])
-    data[begin:end] = HEAD.pack(CHUNK, len(body)) + body
+    chunk.uncompressed_size = len(content) if rng.random() < 0.8 else rng.choice(NUMBERS)
+    chunk.uncompressed_crc = zlib.crc32(content) if rng.random() < 0.8 else rng.choice((0, 1))
+    chunk.data, builder = pack(bytes(content)), RecordBuilder()
+    chunk.write(builder)
+    data[begin:end] = builder.end()

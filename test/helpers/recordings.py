@@ -23,13 +23,9 @@ EPOCH_NS = 1_700_000_000_000_000_000
 
 
 def pose_cdr(number: int) -> bytes:
-    types = JAZZY.types
-    pose = types['geometry_msgs/msg/Pose'](
-        types['geometry_msgs/msg/Point'](1.0, 2.0, float(number)),
-        types['geometry_msgs/msg/Quaternion'](0.0, 0.6, 0.0, 0.8))
-    stamp = types['builtin_interfaces/msg/Time'](1_700_000_000, number)
-    header = types['std_msgs/msg/Header'](stamp, 'world')
-    return bytes(JAZZY.serialize_cdr(types[POSE](header, pose), POSE))
+    """The CDR of a PoseStamped in the frame `world`, packed by hand."""
+    return struct.pack('<4sIII6s6x7d', b'\x00\x01\x00\x00', 1_700_000_000, number, 6, b'world\x00',
+                       1.0, 2.0, number, 0.0, 0.6, 0.0, 0.8)
 
 
 def array_cdr(number: int) -> bytes:
@@ -37,12 +33,13 @@ def array_cdr(number: int) -> bytes:
     return struct.pack('<4sIII4xd', b'\x00\x01\x00\x00', 0, 0, 1, float(number))
 
 
-def write_rows(path, topics, rows, per_chunk=None, metadata=None):
+def write_rows(path, topics, rows, per_chunk=None, **metadata):
     """Write rows (number of a topic, stamp [ns], data) by mcap's writer, so many in a chunk."""
     with open(path, 'wb') as file:
         writer, counts = Writer(file), Counter()
         writer.start('ros2')
-        writer.add_metadata('spinning_top_sim', metadata or {})
+        for name, content in metadata.items():
+            writer.add_metadata(name, content)
         channels = [writer.register_channel(topic.name, 'cdr', writer.register_schema(
             topic.type_name, 'ros2msg', JAZZY.generate_msgdef(
                 topic.type_name, ros_version=2)[0].encode())) for topic in topics]

@@ -18,8 +18,7 @@ from helpers.world import World
 from helpers.world_plan import plan_of
 from spinning_top_sim.recording import provenance, rosbag2, writer
 from spinning_top_sim.recording.errors import LogError
-from spinning_top_sim.recording.reader import LogReader
-from spinning_top_sim.recording.recovery import recover
+from spinning_top_sim.recording.reader import LogReader, recover
 from spinning_top_sim.streams import parameters
 from spinning_top_sim.streams.events import COMMANDS, EVENTS, Event
 from spinning_top_sim.streams.play import Simulation
@@ -150,18 +149,18 @@ def check_handed(world, log, sent):
 
 
 def check_promises(world, log, is_whole, count):
-    state, counters = log.state, log.counters
+    state = log.state
     if state == 'closed' or (is_whole and state != 'failed'):
         assert is_whole and count.total() == len(log.handed), 'a whole log holds all'
     if state == 'failed':
         # A failure in writing the summary costs that alone.
-        assert not log.path or count.total() == counters.messages
-        assert is_whole or not counters.lost or world.disk.failures != 1 or world.was_killed or (
+        assert not log.path or count.total() == log.written[0]
+        assert is_whole or not log.missing or world.disk.failures != 1 or world.was_killed or (
             not log.path), 'the log could have been finished'
         return
     allowed_ns = round(log.possible_loss * SECOND) + SLACK_NS
     if state == 'closed':
-        assert (counters.lost, counters.queued, counters.error) == (0, 0, None)
+        assert (log.missing, log.error) == (0, None)
         assert not world.disk.failures or len(world.logs) > 1, 'a failure is told'
         allowed_ns = 0
     assert world.disk.is_disturbed or log.possible_loss <= world.values['record.max_loss']
@@ -199,7 +198,7 @@ def read(path, *, verified):
 def verify(reader, kept):
     run = read_run_description(reader)
     stamps = [kept[topic][-1][0] for topic in run.topics.values() if topic in kept]
-    if stamps and not reader.damage.lost_bytes:
+    if stamps and not reader.lost_bytes:
         comparison = compare(run, reader, max(stamps), lambda stamp_ns: None)
         assert comparison.identical, comparison.first or comparison.stopped
 

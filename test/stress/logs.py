@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 from helpers.inspected import log_of
-from helpers.logs import STRANGERS, seen_by_mcap, seen_by_us, write_stranger
+from helpers.logs import STRANGERS, run, seen_by_mcap, seen_by_us, write_stranger
 from helpers.mutations import mutate
 
 from spinning_top_sim.recording.errors import LogError
@@ -64,23 +64,21 @@ def read(path):
     return 'read'
 
 
-def run(tool, *arguments):
+def checked(tool, *arguments):
     """Return the exit code and what a tool has printed."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = tool.main([str(argument) for argument in arguments])
-    said = TERMINAL_CODES.search(out.getvalue() + err.getvalue())
+    code, out, err = run(*arguments, tool=tool)
+    said = TERMINAL_CODES.search(out + err)
     assert said is None, f'{tool.__name__} {arguments[1:]} prints {said.group()!r}'
-    assert out.getvalue() or err.getvalue().count('\n') == 1, err.getvalue()
-    return code, out.getvalue()
+    assert out or err.count('\n') == 1, err
+    return code, out
 
 
 def inspected(path):
-    code, _ = run(inspect, path)
-    as_json, out = run(inspect, path, '--json')
+    code, _ = checked(inspect, path)
+    as_json, out = checked(inspect, path, '--json')
     if out:
         json.loads(out, parse_constant=not_json)
-    verified, _ = run(inspect, path, '--verify')
+    verified, _ = checked(inspect, path, '--verify')
     assert {code, as_json, verified} <= {0, 1}
     return (f'inspect {code}', f'verify {verified}')
 
@@ -91,11 +89,11 @@ def not_json(name):
 
 def recovered(path, folder):
     output = folder / 'whole.mcap'
-    code, _ = run(recover, path, '-o', output)
+    code, _ = checked(recover, path, '-o', output)
     assert code in (0, 1, 3) and output.exists() == (code != 1)
     if output.exists():
         assert len(seen_by_mcap(output)) == len(seen_by_us(output))
-        again, _ = run(recover, output, '-o', folder / 'again.mcap')
+        again, _ = checked(recover, output, '-o', folder / 'again.mcap')
         assert again == 0, 'what was recovered is whole'
         (folder / 'again.mcap').unlink()
     return f'recover {code}'
