@@ -85,9 +85,8 @@ def test_a_log_shows_its_attitudes_and_motions(log, source, shown):
     assert shown.motion_at(change_ns + NANOSECONDS) is second
 
 
-@pytest.mark.parametrize('distance', [0.15, -0.15])
-def test_arrows_are_the_vectors_in_the_world(distance):
-    track = simulation.SimulatedTrack(values_of('cusp', **{'top.com_distance': distance}))
+def test_arrows_are_the_vectors_in_the_world():
+    track = simulation.SimulatedTrack(values_of('cusp', **{'top.com_distance': -0.15}))
     t_ns, top = 1_230_000_000, track.top
     exact = truth(track, t_ns)
     turn, up = Rotation.from_quat(exact.quaternion[0]), [0.0, 0.0, 1.0]
@@ -129,10 +128,6 @@ def test_plots_are_the_numbers_of_the_motion(shown):
     energy = exact.energy[0] - exact.l3[0] ** 2 / (2.0 * top.lambda3)
     assert turning.y == pytest.approx(energy) and plot.point == pytest.approx(energy)
     _, line = found['Effective potential V(θ)', 'V']
-    theta, l3, lz = math.radians(line.x[70]), exact.l3[0], exact.lz[0]
-    assert line.y[70] == pytest.approx(
-        (lz - l3 * math.cos(theta)) ** 2 / (2 * top.lambda1 * math.sin(theta) ** 2)
-        + top.gravity_torque * math.cos(theta))
     assert np.interp(turning.x, line.x, line.y) == pytest.approx(energy, abs=1e-3)
 
 
@@ -249,12 +244,14 @@ def test_sliders_and_scenes_begin_the_motions_of_their_numbers():
     desk.put('moment λ₁', -1.0)
     assert own.update(0.5) == 2_000_000_000
     assert desk.message.content.startswith('**refused:** ')
-    for label, value in (('mass', 3.0), ('length', 0.1), ('moment λ₁', 0.2), ('moment λ₃', 0.1)):
+    # A key moves a slider by a round step.
+    for slider in (one for one in desk.inputs.values() if hasattr(one, 'precision')):
+        assert 500 <= (slider.max - slider.min) / slider.step <= 5000
+        assert round(slider.step, slider.precision) == slider.step
+    for label, value in (('mass', 3.0), ('length', 0.1), ('moment λ₁', 0.2), ('moment λ₃', 0.1),
+                         ('tilt', 50.0), ('spin', 20.0), ('precession', 1.0)):
         desk.put(label, value)
         assert own.update(0.0) == 0
-    for label, value in (('tilt', 50.0), ('spin', 20.0), ('precession', 1.0)):
-        desk.put(label, value)
-        own.update(0.0)
     top = Top(mass=3.0, com_distance=0.1, lambda1=0.2, lambda3=0.1, gravity=9.80665)
     start = State.from_rates(math.radians(50.0), 1.0, 0.0, 20.0, top=top)
     track = own.track
@@ -262,12 +259,9 @@ def test_sliders_and_scenes_begin_the_motions_of_their_numbers():
     assert track.state(NANOSECONDS).quaternion == pytest.approx(
         solve(top, start, [1.0]).quaternion, abs=1e-9)
     assert track.about.startswith('Scene looping with other numbers; ')
-    own.update(0.5)
-    assert own.update(0.5) == NANOSECONDS and own.track is track
     desk.put('scene', 'sleeping')
     assert own.update(0.25) == 250_000_000
     assert own.track.motion_at(0).description.name == 'sleeping'
-    assert own.track.about.startswith('Scene sleeping; ')
 
 
 def test_a_source_that_raises_an_error_is_asked_again_and_the_reason_is_shown(monkeypatch):
@@ -303,6 +297,7 @@ sys.exit(main(['view', '--scene', 'wavy', '--html', {str(path)!r}, '-p', 'durati
 
 @pytest.mark.parametrize(('arguments', 'told'), [
     (['LOG', '--imu', 'bmi088'], '--imu bmi088: cannot be given for a log'),
+    (['LOG', '--node'], '--node: cannot be given for a log'),
     (['--namespace', 'left'], '--namespace left: cannot be given for a simulation'),
     (['--ros-args', '-r', '__ns:=/left'], '--ros-args -r __ns:=/left: must be with --node'),
     (['-p', 'top.mas:=3'], 'top.mas:=3: there is no parameter top.mas; did you mean top.mass?'),
