@@ -7,8 +7,10 @@ import threading
 
 import pytest
 import rclpy
+from geometry_msgs.msg import PoseStamped
 from helpers.desk import Desk
 from helpers.node_harness import SimNode, wait_for
+from helpers.simulations import SECOND
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import ReliabilityPolicy
 
@@ -76,6 +78,15 @@ def test_a_running_node(desk, peer, tmp_path):
         assert listening.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
         assert node.end() == 0
         wait_for('the end', lambda: view.update(0.0) and 'has ended' in status.content)
+    # Another run, with an earlier clock.
+    again, pose = peer.node.create_publisher(PoseStamped, '/seen/pose', 10), PoseStamped()
+    pose.header.stamp.sec, pose.header.frame_id = 5, view.track.values['world_frame']
+
+    def began_again():
+        again.publish(pose)
+        return view.update(0.0) is not None and view.track.stamps_ns.tolist() == [5 * SECOND]
+
+    wait_for('the new run', began_again)
     view.stop()
     rclpy.try_shutdown()
     spinning.join()
